@@ -3,6 +3,7 @@
     python benchmarks/hostile.py --seed 1                            # the acceptance run: about half an hour
     python benchmarks/hostile.py --seed 1 --only texts --count 1000
 
+damage  Larger damage to the same files, also with a SHA-256 that was lost or computed again.
 flips   Single bits of files of every kind and of a study's blocks.
 texts   Mutated manifests, tables, arms, specifications and certificates.
 headers Tables whose header contradicts the manifest in unit or order, or is misspelt.
@@ -23,7 +24,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from attacks import calls, flips, headers, kills, structure, texts, users, writes
+from attacks import calls, damage, flips, headers, kills, structure, texts, users, writes
 from attacks.outcomes import FAILURES
 
 # With the usual number of attempts. Writes are first: they fork, which JAX does not survive once it has computed.
@@ -31,6 +32,7 @@ ATTACKS = {
     "writes": (writes.attack, 300),
     "users": (users.attack, 0),
     "kills": (kills.attack, 40),
+    "damage": (damage.attack, 60_000),
     "flips": (flips.attack, 10_000),
     "texts": (texts.attack, 10_000),
     "headers": (headers.attack, 500),

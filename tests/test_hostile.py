@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
         pytest.param(("flips", "texts", "headers", "calls"), 6, marks=pytest.mark.slow),
         pytest.param(("writes",), 36, marks=pytest.mark.exhaustive),
         pytest.param(("users",), 0, marks=pytest.mark.exhaustive),
-        pytest.param(("flips", "texts", "headers", "structure", "calls"), 60, marks=pytest.mark.exhaustive),
+        pytest.param(("damage", "flips", "texts", "headers", "structure", "calls"), 60, marks=pytest.mark.exhaustive),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
 )
@@ -44,5 +44,5 @@ def test_an_attack_fails(attacks, count):
     found = json.loads(done.stdout)
     for attack in attacks:
         assert sum(found[attack]["total"].values()) >= count
-        if attack in ("flips", "texts", "headers", "structure", "calls"):
+        if attack not in ("writes", "users"):
             assert found[attack]["total"]["refused in one sentence"] > count / 4

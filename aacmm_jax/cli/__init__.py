@@ -45,7 +45,7 @@ def main() -> None:
     try:
         from ..core.errors import InputError
         from ..files.outputs import asking
-        from .app import Stopped, app, check_numbers
+        from .app import Stopped, app, check_numbers, prepare_jax
 
         for family in _FAMILIES:
             import_module(f".{family}", __name__)
@@ -57,6 +57,8 @@ def main() -> None:
         _interrupted()
     try:
         check_numbers(sys.argv[1:])
+        if sys.argv[1:2] != ["show"] and not {"--help", "--version"} & set(sys.argv):  # which rarely compute
+            prepare_jax()
         with contextlib.nullcontext() if overwrite else asking():
             app(prog_name="aacmm")
     except SystemExit as done:
@@ -78,6 +80,7 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
+        _fail_without_jax()
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             _discard_output()
             _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
@@ -87,6 +90,15 @@ def main() -> None:
         )
     finally:
         gc.freeze()
+
+
+def _fail_without_jax() -> None:
+    from ..core.backend import check_backend
+
+    try:
+        check_backend()
+    except RuntimeError as error:
+        _fail(str(error), 2)
 
 
 def _interrupted() -> NoReturn:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, NoReturn, get_args, get_type_hints
 import typer
 import typer.core
 
+from ..core.backend import prepare_command
 from ..core.errors import InputError
 from ..core.text import in_short, is_control, is_number, number, printable, quoted
 
@@ -163,6 +164,13 @@ def prepare(
     ] = False,
 ) -> None:
     """Calibrate articulated-arm coordinate measuring machines and other serial arms."""
+
+
+def prepare_jax() -> None:
+    """Before a command computes: on the CPU where JAX cannot start on what it is told to use, with a warning."""
+    warning = prepare_command()
+    if warning is not None:
+        typer.echo(warning, err=True)
 
 
 def with_spinner(what: str, work: Callable[[], Any]) -> Any:

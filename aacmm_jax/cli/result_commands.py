@@ -23,6 +23,7 @@ from .app import (
     Without,
     app,
     examples,
+    prepare_jax,
     show_summary,
     warn_of_unusable,
     with_spinner,
@@ -302,6 +303,7 @@ def show(
     if kind == "study":
         from .study_commands import show_study
 
+        prepare_jax()
         show_study(path, cell, figures, as_json)
         return
     if cell is not None or figures is not None:
@@ -330,6 +332,7 @@ def _show_arm(file: str, base: str | None, tip: str | None, as_json: bool) -> No
     from ..summaries.calibration import arm_summary
     from . import calibration_display
 
+    prepare_jax()
     specification = load_specification(file, base=base, tip=tip)
     summary = arm_summary(specification)
     if specification.urdf is not None:
@@ -355,4 +358,5 @@ def _summary_of(file: Path, kind: str) -> dict[str, Any]:
         "points": (load_points, points_summary),
         "model comparison": (load_compared_models, dict),
     }[kind]
+    prepare_jax()
     return summarise(load(file))

@@ -6,6 +6,7 @@ A calibration in float32 is wrong by tens of micrometres without any sign of it.
 import os
 import sys
 
+from .backend import check_setting
 from .errors import InputError
 
 LARGEST_INTEGER = 2**63 - 1  # of 64 bits; no seed may be larger
@@ -23,8 +24,10 @@ else:
 
 
 def check_x64() -> None:
-    """Raise `InputError` where 64-bit floats were turned off after the import."""
+    """Raise `InputError` where 64-bit floats were turned off after the import, and what `check_setting` raises."""
     import jax
+
+    check_setting()
 
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(

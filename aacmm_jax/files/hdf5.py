@@ -14,16 +14,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..core.backend import check_backend, is_from_jax
 from ..core.errors import InputError
 from .atomic_write import ELSEWHERE, storable, write_atomically
 from .inputs import STREAMED, largest_file, open_input, storable_name
+from .reader_process import damaged, read_through, start, vouch_for
 
 if TYPE_CHECKING:
     from .hdf5_content import Content
 
 FORMAT = "aacmm_jax"
-FORMAT_VERSION = 3  # arms may have prismatic joints and joint corrections since 3
-DIGESTS_SINCE = 2  # the first format version whose files contain a SHA-256 of their content
+FORMAT_VERSION = 4  # prismatic joints and joint corrections since 3; no SHA-256 of the logical content since 4
+SEALED_SINCE = 2  # the first format version whose files end with a SHA-256 of their bytes
+_DIGEST = "content_sha256"  # an attribute of files of versions 2 and 3
 BLOCK = "block"  # kind of the files of a study's blocks, which carry no provenance of their own
 _IN_MEMORY = 64 * 2**20  # bytes up to which a file is read at once, not in parts
 
@@ -94,35 +97,26 @@ def write_tables(
         with _FailureKeepingFile(temporary) as stream:
             with h5py.File(stream, "w", track_order=True) as file:
                 fill(file)
-                stream.check()
-                _add_digest(file)
             stream.check()
         with open(temporary, "rb+") as whole:
-            seal(whole)
+            vouch_for(seal(whole))
 
 
-def file_image(fill: Callable[[Any], None], *, digest: bool = True) -> bytes:
-    """The bytes of an HDF5 file that ``fill`` fills, sealed; ``digest``: with that of the content, too.
+def file_image(fill: Callable[[Any], None]) -> bytes:
+    """The bytes of an HDF5 file that ``fill`` fills, sealed.
 
     HDF5 builds it in memory and Python writes it: on a full disk the HDF5 library crashes the process.
     """
     import h5py
 
-    from .hdf5_content import sealed
+    from .hdf5_content import seal
 
     with h5py.File("image", "w", driver="core", backing_store=False, track_order=True) as file:
         fill(file)
-        if digest:
-            _add_digest(file)
         file.flush()
-        return sealed(file.id.get_file_image())
-
-
-def _add_digest(file: Any) -> None:
-    from .hdf5_content import DIGEST, Content
-
-    own = 2**50  # no limit to what has just been written
-    file.attrs[DIGEST] = Content("the new file", file, own, own, file.attrs.get("parts")).digest()
+        image = io.BytesIO(file.id.get_file_image())
+    vouch_for(seal(image))
+    return image.getvalue()
 
 
 class _FailureKeepingFile:
@@ -242,15 +236,15 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
 
     Raises `InputError` where the file is missing, damaged, of another program or kind, or of a newer version.
     """
-    with opened(path, kinds) as (content, attributes):
+    from .hdf5_content import attributes_of
+
+    with opened(path, kinds) as content:
         groups = {name: group for name, group in content.groups() if name not in without}
         tables = {
             name: {key: content.values(group, key) for key in content.names(group)} for name, group in groups.items()
         }
-        table_attributes = {
-            name: {key: _plain(value) for key, value in content.file[name].attrs.items()} for name in groups
-        }
-    return Stored(attributes, tables, table_attributes)
+        table_attributes = {name: attributes_of(content.file[name]) for name in groups}
+    return Stored(content.attributes, tables, table_attributes)
 
 
 def read_summary(path: str | os.PathLike, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any] | None]:
@@ -260,75 +254,73 @@ def read_summary(path: str | os.PathLike, kinds: Sequence[str]) -> tuple[dict[st
     """
     from importlib import metadata
 
-    with opened(path, kinds) as (content, attributes):
-        current = attributes["package_version"] == metadata.version("aacmm_jax")
+    with opened(path, kinds) as content:
+        current = content.attributes["package_version"] == metadata.version("aacmm_jax")
         root = content.file.id
         text = content.values(root, "summary") if current and "summary" in content.names(root) else None
-        return attributes, None if text is None else json.loads(str(text))
+        return content.attributes, None if text is None else json.loads(str(text))
 
 
 @contextlib.contextmanager
 def opened(
     path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True, bare: bool = False
-) -> Iterator[tuple["Content", dict[str, Any]]]:
-    """The content of a file and its root attributes, where it is one of aacmm of a kind that is asked for.
+) -> Iterator["Content"]:
+    """The content of a file, where it is one of aacmm of a kind that is asked for.
 
-    ``verify=False``: its digest has been verified before. ``bare``: a file without attributes is taken as it is.
+    ``verify=False``: this process has verified it before. ``bare``: a file without attributes is taken as it is.
     Raises `InputError` where it is damaged.
     """
-    import h5py
-
-    from .hdf5_content import Content, is_sealed
-
-    study = "study" in kinds
-    with open_input(path, STREAMED if study else 1) as stream, undamaged(path):
-        size = stream.seek(0, os.SEEK_END)
+    with open_input(path, STREAMED if "study" in kinds else 1) as stream, undamaged(path):
+        size, largest = stream.seek(0, os.SEEK_END), largest_file()
         stream.seek(0)
         if stream.read(8) != b"\x89HDF\r\n\x1a\n":
             raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
         stream.seek(0)
-        image = stream.read() if size <= _IN_MEMORY else None
-        untouched = is_sealed(stream if image is None else io.BytesIO(image)) if verify else None
-        if untouched is False:
-            raise _damaged(path)
-        with h5py.File(stream if image is None else h5py.h5f.open_file_image(image), "r") as file:
-            attributes = {key: _plain(value) for key, value in file.attrs.items()}
-            parts = attributes.get("parts") if study else None
-            content = Content(path, file, size, largest_file(), parts)
-            if attributes or not bare:
-                _check_kind(path, attributes, kinds)
-                if verify:
-                    _verify(path, content, attributes, untouched)
-            yield content, attributes
+        source = stream.read() if size <= _IN_MEMORY else stream
+        if verify and "h5py" not in sys.modules:
+            start()  # which takes as long as the import here
+        from .hdf5_content import content_of, seal_of
+
+        seal = seal_of(io.BytesIO(source) if isinstance(source, bytes) else source) if verify else None
+        if seal == "":
+            raise InputError(f"{path} is damaged or was edited: its content does not match its SHA-256; make it again.")
+        if verify:
+            read_through(path, source, size, largest, seal)
+        with content_of(path, source, size, largest) as content:
+            if content.attributes or not bare:
+                _check_kind(path, content.attributes, kinds)
+                if verify and seal is None:
+                    _check_version(path, content.attributes)
+            yield content
 
 
-def _verify(path: str | os.PathLike, content: "Content", attributes: Mapping[str, Any], untouched: bool | None) -> None:
-    """Raise `InputError` where the content is not what was written; files of earlier versions carry no digest.
-
-    Blocks of a study have their seal only: the digest of their content would take as long as writing them.
-    """
-    from .hdf5_content import DIGEST
-
-    digest = attributes.get(DIGEST, "" if attributes["kind"] == BLOCK else None)
-    if digest is None and attributes["format_version"] < DIGESTS_SINCE:
-        return
-    if digest is None or not (untouched or (digest and content.digest() == digest)):
-        raise _damaged(path)
-
-
-def _damaged(path: str | os.PathLike) -> InputError:
-    return InputError(f"{path} is damaged or was edited: its content does not match its SHA-256; make it again.")
+def _check_version(path: str | os.PathLike, attributes: Mapping[str, Any]) -> None:
+    """Raise `InputError` where a file without a seal is of a version that has one."""
+    sealed = attributes["format_version"] >= SEALED_SINCE or attributes["kind"] == BLOCK
+    if sealed or _DIGEST in attributes:
+        raise InputError(
+            f"{path} is damaged, was cut short or was written to by another program: the SHA-256 at its end is "
+            "missing; name the file as aacmm wrote it, or make it again."
+        )
 
 
 @contextlib.contextmanager
 def undamaged(path: str | os.PathLike) -> Iterator[None]:
-    """While the content of a file is interpreted: what fails there fails because the file was not written so."""
+    """While the content of a file is interpreted: what cannot be read there was not written so.
+
+    What fails for another reason (no memory, a JAX that cannot start or is told to stop) says nothing about the file.
+    """
     try:
         yield
-    except InputError:
+    except (InputError, ImportError):
         raise
+    except MemoryError as error:
+        raise InputError(f"{path} cannot be read: this process has no memory left; free some.") from error
     except Exception as error:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
-        raise InputError(f"{path} is damaged, cut short or was edited; make it again.") from error
+        check_backend()
+        if is_from_jax(error) or isinstance(error, AssertionError | FloatingPointError):
+            raise
+        raise damaged(path) from error
 
 
 def _check_kind(path: str | os.PathLike, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:
@@ -380,11 +372,3 @@ def names_in(attribute: str | Sequence[str] | None) -> tuple[str, ...]:
     if isinstance(attribute, str):
         return tuple(name for name in attribute.split(",") if name)
     return tuple(attribute or ())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, bytes):
-        return value.decode()
-    if isinstance(value, np.ndarray):
-        return [_plain(item) for item in value.tolist()]
-    return value.item() if isinstance(value, np.generic) else value

@@ -1,14 +1,11 @@
 """What an HDF5 file contains, read without following it anywhere else, and the SHA-256 by which damage is detected.
 
-A file carries two digests. The attribute ``content_sha256`` is of its logical content: groups, attributes, and arrays
-with their types, shapes and values, in the order of their names; compression and layout do not change it, so it also
-holds for a file that another program has repacked. The seal, some bytes after the end of what HDF5 reads, is of all
-bytes before it. Where it matches, the content is what was written, at a hundredth of the time that the first one takes.
-Where it does not match, the file is not opened, as the HDF5 library may crash on damaged metadata. Where it is gone
-(other programs do not write it), the content decides. Both detect damage. Neither is a signature: whoever changes a
-file on purpose can compute them again.
+The seal, some bytes after the end of what HDF5 reads, is the SHA-256 of all bytes before it. Every file has had one
+since format version 2. It detects damage and is no signature: whoever changes a file on purpose can compute it again.
+So `reader_process` reads everything in a file once, by `Content.check`, before anything of it is used.
 """
 
+import contextlib
 import hashlib
 import math
 import os
@@ -21,29 +18,24 @@ import numpy as np
 from ..core.errors import InputError
 
 _LOW: Any = h5py  # whose type hints lack some of its modules
-DIGEST = "content_sha256"
 _SEAL = b"\naacmm_jax: SHA-256 of all bytes before this line: %s\n"
 _SEAL_SIZE = len(_SEAL % (64 * b"0"))
 # An honest file's arrays exceed its size little; a few repeated numbers are compressed a thousand times.
 _ALWAYS_READ, _MOST_COMPRESSED = 64 * 2**20, 100
-_BUFFER = 16 * 2**20  # bytes of an array that are hashed at a time
+_BUFFER = 16 * 2**20  # bytes of an array that are read at a time
 
 
-def seal(stream: Any) -> None:
-    """Append the SHA-256 of all bytes of a file that is open for reading and writing."""
+def seal(stream: Any) -> str:
+    """Append the SHA-256 of all bytes of a file that is open for reading and writing; returns it."""
     stream.seek(0)
     digest = hashlib.file_digest(stream, "sha256").hexdigest()
     stream.seek(0, os.SEEK_END)
     stream.write(_SEAL % digest.encode())
+    return digest
 
 
-def sealed(image: bytes) -> bytes:
-    """The bytes of a file with the SHA-256 of all of them appended."""
-    return image + _SEAL % hashlib.sha256(image).hexdigest().encode()
-
-
-def is_sealed(stream: Any) -> bool | None:
-    """Whether the SHA-256 at the end of a file is that of all bytes before; None where there is none."""
+def seal_of(stream: Any) -> str | None:
+    """The SHA-256 at the end of a file: empty where it is not that of all bytes before, None where there is none."""
     size = stream.seek(0, os.SEEK_END) - _SEAL_SIZE
     if size < 0:
         return None
@@ -52,11 +44,19 @@ def is_sealed(stream: Any) -> bool | None:
     if not last.startswith(_SEAL[: _SEAL.index(b"%")]):  # most files of other origin are not read whole
         return None
     stream.seek(0)
-    digest, left = hashlib.sha256(), size
+    sha256, left = hashlib.sha256(), size
     while left and (part := stream.read(min(left, 2**20))):
-        digest.update(part)
+        sha256.update(part)
         left -= len(part)
-    return last == _SEAL % digest.hexdigest().encode()
+    digest = sha256.hexdigest()
+    return digest if last == _SEAL % digest.encode() else ""
+
+
+@contextlib.contextmanager
+def content_of(path: str | os.PathLike, source: Any, size: int, largest: int) -> "Iterator[Content]":
+    """The content of a file in memory, or of one that is open for reading."""
+    with h5py.File(h5py.h5f.open_file_image(source) if isinstance(source, bytes) else source, "r") as file:
+        yield Content(path, file, size, largest)
 
 
 class Content:
@@ -71,13 +71,18 @@ class Content:
         file: The open `h5py.File`.
         size: Its size in bytes.
         largest: The most bytes that may be read into memory.
-        virtual: Folder of the blocks that virtual arrays may be made of, without its path; None allows no such arrays.
+
+    Attributes:
+        attributes: Those of its root. A study's say in which folder the blocks are that virtual arrays may be made of.
     """
 
-    def __init__(self, path: str | os.PathLike, file: Any, size: int, largest: int, virtual: str | None = None):
-        self.path, self.file, self._virtual, self._size = path, file, virtual, size
+    def __init__(self, path: str | os.PathLike, file: Any, size: int, largest: int):
+        self.path, self.file = path, file
+        self.attributes = attributes_of(file)
+        self._virtual = self.attributes.get("parts") if self.attributes.get("kind") == "study" else None
         self._credible = _ALWAYS_READ + _MOST_COMPRESSED * size
         self._left = min(largest, self._credible)
+        self._texts_at_once = max(1, self._credible // size)
 
     def _refuse(self, name: str, what: str) -> InputError:
         return InputError(f"{self.path}: '{name}' is {what}, which is not read; name a file written by aacmm.")
@@ -130,9 +135,10 @@ class Content:
     def values(self, group: Any, name: str) -> np.ndarray:
         """An array, read whole; texts are str."""
         item = self.array(group, name)
-        self._left -= math.prod(item.shape) * item.dtype.itemsize
+        shape, kind = item.shape, item.dtype
+        self._left -= math.prod(shape) * kind.itemsize
         if self._left >= 0:
-            return self._texts(item, name) if h5py.check_string_dtype(item.dtype) else _numbers(item)
+            return self._texts(item, name) if h5py.check_string_dtype(kind) else _read(item, shape, kind)
         raise self._too_large(name, item)
 
     def _too_large(self, name: str, item: Any) -> InputError:
@@ -145,105 +151,81 @@ class Content:
             raise self._refuse(name, "a table of texts in several dimensions")
         if not item.shape:
             return np.asarray(texts[()], dtype=object)
-        step, found = max(1, self._credible // self._size), []
-        for first in range(0, item.shape[0], step):
-            part = texts[first : first + step]
+        found = []
+        for first in range(0, item.shape[0], self._texts_at_once):
+            part = texts[first : first + self._texts_at_once]
             self._left -= sum(map(len, part))
             if self._left < 0:
                 raise self._too_large(name, item)
             found.append(part)
         return np.concatenate(found) if found else np.empty(0, dtype=object)
 
-    def digest(self) -> str:
-        """SHA-256 of the logical content, without the attribute that contains it."""
-        found = _Digest()
+    def check(self) -> None:
+        """Read everything once that a reader of the file may read: raise where HDF5 cannot, or it is not allowed.
+
+        Of a file of another program, only the attributes that show this.
+        """
+        if self.attributes and "format" not in self.attributes:
+            return
         root = self.file.id
-        self._add_attributes(found, root)
-        for name in sorted(self.names(root)):
+        self._check_attributes(root, read=False)  # as they have been
+        for name in self.names(root):
             item = self._item(root, name)
             if not isinstance(item, h5py.h5g.GroupID):
-                self._add_array(found, root, name)
+                self._check_array(root, name)
                 continue
-            found.add("group", name)
-            self._add_attributes(found, item)
-            for inner in sorted(self.names(item)):
-                self._add_array(found, item, inner)
-            found.add("end of group")
-        return found.hexdigest()
+            self._check_attributes(item)
+            for inner in self.names(item):
+                self._check_array(item, inner)
 
-    def _add_array(self, found: "_Digest", group: Any, name: str) -> None:
+    def _check_array(self, group: Any, name: str) -> None:
         item = self.array(group, name)
-        found.add("array", name, _type_name(item.dtype), _sizes(item.shape))
-        properties = item.get_create_plist()
-        if properties.get_layout() == h5py.h5d.VIRTUAL:  # its values are those of other files, which have their own
-            count = properties.get_virtual_count()
-            sources = ((properties.get_virtual_filename(i), properties.get_virtual_dsetname(i)) for i in range(count))
-            places = (properties.get_virtual_vspace(i).get_select_bounds() for i in range(count))
-            for source, place in zip(sources, places, strict=True):
-                found.add(*source, str(place))
+        if self.attributes.get("kind") == "study":  # which xarray reads with all that describes an array
+            self._check_attributes(item)
+            for dimension in h5py.Dataset(item).dims:
+                dimension.keys()
+            if item.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
+                return  # its values are those of other files, which are checked when they are opened
+        shape, kind = item.shape, item.dtype
+        declared = math.prod(shape) * kind.itemsize
+        if declared > self._credible:
+            raise self._too_large(name, item)
+        if h5py.check_string_dtype(kind) and math.prod(shape) > self._texts_at_once:
+            self._texts(item, name)
+        elif declared <= _BUFFER:
+            _read(item, shape, kind)
         else:
-            declared = math.prod(item.shape) * item.dtype.itemsize
-            if declared > self._credible:
-                raise self._too_large(name, item)
-            if h5py.check_string_dtype(item.dtype):
-                found.add_values(self._texts(item, name))
-            elif declared <= _BUFFER:
-                found.add_values(_numbers(item))
-            else:
-                for rows in _parts(item.shape, item.dtype.itemsize):
-                    found.add_values(np.asarray(h5py.Dataset(item)[rows]))
-        self._add_attributes(found, item)
+            for rows in _parts(shape, kind.itemsize):
+                h5py.Dataset(item)[rows]
 
-    def _add_attributes(self, found: "_Digest", item: Any) -> None:
-        attributes = (h5py.h5a.open(item, index=index) for index in range(h5py.h5a.get_num_attrs(item)))
-        for name, attribute in sorted({attribute.name.decode(): attribute for attribute in attributes}.items()):
-            # HDF5 itself keeps REFERENCE_LIST of a scale: the inverse of DIMENSION_LIST.
-            if name == "REFERENCE_LIST" or (name == DIGEST and item == self.file.id):
-                continue
-            if name == "DIMENSION_LIST":
-                found.add("attribute", name, *self._scales(attribute))
-                continue
-            _check_type(name, self._refuse, attribute.get_type())
-            found.add("attribute", name, _type_name(attribute.dtype), _sizes(attribute.shape))
-            values = np.empty(attribute.shape, attribute.dtype)
-            if values.size:
-                attribute.read(values)
-            found.add_values(values)
-
-    def _scales(self, attribute: Any) -> Iterator[str]:
-        """The names of the scales that are attached to each dimension of an array."""
-        values: Any = np.empty(attribute.shape, attribute.dtype)
-        attribute.read(values)
-        for axis, references in enumerate(values.tolist()):
-            for reference in references:
-                yield f"{axis} {(h5py.h5r.get_name(reference, self.file.id) or b'').decode()}"
+    def _check_attributes(self, item: Any, read: bool = True) -> None:
+        for index in range(h5py.h5a.get_num_attrs(item)):
+            attribute = h5py.h5a.open(item, index=index)
+            if attribute.name not in (b"DIMENSION_LIST", b"REFERENCE_LIST"):  # by which HDF5 attaches scales
+                _check_type(attribute.name.decode(), self._refuse, attribute.get_type())
+            shape, kind = attribute.shape, attribute.dtype
+            if math.prod(shape) * kind.itemsize > self._credible:
+                raise self._too_large(attribute.name.decode(), attribute)
+            if read and math.prod(shape):
+                attribute.read(np.empty(shape, kind))
 
 
-class _Digest:
-    """A SHA-256 of pieces, each preceded by its length."""
-
-    def __init__(self) -> None:
-        self._sha256 = hashlib.sha256()
-        self.hexdigest = self._sha256.hexdigest
-
-    def add(self, *texts: str) -> None:
-        for text in texts:
-            self._add(text.encode())
-
-    def _add(self, piece: Any) -> None:
-        self._sha256.update(len(piece).to_bytes(8, "little"))
-        self._sha256.update(piece)
-
-    def add_values(self, values: np.ndarray) -> None:
-        if values.dtype.kind == "O":
-            for value in values.reshape(-1).tolist():
-                self._add(value.encode() if isinstance(value, str) else bytes(value))
-            return
-        self._add(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
+def attributes_of(item: Any) -> dict[str, Any]:
+    """The attributes of a file, a group or an array, in types of Python."""
+    return {name: _plain(value) for name, value in item.attrs.items()}
 
 
-def _numbers(item: Any) -> np.ndarray:
-    values = np.empty(item.shape, item.dtype)
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode()
+    if isinstance(value, np.ndarray):
+        return [_plain(item) for item in value.tolist()]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _read(item: Any, shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
+    """An array as HDF5 reads it: numbers, or texts as bytes."""
+    values = np.empty(shape, kind)
     if values.size:
         item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
     return values
@@ -254,11 +236,6 @@ def _check_type(name: str, refuse: Any, kind: Any) -> None:
     allowed = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
     if kind.get_class() not in allowed:
         raise refuse(name, "of a type that no file of aacmm has")
-
-
-def _type_name(kind: np.dtype) -> str:
-    text = h5py.check_string_dtype(kind)
-    return kind.str if text is None else f"text {text.encoding} {text.length}"
 
 
 def _sizes(shape: tuple[int, ...]) -> str:

@@ -25,9 +25,9 @@ from ..files.atomic_write import ELSEWHERE, write_atomically
 from ..files.captures import arm_table, recording_of, recording_tables, specification_of
 from ..files.hdf5 import (
     BLOCK,
-    DIGESTS_SINCE,
     FORMAT,
     FORMAT_VERSION,
+    SEALED_SINCE,
     Table,
     Variable,
     check_sense,
@@ -78,15 +78,15 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
             dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
 
     with write_atomically(target, _ADVICE, leftovers=False) as temporary:
-        temporary.write_bytes(file_image(fill, digest=False))
+        temporary.write_bytes(file_image(fill))
 
 
 @contextlib.contextmanager
 def _block(path: Path, block: Block, layout: Layout, bare: bool = False) -> Iterator[Mapping[str, Any]]:
-    """The arrays of a block, after its digest was verified; ``bare``: it may be of format version 1, without one."""
+    """The arrays of a block, after its SHA-256 was verified; ``bare``: it may be of format version 1, without one."""
     file = part_of(path, block, layout)
-    with opened(file, (BLOCK,), bare=bare) as (content, attributes):
-        check_sense(file, {"it is another block": attributes.get("block", file.name) != file.name})
+    with opened(file, (BLOCK,), bare=bare) as content:
+        check_sense(file, {"it is another block": content.attributes.get("block", file.name) != file.name})
         yield {name: content.dataset(content.file.id, name) for name in VARIABLES}
 
 
@@ -301,7 +301,7 @@ def check_parts(path: Path, stored: StoredStudy) -> None:
 def check_results(path: Path, stored: StoredStudy) -> None:
     """Raise `InputError` where the results have other shapes, or a finished study has trials that did not run."""
     layout = Layout.of(stored.study, stored.chunk)
-    with opened(path, ("study",), verify=False) as (content, _):
+    with opened(path, ("study",), verify=False) as content:
         arrays = {name: content.dataset(content.group("trials"), name) for name in VARIABLES}
         shapes = any(array.shape != layout.shape(name) for name, array in arrays.items())
         check_sense(path, {"its results have other shapes than its study": shapes})
@@ -315,7 +315,7 @@ def rows_of(
     """Results of one cell, some trials at a time: which trials, and their arrays. One file is open at a time."""
     layout = Layout.of(stored.study, stored.chunk)
     if stored.parts is None:
-        with opened(path, ("study",), verify=False) as (content, _):
+        with opened(path, ("study",), verify=False) as content:
             trials = {name: content.dataset(content.group("trials"), name) for name in names}
             for first in range(0, layout.trials, _TRIALS_IN_MEMORY):
                 part = slice(first, min(first + _TRIALS_IN_MEMORY, layout.trials))
@@ -323,14 +323,14 @@ def rows_of(
         return
     for block in finished_blocks(path, layout):
         if block.first_cell <= cell < block.last_cell:
-            with _block(path, block, layout, stored.version < DIGESTS_SINCE) as arrays:
+            with _block(path, block, layout, stored.version < SEALED_SINCE) as arrays:
                 found = {name: arrays[name][cell - block.first_cell] for name in names}
             yield block.slices[1], found
 
 
 def check_block(path: Path, stored: StoredStudy, block: Block, layout: Layout) -> None:
     """Raise `InputError` where a block's file is damaged."""
-    with _block(path, block, layout, stored.version < DIGESTS_SINCE):
+    with _block(path, block, layout, stored.version < SEALED_SINCE):
         pass
 
 

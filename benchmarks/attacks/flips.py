@@ -9,7 +9,7 @@ import numpy as np
 import aacmm_jax as aj
 
 from .outcomes import Attempt, command_line, exact, read_again
-from .samples import READERS, results, studies, study_results
+from .samples import READERS, make, studies, study_results
 
 COMMAND_SHARE = 20  # one flip in so many is read by the command line instead
 
@@ -23,15 +23,13 @@ class Target(NamedTuple):
 
 
 def targets(folder: Path) -> dict[str, Target]:
-    """One file of each kind, made in a folder."""
+    """What to do with the files that `make` has made."""
 
     def target(file: Path, load: Callable[[Path], Any], shown: Path) -> Target:
         return Target(file, lambda: load(shown), ["show", str(shown), "--json"])
 
-    found = {}
-    for kind, write in results().writers.items():
-        write(folder / f"{kind}.h5")
-        found[kind] = target(folder / f"{kind}.h5", READERS[kind], folder / f"{kind}.h5")
+    files = {kind: folder / f"{kind}.h5" for kind in READERS}
+    found = {kind: target(file, READERS[kind], file) for kind, file in files.items()}
     return found | {kind: target(file, study_results, study) for kind, (file, study) in studies(folder).items()}
 
 
@@ -66,6 +64,7 @@ def flips(kind: str, target: Target, count: int, random: np.random.Generator) ->
 
 def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
     """So many flips, over files of all kinds."""
+    make(folder)
     found = targets(folder)
     for number, (kind, target) in enumerate(found.items()):
         random = np.random.default_rng([seed, number])

@@ -16,7 +16,8 @@ import aacmm_jax as aj
 
 SAME, REFUSED, OTHER, DONE = "same result", "refused in one sentence", "another valid input", "done"
 SILENT, UNEXPECTED, HANG, LOST = "silent difference", "unexpected failure", "hang", "half-written or lost file"
-FAILURES = (SILENT, UNEXPECTED, HANG, LOST)
+LARGE = "much memory"
+FAILURES = (SILENT, UNEXPECTED, HANG, LOST, LARGE)
 
 
 class Attempt(NamedTuple):

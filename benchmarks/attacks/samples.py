@@ -105,14 +105,20 @@ def study_results(path: Path) -> Any:
     return results.finished, [results.columns(cell) for cell in cells], [list(results.errors(cell)) for cell in cells]
 
 
-def studies(folder: Path) -> dict[str, tuple[Path, Path]]:
-    """Studies in a folder: for each kind the file that is attacked, and the study that is read with it."""
+def make(folder: Path) -> None:
+    """One file of each kind, in a folder; a small study runs twice: to its end, and with its blocks kept."""
+    for kind, write in results().writers.items():
+        write(folder / f"{kind}.h5")
     (folder / "study.toml").write_text(STUDY)
     study = aj.study.read_study(folder / "study.toml")
-    whole, parts = folder / "study.h5", folder / "parts" / "study.h5"
     run = partial(aj.study.run_study, study, chunk=BLOCK)
-    run(whole)
-    parts.parent.mkdir()
-    run(parts, keep_parts=True)
+    run(folder / "study.h5")
+    (folder / "parts").mkdir()
+    run(folder / "parts" / "study.h5", keep_parts=True)
+
+
+def studies(folder: Path) -> dict[str, tuple[Path, Path]]:
+    """Those studies: for each kind the file that is attacked, and the study that is read with it."""
+    whole, parts = folder / "study.h5", folder / "parts" / "study.h5"
     block = min(parts.with_name("study.h5.parts").glob("*.h5"))
     return {"study": (whole, whole), "study in blocks": (parts, parts), "block": (block, parts)}

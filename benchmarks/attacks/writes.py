@@ -26,7 +26,7 @@ from aacmm_jax.study import store
 from aacmm_jax.study.blocks import Layout
 
 from .outcomes import LOST, REFUSED, SAME, UNEXPECTED, Attempt, ending, exact
-from .samples import BLOCK, READERS, results, studies, study_results
+from .samples import BLOCK, READERS, make, study_results
 
 SECONDS = 120  # of wall time: making all files, on a busy machine
 LOADING = 600  # of wall time: importing and loading, on a very busy machine
@@ -45,7 +45,7 @@ class Target(NamedTuple):
 
 def targets(folder: Path) -> dict[str, Target]:
     """A writer for each kind of file; all are made in a fork."""
-    assert forked(nothing, lambda _: made(folder))[0] == "written"
+    assert forked(nothing, lambda _: make(folder))[0] == "written"
 
     def save(kind: str) -> Callable[[Any, Path], Any]:
         what = {"observations": "capture", "calibration from observations": "calibration"}.get(kind, kind)
@@ -64,13 +64,6 @@ def targets(folder: Path) -> dict[str, Target]:
         "arm": Target(load_arm, aj.files.save_arm, aj.load_arm),
         "study": Target(partial(aj.study.read_study, folder / "study.toml"), finish, study_results, in_blocks_at),
     }
-
-
-def made(folder: Path) -> None:
-    """A file of each kind."""
-    for kind, write in results().writers.items():
-        write(folder / f"{kind}.h5")
-    studies(folder)
 
 
 def forked(load: Callable[[], Any], work: Callable[[Any], Any], delay: float | None = None) -> tuple[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files import hdf5
+from aacmm_jax.files import hdf5, hdf5_content
 from aacmm_jax.files.hdf5 import Table, Variable, columns, numbering, read_summary, read_tables, write_tables
 from aacmm_jax.files.inputs import LARGEST_FILE, InputFile, fingerprint
 from tests.refusals import assert_refused
@@ -37,6 +37,11 @@ def changed(path, change):
     return path
 
 
+def resealed(path):
+    with open(path, "rb+") as file:
+        hdf5_content.seal(file)
+
+
 def set_value(name, index, value):
     def change(file):
         file[name][index] = value
@@ -58,7 +63,6 @@ CHANGES = {
     "table added": lambda file: file.create_group("true_arm"),
     "array renamed": lambda file: file.move("t/x", "t/y"),
     "no scale": lambda file: file["t/x"].dims[0].detach_scale(file["t/row"]),
-    "digest removed": lambda file: file.attrs.pop("content_sha256"),
     "kind": lambda file: file.attrs.modify("seed", 4),
 }
 
@@ -67,45 +71,24 @@ CHANGES = {
 def test_changed_content_is_refused(path, change):
     changed(path, change)
     for read in (read_tables, read_summary):
-        assert_refused(lambda read=read: read(path, KIND), path, "does not match its SHA-256", "make it again")
+        assert_refused(lambda read=read: read(path, KIND), path, "written to by another program", "make it again")
 
 
-def test_another_layout_is_the_same_content(path, tmp_path, monkeypatch):
-    """Bytes that only HDF5 uses do not matter: another order, no compression, and a file opened for writing."""
-    before = read_tables(path, KIND)
-    size = path.stat().st_size
-    assert changed(path, lambda file: None).stat().st_size < size  # HDF5 has cut off the seal
-    after = read_tables(path, KIND)
-    np.testing.assert_array_equal(after.tables["t"]["x"], before.tables["t"]["x"])
-    other = tmp_path / "other.h5"
-    with h5py.File(path) as source, h5py.File(other, "w") as target:  # no order is kept
-        for name in reversed(list(source.attrs)):
-            target.attrs[name] = source.attrs[name]
-        target.create_dataset("summary", data=source["summary"][()], dtype=h5py.string_dtype())
-        group = target.create_group("t")
-        for name in ("x", "row", "name"):
-            array = source["t"][name]
-            group.create_dataset(name, data=array[()], dtype=array.dtype)
-            for key in ("long_name", "units"):
-                if key in array.attrs:
-                    group[name].attrs[key] = array.attrs[key]
-        group["row"].make_scale("row")
-        for name in ("x", "name"):
-            group[name].dims[0].attach_scale(group["row"])
-        for name, value in source["t"].attrs.items():
-            group.attrs[name] = value
-    np.testing.assert_array_equal(read_tables(other, KIND).tables["t"]["name"], before.tables["t"]["name"])
-
-
-def test_earlier_files_have_no_digest(path):
-    def as_earlier(file):
-        del file.attrs["content_sha256"]
-        file.attrs.modify("format_version", 1)
-
-    assert read_tables(changed(path, as_earlier), KIND).attributes["scale"] == 2.0
+def test_earlier_files_have_no_seal(path):
+    changed(path, lambda file: file.attrs.modify("format_version", 1))
+    assert read_tables(path, KIND).attributes["scale"] == 2.0
     for version in (0, -1, 1.0, "2"):
         changed(path, lambda file, version=version: file.attrs.create("format_version", version))
         assert_refused(lambda: read_tables(path, KIND), path, "format version", "make it again")
+    changed(path, lambda file: file.attrs.update(format_version=1, content_sha256="of version 2 or 3"))
+    assert_refused(lambda: read_tables(path, KIND), path, "the SHA-256 at its end is missing")
+
+
+def test_files_of_versions_2_and_3(path):
+    """They carry a SHA-256 of their logical content, too."""
+    changed(path, lambda file: file.attrs.update(format_version=3, content_sha256="0" * 64))
+    resealed(path)
+    assert read_tables(path, KIND).attributes["scale"] == 2.0
 
 
 def link_to(kind):
@@ -156,26 +139,21 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("digest", [True, False], ids=["seal recomputed", "no digest"])
+@pytest.mark.parametrize("sealed", [True, False], ids=["seal recomputed", "version 1"])
 @pytest.mark.parametrize(("change", "part"), HOSTILE.values(), ids=HOSTILE.keys())
-def test_nothing_leads_out_of_a_file(path, change, part, digest, monkeypatch):
+def test_nothing_leads_out_of_a_file(path, change, part, sealed, monkeypatch):
     """Whoever makes such a file on purpose can seal it, too."""
-    from aacmm_jax.files import hdf5_content
-
     monkeypatch.setattr(hdf5_content, "_ALWAYS_READ", 2**20)  # 16 MB of zeros are written sooner than 256
     changed(path, change)
-    if digest:
-        with open(path, "rb+") as file:
-            hdf5_content.seal(file)
+    if sealed:
+        resealed(path)
     else:
-        changed(path, lambda file: (file.attrs.modify("format_version", 1), file.attrs.pop("content_sha256")))
+        changed(path, lambda file: file.attrs.modify("format_version", 1))
     assert_refused(lambda: read_tables(path, KIND), path, part, "name a file written by aacmm")
 
 
 def test_many_texts_that_are_one(path, monkeypatch):
     """Text is counted while it is read: a thousand elements may refer to the same long text."""
-    from aacmm_jax.files import hdf5_content
-
     monkeypatch.setattr(hdf5_content, "_ALWAYS_READ", 49_000 - 100 * path.stat().st_size)
     assert_refused(lambda: read_tables(path, KIND), path, "'name' is an array of 2000", "far more than the file")
 

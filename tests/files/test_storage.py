@@ -57,10 +57,9 @@ def good(tmp_path_factory) -> SimpleNamespace:
     return SimpleNamespace(recording=recording, record=record, files=files, writers=writers)
 
 
-def without_digest(file: h5py.File) -> None:
-    """As a file of format version 1, whose content is checked without a digest."""
+def as_version_1(file: h5py.File) -> None:
+    """As a file of format version 1, which has no SHA-256 at its end: HDF5 cuts it off when it writes to a file."""
     file.attrs.modify("format_version", 1)
-    del file.attrs["content_sha256"]
 
 
 def edit(change):
@@ -69,7 +68,7 @@ def edit(change):
     def make(path, source):
         shutil.copy(source, path)
         with h5py.File(path, "a") as file:
-            without_digest(file)
+            as_version_1(file)
             change(file)
 
     return make
@@ -105,7 +104,7 @@ BAD = {
     ),
     "empty": (lambda path, source: path.touch(), ["is not an HDF5 file"]),
     "foreign": (make_foreign, ["was not written by aacmm", "name a "]),
-    "newer": (set_attribute("format_version", 4), ["format version 4, newer", "(3)", "update aacmm_jax"]),
+    "newer": (set_attribute("format_version", 5), ["format version 5, newer", "(4)", "update aacmm_jax"]),
     "no version": (edit(lambda file: file.attrs.pop("format_version")), ["damaged", "make it again"]),
     "other kind": (set_attribute("kind", "study"), ["holds a study", "name a "]),
     "no table": (remove("capture"), ["lacks the table 'capture'", "make it again"]),
@@ -148,8 +147,10 @@ def test_a_capture_is_no_calibration(tmp_path, good):
 def test_cut_short(tmp_path, good, kind):
     content = good.files[kind].read_bytes()
     path = tmp_path / "cut.h5"
-    # Without the last bytes alone, the seal, the file is complete for HDF5, and its content decides.
-    for size in (1, 7, 8, 40, 96, 1000, *np.linspace(2000, len(content) - 200, 12).astype(int)):
+    # Without the last bytes alone, the SHA-256, the file is complete for HDF5.
+    seal = len(content) - content.index(b"\naacmm_jax: SHA-256")
+    inside = np.linspace(2000, len(content) - 200, 12).astype(int)
+    for size in (1, 7, 8, 40, 96, 1000, *inside, *(len(content) - cut for cut in (seal, seal - 1, 66, 1))):
         path.write_bytes(content[:size])
         assert_refused(lambda: LOAD[kind](path), path, "damaged", "name a file" if size < 8 else "make it again")
 
@@ -465,7 +466,7 @@ def test_names_with_a_comma(tmp_path, good, held, earlier):
     aj.files.save_calibration(path, record)
     if earlier:
         with h5py.File(path, "a") as file:
-            without_digest(file)
+            as_version_1(file)
             file.attrs["held"] = file["nominal_arm"].attrs["held"] = ",".join(held)
             table = file["cross_validation"]
             table["group"][...] = ",".join(names)
@@ -553,7 +554,7 @@ def test_files_say_where_they_come_from(good):
     for kind, path in good.files.items():
         with h5py.File(path) as file:
             attributes = dict(file.attrs)
-        assert (attributes["format"], attributes["kind"], attributes["format_version"]) == ("aacmm_jax", kind, 3)
+        assert (attributes["format"], attributes["kind"], attributes["format_version"]) == ("aacmm_jax", kind, 4)
         assert attributes["seed"] == 1
         for name in ("package_version", "created", "command"):
             assert attributes[name]

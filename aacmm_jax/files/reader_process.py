@@ -1,0 +1,255 @@
+"""A process that reads every HDF5 file before this one does, within limits of time and memory.
+
+On damaged metadata the HDF5 library loops for ever in C, where Ctrl-C does not end it, takes gigabytes, or crashes. The
+SHA-256 at the end of a file detects what happened to it by chance, but anybody can compute it again, and files of
+format version 1 have none. So a child process reads all of a file first, in the way in which it will be read here.
+Where it does not come to the end, the file is refused and the child replaced.
+
+It is started when the first file is read, serves all that follow, and ends with this process, whose pipe to it is then
+closed. It is a new interpreter and no fork: threads of JAX may hold locks. It does not run the user's script again, as
+one of `multiprocessing` would.
+"""
+
+import atexit
+import contextlib
+import faulthandler
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import InputError
+
+# An intact file takes some milliseconds, and little more memory than its own size.
+_CPU_SECONDS, _SECONDS_PER_MIB, _CLOCK_PER_CPU = 2.0, 1.0, 30
+_MEMORY = 256 * 2**20
+_MOST_SEALS = 100_000
+_vouched_for: set[str] = set()
+_OUT_OF_TIME = (1, -getattr(signal, "SIGPROF", 0))  # exit statuses, by the clock and by the CPU time
+_UNSTARTABLE = (OSError, TypeError, ValueError)  # an interpreter that is not there, has no name, or fails
+_KEPT = 2**20  # bytes of an intact file, for comparison
+_READY = b"ready\n"
+_COMMAND = "import sys; sys.path[:] = sys.argv[1:]; from aacmm_jax.files.reader_process import serve; serve()"
+
+
+def damaged(path: str | os.PathLike) -> InputError:
+    """What is said of a file that cannot be read to its end."""
+    return InputError(f"{path} is damaged, cut short or was edited; make it again.")
+
+
+def vouch_for(seal: str) -> None:
+    """This process has written the file with this seal, or it was read through: it need not be again."""
+    if len(_vouched_for) >= _MOST_SEALS:
+        _vouched_for.clear()
+    _vouched_for.add(seal)
+
+
+def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, seal: str | None) -> None:
+    """Raise `InputError` where HDF5 cannot read a file, or what is in it is not what files of this package contain.
+
+    ``source`` is its bytes, or the open file where they are too many for the memory: the child opens it by its name.
+    ``largest`` is the most bytes that may be read into memory.
+    """
+    if seal in _vouched_for:
+        return
+    content = source.getbuffer() if hasattr(source, "getbuffer") else source  # of a file that is in memory already
+    sent = isinstance(content, bytes | memoryview)
+    opened = None if sent else os.path.abspath(path)
+    seconds = _CPU_SECONDS + _SECONDS_PER_MIB * size / 2**20
+    request = {
+        "path": str(path),
+        "opened": opened,
+        "size": size,
+        "largest": largest,
+        # Of memory: the bytes, copies of them in HDF5, and what is read.
+        "limits": (seconds, _CLOCK_PER_CPU * seconds, _MEMORY + 3 * size + min(largest, 100 * size)),
+    }
+    answer = _reader.answer(request, content if sent else b"")
+    if answer is None:
+        raise damaged(path)
+    if answer:
+        raise InputError(answer)
+    if seal is not None:
+        vouch_for(seal)
+
+
+def start() -> None:
+    """Start the child where none runs; it is ready some time later."""
+    _reader.start()
+
+
+class _Reader:
+    """The child process, and the requests to it: one at a time."""
+
+    def __init__(self) -> None:
+        self._process: Any = None
+        self.lock = threading.Lock()
+        self._ready = self._has_refused = False
+
+    def start(self) -> None:
+        with self.lock, contextlib.suppress(*_UNSTARTABLE):  # which `answer` meets again
+            self._start()
+
+    def _start(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            return
+        self.stop()
+        home = str(Path(__file__).parents[2])
+        # Nothing is imported from the current folder, unless the package itself was.
+        paths = [path for path in sys.path if os.path.isabs(path) or os.path.abspath(path) == home]
+        options: dict[str, Any] = {"start_new_session": True}  # Ctrl-C is for this process alone
+        if os.name == "nt":
+            options = {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-X", "utf8", "-c", _COMMAND, *map(os.path.abspath, [*paths, home])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd=os.path.abspath(os.sep),
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+            **options,
+        )
+
+    def stop(self) -> None:
+        """End the child, which has nothing to lose."""
+        process, self._process = self._process, None
+        self._ready = self._has_refused = False
+        if process is not None:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                with contextlib.suppress(OSError):  # what was not sent
+                    pipe.close()
+
+    def forget(self) -> None:
+        """After a fork, before which it was locked: the child is the parent's."""
+        if self._process is not None:
+            self._process.returncode = 0
+            self._process.stdin.close()
+            self._process.stdout.close()
+        self.__init__()
+
+    def answer(self, request: dict[str, Any], content: Any) -> str | None:
+        """Empty where a file can be read, else why not; None where it is damaged."""
+        with self.lock:
+            try:
+                had_refused = self._has_refused
+                answer, crashed = self._ask(request, content)
+                if crashed and had_refused:  # what it read before may have spoilt its memory
+                    answer, _ = self._ask(request, content)
+                self._has_refused |= answer is None
+                return answer
+            except BaseException:  # the answer to a request that was interrupted must not be taken for the next one's
+                self.stop()
+                raise
+
+    def _ask(self, request: dict[str, Any], content: Any) -> tuple[str | None, bool]:
+        """The answer, and whether the child crashed in place of one."""
+        try:
+            self._start()
+            if not self._ready and self._process.stdout.readline() != _READY:
+                raise OSError(None, f"exit status {self._process.wait()}")
+        except _UNSTARTABLE as error:
+            reason = (getattr(error, "strerror", None) or str(error)).lower()
+            raise InputError(
+                f"{request['path']} cannot be read, as the process that opens HDF5 files first does not start: "
+                f"{reason}; see whether {sys.executable} -c 'import h5py' works."
+            ) from error
+        self._ready, answer = True, b""
+        with contextlib.suppress(OSError):  # it has ended
+            self._process.stdin.write(json.dumps(request | {"sent": len(content)}).encode() + b"\n")
+            self._process.stdin.write(content)
+            self._process.stdin.flush()
+            answer = self._process.stdout.readline()
+        if answer.endswith(b"\n"):
+            return json.loads(answer), False
+        status = self._process.wait()
+        self.stop()
+        if status == -getattr(signal, "SIGKILL", 0):
+            path = request["path"]
+            return f"{path} cannot be read: the system ended the process that opens it; free some memory.", False
+        return None, status not in _OUT_OF_TIME
+
+
+_reader = _Reader()
+atexit.register(_reader.stop)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=_reader.lock.acquire, after_in_parent=_reader.lock.release, after_in_child=_reader.forget
+    )
+
+
+def serve() -> None:
+    """What the child does: read one file after the other, until nobody can ask any more."""
+    answers = os.fdopen(os.dup(1), "wb", buffering=0)
+    os.dup2(2, 1)  # what a library prints is no answer
+    from .hdf5_content import content_of
+
+    def check(content: bytes, request: dict[str, Any]) -> None:
+        with limits.of(*request["limits"]), contextlib.ExitStack() as stack:
+            source = content or stack.enter_context(open(request["opened"], "rb"))
+            stack.enter_context(content_of(request["path"], source, request["size"], request["largest"])).check()
+
+    limits = _Limits()
+    intact: tuple[bytes, dict[str, Any]] | None = None
+    answers.write(_READY)
+    for line in sys.stdin.buffer:
+        request = json.loads(line)
+        content = sys.stdin.buffer.read(request["sent"])
+        answer: str | None = ""
+        try:
+            check(content, request)
+        except InputError as error:
+            answer = str(error)
+        except Exception:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
+            answer = None
+        answers.write(json.dumps(answer).encode() + b"\n")
+        if answer == "" and 0 < len(content) < _KEPT:
+            intact = content, request
+        if answer is None:  # without memory, for one, HDF5 can no longer read what it could before
+            if intact is None:
+                break
+            try:
+                check(*intact)
+            except Exception:
+                break
+    os._exit(0)
+
+
+class _Limits:
+    """Of time and memory, in the child: on Linux all of them, on macOS those of time, on Windows that by the clock."""
+
+    def __init__(self) -> None:
+        if hasattr(signal, "SIGPROF"):
+            signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process; the parent may have had it ignored
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGPROF])
+        self._used = 0
+        with contextlib.suppress(OSError, ImportError):
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            self._used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+    @contextlib.contextmanager
+    def of(self, cpu: float, clock: float, memory: int) -> Iterator[None]:
+        """While a file is read: so many seconds of CPU time and by the clock, and bytes of memory."""
+        faulthandler.dump_traceback_later(clock, exit=True)
+        if self._used:
+            import resource
+
+            hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+            limit = self._used + memory if hard == resource.RLIM_INFINITY else min(self._used + memory, hard)
+            resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_PROF, cpu)
+        try:
+            yield
+        finally:
+            if hasattr(signal, "setitimer"):
+                signal.setitimer(signal.ITIMER_PROF, 0)
+            faulthandler.cancel_dump_traceback_later()
