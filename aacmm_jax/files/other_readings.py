@@ -95,7 +95,7 @@ def compare_reading_sets(manifest: str | os.PathLike, recording: Recording) -> t
             header = _header(folder, entry)
             columns = reading_sets(header, joints).get(role)
             if columns is not None:
-                lines.append(_pick(document, table, entry, header, columns))
+                lines.append(_pick(table, entry, header, columns))
         if not lines:
             return ()
         changed = InputFile(manifest)
@@ -152,14 +152,10 @@ def _header(folder: Path, entry: Any) -> list[str]:
         return []
 
 
-def _pick(document: Any, table: str, entry: Any, header: Sequence[str], columns: Sequence[int]) -> str:
+def _pick(table: str, entry: Any, header: Sequence[str], columns: Sequence[int]) -> str:
     """Have a table pick these columns for its readings; the line that does it, and where."""
     import tomlkit
 
-    if table in ("socket", "sphere"):
-        angles = document.setdefault("angles", tomlkit.table())
-        angles["columns"] = [column + 1 for column in columns]
-        return f"columns = {angles['columns'].as_string()} in [angles]"
     names = [header[column] for column in columns]
     pattern = f"{re.split('[0-9]', names[0])[0]}[0-9]*"
     alone = [name for name in header if fnmatch.fnmatchcase(name, pattern)] == names

@@ -99,8 +99,16 @@ class OutputFile:
             os.chmod(self.temporary, stat.S_IMODE(replaced.st_mode))
 
     def check_replaced(self) -> None:
-        """Raise `InputError` where the complete file would replace one that somebody else wrote; of commands only."""
-        if _asking.get() and self.target.exists() and not _is_own(self.target, self.temporary):
+        """Raise `InputError` where a file would replace one that somebody else wrote; of commands only.
+
+        Before any work where its name tells that the new one will say who wrote it; else once it is complete.
+        """
+        if not _asking.get() or not self.target.exists():
+            return
+        marked = self.target.suffix.lower() in _MARKED
+        if not (
+            _is_own(self.target, self.temporary) if self.temporary.exists() else not marked or _is_marked(self.target)
+        ):
             raise InputError(
                 f"{self.named} exists and is no earlier output of this kind; choose another name, or replace it with "
                 "--overwrite."
@@ -188,6 +196,7 @@ def _remove_unlocked(path: str) -> None:
 
 _asking: ContextVar[bool] = ContextVar("asking", default=False)
 _MARKS = (b"aacmm", b"atplotlib")  # near the beginning or end of most files that are written here
+_MARKED = (".h5", ".html", ".pdf", ".png", ".svg", ".xml")  # of which all have one
 _ENDS = 2**14  # bytes
 _FIRST_ELEMENT = re.compile(rb"<[A-Za-z][^>]*>")
 
@@ -216,13 +225,16 @@ def _is_own(old: Path, new: Path) -> bool:
     Where the new file says who wrote it, the old one must, too. Tables, TOML, JSON and URDF have no place for that:
     they must have the same first line, or first element, which has the names of columns, of the arm or of the robot.
     """
-    if not os.path.getsize(old):
-        return True
-    (first, last), (first_new, last_new) = _ends(old), _ends(new)
-    marks = [mark for mark in _MARKS if mark in first_new + last_new]
-    if marks:
-        return first[:4] == first_new[:4] and any(mark in first + last for mark in marks)
-    return _beginning(first) == _beginning(first_new)
+    first, first_new = _ends(old)[0], _ends(new)[0]
+    if _is_marked(new):
+        return _is_marked(old) and first[:4] in (b"", first_new[:4])
+    return not first or _beginning(first) == _beginning(first_new)
+
+
+def _is_marked(path: Path) -> bool:
+    """Whether a file says that this package wrote it; or is empty."""
+    both = b"".join(_ends(path))
+    return not both or any(mark in both for mark in _MARKS)
 
 
 def _ends(path: Path) -> tuple[bytes, bytes]:
@@ -260,6 +272,7 @@ def together(*paths: str | os.PathLike | None) -> Iterator[None]:
     for number, output in enumerate(outputs):
         with output.refusing():
             output.check()
+        output.check_replaced()
         if any(_same(output.target, other.target) for other in outputs[:number]):
             raise InputError(f"{output.named} is named for two outputs; choose another for one of them.")
     group = _Outputs(outputs)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.units import DEG
 from .arm import (
     Arm,
@@ -42,7 +42,7 @@ class StandingJoint(NamedTuple):
     poses: int
 
 
-def standing_joints(arm: Arm, q: Float[np.ndarray, "N n"]) -> tuple[StandingJoint, ...]:
+def standing_joints(arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[StandingJoint, ...]:
     """Joints whose readings differ by less than 1 degree, or 20 mm; whole revolutions do not count.
 
     Args:
