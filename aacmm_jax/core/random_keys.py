@@ -14,11 +14,12 @@ from jaxtyping import Array
 
 from . import _compat
 from .errors import InputError
-from .x64 import LARGEST_INTEGER
+from .x64 import LARGEST_INTEGER, check_x64
 
 
 def random_key(seed: int | Array) -> Array:
     """The key of a seed, or `InputError`; inside jit the seed is an int64."""
+    check_x64()
     if isinstance(seed, jax.Array):
         halves = jnp.stack([seed >> 32, seed & np.int64(0xFFFFFFFF)])
     else:
@@ -58,7 +59,8 @@ def _split(key: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _fold_in(key: Array, number: Array) -> Array:
-    return jnp.stack(_compat.threefry2x32(key[0], key[1], jnp.zeros_like(number), number))
+    zero = number ^ number  # a batch under vmap where the number is one, which JAX's loop of rounds needs
+    return jnp.stack(_compat.threefry2x32(key[0], key[1], zero, number))
 
 
 def _bits(key: Array, width: int, shape: tuple[int, ...]) -> Array:
