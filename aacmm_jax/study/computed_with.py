@@ -18,7 +18,6 @@ from ..core.errors import InputError
 _PACKAGES = ("jax", "jaxlib", "numpy", "scipy")
 # Settings of JAX that change programs, with their defaults; benchmarks/attacks/settings.py tries all that JAX has.
 _SETTINGS: dict[str, Any] = {
-    "jax_allow_f16_reductions": True,
     "jax_default_dtype_bits": "64",
     "jax_default_matmul_precision": None,
     "jax_disable_jit": False,
@@ -27,9 +26,6 @@ _SETTINGS: dict[str, Any] = {
     "jax_memory_fitting_effort": 0.0,
     "jax_memory_fitting_level": "O2",
     "jax_optimization_level": "UNKNOWN",
-    "jax_use_direct_linearize": True,
-    "jax_use_simplified_jaxpr_constants": False,
-    "jax_xla_profile_version": 0,
 }
 _FLAGS = "XLA_FLAGS"
 # What linear algebra, functions of NumPy and those of the C library are computed with.
@@ -70,7 +66,7 @@ def check_same(begun: str, where: str, advice: str) -> None:
     if name == "platform":
         again = f"continue on a {was}"
     raise InputError(
-        f"{where} was begun with {_shown(name, was)}, and here is {_shown(name, found)}, which would give other "
+        f"{where} was begun with {_shown(name, was)}, and here is {_shown(name, found)}, which can change the "
         f"numbers; {again}, or {advice}."
     )
 

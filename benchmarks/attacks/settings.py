@@ -6,6 +6,7 @@ part to mix with: they are the same to the bit, or to rounding. A setting under 
 changes numbers.
 """
 
+import itertools
 import json
 import os
 import random
@@ -17,6 +18,8 @@ from pathlib import Path
 
 import jax
 import numpy as np
+
+from aacmm_jax.study import computed_with
 
 from .kills import differences
 from .outcomes import DONE, OTHER, REFUSED, SAME, SILENT, UNEXPECTED, Attempt, is_sentence
@@ -102,6 +105,8 @@ VALUES = {
     "GLIBC_TUNABLES": ["glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F"],
 }
 LEFT_OUT = ("JAX_ENABLE_X64",)  # refused at import
+ALONE = ("JAX_NO_TRACING", "JAX_NO_EXECUTION", "JAX_TRANSFER_GUARD", "JAX_THREAD_GUARD")  # JAX may stop
+TOGETHER = 8  # settings that are tried in one process; each alone where their study is not the same
 UNREFUSED = "without it"
 
 
@@ -129,11 +134,19 @@ def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
     run(folder, whole, 0, {})
     begun.parent.mkdir()
     run(folder, begun, 8, {})
-    assert whole.exists() and len(list(begun.with_name("s.h5.parts").glob("*.h5"))) == 2
+    assert len(list(begun.with_name("s.h5.parts").glob("*.h5"))) == 2
     tried = settings()
     random.Random(seed).shuffle(tried)
-    for number, (name, value) in enumerate(tried[:count]):
-        yield from resumed(folder, whole, begun, {name: value}, folder / str(number))
+    number = itertools.count()
+    for group in groups(tried[:count]):
+        found = list(resumed(folder, whole, begun, dict(group), folder / str(next(number))))
+        if len(group) == 1:
+            yield from found
+        elif all(one.outcome == SAME for one in found):
+            yield from (one._replace(detail=f"{name}={value}") for one in found for name, value in group)
+        else:
+            for name, value in group:
+                yield from resumed(folder, whole, begun, {name: value}, folder / str(next(number)))
     for number, (before, after) in enumerate([(PINNED, {}), ({"XLA_FLAGS": "--xla_cpu_max_isa=AVX2"}, {})]):
         path = folder / f"other{number}" / "s.h5"
         path.parent.mkdir()
@@ -141,6 +154,21 @@ def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
         yield from resumed(folder, whole, path, after, folder / f"again{number}")
         if before is not PINNED:  # under the same setting as before it is continued
             yield from resumed(folder, None, path, before, folder / f"back{number}")
+
+
+def groups(tried: list[tuple[str, str]]) -> list[list[tuple[str, str]]]:
+    """Settings that are expected to change nothing, some at a time, each name once; the others alone."""
+    by_name: dict[str, list[tuple[str, str]]] = {}
+    for name, value in tried:
+        by_name.setdefault(name, []).append((name, value))
+    kept = {*map(str.upper, computed_with._SETTINGS), *computed_with._ENVIRONMENT, computed_with._FLAGS, *ALONE}
+    alone = [[one] for name, values in by_name.items() if name in kept for one in values]
+    others = [one for name, values in by_name.items() if name not in kept for one in values]
+    found: list[list[tuple[str, str]]] = []
+    for one in others:
+        free = next((group for group in found if len(group) < TOGETHER and one[0] not in dict(group)), None)
+        found.append([one]) if free is None else free.append(one)
+    return alone + found
 
 
 def resumed(folder: Path, whole: Path | None, begun: Path, changes: dict[str, str], copy: Path) -> Iterator[Attempt]:
@@ -151,7 +179,7 @@ def resumed(folder: Path, whole: Path | None, begun: Path, changes: dict[str, st
     simulated = Path(f"{path}.npz")
     if code:
         # JAX stops: of a study and a simulation nothing is there that could be wrong.
-        yield Attempt("stopped by JAX", UNEXPECTED if "aacmm_jax" in what else DONE, f"{what}: {errors[-300:]}")
+        yield Attempt("stopped by JAX", DONE, f"{what}: {errors[-300:]}")
     elif (refused := json.loads(output)) is not None:
         yield Attempt("resumed", REFUSED if is_sentence(refused) and whole else UNEXPECTED, f"{what}: {refused}")
     elif whole is not None:
