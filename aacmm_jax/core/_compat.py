@@ -32,6 +32,12 @@ def inside_trace() -> bool:
     return is_traced(jax.device_put(0.0))  # the cheapest operation: outside jit it compiles nothing
 
 
+def jax_setting(name: str, usual: Any) -> Any:
+    """A setting of JAX as it is now, or ``usual`` where this version of JAX has none of this name."""
+    config: Any = jax.config
+    return getattr(config, name, config.values.get(name, usual))  # some have no attribute
+
+
 def threefry2x32(key1: Array, key2: Array, high: Array, low: Array) -> tuple[Array, Array]:
     """The Threefry hash of counts of two words each, all uint32."""
     return tuple(threefry2x32_p.bind(key1, key2, high, low))

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 
+from ..core._compat import jax_setting
 from ..core.errors import InputError
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "scipy")
@@ -42,7 +43,7 @@ _HARMLESS = (
 def computed_with() -> str:
     """What the numbers that this process computes depend on, as JSON; settings are left out where they are as usual."""
     known = {**_versions(), "platform": jax.default_backend()}
-    settings = {name.upper(): (getattr(jax.config, name, usual), usual) for name, usual in _SETTINGS.items()}
+    settings = {name.upper(): (jax_setting(name, usual), usual) for name, usual in _SETTINGS.items()}
     known |= {name: str(value) for name, (value, usual) in settings.items() if value != usual}
     environment = {name: os.environ.get(name, "") for name in _ENVIRONMENT} | {_FLAGS: _flags()}
     known |= {name: text for name, text in environment.items() if text}
