@@ -20,6 +20,7 @@ from .x64 import LARGEST_INTEGER, check_x64
 def random_key(seed: int | Array) -> Array:
     """The key of a seed, or `InputError`; inside jit the seed is an int64."""
     check_x64()
+    halves: Any
     if isinstance(seed, jax.Array):
         halves = jnp.stack([seed >> 32, seed & np.int64(0xFFFFFFFF)])
     else:
