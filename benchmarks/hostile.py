@@ -11,6 +11,8 @@ structure  One name misspelt or repeated: in URDFs, and in half as many TOML fil
 calls   Hostile arguments of Python functions and of commands.
 kills   A study killed by SIGKILL, resumed, and compared with one that was not, to the bit; threads and processes.
 writes  Files of every kind while they are written: killed, or out of space.
+settings
+        A study begun under one setting of JAX, XLA or NumPy and resumed under another: every one that there is.
 users   Another user of the machine against the compilation cache and a running study; needs the superuser.
 
 Prints the counts as JSON, and every failure as it is found; exit code 1 where there was one.
@@ -24,7 +26,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from attacks import calls, damage, flips, headers, kills, structure, texts, users, writes
+from attacks import calls, damage, flips, headers, kills, settings, structure, texts, users, writes
 from attacks.outcomes import FAILURES
 
 # With the usual number of attempts. Writes are first: they fork, which JAX does not survive once it has computed.
@@ -32,6 +34,7 @@ ATTACKS = {
     "writes": (writes.attack, 300),
     "users": (users.attack, 0),
     "kills": (kills.attack, 40),
+    "settings": (settings.attack, 200),
     "damage": (damage.attack, 60_000),
     "flips": (flips.attack, 10_000),
     "texts": (texts.attack, 10_000),

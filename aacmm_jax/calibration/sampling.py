@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..core.arguments import checked_arguments
-from ..core.arrays import random_generator
 from ..core.errors import InputError
+from ..core.random_keys import random_generator
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.parameters import Parameters

@@ -1,8 +1,7 @@
 """Conversion of arguments to float64 arrays, with messages that name what is wrong."""
 
-import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jaxtyping import Array, ArrayLike
 from . import _compat
 from .errors import InputError
 from .numpy_or_jax import AnyArray, namespace
-from .x64 import LARGEST_INTEGER, check_x64
+from .x64 import check_x64
 
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]
@@ -64,31 +63,6 @@ def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False)
     tools: Any = np if known else jnp
     whole = (tools.stack if new else tools.concatenate)(rows, axis=axis)
     return jax.device_put(whole) if known else whole
-
-
-def random_key(seed: int) -> Array:
-    """The key of JAX for a seed, or `InputError`."""
-    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-    if not whole or not -LARGEST_INTEGER <= seed <= LARGEST_INTEGER:
-        raise InputError(f"the seed is {seed!r}; give a whole number of at most 63 bits.")
-    return jax.random.key(seed)
-
-
-def random_generator(seed: int) -> np.random.Generator:
-    """The generator of NumPy for a seed, or `InputError`."""
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise InputError(f"the seed is {seed!r}; give a whole number, zero or positive.")
-    return np.random.default_rng(seed)
-
-
-def random_numbers(kind: Literal["normal", "uniform"], key: Array, shape: tuple[int, ...]) -> np.ndarray:
-    """Random numbers of JAX: standard normal, or uniform from 0 to 1; the same as ``jax.random`` draws in this shape.
-
-    A number depends on the key and its place alone, so one compiled size serves all shapes up to it.
-    """
-    count = math.prod(shape)
-    drawn = getattr(jax.random, kind)(key, (max(256, 2 ** math.ceil(math.log2(max(count, 1)))),))
-    return np.asarray(drawn)[:count].reshape(shape)
 
 
 def as_floats(value: Numbers, what: str) -> AnyArray:

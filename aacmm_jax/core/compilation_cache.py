@@ -1,7 +1,8 @@
 """Compiled programs are kept between processes, in the user's own cache folder; set up when the package is imported.
 
-They are native code, which is run as it is read. So a folder that anybody else can write to is not used, be it the
-default one or one that JAX_COMPILATION_CACHE_DIR names. AACMM_JAX_CACHE=0 leaves JAX's setting alone, unchecked.
+They are native code, which is run as it is read. So a folder is not used where anybody else can write to it, or can
+have written what is in it, be it the default one or one that JAX_COMPILATION_CACHE_DIR names. AACMM_JAX_CACHE=0 leaves
+JAX's setting alone, unchecked.
 """
 
 import os
@@ -9,6 +10,8 @@ import stat
 import sys
 import warnings
 from pathlib import Path
+
+from .file_owners import POSIX, is_ours, others_may_rename, others_may_write
 
 _LEAST_SECONDS = "0.1"  # shorter compilations are not kept: reading them would take as long
 _FOLDER, _TURNED_OFF = "JAX_COMPILATION_CACHE_DIR", "AACMM_JAX_CACHE"
@@ -67,19 +70,27 @@ def _unsafe(folder: Path) -> str:
     if not folder.is_absolute():
         return "its path is relative, so it depends on where a program is started"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if os.name != "posix":
+    if not POSIX:
         return ""
     folder = folder.resolve()
     found = folder.stat()
-    if found.st_uid != os.getuid():
+    if not is_ours(found):
         return "it belongs to another user"
     if found.st_mode & 0o022:
         return f"others may write to it (mode {stat.S_IMODE(found.st_mode):04o})"
-    # Whoever can rename a folder above can put another one there. Groups of one user write to many a home folder.
+    owner = found.st_uid
+    # Whoever can rename a folder above can put another one there.
     for above in folder.parents:
         found = above.stat()
-        if found.st_uid not in (0, os.getuid()):
+        if found.st_uid != 0 and not is_ours(found):
             return f"{above} belongs to another user"
-        if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
+        if others_may_rename(found):
             return f"others may write to {above} (mode {stat.S_IMODE(found.st_mode):04o})"
+    # What was put there while others could: JAX reads it by its name, and a link leads to where others may write now.
+    with os.scandir(folder) as entries:
+        for entry in entries:  # of which there may be thousands: 2 microseconds each
+            found = entry.stat(follow_symlinks=False)
+            changeable = found.st_mode & 0o022 and others_may_write(found)
+            if found.st_uid != owner or changeable or entry.is_symlink():
+                return f"others can have written {entry.name} in it"
     return ""

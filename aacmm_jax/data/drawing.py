@@ -1,7 +1,7 @@
 """A part of a capture's poses drawn at random, to calibrate with, and the others, to test the result on."""
 
-from ..core.arrays import random_generator
 from ..core.errors import InputError
+from ..core.random_keys import random_generator
 from .capture import Capture, check_one_capture
 from .visits import visits_of
 

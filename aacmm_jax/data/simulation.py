@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.arguments import check_finite, checked_arguments, items_of, real_number, shown
-from ..core.arrays import Numbers, as_floats, random_key, random_numbers
+from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, to_numpy
+from ..core.random_keys import random_generator, random_key, random_numbers
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.chain import length_scale
@@ -139,7 +140,7 @@ class _Temperatures:
         if self._range.shape not in ((), (2,)) or np.any(np.diff(np.atleast_1d(self._range)) < 0):
             raise InputError("temperature must be one number, or the lowest and the highest; C.")
         check_temperatures("the simulation", self._range)
-        self._columns, self._random = int(arm.thermometer), np.random.default_rng(seed)
+        self._columns, self._random = int(arm.thermometer), random_generator(seed)
 
     def configurations(
         self, arm: Arm, targets: Float[AnyArray, "m 3"], key: Array, limits: np.ndarray, labels: Sequence[str]

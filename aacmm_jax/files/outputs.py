@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
+from ..core.file_owners import is_planted_link, may_replace
 
 try:
     import fcntl
@@ -62,6 +63,8 @@ class OutputFile:
     def check(self) -> None:
         """Raise `OSError` where the file cannot be written: a folder, a device, a read-only file."""
         named, target = self.named, self.target
+        if is_planted_link(named):
+            raise OSError(None, "it is another user's link")
         # A link in /proc (/dev/stdout) leads to what has no path, and one that leads to itself remains a link.
         if (named.exists() or target.exists() or target.is_symlink()) and not target.is_file():
             raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
@@ -73,11 +76,13 @@ class OutputFile:
             raise OSError(None, "not a directory")
         if not os.access(target.parent, os.W_OK | os.X_OK):
             raise OSError(None, "its folder is read-only")
+        if target.exists() and not may_replace(target):
+            raise OSError(None, "it belongs to another user, and only they can replace it in its folder")
 
     def create(self) -> None:
         """Make the temporary file and lock it; whoever removes leftovers may have seen it before it was locked."""
         while True:
-            mode = stat.S_IMODE(self.target.stat().st_mode) if self.target.exists() else 0o666
+            mode = 0o600 if self.target.exists() else 0o666  # `finish` gives it the permissions of what it replaces
             self._lock = os.open(self.temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
             if fcntl is None:
                 return

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.arguments import checked_arguments, items_of, real_number
-from ..core.arrays import Numbers, as_array, is_concrete, joined, random_key
+from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
 from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.random_keys import random_key
 from .arm import (
     Arm,
     correction_names,
@@ -347,7 +348,7 @@ def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int =
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"the deviation of a free {what} is {value:g}; it must be zero or positive.")
     width = jnp.where(jnp.asarray(space.lengths), length, angle)
-    shift = jax.random.uniform(random_key(seed), width.shape, minval=-1.0, maxval=1.0)
+    shift = jax.random.uniform(random_key(seed), width.shape, jnp.float64, -1.0, 1.0)
     return space.arm(space.vector() + width * shift)
 
 

@@ -1,5 +1,6 @@
 """What is stored of every trial, and how trials are cut into blocks."""
 
+import hashlib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.errors import InputError
+from .computed_with import computed_with
 from .definition import Study
 from .settings import Setting
 
@@ -85,24 +87,31 @@ class Layout(NamedTuple):
     parameters: int
     block_cells: int
     block_trials: int
-    mark: str  # in the names of the files: blocks of this study, of this size, computed by this version
+    mark: str  # in the names of the files: blocks of this study, of this size, computed by this version and with these
+    computed_with: str
 
     @classmethod
-    def of(cls, study: Study, chunk: int) -> "Layout":
-        """Blocks of about ``chunk`` trials; small cells share a block where they have the same compiled program."""
+    def of(cls, study: Study, chunk: int, made_by: tuple[str, str] | None = None) -> "Layout":
+        """Blocks of about ``chunk`` trials; small cells share a block where they have the same compiled program.
+
+        ``made_by`` is the version of this package, and what the numbers are computed with; by default as they are here.
+        """
         cells, trials = len(study.cells), study.trials
         if cells * -(-trials // chunk) > MOST_BLOCKS:
             raise InputError(
                 f"chunks of {chunk} cut {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} blocks; "
                 "give a larger chunk."
             )
-        mark = f"{study.digest[:12]}-{chunk}-{metadata.version('aacmm_jax')}"
+        version, settings = made_by or (metadata.version("aacmm_jax"), computed_with())
+        mark = f"{study.digest[:12]}-{chunk}-{version}"
+        if settings:  # files of earlier versions do not say
+            mark += f"-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
         together = 1
         if trials < chunk:
             together = max(n for n in range(1, min(chunk // trials, cells) + 1) if _uniform(study.settings, n))
         # Blocks of nearly equal size: a short last one would run the same compiled program for fewer trials.
         block_trials = -(-trials // -(-trials // chunk))
-        return cls(cells, trials, len(study.space.names), together, block_trials, mark)
+        return cls(cells, trials, len(study.space.names), together, block_trials, mark, settings)
 
     def shape(self, name: str, cells: int | None = None, trials: int | None = None) -> tuple[int, ...]:
         """Shape of an array of results, of the whole study or of part of it."""

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
+from ..core.random_keys import random_key
 from ..kinematics import chain
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import damped_inverse, least_norm_inverse, solve_to_targets
@@ -114,7 +115,7 @@ def pool_key(seed: int, fixture: Fixture, limits: tuple, capacity: tuple[int, in
     would change the results of every study.
     """
     text = repr((fixture, limits, capacity)).replace("Fixture(", "Stand(", 1)
-    return jax.random.fold_in(jax.random.key(seed, impl="threefry2x32"), zlib.crc32(text.encode()))
+    return jax.random.fold_in(random_key(seed), zlib.crc32(text.encode()))
 
 
 def check_reach(study: Study) -> None:
@@ -128,7 +129,7 @@ def check_reach(study: Study) -> None:
         for fixture in setting.fixtures
     }
     for fixture, joint_limits in sorted(fixtures, key=repr):
-        limits, key = jnp.asarray(joint_limits), jax.random.key(study.specification.seed, impl="threefry2x32")
+        limits, key = jnp.asarray(joint_limits), random_key(study.specification.seed)
         if fixture.points is None:
             _placements(arm, fixture, limits, key, 1)
             continue
@@ -177,7 +178,7 @@ def _fixture_rows(
 
 def _uniform(key: Array, limits: Array, count: int) -> np.ndarray:
     low, high = limits[None, :, 0], limits[None, :, 1]
-    return np.asarray(jax.random.uniform(key, (count, limits.shape[0]), minval=low, maxval=high))
+    return np.asarray(jax.random.uniform(key, (count, limits.shape[0]), jnp.float64, low, high))
 
 
 def _solved(arm: Arm, start: np.ndarray, points: np.ndarray, limits: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -249,7 +250,7 @@ def _candidates(fixture: Fixture, region: Region, key: Array, count: int) -> np.
     centre = _in_region(region, centre_key, count)
     if fixture.length is None:
         return centre[_inside(region, centre)][:, None, :]
-    direction = np.asarray(jax.random.normal(direction_key, (count, 3)))
+    direction = np.asarray(jax.random.normal(direction_key, (count, 3), jnp.float64))
     half = 0.5 * fixture.length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     ends = np.stack([centre - half, centre + half], axis=1)
     return ends[_inside(region, ends).all(axis=1)]
@@ -260,7 +261,7 @@ def _in_region(region: Region, key: Array, count: int) -> np.ndarray:
     outer = region.distance_mm[1] if region.distance_mm else np.inf
     axes = (region.x_mm, region.y_mm, region.z_mm)
     low, high = np.array([(max(r[0], -outer), min(r[1], outer)) if r else (-outer, outer) for r in axes]).T
-    return low + (high - low) * np.asarray(jax.random.uniform(key, (count, 3)))
+    return low + (high - low) * np.asarray(jax.random.uniform(key, (count, 3), jnp.float64))
 
 
 def _inside(region: Region, points: Float[np.ndarray, "... 3"]) -> np.ndarray:

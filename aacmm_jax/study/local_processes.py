@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from typing import Any
 
 from .worker_setup import CacheSettings, use_compilation_cache
 
+_SAFE_PATH, _STARTING = "PYTHONSAFEPATH", threading.Lock()
 _TRIES = 4  # of a task whose process died
 THREADS = "aacmm-study"  # beginning of the names of threads that may still compute when an interrupt is answered
 
@@ -90,7 +92,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")  # JAX does not survive a fork
         self._connection, other_end = context.Pipe()
         self.process = context.Process(target=_serve, args=(other_end, *self._arguments), daemon=True)
-        with _signals_blocked():
+        with _safe_path(), _signals_blocked():
             self.process.start()
         other_end.close()
 
@@ -103,6 +105,25 @@ class _Worker:
 def _part(cores: list[int], number: int, count: int) -> list[int]:
     """The cores of one of the processes; otherwise each would use all, and wait for the others."""
     return cores[number * len(cores) // count : (number + 1) * len(cores) // count] or cores
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """A process started within imports nothing from its working folder, where others may have put modules.
+
+    multiprocessing starts its processes by ``python -c``, which looks there first, until they have the path of searches
+    of this process.
+    """
+    with _STARTING:
+        former = os.environ.get(_SAFE_PATH)
+        os.environ[_SAFE_PATH] = "1"
+        try:
+            yield
+        finally:
+            if former is None:
+                del os.environ[_SAFE_PATH]
+            else:
+                os.environ[_SAFE_PATH] = former
 
 
 @contextmanager

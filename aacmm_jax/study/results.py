@@ -13,7 +13,7 @@ from ..core.extras import require
 from ..files.hdf5 import check_sense, undamaged
 from ..files.outputs import as_path
 from . import store
-from .blocks import VARIABLES, Layout, fill_of
+from .blocks import VARIABLES, fill_of
 from .definition import POOL_PARTS, Study
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     opened = Results.of(path)
     study = opened.study
     if opened.stored.parts is not None:
-        blocks = store.finished_blocks(opened.path, layout := Layout.of(study, opened.stored.chunk))
+        blocks = store.finished_blocks(opened.path, layout := opened.stored.layout)
         _allow_files(len(blocks), opened.path)
         for block in blocks:  # HDF5 will read them without looking at their digests
             store.check_block(opened.path, opened.stored, block, layout)
@@ -166,7 +166,7 @@ class Results(NamedTuple):
         return found | {"group": np.arange(self.study.trials) % POOL_PARTS}
 
     def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
-        layout = Layout.of(self.study, self.stored.chunk)
+        layout = self.stored.layout
         found = {name: np.full(layout.shape(name)[1:], fill_of(name), VARIABLES[name].dtype) for name in names}
         with undamaged(self.path):
             for part, rows in store.rows_of(self.path, self.stored, [*{*names, "converged"}], cell):

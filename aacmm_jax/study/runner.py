@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import platform
 import signal
 import threading
 from collections import deque
@@ -19,9 +20,11 @@ from ..core.errors import InputError
 from ..files.outputs import as_path
 from . import store
 from .blocks import Block, Layout, parts_of
+from .computed_with import check_same, computed_with
 from .configuration_pool import check_reach
 from .definition import Study
 from .local_processes import THREADS
+from .parts_folder import check_ours, refuse_planted
 from .settings import Setting
 from .trials import run_block
 
@@ -97,17 +100,17 @@ def run_study(
         >>> print(outcome.total, outcome.finished)
         80 True
     """
+    refuse_planted(as_path(path))
     path = Path(os.path.realpath(as_path(path)))
     for what, number in (("workers", workers), ("chunk", chunk)):
         if number is not None and (not isinstance(number, int) or number < 1):
             raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")
-    if executor is not None and not isinstance(executor, Executor):
-        raise InputError(
-            f"executor is a {type(executor).__name__}; give a concurrent.futures.Executor, or leave it out."
-        )
+    if executor is not None:
+        _check_executor(executor)
     with _locked(path):
+        check_ours(path)
         store.tidy(path)
-        layout, chunk, finished = _opened(study, path, chunk)
+        layout, chunk, finished = _opened(study, path, chunk, executor)
         total = layout.cells * layout.trials
         if finished and not parts_of(path).is_dir():
             return Outcome(path, total, total, 0)
@@ -142,10 +145,23 @@ def run_study(
         return Outcome(path, done, total, done - before)
 
 
+def _check_executor(executor: Any) -> None:
+    if not isinstance(executor, Executor):
+        raise InputError(
+            f"executor is a {type(executor).__name__}; give a concurrent.futures.Executor, or leave it out."
+        )
+    context = getattr(executor, "_mp_context", None)
+    if context is not None and context.get_start_method() == "fork":
+        raise InputError(
+            "the executor forks, which JAX does not survive; give it mp_context=multiprocessing.get_context('spawn')."
+        )
+
+
 def _run_and_pack(
     study: Study, layout: Layout, shared: Path | None, block: Block, resources: "_Resources"
 ) -> store.Packed | None:
-    """The task of a worker: one block."""
+    """The task of a worker: one block, computed with what the study was begun with."""
+    check_same(layout.computed_with, f"on the worker {platform.node()}: the study", "leave that worker out")
     packed = store.pack(run_block(study, block, device=resources.device, workers=resources.threads), layout)
     if shared is None:
         return packed
@@ -164,12 +180,6 @@ class _Resources(NamedTuple):
 def _executor(executor: Executor | None, workers: int | None) -> Iterator[tuple[Executor, int, Iterator[_Resources]]]:
     """The executor, its number of workers, and the resources of one block after another."""
     if executor is not None:
-        context = getattr(executor, "_mp_context", None)
-        if context is not None and context.get_start_method() == "fork":
-            raise InputError(
-                "the executor forks, which JAX does not survive; give it "
-                "mp_context=multiprocessing.get_context('spawn')."
-            )
         count = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
         yield executor, count, itertools.repeat(_Resources())
         return
@@ -303,14 +313,16 @@ def _locked(path: Path) -> Iterator[None]:
         lock.release()
 
 
-def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, bool]:
+def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> tuple[Layout, int, bool]:
     """The layout of an existing or a new file, its chunk, and whether it is finished."""
     from importlib import metadata
 
     if not path.exists():
         _interruptible(check_reach, study)
         chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
-        layout = Layout.of(study, chunk)
+        # With what a worker computes: it may be another machine, with other devices.
+        settings = computed_with() if executor is None else executor.submit(computed_with).result()
+        layout = Layout.of(study, chunk, (metadata.version("aacmm_jax"), settings))
         store.create(path, study, layout, chunk)
         return layout, chunk, False
     stored = store.read(path)
@@ -321,7 +333,7 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
     store.check_parts(path, stored._replace(finished=False))
     if stored.finished and stored.parts is None:
         store.clean(path)  # left by a killed process
-        return Layout.of(study, stored.chunk), stored.chunk, True
+        return stored.layout, stored.chunk, True
     if chunk is not None and chunk != stored.chunk:
         raise InputError(f"{path} was begun with chunks of {stored.chunk} trials; leave the chunk out to continue.")
     if stored.package_version != metadata.version("aacmm_jax"):
@@ -329,7 +341,13 @@ def _opened(study: Study, path: Path, chunk: int | None) -> tuple[Layout, int, b
             f"{path} was begun with aacmm_jax {stored.package_version}; continue with that version, or choose another "
             "output path."
         )
-    return Layout.of(study, stored.chunk), stored.chunk, stored.finished
+    if not stored.computed_with:
+        raise InputError(
+            f"{path} does not say with which settings it was begun, as files of today do; choose another output path."
+        )
+    if executor is None:
+        check_same(stored.computed_with, str(path), "choose another output path")
+    return stored.layout, stored.chunk, stored.finished
 
 
 def _difference(one: Study, other: Study) -> str:

@@ -43,6 +43,8 @@ from ..files.hdf5 import (
 from ..kinematics.arm import parameter_unit
 from .blocks import NOT_RUN, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
+from .parts_folder import check_block as check_owner
+from .parts_folder import check_ours, check_readable
 from .specification import Specification, unit
 
 _ADVICE = "free some space there, then run the same command again: what is finished is kept"
@@ -85,6 +87,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
 def _block(path: Path, block: Block, layout: Layout, bare: bool = False) -> Iterator[Mapping[str, Any]]:
     """The arrays of a block, after its SHA-256 was verified; ``bare``: it may be of format version 1, without one."""
     file = part_of(path, block, layout)
+    check_owner(file)
     with opened(file, (BLOCK,), bare=bare) as content:
         check_sense(file, {"it is another block": content.attributes.get("block", file.name) != file.name})
         yield {name: content.dataset(content.file.id, name) for name in VARIABLES}
@@ -103,7 +106,8 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
     """Make the file of a new study, and the folder of its blocks."""
     folder = parts_of(path)
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
+        check_ours(path)
         for item in folder.glob("*.h5"):  # blocks of a study whose file was removed
             if not item.name.startswith(f"{layout.mark}-"):
                 item.unlink()
@@ -113,7 +117,7 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
         ) from error
 
     try:
-        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=False, advice=ELSEWHERE)
+        _write(path, study, chunk, partial(_add_virtual, path, layout), layout, finished=False, advice=ELSEWHERE)
     except BaseException:
         with contextlib.suppress(OSError):
             folder.rmdir()  # only where it is empty
@@ -135,7 +139,7 @@ def _add_virtual(path: Path, layout: Layout, group: Any, name: str) -> Any:
 def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: bool = False) -> None:
     """Copy all blocks into one plain file and remove their folder; with ``keep_parts``, leave them as they are."""
     if keep_parts:
-        _write(path, study, chunk, partial(_add_virtual, path, layout), finished=True)
+        _write(path, study, chunk, partial(_add_virtual, path, layout), layout, finished=True)
         return
 
     def add_results(group: Any, name: str) -> Any:
@@ -150,7 +154,7 @@ def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: boo
                     target.id.write_direct_chunk((block.first_cell, block.first_trial, 0)[: source.ndim], content, mask)
 
     with undamaged(parts_of(path)):
-        _write(path, study, chunk, add_results, fill, finished=True)
+        _write(path, study, chunk, add_results, layout, fill, finished=True)
     clean(path)
 
 
@@ -171,6 +175,7 @@ def _write(
     study: Study,
     chunk: int,
     add_results: Callable,
+    layout: Layout,
     fill: Callable | None = None,
     *,
     finished: bool,
@@ -182,6 +187,7 @@ def _write(
         "seed": study.specification.seed,
         "digest": study.digest,
         "chunk": chunk,
+        "computed_with": layout.computed_with,
         "finished": int(finished),
         "parts": parts_of(path).name if fill is None else None,
     }
@@ -254,6 +260,12 @@ class StoredStudy(NamedTuple):
     parts: str | None  # folder of the blocks, where the results are in it
     package_version: str
     version: int  # of the file's format
+    computed_with: str  # see `computed_with`; empty in files of earlier versions
+
+    @property
+    def layout(self) -> Layout:
+        """How it is cut into blocks."""
+        return Layout.of(self.study, self.chunk, (self.package_version, self.computed_with))
 
 
 def read(path: Path) -> StoredStudy:
@@ -271,7 +283,7 @@ def read(path: Path) -> StoredStudy:
                 f"{path} is damaged or was edited: its specification does not match its results; make it again."
             )
         finished, parts = bool(attributes["finished"]), attributes.get("parts")
-        made_by = attributes["package_version"], attributes["format_version"]
+        made_by = attributes["package_version"], attributes["format_version"], attributes.get("computed_with", "")
         return StoredStudy(study, attributes["chunk"], finished, parts, *made_by)
 
 
@@ -289,7 +301,8 @@ def check_parts(path: Path, stored: StoredStudy) -> None:
         raise InputError(
             f"{path} has its results in the folder {stored.parts}, which is missing; put it next to the file."
         )
-    layout = Layout.of(stored.study, stored.chunk)
+    check_readable(path)
+    layout = stored.layout
     missing = sum(1 for _ in layout.blocks()) - len(finished_blocks(path, layout))
     if stored.finished and missing:
         raise InputError(
@@ -300,7 +313,7 @@ def check_parts(path: Path, stored: StoredStudy) -> None:
 
 def check_results(path: Path, stored: StoredStudy) -> None:
     """Raise `InputError` where the results have other shapes, or a finished study has trials that did not run."""
-    layout = Layout.of(stored.study, stored.chunk)
+    layout = stored.layout
     with opened(path, ("study",), verify=False) as content:
         arrays = {name: content.dataset(content.group("trials"), name) for name in VARIABLES}
         shapes = any(array.shape != layout.shape(name) for name, array in arrays.items())
@@ -313,7 +326,7 @@ def rows_of(
     path: Path, stored: StoredStudy, names: Sequence[str], cell: int
 ) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
     """Results of one cell, some trials at a time: which trials, and their arrays. One file is open at a time."""
-    layout = Layout.of(stored.study, stored.chunk)
+    layout = stored.layout
     if stored.parts is None:
         with opened(path, ("study",), verify=False) as content:
             trials = {name: content.dataset(content.group("trials"), name) for name in names}
@@ -344,6 +357,9 @@ def is_readable(path: Path, block: Block, layout: Layout) -> bool:
 
 
 def finished_blocks(path: Path, layout: Layout) -> list[Block]:
-    """Blocks whose files exist."""
+    """Blocks whose files exist. Raises `InputError` where one is a link, or somebody else's."""
     names = {item.name for item in parts_of(path).glob("*.h5")} if parts_of(path).is_dir() else set()
-    return [block for block in layout.blocks() if part_of(path, block, layout).name in names]
+    finished = [block for block in layout.blocks() if part_of(path, block, layout).name in names]
+    for block in finished:
+        check_owner(part_of(path, block, layout))
+    return finished

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..core.random_keys import random_key
 from ..kinematics.arm import with_values
 from ..kinematics.chain import (
     Corrections,
@@ -128,7 +129,7 @@ def ends_of(study: Study, setting: Setting) -> list[tuple[int, int]]:
 def _draw(
     static: _Static, shared: _Shared, seed: Array, cells: Array, trials: Array, values: CellValues
 ) -> DrawnTrials:
-    key = jax.random.key(seed, impl="threefry2x32")
+    key = random_key(seed)
 
     def some(chunk: tuple) -> DrawnTrials:
         cell, trial, values = chunk
@@ -144,7 +145,7 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
     n, p = shared.geometry.alpha.shape[-1], shared.nominal.shape[0]
     parts = jax.vmap(lambda k: jax.random.split(k, 7))(keys)
     poses = sum(ends * taken for _, _, ends, _, taken in static.fixtures)
-    normal = jax.vmap(lambda k: jax.random.normal(k, (p,)))(parts[:, 0])
+    normal = _normal(parts[:, 0], (p,))
     # One draw for both distributions: its rank among all normal draws is uniform.
     deviation = values.width * jnp.where(values.normal, normal, jax.scipy.special.erf(normal / math.sqrt(2)))
     true = shared.nominal[None] + deviation
@@ -173,7 +174,7 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
     value, u = _certified(static, point, parts[:, 5], u)
     start = jnp.broadcast_to(shared.nominal, true.shape)
     if static.random_start:
-        fraction = jax.vmap(lambda k: jax.random.uniform(k, (p,)))(parts[:, 6])
+        fraction = jax.vmap(lambda k: jax.random.uniform(k, (p,), jnp.float64))(parts[:, 6])
         free = jnp.asarray(np.arange(p) != (-1 if static.anchor is None else static.anchor))[None]
         free = free & jnp.isfinite(values.upper - values.lower)  # coefficients of corrections have no bounds
         start = jnp.where(free, values.lower + fraction * (values.upper - values.lower), start)
@@ -202,12 +203,16 @@ def _certified(
         return jnp.zeros((_WIDTH, 0)), jnp.zeros((_WIDTH, 0))
     between = jnp.stack([point[:, :, b] - point[:, :, a] for a, b in static.lengths], axis=1)
     u = jnp.broadcast_to(u, between.shape[:2])
-    return jnp.linalg.norm(between, axis=-1) + u * jax.vmap(lambda k: jax.random.normal(k, between.shape[1:2]))(keys), u
+    return jnp.linalg.norm(between, axis=-1) + u * _normal(keys, between.shape[1:2]), u
+
+
+def _normal(keys: Array, shape: tuple[int, ...], dtype: Any = jnp.float64) -> Float[Array, "w ..."]:
+    return jax.vmap(lambda k: jax.random.normal(k, shape, dtype))(keys)
 
 
 def _noise(keys: Array, shape: tuple[int, ...]) -> Float[Array, "w ..."]:
     """Standard normal noise for every trial, in float32: a third of the time, and noise needs no more digits."""
-    return jax.vmap(lambda k: jax.random.normal(k, shape, dtype=jnp.float32))(keys).astype(jnp.float64)
+    return _normal(keys, shape, jnp.float32).astype(jnp.float64)
 
 
 def _chosen(static: _Static, keys: Array, trials: Int[Array, " w"]) -> Int[Array, "w N"]:
@@ -346,7 +351,7 @@ def _readings(
         encoder = jnp.where(kinds.mask(3), values.linear_encoder[None, :, None], encoder)
         step = jnp.where(kinds.mask(3), values.linear_resolution[None, :, None], step)
     if static.eccentric:
-        harmonics = jax.vmap(lambda k: jax.random.normal(k, (2, n)))(keys[:, 1]) * values.eccentricity[:, None, None]
+        harmonics = _normal(keys[:, 1], (2, n)) * values.eccentricity[:, None, None]
         harmonics = jnp.moveaxis(harmonics, 0, -1)[..., None]
         if kinds is not None:
             harmonics = jnp.where(kinds.mask(3)[None], 0.0, harmonics)

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
-from ..core.arrays import random_generator
 from ..core.errors import InputError
 from ..core.linear_algebra import semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
+from ..core.random_keys import random_generator
 from ..kinematics.arm import Arm, joint_limits
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length

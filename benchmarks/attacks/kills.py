@@ -1,10 +1,12 @@
 """A study is killed by SIGKILL at random moments, resumed each time, and compared to the bit with one that was not.
 
 The command runs in a process of its own; half of the kills hit a study in threads, half one in processes
-(``--dask local``).
+(``--dask local``). ``calibrate``, ``report`` and ``export`` are killed as well: the output of each is then what it
+was before, or what the command makes when it is not killed, but for the time of writing.
 """
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -22,9 +24,22 @@ SECONDS = 600
 WAYS = {"threads": (), "processes": ("--dask", "local")}
 
 
+# Commands, the last words of which are their outputs.
+COMMANDS = {
+    "calibrate": ("calibrate", "capture.h5", "-o", "killed.h5"),
+    "report": ("report", "result.h5", "-o", "killed.html"),
+    "export": ("export", "result.h5", "-o", "killed.toml"),
+}
+
+
 def started(folder: Path, *arguments: object) -> subprocess.Popen:
     """The command ``study`` as a process of its own."""
-    line = [sys.executable, "-m", "aacmm_jax", "study", "bound-sensitivity", *map(str, arguments)]
+    return command(folder, "study", "bound-sensitivity", *arguments)
+
+
+def command(folder: Path, *arguments: object) -> subprocess.Popen:
+    """A command as a process of its own."""
+    line = [sys.executable, "-m", "aacmm_jax", *map(str, arguments)]
     return subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
@@ -37,7 +52,7 @@ def differences(one: Path, other: Path) -> list[str]:
 
 
 def _bytes(item: h5py.Dataset) -> object:
-    values = item[()]
+    values = np.asarray(item[()])
     return values.tolist() if values.dtype.kind == "O" else (values.dtype.str, values.shape, values.tobytes())
 
 
@@ -73,6 +88,50 @@ def attack(folder: Path, seed: int, count: int, trials: int = 1000, chunk: int =
             except Exception as error:
                 yield Attempt(f"{way}: killed", LOST, f"{type(error).__name__}: {error}")
         yield _resumed(whole, path, started(folder, "-o", path, *arguments, *more), way)
+    yield from commands(folder / "commands", random, max(count // 4, 1))
+
+
+def commands(folder: Path, random: np.random.Generator, count: int) -> Iterator[Attempt]:
+    """So many kills of each of the other commands."""
+    folder.mkdir()
+    sockets = ("--socket", "A=400,200,300", "--socket", "B=600,200,300", "--length", "A,B,0.002", "--poses", 30)
+    command(folder, "simulate", "cheng2018-simulation", "-o", "capture.h5", *sockets).communicate()
+    command(folder, "calibrate", "capture.h5", "-o", "result.h5").communicate()
+    inputs = {item.name for item in folder.iterdir()}
+    for name, words in COMMANDS.items():
+        output, begun = folder / words[-1], time.monotonic()
+        command(folder, *words).communicate()
+        whole, lasted = _content(output), time.monotonic() - begun
+        for _ in range(count):
+            output.write_bytes(b"old")
+            process = command(folder, *words)
+            time.sleep(random.uniform(0.5, 1.1) * lasted)  # before, it imports
+            process.kill()
+            process.communicate()
+            found = b"old" if output.exists() and output.read_bytes() == b"old" else _content(output)
+            yield Attempt(f"{name}: killed", SAME if found in (b"old", whole) else LOST, str(output))
+        command(folder, *words).communicate()
+        left = {item.name for item in folder.iterdir()} - inputs
+        same = left == {output.name} and _content(output) == whole
+        yield Attempt(f"{name}: run again", SAME if same else LOST, f"left: {sorted(left)}")
+        output.unlink()
+
+
+def _content(path: Path) -> object:
+    """What a file holds, but for the time of writing; an HDF5 file is verified, and its arrays and attributes taken."""
+    if path.suffix != ".h5":
+        return re.sub(rb"20\d\d-\d\d-\d\d[T ]\d\d:\d\d(:\d\d)?", b"", path.read_bytes())
+    aj.files.load_calibration(path)
+    with h5py.File(path) as file:
+        items = {"": file}
+        file.visititems(items.__setitem__)
+        attributes = {
+            f"{name}@{key}": str(value)
+            for name, item in items.items()
+            for key, value in item.attrs.items()
+            if key not in ("created", "content_sha256", "DIMENSION_LIST", "REFERENCE_LIST")
+        }
+        return attributes | {name: _bytes(item) for name, item in items.items() if isinstance(item, h5py.Dataset)}
 
 
 def _resumed(whole: Path, path: Path, process: subprocess.Popen, way: str) -> Attempt:

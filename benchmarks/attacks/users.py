@@ -1,11 +1,11 @@
-"""Another user of the machine against the compilation cache and against a study that runs in local processes.
+"""Another user of the machine against the compilation cache, studies, commands and the files that they write.
 
 The other user is a fork of this process that gives up the superuser's rights; it lists, opens and connects to whatever
-it can find.
+it can find. What it leaves for others to find is in `planted`.
 """
 
-import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -14,32 +14,12 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from . import planted
 from .outcomes import DONE, REFUSED, SILENT, UNEXPECTED, Attempt
+from .work_as import OTHER_USER, as_user
 
-OTHER_USER = 65534
 SECRETS = ("mem", "environ", "maps", "fd", "cwd", "root", "exe")  # of a process, in /proc
 PRINT_FOLDER = "import aacmm_jax, jax; print(jax.config.jax_compilation_cache_dir)"
-
-
-def as_other(work: Callable[[], list[str]]) -> list[str]:
-    """What a function returns that another user runs."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            os.setgroups([])
-            os.setresgid(*[OTHER_USER] * 3)
-            os.setresuid(*[OTHER_USER] * 3)
-            found = work()
-        except BaseException as error:
-            found = [f"{type(error).__name__}: {error}"]
-        os.write(writing, json.dumps(found).encode())
-        os._exit(0)
-    os.close(writing)
-    with os.fdopen(reading) as stream:
-        content = stream.read()
-    os.waitpid(child, 0)
-    return json.loads(content)
 
 
 def succeeded(tries: dict[str, Callable[[], object]]) -> list[str]:
@@ -77,12 +57,12 @@ def against_the_cache(folder: Path) -> Iterator[Attempt]:
         "renamed": lambda: cache.rename(own / "away"),
         "opened": lambda: cache.chmod(0o777),
     }
-    done = as_other(lambda: succeeded(tries))
+    done = as_user(OTHER_USER, lambda: succeeded(tries))
     for name in tries:
         yield Attempt("cache", SILENT if name in done else REFUSED, f"the other user: {name}")
     offered = Path(tempfile.mkdtemp(dir="/tmp"))  # where everybody may make folders
     offered.chmod(0o1777)
-    made = as_other(lambda: succeeded({"made": lambda: (offered / "aacmm_jax").mkdir(mode=0o755)}))
+    made = as_user(OTHER_USER, lambda: succeeded({"made": lambda: (offered / "aacmm_jax").mkdir(mode=0o755)}))
     assert made == ["made"]
     for name, cache in (("XDG_CACHE_HOME", offered), ("JAX_COMPILATION_CACHE_DIR", offered / "aacmm_jax")):
         used_folder, warning = used(cache, name)
@@ -90,6 +70,29 @@ def against_the_cache(folder: Path) -> Iterator[Attempt]:
         yield Attempt("cache", REFUSED if refused else SILENT, f"a folder of another user in {name}: {warning}")
     (offered / "aacmm_jax").rmdir()
     offered.rmdir()
+    above = folder / "above"
+    for what, reason in {
+        "a group may write to the folder above": f"others may write to {above}",
+        "an entry of another user": "others can have written planted-cache in it",
+        "a link": "others can have written planted-cache in it",
+        "an entry that others may write to": "others can have written planted-cache in it",
+    }.items():
+        cache = above / "aacmm_jax"
+        cache.mkdir(parents=True, mode=0o700)
+        entry = cache / "planted-cache"
+        if what == "a link":
+            entry.symlink_to(folder)
+        elif "entry" in what:
+            entry.write_bytes(b"native code")
+            entry.chmod(0o602 if "others" in what else 0o600)
+            os.chown(entry, 0 if "others" in what else OTHER_USER, 0)
+        else:
+            above.chmod(0o770)
+            os.chown(above, 0, OTHER_USER)
+        used_folder, warning = used(above)
+        refused = used_folder == "None" and reason in warning and warning.count("\n") == 1
+        yield Attempt("cache", REFUSED if refused else SILENT, f"{what}: {warning}")
+        shutil.rmtree(above)
 
 
 def descendants(process: int) -> list[int]:
@@ -169,7 +172,7 @@ def against_a_study(folder: Path) -> Iterator[Attempt]:
             "a block added": lambda: (parts / "x.h5").write_bytes(b"poison"),
             "the study replaced": lambda: (folder / "study.h5").write_bytes(b"poison"),
         }
-        done = as_other(lambda: succeeded(tries))
+        done = as_user(OTHER_USER, lambda: succeeded(tries))
         yield Attempt("study: processes", DONE if len(processes) >= 3 else UNEXPECTED, str(len(processes)))
         yield Attempt("study: sockets", SILENT if sockets else REFUSED, str(sockets))
         for name in tries:
@@ -187,3 +190,4 @@ def attack(folder: Path, seed: int, count: int) -> Iterator[Attempt]:
     yield from against_the_cache(folder)
     (folder / "study").mkdir()
     yield from against_a_study(folder / "study")
+    yield from planted.attack(folder)

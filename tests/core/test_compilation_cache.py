@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from aacmm_jax.core.compilation_cache import _unsafe
+
 JAX = "print(jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64)"
 IMPORTS = {
     "aacmm_jax, jax": f"import aacmm_jax, jax; {JAX}",
@@ -96,14 +98,36 @@ def test_a_folder_of_others_is_not_used(tmp_path, mode, above, settings, reason)
     assert reason in done.stderr
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only the superuser can act for two users")
-def test_a_folder_of_another_user_is_not_used(tmp_path):
-    folder = tmp_path / "aacmm_jax"
+root = pytest.mark.skipif(
+    not hasattr(os, "getuid") or os.getuid() != 0, reason="only the superuser can act for two users"
+)
+# What is done to the cache's folder and the entry in it, and why it is not used then.
+PLANTED = {
+    "folder": (lambda folder, entry: os.chown(folder, 65534, 65534), "it belongs to another user"),
+    "entry": (lambda folder, entry: os.chown(entry, 65534, 65534), "others can have written x-cache in it"),
+    "open entry": (lambda folder, entry: entry.chmod(0o666), "others can have written x-cache in it"),
+    "link": (
+        lambda folder, entry: entry.with_name("y-cache").symlink_to(entry),
+        "others can have written y-cache in it",
+    ),
+    "group above": (
+        lambda folder, entry: (os.chown(folder.parent, 0, 65534), folder.parent.chmod(0o770)),
+        "others may write to {above} (mode 0770)",
+    ),
+    "private group above": (lambda folder, entry: folder.parent.chmod(0o770), ""),
+}
+
+
+@root
+@pytest.mark.parametrize("case", PLANTED)
+def test_what_another_user_can_have_written_is_not_used(tmp_path, case):
+    plant, reason = PLANTED[case]
+    folder, entry = tmp_path / "aacmm_jax", tmp_path / "aacmm_jax" / "x-cache"
     folder.mkdir(mode=0o700)
-    os.chown(folder, 65534, 65534)
-    done = python(IMPORTS["aacmm_jax"], tmp_path)
-    assert done.stdout.split() == ["None", "1"]
-    assert "it belongs to another user" in done.stderr
+    entry.touch(mode=0o600)
+    plant(folder, entry)
+    assert reason.format(above=tmp_path) in _unsafe(folder)
+    assert bool(reason) == bool(_unsafe(folder))
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -17,7 +18,7 @@ from aacmm_jax.study.local_processes import LocalProcesses
 from aacmm_jax.study.worker_setup import CacheSettings, use_compilation_cache
 
 from . import worker_tasks
-from .small_study import CHUNK, command, same, until, until_parts
+from .small_study import CHUNK, ROOT, command, same, until, until_parts
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,24 @@ def test_local_processes_wait_for_no_connection(processes):
     """The whole reason for pipes: a port is open to all users of a machine, whoever owns the process."""
     assert processes.submit(worker_tasks.listening).result() == []
     assert worker_tasks.listening() == []
+
+
+@pytest.mark.slow
+def test_processes_import_nothing_from_the_working_folder(tmp_path):
+    """Others may have put a module there; multiprocessing starts its processes by ``python -c``, which looks there."""
+    (tmp_path / "multiprocessing.py").write_text("import pathlib; pathlib.Path('ran').touch()")
+    script = tmp_path / "script" / "aacmm"
+    script.parent.mkdir()
+    script.write_text(
+        "import os\nfrom aacmm_jax.study.local_processes import LocalProcesses\n"
+        "if __name__ == '__main__':\n    print(LocalProcesses(1).submit(os.getcwd).result())\n"
+        "    print('PYTHONSAFEPATH' in os.environ)"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    line, environment = [sys.executable, script], environment | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(tmp_path), "False"]
+    assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")

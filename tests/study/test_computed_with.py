@@ -1,0 +1,99 @@
+"""What a study's numbers depend on besides the study is kept, and nothing else continues it."""
+
+import json
+from importlib import metadata
+
+import h5py
+import jax
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.study import computed_with as module
+from aacmm_jax.study import runner, store
+from aacmm_jax.study.blocks import Layout, part_of
+from aacmm_jax.study.computed_with import check_same, computed_with
+
+
+@pytest.fixture(autouse=True)
+def plain(monkeypatch):
+    """The environment sets nothing: the tests' own flags are gone."""
+    for name in (module._FLAGS, *module._ENVIRONMENT):
+        monkeypatch.delenv(name, raising=False)
+
+
+FLAGS = {
+    "none": ("", ""),
+    "order and number": ("--xla_b=2 --xla_a=1 --xla_b=2", "--xla_a=1 --xla_b=2"),
+    "harmless": ("--xla_dump_to=x --xla_force_host_platform_device_count=8", ""),
+    "a file": ("{folder}/flags.txt", "--xla_a=1 --xla_c=3"),
+    "a file that is missing": ("{folder}/none.txt", "{folder}/none.txt"),
+}
+
+
+@pytest.mark.parametrize("case", FLAGS)
+def test_flags_are_a_set(case, tmp_path, monkeypatch):
+    (tmp_path / "flags.txt").write_text("--xla_c=3\n--xla_dump_to=x\n--xla_a=1\n")
+    given, expected = (text.format(folder=tmp_path) for text in FLAGS[case])
+    monkeypatch.setenv("XLA_FLAGS", given)
+    assert json.loads(computed_with()).get("XLA_FLAGS", "") == expected
+
+
+DIFFERENT = {
+    "jax": ({"jax": "0.1"}, r"with jax 0\.1, and here is jax .*; install jax 0\.1, or choose"),
+    "platform": ({"platform": "gpu"}, r"with platform gpu, .* platform cpu, .*; continue on a gpu, or"),
+    "set then": ({"XLA_FLAGS": "--xla_a=1"}, r"with XLA_FLAGS=--xla_a=1, .* no XLA_FLAGS, .*; set XLA_FLAGS to '--x"),
+    "set now": ({"JAX_DISABLE_JIT": None}, r"with no JAX_DISABLE_JIT, .* JAX_DISABLE_JIT=True, .*; unset JAX_DISABLE_"),
+}
+
+
+@pytest.mark.parametrize("case", DIFFERENT)
+def test_the_difference_is_named(case):
+    changes, message = DIFFERENT[case]
+    with jax.disable_jit(None in changes.values()):
+        begun = json.loads(computed_with()) | changes
+        begun = json.dumps({name: value for name, value in begun.items() if value is not None}, sort_keys=True)
+        with pytest.raises(aj.InputError, match=f"^s.h5 was begun {message}"):
+            check_same(begun, "s.h5", "choose another output path")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ("other", r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, and here is no XLA_FLAGS"),
+        ("", r"s\.h5 does not say with which settings it was begun, as files of today do; choose another output path"),
+    ],
+    ids=["other settings", "a file of an earlier version"],
+)
+def test_what_was_begun_otherwise_is_read_but_not_continued(study, tmp_path, settings, message):
+    if settings:
+        settings = json.dumps(json.loads(computed_with()) | {"XLA_FLAGS": "--xla_a=1"}, sort_keys=True)
+    layout = Layout.of(study, 16, (metadata.version("aacmm_jax"), settings))
+    store.create(tmp_path / "s.h5", study, layout, 16)
+    with pytest.raises(aj.InputError, match=message):
+        aj.study.run_study(study, tmp_path / "s.h5")
+    found = aj.study.Results.of(tmp_path / "s.h5")
+    assert (found.finished, found.stored.layout.mark) == (False, layout.mark)
+
+
+def test_blocks_of_other_settings_are_other_blocks(study, tmp_path, monkeypatch):
+    """A study's file was removed, its blocks stayed: they are used again only under the settings of then."""
+    here = Layout.of(study, 16)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=1")
+    block = next(here.blocks())
+    assert part_of(tmp_path, block, Layout.of(study, 16)) != part_of(tmp_path, block, here)
+
+
+def test_a_worker_with_other_settings_computes_nothing(study, monkeypatch):
+    layout = Layout.of(study, 16)
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Nehalem")
+    monkeypatch.setattr(runner, "run_block", lambda *_, **__: pytest.fail("computed"))
+    with pytest.raises(
+        aj.InputError, match=r"on the worker .*: the study was begun with no OPENBLAS_CORETYPE, and her"
+    ):
+        runner._run_and_pack(study, layout, None, next(layout.blocks()), runner._Resources())
+
+
+def test_the_file_says_what_it_was_computed_with(home):
+    with h5py.File(home / "whole.h5") as file:
+        kept = json.loads(file.attrs["computed_with"])
+    assert {"jax", "jaxlib", "numpy", "scipy", "platform"} <= set(kept)

@@ -1,0 +1,107 @@
+"""Whose blocks are believed: the user's own, and of a study that is read those of its owner."""
+
+import os
+import shutil
+
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.study import store
+from aacmm_jax.study.blocks import Layout, parts_of
+from aacmm_jax.study.parts_folder import check_ours, check_readable
+
+from .test_store import written_in_blocks
+
+OTHER = 65534
+root = pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only the superuser can act for two users"
+)
+
+
+def give(*paths):
+    for path in paths:
+        os.chown(path, OTHER, OTHER, follow_symlinks=False)
+
+
+def link_folder(path):
+    parts_of(path).rename(path.parent / "elsewhere")
+    parts_of(path).symlink_to(path.parent / "elsewhere")
+
+
+def link_block(path):
+    block = min(parts_of(path).iterdir())
+    block.rename(path.parent / "elsewhere.h5")
+    block.symlink_to(path.parent / "elsewhere.h5")
+
+
+def colleague(path):
+    give(path, parts_of(path), *parts_of(path).iterdir())
+
+
+FOLDER = r"s\.h5\.parts belongs to nobody, "
+BLOCK = r"cell.*\.h5 belongs to nobody, who does not own its folder, so it is not read; remove it"
+OURS = ("a link to a folder", "a link to a block", "an open folder")  # which need no second user
+# What is done to a study of the user with blocks, and how running it and reading it is refused; None: it is not.
+PLANTED = {
+    "a link to a folder": (link_folder, *[r"s\.h5\.parts is a link, so the blocks in it are not read"] * 2),
+    "a link to a block": (link_block, *[r"cell.*\.h5 is a link, so it is not read; remove it"] * 2),
+    "an open folder": (
+        lambda path: parts_of(path).chmod(0o777),
+        *[r"others may write to .*s\.h5\.parts \(mode 0777\), .*; if they are yours, run chmod go-w '.*s\.h5\.parts'"]
+        * 2,
+    ),
+    "a folder": (
+        lambda path: give(parts_of(path)),
+        FOLDER + r"so its results are not continued; choose another output path",
+        FOLDER + r"but s\.h5 to root, so its blocks are not read; have one user own both",
+    ),
+    "a block": (lambda path: give(min(parts_of(path).iterdir())), BLOCK, BLOCK),
+    "a colleague's": (colleague, r"s\.h5 belongs to nobody, so its results are not continued", None),
+}
+
+
+@pytest.mark.parametrize("case", [case if case in OURS else pytest.param(case, marks=root) for case in PLANTED])
+def test_what_others_could_have_written_is_refused(case, home, study, tmp_path):
+    plant, running, reading = PLANTED[case]
+    path = tmp_path / "s.h5"
+    written_in_blocks(home, study, path, 16)
+    plant(path)
+    before = sorted(os.listdir(tmp_path))
+    with pytest.raises(aj.InputError, match=running):
+        aj.study.run_study(study, path)
+    assert sorted(os.listdir(tmp_path)) == before
+    if reading is None:
+        aj.study.Results.of(path)
+        return
+    for read in (aj.study.Results.of, aj.study.open_study):
+        with pytest.raises(aj.InputError, match=reading):
+            read(path)
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077, 0])
+def test_nobody_else_may_write_into_a_new_folder(study, tmp_path, umask):
+    former = os.umask(umask)
+    try:
+        store.create(tmp_path / "s.h5", study, Layout.of(study, 16), 16)
+    finally:
+        os.umask(former)
+    assert parts_of(tmp_path / "s.h5").stat().st_mode & 0o777 == 0o755 & ~umask
+
+
+@root
+def test_a_folder_that_another_user_made_first_is_left_as_it_is(study, tmp_path):
+    parts = parts_of(tmp_path / "s.h5")
+    parts.mkdir()
+    (parts / "old.h5").touch()
+    give(parts)
+    for check in (check_ours, lambda path: store.create(path, study, Layout.of(study, 16), 16)):
+        with pytest.raises(aj.InputError, match=r"s\.h5\.parts belongs to nobody"):
+            check(tmp_path / "s.h5")
+    assert os.listdir(parts) == ["old.h5"]
+
+
+def test_without_a_folder_there_is_nothing_to_check(tmp_path):
+    (tmp_path / "s.h5").touch()
+    check_ours(tmp_path / "s.h5")
+    check_readable(tmp_path / "s.h5")
+    shutil.rmtree(tmp_path)
