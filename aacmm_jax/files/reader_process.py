@@ -218,7 +218,6 @@ def serve() -> None:
                 check(*intact)
             except Exception:
                 break
-    os._exit(0)
 
 
 class _Limits:

@@ -11,9 +11,9 @@ from ..core.units import DEG, LENGTH_UNITS, length_unit
 from ..data.capture import Capture
 from ..data.observations.measured_points import AbstractMeasured
 from ..kinematics.arm import Arm
+from ..kinematics.joint_travel import lost_by_standing, standing_joints
 from ..kinematics.reading_check import ReadingCheck, check_readings
 from ..kinematics.reading_fit import Explanation
-from ..kinematics.standing_joints import lost_by_standing, standing_joints
 
 _LISTED = 5
 _MUCH = 2.0  # a place of the tip that reduces the residuals by less is not spoken of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.kinematics.standing_joints import lost_by_standing, standing_joints
+from aacmm_jax.kinematics.joint_travel import lost_by_standing, standing_joints
 
 DEG = np.pi / 180
 
