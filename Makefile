@@ -38,8 +38,7 @@ SELECTION := tests/test_package.py tests/kinematics --ignore=tests/kinematics/te
 PANDA := aacmm-demo/panda
 SUMMARY := sed '/^Warning/,$$d'
 # As a processor of 2008 rounds: SSE4.2 and the linear algebra of that time (without effect on other architectures).
-OTHER_ROUNDING := OPENBLAS_CORETYPE=Nehalem XLA_FLAGS="--xla_backend_optimization_level=0 \
-	--xla_cpu_use_fusion_emitters=false --xla_cpu_max_isa=SSE4_2"
+OTHER_ROUNDING := OPENBLAS_CORETYPE=Nehalem XLA_FLAGS=--xla_cpu_max_isa=SSE4_2
 
 .PHONY: demo test test-slow test-rounding test-exhaustive test-newest install-newest run-newest test-lowest check package \
 	package-matrix audit bench peers docs reproduce clean

@@ -5,6 +5,7 @@ have written what is in it, be it the default one or one that JAX_COMPILATION_CA
 JAX's setting alone, unchecked.
 """
 
+import contextlib
 import os
 import stat
 import sys
@@ -78,7 +79,7 @@ def _unsafe(folder: Path) -> str:
         return "it belongs to another user"
     if found.st_mode & 0o022:
         return f"others may write to it (mode {stat.S_IMODE(found.st_mode):04o})"
-    owner = found.st_uid
+    owner, others_may_enter = found.st_uid, found.st_mode & 0o011
     # Whoever can rename a folder above can put another one there.
     for above in folder.parents:
         found = above.stat()
@@ -89,8 +90,9 @@ def _unsafe(folder: Path) -> str:
     # What was put there while others could: JAX reads it by its name, and a link leads to where others may write now.
     with os.scandir(folder) as entries:
         for entry in entries:  # of which there may be thousands: 2 microseconds each
-            found = entry.stat(follow_symlinks=False)
-            changeable = found.st_mode & 0o022 and others_may_write(found)
-            if found.st_uid != owner or changeable or entry.is_symlink():
-                return f"others can have written {entry.name} in it"
+            with contextlib.suppress(FileNotFoundError):  # another process has removed it
+                found = entry.stat(follow_symlinks=False)
+                changeable = others_may_enter and found.st_mode & 0o022 and others_may_write(found)
+                if found.st_uid != owner or changeable or entry.is_symlink():
+                    return f"others can have written {entry.name} in it"
     return ""

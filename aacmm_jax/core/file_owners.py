@@ -5,6 +5,7 @@ On POSIX only; elsewhere (Windows) access lists say more than a mode does, and e
 
 import os
 import stat
+import tempfile
 
 POSIX = os.name == "posix"
 
@@ -61,7 +62,7 @@ def may_replace(path: str | os.PathLike) -> bool:
 
 
 def _is_private(group: int, user: int) -> bool:
-    """Whether a group is that of one user: it bears the user's name and has no other member."""
+    """Whether a group is that of one user alone: it bears the user's name, or no other user's first group is the same."""
     import grp
     import pwd
 
@@ -69,4 +70,16 @@ def _is_private(group: int, user: int) -> bool:
         name, entry = pwd.getpwuid(user).pw_name, grp.getgrgid(group)
     except KeyError:
         return False
-    return entry.gr_name == name and set(entry.gr_mem) <= {name}
+    alone = entry.gr_name == name or {one.pw_name for one in pwd.getpwall() if one.pw_gid == group} == {name}
+    return alone and set(entry.gr_mem) <= {name}
+
+
+def keeps_owners(folder: str | os.PathLike) -> bool:
+    """Whether a file system keeps owners and modes (some shares and drives of other systems show all files alike): a
+    file that is made in the folder, for nobody else, is ours and nobody else's. True where none can be made."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            found = os.fstat(probe.fileno())
+    except OSError:
+        return True
+    return is_ours(found) and not found.st_mode & 0o077

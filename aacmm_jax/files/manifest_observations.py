@@ -62,10 +62,18 @@ def parts(
     """The parts of one table of a manifest, one for each session and group; ``where`` names it in messages."""
     reader = _Reader(source, kind, table, where)
     session = session_name(getattr(table, "session", None), values, where)
-    found = [reader.read(label, fill(file, values), session) for label, file in _files(table)]
+    labels, files_read = zip(*((label, fill(file, values)) for label, file in _files(table)), strict=True)
+    found = [reader.read(label, file, session) for label, file in zip(labels, files_read, strict=True)]
     groups = np.concatenate([group for group, _, _ in found])
     sessions = np.concatenate([session for _, session, _ in found])
     files = np.repeat(np.arange(len(found)), [len(group) for group, _, _ in found])
+    for file, (*_, rows) in zip(files_read, found, strict=True):
+        different = sorted(found[0][2].keys() ^ rows.keys())
+        if different:
+            raise InputError(
+                f"{where}: only one of {files_read[0]} and {file} has '{different[0]}'; give it in all files of a "
+                "table, or make a table for each."
+            )
     by_pose = {key: np.concatenate([rows[key] for *_, rows in found]) for key in found[0][2]}
     stated = reader.stated(values)
     both = sorted(by_pose.keys() & stated.keys())

@@ -127,12 +127,11 @@ class _Reader:
                     pipe.close()
 
     def forget(self) -> None:
-        """After a fork, before which it was locked: the child is the parent's."""
+        """After a fork: the child is the parent's, and so are requests to it, which another thread may have begun."""
         if self._process is not None:
             self._process.returncode = 0
-            self._process.stdin.close()
-            self._process.stdout.close()
-        self.__init__()
+            for pipe in (self._process.stdin, self._process.stdout):
+                os.close(pipe.fileno())  # and not `close`, which would send what the parent's thread has begun to send
 
     def answer(self, request: dict[str, Any], content: Any) -> str | None:
         """Empty where a file can be read, else why not; None where it is damaged."""
@@ -176,12 +175,17 @@ class _Reader:
         return None, status not in _OUT_OF_TIME
 
 
+def _renew() -> None:
+    """A reader of its own for a process that was forked, with a lock that nobody holds."""
+    global _reader
+    _reader.forget()
+    _reader = _Reader()
+
+
 _reader = _Reader()
 atexit.register(_reader.stop)
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(
-        before=_reader.lock.acquire, after_in_parent=_reader.lock.release, after_in_child=_reader.forget
-    )
+    os.register_at_fork(after_in_child=_renew)
 
 
 def serve() -> None:

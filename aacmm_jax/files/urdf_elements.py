@@ -64,7 +64,8 @@ _KNOWN = {
     "child": _Names("link"),
     "axis": _Names("xyz"),
     "limit": _Names(
-        "lower upper effort velocity acceleration deceleration jerk + command_effort current gear_velocity"
+        "lower upper effort velocity acceleration deceleration jerk + command_effort current gear_velocity damping "
+        "friction"
     ),
     "mimic": _Names("joint multiplier offset"),
     "inertial": _Names("", "origin mass inertia"),

@@ -52,7 +52,8 @@ def tuning_constant(name: LossName, rows: int) -> float:
     many rows even a tiny c is more efficient than that; then a quarter of good poses has |x| < c.
     """
     root = np.linspace(0.0, np.sqrt(rows) + 8.0, 4_001)
-    density = np.exp((rows - 1) * np.log(np.maximum(root, 1e-300)) - 0.5 * root**2)
+    exponent = (rows - 1) * np.log(np.maximum(root, 1e-300)) - 0.5 * root**2
+    density = np.exp(exponent - exponent.max())
     density[0] /= 2  # as the trapezoidal rule counts it
     density /= density.sum()
     low, high = np.sqrt(chi_square_quantile(0.25, rows)), 20.0 + 2 * np.sqrt(rows)

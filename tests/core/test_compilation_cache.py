@@ -105,7 +105,11 @@ root = pytest.mark.skipif(
 PLANTED = {
     "folder": (lambda folder, entry: os.chown(folder, 65534, 65534), "it belongs to another user"),
     "entry": (lambda folder, entry: os.chown(entry, 65534, 65534), "others can have written x-cache in it"),
-    "open entry": (lambda folder, entry: entry.chmod(0o666), "others can have written x-cache in it"),
+    "open entry": (
+        lambda folder, entry: (folder.chmod(0o755), entry.chmod(0o666)),
+        "others can have written x-cache in it",
+    ),
+    "open entry that nobody else reaches": (lambda folder, entry: entry.chmod(0o666), ""),
     "link": (
         lambda folder, entry: entry.with_name("y-cache").symlink_to(entry),
         "others can have written y-cache in it",

@@ -1,6 +1,7 @@
 """The process that reads HDF5 files first: what it must survive, and what it must not be blamed for."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -57,13 +58,12 @@ def test_an_endless_file_is_damaged(path, endless, monkeypatch, limit):
     assert_readable(path)
 
 
-def test_ctrl_c_ends_waiting_for_an_endless_file(path, endless):
+def test_ctrl_c_ends_waiting_for_an_endless_file(path, endless, monkeypatch):
     assert_readable(path)
-    began = time.perf_counter()
+    monkeypatch.setattr(reader_process, "_CPU_SECONDS", 3600)
     threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
         read_tables(endless, KIND)
-    assert time.perf_counter() - began < 1.5
     assert_readable(path)
 
 
@@ -90,11 +90,9 @@ def test_a_child_that_has_ended_is_replaced(path):
 
 @pytest.mark.parametrize(
     ("executable", "reason"),
-    [("/no/such/program", "no such file"), (sys.executable.replace("python", "false"), ""), ("", ""), (None, "")],
+    [("/no/such/program", "no such file"), (shutil.which("false"), "exit status 1")],
 )
 def test_a_child_that_does_not_start_is_no_damage(path, monkeypatch, executable, reason):
-    if executable and "false" in executable:
-        executable = "/bin/false"
     monkeypatch.setattr(sys, "executable", executable)
     reader_process._reader.stop()
     assert_refused(lambda: read_tables(path, KIND), path, "cannot be read", "does not start", reason, "import h5py")

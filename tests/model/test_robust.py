@@ -31,9 +31,12 @@ def test_tuning_constants_give_95_percent(name, rows):
     assert a**2 / b == pytest.approx(0.95, abs=2e-3)
 
 
+@pytest.mark.parametrize("rows", [40, 1000])
 @pytest.mark.parametrize("name", LOSSES)
-def test_many_rows_keep_a_quarter_of_good_poses(name):
-    assert tuning_constant(name, 40) >= stats.chi(40).ppf(0.25) - 1e-3
+def test_many_rows_keep_a_quarter_of_good_poses(name, rows):
+    quarter, middle = stats.chi(rows).ppf([0.25, 0.5])
+    assert quarter - 1e-3 <= tuning_constant(name, rows) < 3 * middle
+    assert (tuning_constant(name, rows) > 1.1 * middle) == (name == "tukey")  # which rejects what is beyond it
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 6, 40])
