@@ -62,7 +62,7 @@ def may_replace(path: str | os.PathLike) -> bool:
 
 
 def _is_private(group: int, user: int) -> bool:
-    """Whether a group is that of one user alone: it bears the user's name, or no other user's first group is the same."""
+    """Whether a group is that of one user alone: it bears the user's name, or is the first group of nobody else."""
     import grp
     import pwd
 

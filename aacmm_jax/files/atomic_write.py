@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ..core.errors import InputError
@@ -10,16 +10,22 @@ from .outputs import ELSEWHERE, OutputFile, hand_over, put_in_place, remove_left
 
 
 @contextlib.contextmanager
-def write_atomically(path: str | os.PathLike, advice: str = ELSEWHERE, *, leftovers: bool = True) -> Iterator[Path]:
+def write_atomically(
+    path: str | os.PathLike,
+    advice: str = ELSEWHERE,
+    *,
+    leftovers: bool = True,
+    same_kind: Callable[[Path], bool] | None = None,
+) -> Iterator[Path]:
     """Write a file whole or not at all: yields a temporary path in the same folder, renamed onto it at the end.
 
     Inside `together`, the end is that of all outputs. A symbolic link is followed: the file that it points to is
     written. A file that is replaced leaves its permissions to the new one. Whatever goes wrong (Ctrl-C included), the
     temporary file is removed and an existing target stays as it was; ``leftovers``: those of killed processes are
-    removed as well. Raises `InputError` where the path cannot be written, is a folder, a device, a pipe or read-only,
-    or, in a command, where it is a file that aacmm did not write (`asking`).
+    removed as well; ``same_kind`` as in `OutputFile`. Raises `InputError` where the path cannot be written, is a
+    folder, a device, a pipe or read-only, or, in a command, where it is a file that aacmm did not write (`asking`).
     """
-    file = OutputFile(path, advice)
+    file = OutputFile(path, advice, same_kind)
     waits = False
     try:
         with file.refusing():

@@ -90,7 +90,7 @@ def write_tables(
         if extend is not None:
             extend(file)
 
-    with write_atomically(path, advice) as temporary:
+    with write_atomically(path, advice, same_kind=lambda earlier: _is_of_kind(earlier, kind)) as temporary:
         if not streamed:
             temporary.write_bytes(file_image(fill))
             return
@@ -321,6 +321,15 @@ def undamaged(path: str | os.PathLike) -> Iterator[None]:
         if is_from_jax(error) or isinstance(error, AssertionError | FloatingPointError):
             raise
         raise damaged(path) from error
+
+
+def _is_of_kind(path: Path, kind: str) -> bool:
+    """Whether a file can be read as one of a kind."""
+    try:
+        with opened(path, (kind,)):
+            return True
+    except InputError:
+        return False
 
 
 def _check_kind(path: str | os.PathLike, attributes: Mapping[str, Any], kinds: Sequence[str]) -> None:

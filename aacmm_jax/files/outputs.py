@@ -12,7 +12,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -36,10 +36,15 @@ def as_path(path: Any) -> Path:
 
 
 class OutputFile:
-    """A file that is being written under a temporary name; a symbolic link is followed to the file it points to."""
+    """A file that is being written under a temporary name; a symbolic link is followed to the file it points to.
 
-    def __init__(self, path: str | os.PathLike, advice: str = ELSEWHERE):
-        self.named, self._advice = as_path(path), advice
+    ``same_kind`` says whether an existing file is of the kind of the new one, where more than their ends tells it.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike, advice: str = ELSEWHERE, same_kind: Callable[[Path], bool] | None = None
+    ):
+        self.named, self._advice, self._same_kind = as_path(path), advice, same_kind
         with self.refusing():
             if "\0" in str(path):
                 raise OSError(None, "its name holds a NUL")
@@ -110,10 +115,15 @@ class OutputFile:
         """
         if not _asking.get() or not self.target.exists():
             return
-        marked = self.target.suffix.lower() in _MARKED
-        if not (
-            _is_own(self.target, self.temporary) if self.temporary.exists() else not marked or _is_marked(self.target)
-        ):
+        if self.temporary.exists():
+            own = _is_own(self.target, self.temporary)
+            if own and self._same_kind is not None and os.path.getsize(self.target):
+                token = _current.set(None)  # it may be read, though it is an output
+                own = self._same_kind(self.target)
+                _current.reset(token)
+        else:
+            own = self.target.suffix.lower() not in _MARKED or _is_marked(self.target)
+        if not own:
             raise InputError(
                 f"{self.named} exists and is no earlier output of this kind; choose another name, or replace it with "
                 "--overwrite."

@@ -6,10 +6,11 @@ afterwards, by HDF5 too, which opens the blocks of a virtual array itself: nobod
 
 import os
 import stat
+import warnings
 from pathlib import Path
 
 from ..core.errors import InputError
-from ..core.file_owners import POSIX, is_ours, is_planted_link, others_may_write, user_name
+from ..core.file_owners import POSIX, is_ours, is_planted_link, keeps_owners, others_may_write, user_name
 from .blocks import parts_of
 
 
@@ -20,9 +21,10 @@ def check_ours(path: Path) -> None:
         if found is None:
             continue
         if not is_ours(found):
-            raise InputError(
+            _refuse(
+                item,
                 f"{item} belongs to {user_name(found.st_uid)}, so its results are not continued; choose another output "
-                "path."
+                "path.",
             )
     _check_folder(parts_of(path))
 
@@ -70,10 +72,23 @@ def _check_folder(folder: Path) -> None:
             f"{folder} is a link, so the blocks in it are not read; put the folder itself there, or remove the link."
         )
     if others_may_write(found):
-        raise InputError(
+        _refuse(
+            folder,
             f"others may write to {folder} (mode {stat.S_IMODE(found.st_mode):04o}), so the blocks in it are not read; "
-            f"if they are yours, run chmod go-w '{folder}', otherwise remove it."
+            f"if they are yours, run chmod go-w '{folder}', otherwise remove it.",
         )
+
+
+def _refuse(path: Path, sentence: str) -> None:
+    """Raise `InputError`, unless the file system says nothing of owners: then a warning says that none are checked."""
+    if keeps_owners(path.parent):
+        raise InputError(sentence)
+    warnings.warn(
+        f"the file system of {path.parent} does not keep who owns a file, so nothing shows whether somebody else wrote "
+        "the blocks of this study.",
+        UserWarning,
+        stacklevel=3,
+    )
 
 
 def _status(path: Path) -> os.stat_result | None:

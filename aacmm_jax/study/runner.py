@@ -229,7 +229,7 @@ def _completed(
                 ended, _ = wait(submitted, timeout=0.2, return_when=FIRST_COMPLETED)
                 # Successful blocks first: they are kept even where another block failed at the same moment.
                 for future in sorted(ended, key=lambda future: future.exception() is not None):
-                    yield (block := submitted.pop(future)), _result(future, block)
+                    yield (block := submitted.pop(future)), _result(future, f"block {block}")
                 if not stopped.is_set():
                     continue
                 if blocks is phases[0]:
@@ -244,14 +244,14 @@ def _completed(
             future.cancel()
 
 
-def _result(future: Future, block: Block) -> Any:
+def _result(future: Future, what: object) -> Any:
     try:
         return future.result()
     except InputError:
         raise
     except Exception as error:
         raise RuntimeError(
-            f"block {block} failed on its worker ({type(error).__name__}: {error}); finished blocks are kept, run "
+            f"{what} failed on its worker ({type(error).__name__}: {error}); finished blocks are kept, run "
             "again to continue"
         ) from error
 
@@ -321,7 +321,7 @@ def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | No
         _interruptible(check_reach, study)
         chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
         # With what a worker computes: it may be another machine, with other devices.
-        settings = computed_with() if executor is None else executor.submit(computed_with).result()
+        settings = computed_with() if executor is None else _result(executor.submit(computed_with), "the first task")
         layout = Layout.of(study, chunk, (metadata.version("aacmm_jax"), settings))
         store.create(path, study, layout, chunk)
         return layout, chunk, False

@@ -80,6 +80,7 @@ def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None
             dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
 
     with write_atomically(target, _ADVICE, leftovers=False) as temporary:
+        temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: nobody else may change a block
         temporary.write_bytes(file_image(fill))
 
 
@@ -107,7 +108,8 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
     folder = parts_of(path)
     try:
         folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
-        check_ours(path)
+        with _removed_if_empty(folder):
+            check_ours(path)
         for item in folder.glob("*.h5"):  # blocks of a study whose file was removed
             if not item.name.startswith(f"{layout.mark}-"):
                 item.unlink()
@@ -116,11 +118,18 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
             f"{folder} cannot be created: {(error.strerror or str(error)).lower()}; choose another output path."
         ) from error
 
-    try:
+    with _removed_if_empty(folder):
         _write(path, study, chunk, partial(_add_virtual, path, layout), layout, finished=False, advice=ELSEWHERE)
+
+
+@contextlib.contextmanager
+def _removed_if_empty(folder: Path) -> Iterator[None]:
+    """Whatever goes wrong, an empty folder is not left behind."""
+    try:
+        yield
     except BaseException:
         with contextlib.suppress(OSError):
-            folder.rmdir()  # only where it is empty
+            folder.rmdir()
         raise
 
 
@@ -334,7 +343,7 @@ def rows_of(
                 part = slice(first, min(first + _TRIALS_IN_MEMORY, layout.trials))
                 yield part, {name: trials[name][cell, part] for name in names}
         return
-    for block in finished_blocks(path, layout):
+    for block in _present(path, layout):
         if block.first_cell <= cell < block.last_cell:
             with _block(path, block, layout, stored.version < SEALED_SINCE) as arrays:
                 found = {name: arrays[name][cell - block.first_cell] for name in names}
@@ -358,8 +367,12 @@ def is_readable(path: Path, block: Block, layout: Layout) -> bool:
 
 def finished_blocks(path: Path, layout: Layout) -> list[Block]:
     """Blocks whose files exist. Raises `InputError` where one is a link, or somebody else's."""
-    names = {item.name for item in parts_of(path).glob("*.h5")} if parts_of(path).is_dir() else set()
-    finished = [block for block in layout.blocks() if part_of(path, block, layout).name in names]
+    finished = _present(path, layout)
     for block in finished:
         check_owner(part_of(path, block, layout))
     return finished
+
+
+def _present(path: Path, layout: Layout) -> list[Block]:
+    names = {item.name for item in parts_of(path).glob("*.h5")} if parts_of(path).is_dir() else set()
+    return [block for block in layout.blocks() if part_of(path, block, layout).name in names]

@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 
+import h5py
 import pytest
 
 import aacmm_jax as aj
@@ -147,6 +148,9 @@ def test_a_capture_of_somebody_else_is_not_replaced(aacmm, inputs):
     assert (inputs / "x.h5").read_bytes() == FOREIGN
     aacmm(*SIMULATE, "-o", "x.h5", "--overwrite")
     aacmm(*SIMULATE, "-o", "x.h5")
+    with h5py.File(inputs / "x.h5", "a") as file:  # a file of aacmm, but of another kind
+        file.attrs.update(kind="calibration", format_version=1)
+    assert "x.h5 exists and is no earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
 
 
 @pytest.mark.slow
@@ -197,7 +201,7 @@ def test_the_robot_of_the_user_is_not_replaced(aacmm, tmp_path):
 @pytest.mark.parametrize("failing", ["figure", "replace"])
 def test_all_outputs_or_none(aacmm, inputs, monkeypatch, failing):
     """A command that fails at its second output, or while it puts them in place, leaves the first as it was."""
-    (inputs / "old.h5").write_bytes((inputs / "c.h5").read_bytes())
+    aacmm("calibrate", "c.h5", "-o", "old.h5")
     before = content(inputs)
 
     def refused(*_):

@@ -100,6 +100,15 @@ def test_a_child_that_does_not_start_is_no_damage(path, monkeypatch, executable,
     assert_readable(path)
 
 
+@pytest.mark.parametrize("executable", ["", None])
+def test_without_an_interpreter_files_with_their_sha256_are_read(path, monkeypatch, executable):
+    monkeypatch.setattr(sys, "executable", executable)
+    monkeypatch.setattr(reader_process, "_vouched_for", set())
+    reader_process._reader.stop()
+    assert_readable(path)
+    assert process() is None
+
+
 def test_nothing_is_imported_from_the_current_folder(path, tmp_path, monkeypatch):
     for name in ("h5py", "json", "aacmm_jax"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')")

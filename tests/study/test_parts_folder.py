@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.core.file_owners import keeps_owners
 from aacmm_jax.study import store
 from aacmm_jax.study.blocks import Layout, parts_of
 from aacmm_jax.study.parts_folder import check_ours, check_readable
@@ -86,6 +87,31 @@ def test_nobody_else_may_write_into_a_new_folder(study, tmp_path, umask):
     finally:
         os.umask(former)
     assert parts_of(tmp_path / "s.h5").stat().st_mode & 0o777 == 0o755 & ~umask
+
+
+def test_nobody_else_may_change_a_block(home, study, tmp_path):
+    former = os.umask(0)
+    try:
+        written_in_blocks(home, study, tmp_path / "s.h5", 16)
+    finally:
+        os.umask(former)
+    assert {block.stat().st_mode & 0o777 for block in parts_of(tmp_path / "s.h5").iterdir()} == {0o644}
+
+
+def test_a_file_system_without_owners_is_a_warning(home, study, tmp_path, monkeypatch):
+    """As shares and drives of other systems, which show all files alike."""
+    path = tmp_path / "s.h5"
+    written_in_blocks(home, study, path, 16)
+    parts_of(path).chmod(0o777)
+    monkeypatch.setattr("aacmm_jax.study.parts_folder.keeps_owners", lambda folder: False)
+    with pytest.warns(UserWarning, match="does not keep who owns a file"):
+        check_ours(path)
+    with pytest.warns(UserWarning, match="does not keep who owns a file"):
+        aj.study.Results.of(path)
+
+
+def test_this_file_system_keeps_owners(tmp_path):
+    assert keeps_owners(tmp_path)
 
 
 @root
