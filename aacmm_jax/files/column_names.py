@@ -24,9 +24,10 @@ _OTHERS = {*("cm", "dm", "nm", "ft", "feet", "mil", "arcmin", "urad", "mdeg", "r
            *("hz", "rad/s", "deg/s", "\u00b0/s")}  # fmt: skip
 _IN_BRACKETS = re.compile(r"\s*(?:\[([^\]]*)\]|\(([^)\d]*)\))\s*$")
 _BRACKETED = re.compile(r"[\[(]([^\])]*)[\])]")
-# "_m" may mean anything, and so may each single letter, "in" and "as"; "x/mm" is of a unit, and so is "q_rad/s".
-_WORDS = (re.compile(r"[_\s,.:()\[\]-]+"), re.compile(r"[_\s,.:()\[\]/-]+"))
-_NO_WORDS = {"in", "as", *(unit for unit in (*_UNITS, *_OTHERS) if len(unit) == 1 and unit != "\u00b0")}
+# "_m" may mean anything, and so may each single letter, "in" and "as".
+_WORDS = {unit for unit in (*_UNITS, *_OTHERS) if len(unit) > 1 or unit == "\u00b0"} - {"in", "as"}
+_LONGEST_FIRST = "|".join(map(re.escape, sorted(_WORDS, key=len, reverse=True)))  # rad/s before rad
+_WORD = re.compile(rf"(?:^|[_\s,.:/-]+)({_LONGEST_FIRST})(?=$|[_\s,.:/-])", re.IGNORECASE)
 _LAST_NUMBER = re.compile(r"(.*?)([0-9]+)([^0-9]*)", re.DOTALL)
 _ALIKE = 0.6  # similarity from which a word in round brackets is a misspelt unit
 
@@ -51,17 +52,14 @@ def are_units(cells: list[str], alone: bool) -> bool:
         return False
     if all(map(_is_unit, texts)):
         return not alone or any(text in _UNITS for text in texts)
-    return 2 * sum(map(_is_word, texts)) > len(texts) or (len(set(texts)) == 1 and _nearly_unit(texts[0]))
+    return 2 * sum(text in _WORDS for text in texts) > len(texts) or (
+        len(set(texts)) == 1 and len(texts[0]) > 3 and _nearly_unit(texts[0])
+    )
 
 
 def with_units(names: list[str], cells: list[str]) -> list[str]:
     """Names with the units of a row of their own in brackets; one that nobody knows is refused where it is picked."""
     return [f"{name} [{_inside(cell)}]" if cell else name for name, cell in zip(names, cells, strict=True)]
-
-
-def _is_word(text: str) -> bool:
-    """Whether a word is a unit also without brackets around it."""
-    return (text in _UNITS or text in _OTHERS) and text not in _NO_WORDS
 
 
 def _nearly_unit(text: str) -> bool:
@@ -72,17 +70,16 @@ def unit_in(name: str) -> str | None:
     """The unit in a column's name; None where it states none.
 
     What stands in square brackets is a unit, also where nobody knows it; so is what is nearly one in round brackets.
+    Brackets come before words.
     """
     name = name.casefold()
     bracketed = _IN_BRACKETS.search(name)
     unit = _inside(bracketed[0]) if bracketed else ""
     inside = [unit, *(text.strip() for text in _BRACKETED.findall(name))]
-    words = [text for divided in _WORDS for text in reversed(divided.split(name)) if _is_word(text)]
-    known = next((text for text in (*filter(_is_unit, inside), *words)), None)
-    if known is not None:
-        return _UNITS.get(known, known)
     square = bracketed is not None and bracketed[1] is not None and re.search(r"[^\W\d_]", unit)
-    return unit if square or (unit and _nearly_unit(unit)) else None
+    unknown = [unit] if square or (unit and _nearly_unit(unit)) else []
+    found = next(iter([*filter(_is_unit, inside), *unknown, *_WORD.findall(name)[::-1]]), None)
+    return None if found is None else _UNITS.get(found, found)
 
 
 def plain_name(name: str) -> str:
@@ -95,9 +92,9 @@ def plain_name(name: str) -> str:
 
 
 def bare_name(name: str) -> str:
-    """A column's name without quotes and a unit in brackets."""
+    """A column's name without quotes and unit."""
     name = name.strip("\"' ")
-    return name if unit_in(name) is None else _IN_BRACKETS.sub("", name)
+    return name if unit_in(name) is None else _WORD.sub("", _IN_BRACKETS.sub("", name))
 
 
 def stem_and_number(name: str) -> tuple[str, int] | None:

@@ -326,6 +326,9 @@ SIX = ",".join(f"{x}" for x in Q[0, :6]) + "\n"
          ["column 1 'J1' is one of the joint readings, but is also picked for something else"]),
         (JOINTS + SIX, 'group = "J1"\ncolumns = "J*"\n', ["column 1 'J1' is one of the joint readings"]),
         ("Socket,1,2,3,4,5,6\nA," + SIX, 'group = "Socket"\n', ["add skip = 1, and pick column 1 by its number"]),
+        (",".join(numbered("q{}_rad/s")) + "\n" + SIX, "", ["states 'rad/s' for readings of revolute joints ('q1_"]),
+        ("J6,J5,J4,J3,J2,J1\nbegin,data\n" + SIX, "", ["in the order 'J6'"]),
+        ("Time,J6,J5,J4,J3,J2,J1\n" + SIX, "", ["6 columns, but its header 7 names", "correct the header"]),
         ("a,b\n1,2\n", "", ["[[socket]] 'a': "]),
     ],
 )  # fmt: skip
