@@ -12,10 +12,11 @@ from ..core.rotations import rotation_matrix
 from ..core.text import csv_text
 from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
+from .header_lines import Column
 from .manifest_angles import header_units
 from .table_columns import columns_of_joints, find_named, position_columns, reading_columns
 from .temperatures import TEMPERATURE
-from .text_table import Column, TextTable
+from .text_table import TextTable
 
 _ANGLES = {"deg": DEG, "rad": 1.0}
 _QUATERNION, _ROTATION = ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
@@ -66,7 +67,7 @@ def read_commanded_poses(
     table, joints = TextTable(path), arm.joints
     orientation = _orientation(table)
     picked = _reading_columns(path, table, joints, alone=orientation is None, wanted=columns)
-    stated, linear = header_units(table, picked, arm) if picked else (None, None)
+    stated, linear = header_units(table, picked, arm, unit) if picked else (None, None)
     if linear not in (None, "mm"):
         raise InputError(f"{path} states {linear} for readings of prismatic joints; convert them to mm.")
     if stated is not None and (stated not in _ANGLES or unit not in (None, stated)):
@@ -125,7 +126,7 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
         orientation, position = _orientation(table), position_columns(table)
         if position is not None:
             point, length = position[0], position[1] or "mm"
-    header = table.unit(picked)
+    header = table.unit(picked, unit)
     if header is not None and (header not in _ANGLES or unit not in (None, header)):
         raise InputError(f"{path} states {header} for joint readings; give them in deg or rad, and leave out --unit.")
     readings = table.numbers(picked)

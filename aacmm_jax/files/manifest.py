@@ -337,6 +337,9 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
     of_session = fields_of(getattr(entry, "session", None) or "")
     for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
         if fields_of(text) | (of_session & fields if what == "name" else set()) != fields:
+            if what == "name" and not text:
+                line = "/".join(f"{{{field}}}" for field in sorted(fields - of_session))
+                raise InputError(f"file '{first}' has {in_braces(fields)}, so add name = \"{line}\" in [[{table}]].")
             raise InputError(
                 f"{table} {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has "
                 f"{in_braces(fields)}; use the same fields in the name and in every file."

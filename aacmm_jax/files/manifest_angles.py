@@ -14,7 +14,7 @@ from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
 from .manifest_tables import Picked, Wanted, as_list
-from .table_columns import reading_columns
+from .table_columns import check_not_taken, reading_columns
 from .temperatures import TEMPERATURE, with_temperature
 from .text_table import TextTable
 from .toml import Strict
@@ -84,15 +84,16 @@ def in_rad(readings: np.ndarray, angles: Angles, arm: Arm) -> np.ndarray:
     return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * units
 
 
-def header_units(text: TextTable, picked: Sequence[int], arm: Arm) -> tuple[str | None, str | None]:
-    """The units that the header states for readings of revolute and of prismatic joints, or None.
+def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str | None) -> tuple[str | None, str | None]:
+    """The units that the header states for readings of revolute and of prismatic joints, or None; ``stated``: that of
+    the former in the manifest.
 
     Raises:
         InputError: It states units of something else.
     """
     slides = [picked[i - 1] for i in arm.prismatic]
     turns = [i for i in picked if i not in slides]
-    units = text.unit(turns), text.unit(slides)
+    units = text.unit(turns, stated), text.unit(slides)
     for unit, known, columns, joints in zip(
         units, (ANGLE_UNITS, LENGTH_UNITS), (turns, slides), ("revolute", "prismatic"), strict=True
     ):
@@ -130,7 +131,8 @@ class Readings:
             raise InputError(
                 f"{text.path} column {own[0] + 1} is {TEMPERATURE}, no joint reading; leave it out of columns."
             )
-        numbers = text.numbers(picked, distinct=True)
+        stated = wanted.columns is not None or (self._angles is not None and self._angles.columns is not None)
+        numbers = text.numbers(picked, measured=True, stated=stated)
         q = in_rad(numbers, self._angles_of(text, picked, wanted), self._arm)
         temperature = text.numbers(own)[:, 0] if own else None
         readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
@@ -151,6 +153,7 @@ class Readings:
         if columns is None:
             return reading_columns(text, joints, wanted.taken)
         picked = text.pick(columns)
+        check_not_taken(text, picked, wanted.taken)
         if len(picked) != joints:
             what = "angles.columns" if wanted.columns is None else "columns"
             raise InputError(
@@ -161,7 +164,8 @@ class Readings:
 
     def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted) -> Angles:
         """How these readings are written: what the manifest states must not contradict the header."""
-        angular, linear = header_units(text, picked, self._arm)
+        stated_unit = wanted.unit or (None if self._angles is None else self._angles.unit)
+        angular, linear = header_units(text, picked, self._arm, stated_unit)
         if angular == "counts" and self._angles is None and wanted.unit is None:
             raise InputError(
                 f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'
@@ -174,10 +178,9 @@ class Readings:
         )
         for header, stated, what in pairs:
             if header is not None and header != stated:
-                german = " (the German Grad is deg)" if (header, stated) == ("gon", "deg") else ""
                 raise InputError(
                     f"{text.path}: the header of the {what} says {header}, but the manifest {stated}; correct one of "
-                    f"them{german}."
+                    "them."
                 )
         if linear == "counts" and angles.counts_per_mm is None:
             raise InputError(

@@ -14,11 +14,12 @@ from ..core.errors import InputError, nearest
 from ..core.text import quoted, shorten
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.observations.observation import AbstractObservation, Entry
+from .header_lines import Column
 from .inputs import InputFile
 from .manifest_sessions import session_name
 from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, Wanted, as_list
 from .patterns import check_name, fields_of, fill
-from .text_table import Column, TextTable
+from .text_table import TextTable
 
 
 class Source(NamedTuple):
@@ -63,7 +64,12 @@ def parts(
     reader = _Reader(source, kind, table, where)
     session = session_name(getattr(table, "session", None), values, where)
     labels, files_read = zip(*((label, fill(file, values)) for label, file in _files(table)), strict=True)
-    found = [reader.read(label, file, session) for label, file in zip(labels, files_read, strict=True)]
+    try:
+        found = [reader.read(label, file, session) for label, file in zip(labels, files_read, strict=True)]
+    except InputError as error:  # a line to add is one of this table
+        if where in str(error):
+            raise
+        raise InputError(f"{where}: {error}") from error
     groups = np.concatenate([group for group, _, _ in found])
     sessions = np.concatenate([session for _, session, _ in found])
     files = np.repeat(np.arange(len(found)), [len(group) for group, _, _ in found])
@@ -163,7 +169,14 @@ class _Reader:
 
     def _open(self, file: str, skip: int) -> TextTable:
         table, source = self._table, self._source
-        return TextTable(source.open(source.folder / file), delimiter=table.delimiter, decimal=table.decimal, skip=skip)
+        wanted = [*(column for columns in self._columns.values() for column in columns), table.group or 1]
+        return TextTable(
+            source.open(source.folder / file),
+            delimiter=table.delimiter,
+            decimal=table.decimal,
+            skip=skip,
+            wanted=wanted if self._own_file is None else (),
+        )
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if entry.dimensions[:1] != ("pose",):
@@ -173,7 +186,8 @@ class _Reader:
                 raise InputError(f"{self._where}: {entry.name} is in one column; pick one.")
             return text.texts(wanted[0])
         picked = text.pick(wanted)
-        numbers, header = text.numbers(picked), text.unit(picked)
+        numbers = text.numbers(picked)
+        header = text.unit(picked, self._table.units.get(entry.name) or self._preset.units.get(entry.name), entry.name)
         if entry.unit == "1":
             return self._rotations(entry, numbers, header)
         counts = {("pose",): (1,), ("pose", "axis"): (3,), ("pose", "axis", "axis_2"): (9,)}[entry.dimensions]

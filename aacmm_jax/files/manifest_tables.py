@@ -17,8 +17,8 @@ from pydantic import (
 
 from ..data.observations.observation import AbstractObservation, Entry
 from ..data.observations.socket import Socket
+from .header_lines import Column
 from .observation_kinds import kinds
-from .text_table import Column
 from .toml import Strict, each_once
 
 NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
@@ -38,8 +38,8 @@ PRESETS = {
     # Positions as `aacmm plan` writes them, or with plainer names; readings are found by their names.
     "csv": Preset(
         {
-            "points": [["[xyz]_mm"], ["x", "y", "z"]],
-            "u": [["u_[xyz]_mm"], ["u_x", "u_y", "u_z"]],
+            "points": [["x_mm", "y_mm", "z_mm"], ["x", "y", "z"]],
+            "u": [["u_x_mm", "u_y_mm", "u_z_mm"], ["u_x", "u_y", "u_z"]],
         },
         {"q": "deg"},
     ),
@@ -58,7 +58,11 @@ PRESETS = {
     "xyzijk": Preset({"points": [["X", "Y", "Z"], [1, 2, 3]]}),
     # christianlandgraf/ipa-robot-accuracy; R = Rx(rx) Ry(ry) Rz(rz) is the order that agrees with the robot's joints.
     "ipa": Preset(
-        {"points": [["[xyz]_mm"]], "u": [["std_[xyz]_mm"]], "rotations": [["r[xyz]_deg"]]},
+        {
+            "points": [["x_mm", "y_mm", "z_mm"]],
+            "u": [["std_x_mm", "std_y_mm", "std_z_mm"]],
+            "rotations": [["rx_deg", "ry_deg", "rz_deg"]],
+        },
         {"q": "rad", "rotations": "deg"},
         rotation="XYZ",
     ),

@@ -107,7 +107,7 @@ def _points(text: TextTable, wanted: Wanted, model: PointsManifest) -> np.ndarra
             f"{text.path} has {text.shown()}, and it is not clear which of them are x, y and z; add {line} with these "
             "three."
         )
-    header = text.unit(picked) if named is None else named[1]
+    header = text.unit(picked, key="points") if named is None else named[1]
     stated = wanted.unit or model.points.unit or header or wanted.usual_unit
     if stated is None:
         raise InputError(f'{text.path} does not say the unit of its points; add unit = "mm" to [points].')
@@ -118,4 +118,4 @@ def _points(text: TextTable, wanted: Wanted, model: PointsManifest) -> np.ndarra
         )
     if stated not in LENGTH_UNITS:
         raise InputError(f"{text.path}: points are in {quoted(stated)}; give one of {', '.join(LENGTH_UNITS)}.")
-    return text.numbers(picked, distinct=True) * LENGTH_UNITS[stated]
+    return text.numbers(picked, measured=True, stated=columns is not None) * LENGTH_UNITS[stated]

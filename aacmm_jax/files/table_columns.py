@@ -20,6 +20,8 @@ _OF_OTHERS = re.compile(
 )
 # First words in the names of columns that hold no reading.
 _NO_JOINT = re.compile("[xyzt]|time|timestamp|date|stamp|index|row|point|socket|group|name|nr|no")
+# Universal Robots' joints in ROS, whose messages have them in alphabetical order.
+_OF_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
 LINE = "columns = [{}]"  # what a manifest states; of commands it is an option
 
@@ -77,7 +79,22 @@ def columns_of_joints(
     if whole:
         table.check_ascending(whole[0], line)
         return whole[0], True
+    for _, columns in _numbered(table):
+        both = set(columns) & set(taken)
+        if 0 < len(both) < len(columns) and _is_whole(table, columns, joints):
+            check_not_taken(table, columns, taken)
     return [], bool(sets)
+
+
+def check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[int]) -> None:
+    """Refuse columns of readings, from 0, that hold something else, too."""
+    both = next((i for i in columns if i in taken), None)
+    if both is not None:
+        name = f" {quoted(table.header[both])}" if table.header else ""
+        raise InputError(
+            f"{table.path} column {both + 1}{name} is one of the joint readings, but is also picked for something else "
+            "(group, session, or a measured value); pick another."
+        )
 
 
 def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE) -> list[int]:
@@ -95,16 +112,20 @@ def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), li
     foreign = [
         i for i in free if table.header and any(map(_NO_JOINT.fullmatch, _words(bare_name(table.header[i]))[:1]))
     ]
-    if len(free) == joints and not foreign and not any_names:
+    if len(free) == joints and not foreign and not any_names and not table.misnumbered:
         table.check_ascending(free, line)
         numbered = [columns for _, columns in _numbered(table) if len(columns) == joints]
-        if not numbered or _is_whole(table, numbered[0], joints):
+        nameless = joints == 1 or not any(bare_name(table.header[i]) for i in free if table.header)
+        if _is_whole(table, numbered[0], joints) if numbered else nameless:
             return free
     guess = [
         columns
         for _, columns in _numbered(table)
         if _is_whole(table, columns, joints) and all(map(table.is_numeric, columns))
     ]
+    of_ur = [[i for i, name in enumerate(table.header) if joint in name.casefold()] for joint in _OF_UR]
+    if joints == len(_OF_UR) and all(len(columns) == 1 for columns in of_ur):
+        guess = [[columns[0] for columns in of_ur]]
     proposed = guess[0] if guess else proposed_columns(table, joints, taken)
     add = f"add {_line(line, proposed)} if these are the joints in their order"
     if table.misnamed:

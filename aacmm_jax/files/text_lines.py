@@ -70,7 +70,8 @@ def delimiter_of(lines: Sequence[str], decimal: str) -> str:
     for delimiter in _DELIMITERS:
         if delimiter != decimal and 2 * sum(delimiter in line for line in sample) > len(sample):
             return delimiter
-    return " "
+    between_quotes = sum('",' in line or ',"' in line for line in sample)  # "27,392","46,043"
+    return "," if 2 * between_quotes > len(sample) else " "
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:

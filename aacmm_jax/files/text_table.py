@@ -1,7 +1,6 @@
 """Text tables: comma, semicolon, tab or blank between columns, header lines allowed."""
 
 import contextlib
-import fnmatch
 import itertools
 import math
 import os
@@ -12,18 +11,26 @@ import numpy as np
 
 from ..core.errors import InputError, nearest
 from ..core.text import is_number, number, quoted, shorten
-from .column_names import plain_name, stem_and_number, unit_in, with_units
+from .column_names import AMBIGUOUS, along_axes, plain_name, stem_and_number, unit_in
+from .header_lines import (
+    Column,
+    are_numbered,
+    has_number,
+    header_cells,
+    is_row,
+    matching,
+    names_of_columns,
+    stripped,
+    trimmed,
+)
 from .text_lines import cells_of, delimiter_of, table_lines
 
 _LARGEST = 1e15  # encoder counts reach 1e10; beyond it squares lose what is measured
-_LIKE_A_NUMBER = re.compile(r"[\"']?\s*[+-]?[.,]?\d")  # digits of any script
 _PLAIN = frozenset("0123456789+-eE \t")  # and the decimal mark: float takes these as people read them, or not at all
 _WITH_COMMA = re.compile("[+-]?[0-9]*,[0-9]+")
 _DECIMALS = re.compile(r"[+-]?[0-9]*(?:\.([0-9]*))?(?:[eE][+-]?([0-9]*))?")
 _FEW = 3  # rows from which equal columns, or a shorter last number, are no coincidence
 _LONG = 12  # columns, or characters of a name, that a message shows
-
-Column = str | int
 
 
 class TextTable:
@@ -37,12 +44,21 @@ class TextTable:
         delimiter: What divides its columns; None finds it.
         decimal: The decimal mark of its numbers.
         skip: Lines before its header.
+        wanted: Columns that are going to be picked; of several lines of words, the header is the one that has them.
 
     Raises:
-        InputError: The file is no text, or its rows differ in their number of columns.
+        InputError: The file is no text, its rows differ in their number of columns, or several lines may be its header.
     """
 
-    def __init__(self, path: str | os.PathLike, *, delimiter: str | None = None, decimal: str = ".", skip: int = 0):
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        *,
+        delimiter: str | None = None,
+        decimal: str = ".",
+        skip: int = 0,
+        wanted: Sequence[Column] = (),
+    ):
         self._path, self._decimal = path, decimal
         lines, self._ended = table_lines(path)
         if lines[skip : skip + 1] and (stated := re.fullmatch('"?sep=(.)"?', lines[skip])):  # of spreadsheets
@@ -50,33 +66,38 @@ class TextTable:
         self._delimiter = delimiter or delimiter_of(lines[skip:], decimal)
         self._rows: list[list[str]] = []
         self._lines: list[int] = []
-        words: list[list[str]] = []
-        comment = ""
+        self._hashed: list[int] = []  # rows that begin like comments
+        words: list[tuple[int, list[str]]] = []
+        comments: list[tuple[int, list[str]]] = []
         for line_number, line in enumerate(lines[skip:], start=skip + 1):
             if not line or line[0] in ' \t#"':
                 text = line.strip(' \t"')
-                if not text or text[0] == "#":
-                    comment = text[1:] if text and not self._rows else comment
+                if not text:
                     continue
+                if text[0] == "#":
+                    cells = cells_of(line, self._delimiter)
+                    if (words or self._rows) and has_number(stripped(cells[1:])):
+                        self._hashed.append(line_number)
+                    else:
+                        comments.append((line_number, header_cells(text[1:].strip(" \t"), self._delimiter)))
+                        continue
             cells = cells_of(line, self._delimiter)
             if not cells[0] and not any(cell.strip() for cell in cells):
                 continue
-            if not self._rows and not any(_LIKE_A_NUMBER.match(cell) or is_number(cell) for cell in _stripped(cells)):
-                words.append(_stripped(self._header_cells(line)))
+            if len(self._rows) == len(self._hashed) and not is_row(stripped(cells)):
+                words.append((line_number, header_cells(line, self._delimiter)))
                 continue
             self._rows.append(cells)
             self._lines.append(line_number)
+        self._leave_out_comments()
         if not self._rows:
             raise InputError(f"{path} holds no numbers; give one line a pose.")
         self._check_widths()
-        self._leave_out_trailing(words)
-        words = [_trimmed(cells, self.width) for cells in words]
-        self._title = words[-1] if words else []  # a line of words that does not name the columns
-        self._header = self._names(words, _trimmed(_stripped(self._header_cells(comment)), self.width))
-
-    def _header_cells(self, line: str) -> list[str]:
-        """The cells of a line of names; between blanks, a unit belongs to the name before it."""
-        return cells_of(re.sub(r"[ \t]+(?=[\[(])", "", line) if self._delimiter == " " else line, self._delimiter)
+        self._leave_out_trailing([cells for _, cells in words])
+        lines_of_words = [(line, trimmed(cells, self.width)) for line, cells in words]
+        self._title = lines_of_words[-1][1] if words else []  # a line of words that does not name the columns
+        names = names_of_columns(path, self.width, lines_of_words, comments, wanted)
+        self._header = [name.strip("\"'") for name in names]
 
     def _check_widths(self) -> None:
         if len(set(map(len, self._rows))) == 1:
@@ -97,20 +118,20 @@ class TextTable:
 
     def _leave_out_trailing(self, words: list[list[str]]) -> None:
         """Columns at the end that are empty in all rows and without a name: lines that end with delimiters."""
-        named = max((len(_trimmed(cells, 1)) for cells in words), default=0)
+        named = max((len(trimmed(cells, 1)) for cells in words), default=0)
         while self.width > max(1, named) and not any(row[-1].strip() for row in self._rows):
             for row in self._rows:
                 row.pop()
 
-    def _names(self, words: list[list[str]], comment: list[str]) -> list[str]:
-        """The names of the columns, perhaps with units from a line of their own; none where they are not named."""
-        names: list[str] = []
-        if words and len(words[-1]) == self.width:
-            before = words[-2] if len(words) > 1 and len(words[-2]) == self.width else [""] * self.width
-            names = with_units(before, words[-1]) or words[-1]
-        elif not words and len(comment) == self.width and not any(map(_LIKE_A_NUMBER.match, comment)):
-            names = comment
-        return [name.strip("\"'") for name in names]
+    def _leave_out_comments(self) -> None:
+        """Leave out the lines that begin with "#" and are not as wide as the rows."""
+        if not self._hashed:
+            return
+        hashed, both = set(self._hashed), list(zip(self._rows, self._lines, strict=True))
+        width = next((len(row) for row, line in both if line not in hashed), len(both[0][0]))
+        kept = [(row, line) for row, line in both if line not in hashed or len(row) == width]
+        self._rows, self._lines = [row for row, _ in kept], [line for _, line in kept]
+        self._hashed = [line for _, line in kept if line in hashed]
 
     @property
     def path(self) -> str | os.PathLike:
@@ -128,6 +149,11 @@ class TextTable:
         return not self._header and len(self._title) > 1
 
     @property
+    def misnumbered(self) -> bool:
+        """Whether these are numbered, so that the order of the columns is not known."""
+        return self.misnamed and are_numbered(self._title)
+
+    @property
     def width(self) -> int:
         """Number of columns."""
         return len(self._rows[0])
@@ -142,7 +168,8 @@ class TextTable:
         if not self._header:
             others = f", but its header {len(self._title)} names" if self.misnamed else " without names"
             return f"{self.width} columns{others}"
-        names = [f"{i} {quoted(name[:_LONG])}" for i, name in enumerate(self._header, start=1)]
+        most = max(_LONG, 150 // self.width)
+        names = [f"{i} {quoted(name[:most])}" for i, name in enumerate(self._header, start=1)]
         return f"the columns {shorten(names, _LONG)}"
 
     def has(self, wanted: Sequence[Column]) -> bool:
@@ -159,17 +186,19 @@ class TextTable:
     def _matching(self, column: Column) -> list[int]:
         if isinstance(column, int):
             return [column - 1] if 1 <= column <= self.width else []
-        wanted, plain = plain_name(column), [plain_name(name) for name in self._header]
-        # As it stands first: q[1] is also a pattern, of q1.
-        for names, text in ((self._header, column), (plain, wanted)):
-            same = [i for i, name in enumerate(names) if name == text]
-            if same:
-                return same
-        exact = [i for i, name in enumerate(self._header) if fnmatch.fnmatchcase(name, column)]
-        return exact or [i for i, name in enumerate(plain) if fnmatch.fnmatchcase(name, wanted)]
+        return matching(self._header, column)
 
-    def unit(self, picked: Sequence[int]) -> str | None:
-        """The unit that the header states for columns, counted from 0, or None. Raises `InputError` for several."""
+    def unit(self, picked: Sequence[int], stated_unit: str | None = None, key: str = "q") -> str | None:
+        """The unit that the header states for columns, counted from 0, or None.
+
+        Args:
+            picked: The columns.
+            stated_unit: The unit that the manifest states; it decides what the ambiguous grad is.
+            key: What the manifest calls the quantity in ``units``.
+
+        Raises:
+            InputError: It states several units, or one that is not clear.
+        """
         stated = {self._header[i]: unit_in(self._header[i]) for i in picked if self._header}
         found = {unit: name for name, unit in stated.items() if unit is not None}
         if len(found) > 1:
@@ -178,7 +207,13 @@ class TextTable:
                 f"{self._path} mixes units: {quoted(first)} is in {one[:_LONG]}, {quoted(second)} in {other[:_LONG]}; "
                 "convert one of them, and change its header."
             )
-        return next(iter(found), None)
+        if AMBIGUOUS in found and stated_unit not in ("deg", "gon"):
+            but = f", but the manifest says {stated_unit}" if stated_unit else ""
+            raise InputError(
+                f"{self._path}: the header says {quoted(found[AMBIGUOUS])}, and grad is deg in German and gon elsewhere"
+                f'{but}; add units = {{ {key} = "deg" }}, or "gon", or write it in the header.'
+            )
+        return stated_unit if AMBIGUOUS in found else next(iter(found), None)
 
     def pick(self, wanted: Sequence[Column]) -> list[int]:
         """Indices of columns, a pattern in the order of the header. Raises `InputError` for one that is not there."""
@@ -209,10 +244,25 @@ class TextTable:
                 f"no column {quoted(column)}: its header has {len(self._title)} names, but its rows {self.width} "
                 "columns; correct the header, or give numbers (decimal commas need another delimiter)."
             )
+        first = [cell.strip(" \t\"'") for cell in self._rows[0]]
+        if column in first:
+            line = self._lines[0]
+            return (
+                f"no column {quoted(column)}: line {line} names it, but has numbers for names besides, so it is not a "
+                f"header; add skip = {line}, and pick column {first.index(column) + 1} by its number."
+            )
         return f"no column {quoted(column)}; it has no header: give numbers."
 
     def check_ascending(self, picked: Sequence[int], line: str = "columns = [{}]") -> None:
-        """Refuse columns whose names are numbered, but not in their order; ``line``: what states the order."""
+        """Refuse columns whose names are numbered, or of axes, but not in their order; ``line``: what states it."""
+        axes = along_axes([self._header[i] for i in picked]) if self._header and len(picked) > 1 else None
+        if axes is not None and axes != sorted(axes):
+            names = shorten([quoted(self._header[i][:_LONG]) for i in picked], _LONG)
+            ordered = ", ".join(str(picked[i] + 1) for i in axes)
+            raise InputError(
+                f"{self._path} has its columns in the order {names}; pick them as a list, [{ordered}], in that of the "
+                "axes."
+            )
         numbered = [stem_and_number(self._header[i]) for i in picked] if self._header else []
         found = [x for x in numbered if x is not None]
         if len(picked) < 2 or len(found) < len(picked) or len({stem.casefold() for stem, _ in found}) > 1:
@@ -229,13 +279,19 @@ class TextTable:
                 "order of the joints."
             )
 
-    def numbers(self, picked: Sequence[int], *, distinct: bool = False) -> np.ndarray:
-        """The numbers of columns, counted from 0, ``(rows, columns)``; ``distinct``: no two of them are the same."""
+    def numbers(self, picked: Sequence[int], *, measured: bool = False, stated: bool = False) -> np.ndarray:
+        """The numbers of columns, counted from 0, ``(rows, columns)``; ``measured``: they are not numbers of columns,
+        and no two of them are the same unless somebody ``stated`` the columns."""
+        if self._hashed:
+            raise InputError(
+                f"{self._path} line {self._hashed[0]} begins with #, but has as many columns as the rows; leave it out "
+                "if it is a comment, else write its first cell without #."
+            )
         self._check_end(picked)
-        if distinct:
+        if measured:
             self._check_first(picked)
         table = np.stack([self._column(i) for i in picked], axis=1)
-        if distinct:
+        if measured and not stated:
             self._check_twice(picked, table)
         return table
 
@@ -291,6 +347,7 @@ class TextTable:
     def texts(self, column: Column) -> np.ndarray:
         """The cells of one column."""
         (index,) = self.pick([column])
+        self._hashed = self._hashed if index else []  # "#2" is a text
         return np.array([row[index].strip(" \t").strip("\"'") for row in self._rows])
 
     def _check_first(self, picked: Sequence[int]) -> None:
@@ -329,17 +386,6 @@ class TextTable:
         for (i, one), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
             if np.ptp(one) > 0 and np.array_equal(one, other):
                 raise InputError(
-                    f"{self._path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or "
-                    "pick them with columns = [...]."
+                    f"{self._path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
+                    f"columns = [{', '.join(str(column + 1) for column in picked)}] if these are right."
                 )
-
-
-def _stripped(cells: list[str]) -> list[str]:
-    return [cell.strip(" \t") for cell in cells]
-
-
-def _trimmed(cells: list[str], least: int) -> list[str]:
-    """Cells without the empty ones at their end."""
-    while len(cells) > least and not cells[-1]:
-        cells = cells[:-1]
-    return cells

@@ -122,8 +122,9 @@ def test_columns_of_other_names_and_positions_in_metres(arms):
     for options in (by_name, ("--columns", "2,3,4,5,6,7")):
         run(arms, "named.csv", "-o", "out.csv", "--unit", "rad", *options)
         assert list(table(folder / "out.csv")[0]) == ["speed", *names]
-    write(folder / "all.csv", names, Q)  # a column for each joint needs no names
-    run(arms, "all.csv", "-o", "all-out.csv", "--unit", "rad")
+    write(folder / "all.csv", names, Q)  # their order may be another than that of the joints
+    assert "--columns 1, 2, 3, 4, 5, 6" in run(arms, "all.csv", "-o", "no.csv", "--unit", "rad", expect=2).stderr
+    run(arms, "all.csv", "-o", "all-out.csv", "--unit", "rad", "--columns", "1,2,3,4,5,6")
     corrected = [[row[name] for name in names] for row in table(folder / "out.csv")]
     assert [[row[name] for name in names] for row in table(folder / "all-out.csv")] == corrected
     poses = np.asarray(nominal.pose(Q[:2]))

@@ -304,7 +304,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         ),
         (SMALL.replace('"rad"', '"rad"\ncolumns = [0, 2, 3, 4, 5, 6]'), ["'angles.columns 1' must be greater than 0"]),
         (HEAD + ANGLES + PATTERN.replace(".csv", ".txt"), ["no file matches '{place}.txt'", "check the path"]),
-        (HEAD + ANGLES + PATTERN.replace('name = "{place}"\n', ""), ["has {place}", "use the same fields in the name"]),
+        (HEAD + ANGLES + PATTERN.replace('name = "{place}"\n', ""), ['has {place}, so add name = "{place}" in']),
         (
             HEAD + ANGLES + PATTERN.replace('file = "{place}.csv"', 'files = ["{place}.csv", "{palce}_2.csv"]'),
             ["file '{palce}_2.csv' has {palce}", "'{place}.csv' has {place}", "use the same fields"],

@@ -122,6 +122,46 @@ RECORDERS: dict[str, tuple[str, str | bytes, str, str | None]] = {
         DEGREES + SOCKET, "columns = [2, 3, 4, 5, 6, 7]\n"),
     "spreadsheet, columns numbered": (
         ARM, table([str(i) for i in range(1, 7)], D[:, :6], ";"), DEGREES + SOCKET, "skip = 1\n"),
+    "spreadsheet, joints by words and nothing else": (
+        ARM, table(["Base", "Shoulder", "Elbow", "Roll", "Pitch", "Yaw"], D[:, :6]),
+        DEGREES + SOCKET, "columns = [1, 2, 3, 4, 5, 6]\n"),
+    "ROS, joints of a UR in the order of the alphabet": (
+        ARM, table(["elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", *numbered("wrist_{}_joint", 3)],
+                   D[:, [2, 1, 0, 3, 4, 5]]),
+        DEGREES + SOCKET, "columns = [3, 2, 1, 4, 5, 6]\n"),
+    "spreadsheet, types below the names": (
+        ARM, table(numbered("J{}")[::-1], D[:, 5::-1]).replace("J1\n", "J1\n" + ",".join(["float"] * 6) + "\n"),
+        DEGREES + SOCKET, "columns = [6, 5, 4, 3, 2, 1]\n"),
+    "spreadsheet, descriptions above the names": (
+        ARM, table(["Base", "Arm", "Elbow", "R", "P", "Y"], []) + table(["a", "b", "c", "d", "e", "f"], D[:, :6]),
+        DEGREES + SOCKET + "columns = [1, 2, 3, 4, 5, 6]\n", "skip = 1\n"),
+    "spreadsheet, descriptions above the names that are picked": (
+        ARM, table(["Base", "Arm", "Elbow", "R", "P", "Y"], []) + table(["a", "b", "c", "d", "e", "f"], D[:, :6]),
+        DEGREES + SOCKET + 'columns = ["a", "b", "c", "d", "e", "f"]\n', None),
+    "spreadsheet, units above the names": (
+        ARM, table(["hh:mm", *["degrees"] * 6], []) + table(["Time", *numbered("J{}")], stamped(D[:, :6], "1234")),
+        SOCKET, None),
+    "spreadsheet, a title below the names": (
+        ARM, table(numbered("J{}")[::-1], []) + table("end of header", D[:, 5::-1]),
+        DEGREES + SOCKET, "columns = [6, 5, 4, 3, 2, 1]\n"),
+    "spreadsheet, decimal commas in quotes": (
+        ARM, table(numbered("J{} [deg]"), [[f'"{x}"'.replace(".", ",") for x in row] for row in D[:, :6]]),
+        SOCKET, COMMA),
+    "spreadsheet, columns numbered and one name": (
+        ARM, table(["Socket", *"123456"], [["A", *row] for row in D[:, :6]]),
+        DEGREES + SOCKET + "group = 1\n", "skip = 1\n"),
+    "spreadsheet, holes named #1 and #2": (
+        ARM, table(["Hole", *numbered("J{}_degrees")], [[f"#{i // 2}", *row] for i, row in enumerate(D[:, :6])]),
+        SOCKET + 'group = "Hole"\n', None),
+    "German spreadsheet": (
+        ARM, table(numbered("Achse {} (Grad)"), D[:, :6]), SOCKET, 'units = { q = "deg" }\n'),
+    "two joints of one motor": (
+        ARM, table(numbered("J{}"), D[:, [0, 1, 1, 3, 4, 5]]),
+        DEGREES + SOCKET, "columns = [1, 2, 3, 4, 5, 6]\n"),
+    "unit within the names": (
+        ARM, table(numbered("q_deg_{}"), D[:, :6]), SOCKET, None),
+    "unit before a word": (
+        ARM, table(numbered("J{} (deg) raw"), D[:, :6]), SOCKET, None),
     "numpy.savetxt with a header": (
         ARM, table("# " + " ".join(numbered("q_{}_deg")), D[:, :6], " ", before="# recorded on Monday\n"),
         SOCKET, None),
@@ -149,7 +189,8 @@ def test_tables_of_recorders(tmp_path, recorder):
     assert len(f"arm\n{manifest}".splitlines()) <= 10
     capture = read(tmp_path, content, manifest, arm)
     joints = aj.load_arm(arm).joints
-    np.testing.assert_allclose(np.concatenate(list(capture.sockets.values())), Q[:, :joints], atol=2e-6)
+    expected = Q[:, [0, 1, 1, 3, 4, 5]] if "one motor" in recorder else Q[:, :joints]
+    np.testing.assert_allclose(np.concatenate(list(capture.sockets.values())), expected, atol=2e-6)
     if "all sockets" in recorder:
         assert (capture.names, capture.sizes, len(capture.lengths)) == (("A", "B"), (2, 2), 1)
 
@@ -194,7 +235,7 @@ def test_order_stated_by_hand_is_taken(tmp_path):
 
 HEADERS = ["rad", "deg", "gon", "grad", "mrad", "arcsec", "counts", "mm", "m", "um", "inch", "cm", "\u00b0", "Nm", "A",
            "V", "s", "rad/s", "\u00b0C", "%", "rev", "dge", "radd", "ticks", "urad", "K"]  # fmt: skip
-SAME = {"grad": "gon", "\u00b0": "deg"}
+SAME = {"\u00b0": "deg"}
 
 
 @pytest.mark.parametrize("header", HEADERS)
@@ -211,6 +252,8 @@ def test_units_that_contradict_the_manifest(tmp_path, header):
         (tmp_path / "a.csv").write_text(text)
         file = TextTable(tmp_path / "a.csv")
         for stated in sorted({"deg", "rad", "gon"} - {unit}):
+            if unit == "grad" and stated != "rad":
+                continue
             for angles, of_table in ((Angles(unit=stated), None), (None, stated)):
                 wanted = Wanted(None, of_table, None, [], None)
                 sentence = refusal(lambda file=file, angles=angles, wanted=wanted: Readings(arm, angles)(file, wanted))
@@ -221,7 +264,7 @@ def test_units_that_contradict_the_manifest(tmp_path, header):
             np.testing.assert_allclose(Readings(arm, None)(file, nothing), ANGLE_UNITS[unit] * Q[:, :6])
         else:
             refusal(lambda file=file, nothing=nothing: Readings(arm, None)(file, nothing))
-    stated = "rad" if unit == "deg" else "deg"
+    stated = "rad" if unit in ("deg", "grad") else "deg"
     refusal(lambda: read(tmp_path, texts[0], f'{SOCKET}units = {{ q = "{stated}" }}\n'))
 
 
@@ -254,6 +297,65 @@ def test_points_of_manifests_of_points(tmp_path, header, unit, parts):
     np.testing.assert_array_equal(found["B"], rows[2:, ::-1])
 
 
+JOINTS = ",".join(numbered("J{}")) + "\n"
+SIX = ",".join(f"{x}" for x in Q[0, :6]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "stated", "parts"),
+    [
+        *((",".join(numbered("J{}")[::-1]) + "\n" + ",".join([word] * 6) + "\n" + SIX, "", ["in the order 'J6'"])
+          for word in ("float", "raw")),
+        *((JOINTS + ",".join([word] * 6) + "\n" + SIX, "", ["line 2 column 1", "is not a number"])
+          for word in ("NA", "null", "None", "N/A", "-", "\u22120.5", "(0.5)", "=0.5", "$0.5")),
+        (JOINTS + ",".join(["radiants"] * 6) + "\n" + SIX, "", ["states 'radiants' for readings"]),
+        (JOINTS + "deg,deg,deg,dge,deg,deg\n" + SIX, "", ["mixes units: 'J6 [deg]' is in deg, 'J4 [dge]' in dge"]),
+        (",".join(["meter"] + ["deg"] * 5) + "\n" + JOINTS + SIX, "", ["mixes units: 'J1 [meter]' is in m"]),
+        (",".join(["rads"] * 6) + "\n" + JOINTS + SIX, "", ["says rad, but the manifest deg"]),
+        ("Base,Arm,Elbow,R,P,Y\n" + ",".join(["int"] * 6) + "\n" + SIX, "",
+         ["in lines 1 ('Base, Arm, Elbow and 3 more') and 2 ('int", "add skip = 1 if line 2 names the columns"]),
+        ("# J6,J5,J4,J3,J2,J1\n# by hand\n" + SIX, "", ["in the order 'J6'"]),
+        ("F,E,D,C,B,A\n" + SIX, "", ["add columns = [1, 2, 3, 4, 5, 6] if these are the joints in their order"]),
+        *((",".join(numbered(name)) + "\n" + SIX, "", ["says rad, but the manifest deg"])
+          for name in ("J{}_radians", "q_rad_{}", "J{} (rad) raw", "J{}.rad")),
+        (",".join(numbered("J{}_mdeg")) + "\n" + SIX, "", ["states 'mdeg' for readings of revolute joints"]),
+        (",".join(numbered("J{} [Grad]")) + "\n" + SIX, 'units = { q = "rad" }\n', ["grad is deg in German and gon"]),
+        (JOINTS + SIX + "#" + SIX, "", ["line 3 begins with #", "write its first cell without #"]),
+        (JOINTS + "#N/A" + SIX[SIX.index(","):] + SIX, "", ["line 2 begins with #"]),
+        ("J1,J2,J3,J4,J5,J6,Load\n" + SIX.replace("\n", ",1\n"), 'group = "J1"\n',
+         ["column 1 'J1' is one of the joint readings, but is also picked for something else"]),
+        (JOINTS + SIX, 'group = "J1"\ncolumns = "J*"\n', ["column 1 'J1' is one of the joint readings"]),
+        ("Socket,1,2,3,4,5,6\nA," + SIX, 'group = "Socket"\n', ["add skip = 1, and pick column 1 by its number"]),
+        (",".join(numbered("q{}_rad/s")) + "\n" + SIX, "", ["states 'rad/s' for readings of revolute joints ('q1_"]),
+        ("J6,J5,J4,J3,J2,J1\nbegin,data\n" + SIX, "", ["in the order 'J6'"]),
+        ("Time,J6,J5,J4,J3,J2,J1\n" + SIX, "", ["6 columns, but its header 7 names", "correct the header"]),
+        ("a,b\n1,2\n", "", ["[[socket]] 'a': "]),
+    ],
+)  # fmt: skip
+def test_headers_that_are_not_ignored(tmp_path, content, stated, parts):
+    assert_refused(lambda: read(tmp_path, content, DEGREES + SOCKET + stated), *parts)
+
+
+@pytest.mark.parametrize(
+    ("names", "stated", "part"),
+    [
+        ("z_mm,y_mm,x_mm", 'columns = { points = "[xyz]_mm" }', "pick them as a list, [9, 8, 7], in that of the axes"),
+        ("z_mm,y_mm,x_mm", 'preset = "csv"', None),
+        ("z_mm,y_mm,x_mm", 'preset = "ipa"', None),
+        ("z_cm,y_cm,x_cm", 'columns = { points = ["x_cm", "y_cm", "z_cm"] }', "header of points says 'cm'"),
+        ("z_inches,y_inches,x_inches", 'columns = { points = [9, 8, 7] }', None),
+    ],
+)  # fmt: skip
+def test_columns_of_positions(tmp_path, names, stated, part):
+    text = ",".join(numbered("q{}")) + f",{names}\n" + 3 * SIX.replace("\n", ",300,200,100\n")
+    points = f"{RADIANS}[[points]]\nfile = 'a.csv'\n{stated}\n"
+    if part is not None:
+        assert_refused(lambda: read(tmp_path, text, points), part)
+        return
+    (found,) = read(tmp_path, text, points).observations
+    np.testing.assert_allclose(found.points[0], np.array([100, 200, 300]) * (25.4 if "inch" in names else 1))
+
+
 NUMBERS = "0.12345,1.12345,2.12345,3.12345,4.12345,-2.12345\n"
 
 
@@ -272,7 +374,7 @@ NUMBERS = "0.12345,1.12345,2.12345,3.12345,4.12345,-2.12345\n"
         ("6,5,4,3,2,1\n" + NUMBERS, ["line 1 is 6 to 1", "add skip = 1 and columns = [6, 5, 4, 3, 2, 1]"]),
         ("q1,q2,q3,q4,q5,q7\n" + NUMBERS, ["the columns 1 'q1'", "add columns = [1, 2, 3, 4, 5, 6] if"]),
         ("x,y,z,rx,ry,rz\n" + NUMBERS, ["6 'rz', and it is not clear which of them", "add columns = [1, 2"]),
-        ("x,".replace("x", "n" * 10**5) * 6 + "\n" + "0.5,1,2,3,4,5,6\n", ["1 'nnnnnnnnnnnn', 2"]),
+        ("x,".replace("x", "n" * 10**5) * 6 + "\n" + "0.5,1,2,3,4,5,6\n", ["1 'nnnnnnnnnnnnnnnnnnnnn', 2"]),
         (",".join(f"s {i}" for i in range(2000)) + "\n" + ",".join(["0.5"] * 2000), ["1 's 0'", "1988 more"]),
         ("0.5,1,2,3,4," + "x" * 10**4, ["line 1 column 6: 'xxx", "...' is not a number"]),
         ("0.5;1;2;3;4;1.234,5\n", ["column 6: '1.234,5' is not a number; write it without separators of thousands"]),
