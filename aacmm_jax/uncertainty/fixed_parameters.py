@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from ..data.capture import Capture
 from ..kinematics.arm import is_length, parameter_names, value_of
+from ..kinematics.joint_travel import lost_by_standing
 from ..kinematics.parameters import Bounds, Parameters
 from .identifiability import observability
 
@@ -35,9 +36,12 @@ def fixed_parameters(bounds: Bounds, capture: Capture, joints: Sequence[int], si
     def rank(name: str) -> tuple[bool, bool]:
         return is_length(name) and abs(float(value_of(arm, name))) > _ROUNDING, name not in own
 
-    names = list(bounds.space.names)
+    # First as if they stood exactly still, since it is little, and mostly noise, that a small movement says.
+    order = sorted(bounds.space.names, key=rank, reverse=True)
+    lost = {name for part in lost_by_standing(arm, capture, joints, order) for name in part}
+    names = [name for name in bounds.space.names if name not in lost]
     scaled = bool(capture.lengths) or any(one.fixes_scale for one in capture.observations)
-    for _ in range(len(bounds.space.names)):
+    for _ in bounds.space.names:
         space = Parameters(arm, tuple(names))
         found = observability(arm, capture, space, sigma=sigma, bounds=_of(bounds, space))
         null = found.null if scaled else _without_scale(found.null, space)
