@@ -31,8 +31,9 @@ def main() -> None:
 
     Exit codes: 0 done, 1 not achieved, 2 bad input, 130 interrupted, 141 standard output closed by its reader.
     """
-    debug, overwrite = (option in sys.argv for option in ("--debug", "--overwrite"))
-    sys.argv = [word for word in sys.argv if word not in ("--debug", "--overwrite")]
+    end = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)  # what follows is no option
+    debug, overwrite = (option in sys.argv[:end] for option in ("--debug", "--overwrite"))
+    sys.argv = [word for i, word in enumerate(sys.argv) if i >= end or word not in ("--debug", "--overwrite")]
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal's encoding does not have
     # Tracing makes hundreds of thousands of objects that live until the process ends. Looking for garbage among them

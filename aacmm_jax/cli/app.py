@@ -66,7 +66,11 @@ Without = Annotated[
     ),
 ]
 
-CaptureOutput = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")]
+KEPT = " An existing file that aacmm did not write is kept unless --overwrite."  # of what -o names
+
+CaptureOutput = Annotated[
+    Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5)." + KEPT)
+]
 
 NominalArm = Annotated[
     str,

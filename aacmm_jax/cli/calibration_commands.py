@@ -13,6 +13,7 @@ from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
 from .app import (
+    KEPT,
     Json,
     KnownEncoderNoise,
     KnownSeatingNoise,
@@ -40,7 +41,15 @@ def calibrate(
         list[Path],
         typer.Argument(metavar="CAPTURE.h5 ...", help="Capture, or captures of one arm in several sessions."),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Calibration to write (HDF5).")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE.h5",
+            help="Calibration to write (HDF5)." + KEPT,
+        ),
+    ],
     method: Annotated[
         Literal["two-stage", "joint"] | None,
         typer.Option(

@@ -12,6 +12,7 @@ from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
 from .app import (
+    KEPT,
     BaseLink,
     CaptureOutput,
     EncoderNoise,
@@ -186,7 +187,7 @@ def import_(
         ),
     ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5).")
+        Path | None, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5)." + KEPT)
     ] = None,
     check: Annotated[
         bool,

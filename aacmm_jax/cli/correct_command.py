@@ -11,7 +11,7 @@ from ..core.errors import InputError
 from ..core.text import number, pluralise
 from ..files.inputs import InputFile
 from ..files.outputs import together
-from .app import CalibrationFile, Json, app, bad_option, examples, names_option, show_summary, warn_of_unusable
+from .app import KEPT, CalibrationFile, Json, app, bad_option, examples, names_option, show_summary, warn_of_unusable
 from .display import formatted, new_console, new_table, print_table, print_warnings, print_written
 
 _MOST_ROWS = 20  # that are printed
@@ -34,7 +34,7 @@ def correct(
         ),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Table with corrected readings to write.")
+        Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Table with corrected readings to write." + KEPT)
     ],
     unit: Annotated[
         Literal["deg", "rad"] | None,

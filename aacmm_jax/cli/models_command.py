@@ -12,6 +12,7 @@ from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
 from ..summaries.tables import difference_from_best
 from .app import (
+    KEPT,
     Json,
     KnownEncoderNoise,
     KnownSeatingNoise,
@@ -64,7 +65,13 @@ def compare_models(
     linear_encoder_mm: LinearEncoderNoise = None,
     seating_mm: KnownSeatingNoise = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE.h5", help="Keep the comparison, for show and report.")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE.h5",
+            help="Keep the comparison, for show and report." + KEPT,
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:

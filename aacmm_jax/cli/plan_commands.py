@@ -13,6 +13,7 @@ from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
 from .app import (
+    KEPT,
     BaseLink,
     Json,
     LinearEncoderNoise,
@@ -60,7 +61,10 @@ def plan(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE.csv", help="Plan to write: one row a pose, in the order to take them."
+            "--output",
+            "-o",
+            metavar="FILE.csv",
+            help="Plan to write: one row a pose, in the order to take them." + KEPT,
         ),
     ],
     poses: Annotated[

@@ -37,7 +37,7 @@ def check_recording(specification: Any, recording: Any, manifest: Path | None) -
     summary = _summary(
         specification, found, None if manifest is not None else "rad", positions_unit(manifest), manifest
     )
-    summary["standing"] = standing_rows(specification.arm, recording.capture)
+    summary["standing"] = standing_rows(specification.arm, recording.capture, recording.nominal)
     if manifest is not None:
         from ..files.other_readings import compare_reading_sets, reading_sets_sentence
 

@@ -15,6 +15,7 @@ from ..files.inputs import InputFile
 from ..files.outputs import check_kept, together
 from ..files.sense import check_shown
 from .app import (
+    KEPT,
     BaseLink,
     CalibrationFile,
     Json,
@@ -61,7 +62,7 @@ def evaluate(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE.h5", help="Evaluation to write (HDF5), for aacmm report."),
+        typer.Option("--output", "-o", metavar="FILE.h5", help="Evaluation to write (HDF5), for aacmm report." + KEPT),
     ] = None,
     only: Only = None,
     without: Without = None,
@@ -170,7 +171,7 @@ def report(
             "--output",
             "-o",
             metavar="FILE.html",
-            help="Report to write: one HTML file that needs no network connection.",
+            help="Report to write: one HTML file that needs no network connection." + KEPT,
         ),
     ],
     about: About = None,
@@ -225,7 +226,13 @@ def export(
         Literal["mm-deg", "m-rad"] | None, typer.Option(help="Of --format table. Default: mm-deg.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write. Default: standard output.")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="File to write. Default: standard output." + KEPT,
+        ),
     ] = None,
     about: About = None,
     evaluation: Annotated[

@@ -15,7 +15,7 @@ import typer
 from ..core.errors import InputError
 from ..files.outputs import together
 from . import INTERRUPTED, INTERRUPTED_SENTENCE
-from .app import Json, Stopped, app, examples, show_summary, with_spinner
+from .app import KEPT, Json, Stopped, app, examples, show_summary, with_spinner
 
 
 @app.command(
@@ -27,7 +27,7 @@ from .app import Json, Stopped, app, examples, show_summary, with_spinner
 )
 def study(
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Study to write, or to continue (HDF5).")
+        Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Study to write, or to continue (HDF5)." + KEPT)
     ],
     specification: Annotated[
         str | None,

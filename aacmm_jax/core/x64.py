@@ -5,6 +5,7 @@ A calibration in float32 is wrong by tens of micrometres without any sign of it.
 
 import os
 import sys
+from pathlib import Path
 
 from .backend import check_setting
 from .errors import InputError
@@ -13,10 +14,15 @@ LARGEST_INTEGER = 2**63 - 1  # of 64 bits; no seed may be larger
 
 _setting = os.environ.get("JAX_ENABLE_X64")
 if _setting is not None and _setting.strip().lower() in {"0", "false", "off", "no"}:
-    raise ImportError(
+    _refusal = (
         f"aacmm_jax needs 64-bit floats, but JAX_ENABLE_X64={_setting} forbids them: in float32 a calibration is "
         "wrong by tens of micrometres; unset JAX_ENABLE_X64 or set it to 1."
     )
+    # The command line imports the package before any code of its own can catch this.
+    if Path(sys.argv[0]).stem == "aacmm" or (sys.argv[0] == "-m" and "aacmm_jax" in sys.orig_argv):
+        print(f"Error: {_refusal}", file=sys.stderr)
+        sys.exit(2)
+    raise ImportError(_refusal)
 if "jax" in sys.modules:
     sys.modules["jax"].config.update("jax_enable_x64", True)
 else:

@@ -385,18 +385,23 @@ def _form(observations: tuple[AbstractObservation, ...]) -> tuple[Any, ...]:
     return structure, tuple(leaf.shape for leaf in leaves)
 
 
-def check_readings(capture: Capture, arm: Arm) -> None:
-    """Raise `InputError` where known readings of an arm's revolute joints look like degrees."""
-    angular = np.array([i not in arm.prismatic for i in range(1, arm.joints + 1)])
+def check_readings(capture: Capture, arm: Arm, *, advice: str = "convert with numpy.deg2rad") -> None:
+    """Raise `InputError` where known readings of an arm's revolute joints look like degrees, with advice on them."""
     of_sockets = [(f"socket '{name}'", readings) for name, readings in capture.sockets.items()]
     for where, readings in [*of_sockets, *((f"observation '{one.name}'", one.q) for one in capture.observations)]:
         if not is_concrete(readings) or readings.shape[-1] not in (arm.joints, arm.columns):
             continue
         check_temperatures(where, np.asarray(readings)[..., arm.joints :])
-        size = np.where(angular, np.abs(np.asarray(readings)[..., : arm.joints]), 0.0).reshape(-1, arm.joints)
-        if size.max() > _MOST_RADIANS:
-            row, column = np.argwhere(size == size.max())[0] + 1
-            raise InputError(
-                f"{where} pose {row} joint {column} is {size.max():g} rad, more than four revolutions: these look like "
-                "degrees; convert with numpy.deg2rad, or state the unit in the manifest."
-            )
+        check_revolutions(where, readings, arm, advice)
+
+
+def check_revolutions(where: str, readings: AnyArray, arm: Arm, advice: str) -> None:
+    """Raise `InputError` where readings of revolute joints look like degrees."""
+    angular = np.array([i not in arm.prismatic for i in range(1, arm.joints + 1)])
+    size = np.where(angular, np.abs(np.asarray(readings)[..., : arm.joints]), 0.0).reshape(-1, arm.joints)
+    if size.size and size.max() > _MOST_RADIANS:
+        row, column = np.argwhere(size == size.max())[0] + 1
+        raise InputError(
+            f"{where} pose {row} joint {column} is {size.max():g} rad, more than four revolutions: these look like "
+            f"degrees; {advice}."
+        )

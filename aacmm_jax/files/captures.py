@@ -271,7 +271,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     nominal = specification_of(path, stored, "nominal_arm")._replace(urdf=_urdf_of(path, stored))
     check_recording(path, stored)
     try:
-        check_readings(capture, nominal.arm)
+        check_readings(capture, nominal.arm, advice='import them with unit = "deg" in [angles] of the manifest')
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return Recording(

@@ -203,12 +203,12 @@ def read_manifest(path: str | os.PathLike) -> Recording:
     return _read(path)[0]
 
 
-def columns_of_readings(path: str | os.PathLike) -> list[int]:
-    """The columns of the joint readings, from 1, in the first table that a manifest names. Raises `InputError`."""
+def readings_of_manifest(path: str | os.PathLike) -> Readings:
+    """With which columns and unit the first table that a manifest names was read. Raises `InputError`."""
     return _read(path)[1]
 
 
-def _read(path: str | os.PathLike) -> tuple[Recording, list[int]]:
+def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
     model = read_toml(manifest := InputFile(path), _Manifest)
     path = as_path(path)
     try:
@@ -258,7 +258,7 @@ def _read(path: str | os.PathLike) -> tuple[Recording, list[int]]:
             measuring_range=model.measuring_range,
             usual=usual_noise(arm, base=model.base, tip=model.tip),
         )
-        return recording, readings.columns
+        return recording, readings
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

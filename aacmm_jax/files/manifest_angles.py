@@ -12,6 +12,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
+from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm, by_joint
 from .manifest_tables import Picked, Wanted, as_list
 from .table_columns import check_not_taken, reading_columns
@@ -122,6 +123,7 @@ class Readings:
         self._arm, self._angles = arm, angles
         self._tables: list[tuple[int, str | os.PathLike]] = []  # columns of readings of the first table, and its file
         self.columns: list[int] = []  # of the joints in the first table, from 1
+        self.angles: Angles | None = None  # with which the first table was read, its header and units considered
 
     def __call__(self, text: TextTable, wanted: Wanted) -> Float[np.ndarray, "N n"]:
         """The readings of one table."""
@@ -133,10 +135,12 @@ class Readings:
             )
         stated = wanted.columns is not None or (self._angles is not None and self._angles.columns is not None)
         numbers = text.numbers(picked, measured=True, stated=stated)
-        q = in_rad(numbers, self._angles_of(text, picked, wanted), self._arm)
+        angles = self._angles_of(text, picked, wanted)
+        q = in_rad(numbers, angles, self._arm)
+        check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
         temperature = text.numbers(own)[:, 0] if own else None
         readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
-        self.columns = self.columns or [i + 1 for i in picked]
+        self.columns, self.angles = self.columns or [i + 1 for i in picked], self.angles or angles
         self._tables = [*self._tables[:1], (readings.shape[1], text.path)]
         (fewer, without), (more, other) = sorted((self._tables[0], self._tables[-1]), key=lambda table: table[0])
         if fewer != more:

@@ -61,7 +61,9 @@ def standing_joints(arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[StandingJoint,
     return tuple(StandingJoint(i + 1, float(x), len(q)) for i, x in enumerate(ranges) if x < most[i])
 
 
-def lost_by_standing(arm: Arm, capture: SocketPoses, joints: Sequence[int]) -> list[tuple[str, ...]]:
+def lost_by_standing(
+    arm: Arm, capture: SocketPoses, joints: Sequence[int], order: Sequence[str] = ()
+) -> list[tuple[str, ...]]:
     """Parameters that the poses of a capture would determine if joints moved in them, and do not while they stand.
 
     Of what cannot be separated, those of these joints are named. What two of them leave open together is named with the
@@ -71,28 +73,26 @@ def lost_by_standing(arm: Arm, capture: SocketPoses, joints: Sequence[int]) -> l
         arm: One arm, nominal.
         capture: Its poses.
         joints: The joints that stand still, from 1.
+        order: The parameters in question, of which the last are lost first; by default all that data may determine.
 
     Returns:
         The names for each joint.
     """
-    space = Parameters.independent(to_numpy(arm))
-    own = {f"{kind}_{joint}" for kind in ("alpha", "a", "d", "theta", "beta") for joint in joints}
-    # Also what sockets do not determine of the nominal arm, but points that were seen on a target may.
-    parallel = nearly_parallel(arm)
-    without = {f"d_{i}" if i in parallel else f"beta_{i}" for i in range(1, arm.joints + 1)}
-    others = (name for name in parameter_names(without_corrections(to_numpy(space.base))) if name not in without)
-    order = sorted(dict.fromkeys([*space.names, *others]), key=own.__contains__)
+    base = to_numpy(arm)
+    if not order:
+        base, order = _usual_order(base, joints)
     # Without the exact alignments of the nominal arm.
-    neighbour = neighbouring_arm(to_numpy(space.base), tuple(order))
+    neighbour = neighbouring_arm(base, tuple(order))
     if any(one.target for one in capture.observations):  # whose place is unknown, and hardly on the last axis
         neighbour = with_arrays(neighbour, probe=np.asarray(neighbour.probe) + _TARGET)
     low, high = np.asarray(joint_limits(arm, None)).T
+    standing = next(np.asarray(one.q)[0] for one in (capture, *capture.observations) if len(one.q))
     random = np.random.default_rng(0)
 
     def seen(still: Sequence[int]) -> tuple[str, ...]:
         def changed(q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
             for i in (joint - 1 for joint in joints):
-                q[:, i] = (low[i] + high[i]) / 2 if i + 1 in still else random.uniform(low[i], high[i], len(q))
+                q[:, i] = standing[i] if i + 1 in still else random.uniform(low[i], high[i], len(q))
             return q
 
         return determined_at(neighbour, capture, order, changed)
@@ -103,3 +103,15 @@ def lost_by_standing(arm: Arm, capture: SocketPoses, joints: Sequence[int]) -> l
         lost.append(tuple(name for name in before if name not in left))
         before = left
     return lost
+
+
+def _usual_order(arm: Arm, joints: Sequence[int]) -> tuple[Arm, list[str]]:
+    """All parameters that data may determine, those of these joints last, and the arm that has them."""
+    space = Parameters.independent(arm)
+    arm = to_numpy(space.base)
+    own = {f"{kind}_{joint}" for kind in ("alpha", "a", "d", "theta", "beta") for joint in joints}
+    # Also what sockets do not determine of the nominal arm, but points that were seen on a target may.
+    parallel = nearly_parallel(arm)
+    without = {f"d_{i}" if i in parallel else f"beta_{i}" for i in range(1, arm.joints + 1)}
+    others = (name for name in parameter_names(without_corrections(arm)) if name not in without)
+    return arm, sorted(dict.fromkeys([*space.names, *others]), key=own.__contains__)

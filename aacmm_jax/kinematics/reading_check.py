@@ -19,6 +19,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.units import DEG, INCH, M
 from .arm import Arm, is_single, joint_limits
 from .jacobian import tip_position
+from .joint_travel import standing_joints
 from .reading_fit import Explanation, ReadingFit
 from .reading_search import Evidence, Found, Hypothesis, as_recorded, search
 from .workspace import total_link_length
@@ -33,6 +34,7 @@ _NEVER = 8 * np.pi
 _LENGTHS = (M, 1 / M, INCH, 1 / INCH)
 _NEAREST, _FARTHEST = 0.05, 1.3  # of the arm's size: distances of known positions from the base
 _APART = 50 * DEG  # zeros that differ by less are adjusted, not confused
+_SAME = 5 * DEG  # alternatives whose zeros differ by less are one
 _COMMON = 200  # readings at which two hypotheses are compared
 _ALIKE = 1e-6  # of the arm's size
 
@@ -127,6 +129,7 @@ def check_readings(
     simplest = min(every, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
     best = simplest if explained else min(every, key=lambda one: one.rms_fitted)
     others, equal = _others(fit, best, good) if explained else ((), 0)
+    best = best if best == given else fit.within_limits(best)
     return ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)._replace(
         rms_with_tip=fit.with_tip_found(best) if own_frame else None, free_tip=free_tip
     )
@@ -223,17 +226,27 @@ def _others(
             found = fit.refitted(member, one.angle, one.length) if of_best else one
             if found.rms_fitted <= bound and (best.outside > 0 or not found.outside) and _distinct(found, best):
                 others.append((member, found._replace(mirrored=mirrored)))
-    found = [other for _, other in others]
-    return tuple(sorted(found, key=lambda other: (other.changes, other.rms_fitted))), equal
+    # Of a joint that stands still, unless there is a single pose, nothing that an alternative says could be tested.
+    still = [joint.joint - 1 for joint in standing_joints(fit.arm, best.angle * fit.evidence.q)]
+    still = still if len(still) < fit.arm.joints else []
+    kept: list[Explanation] = []
+    for _, other in others:
+        moved = other.angle == best.angle and any(_of_joint(other, i) != _of_joint(best, i) for i in still)
+        if not moved and all(_distinct(other, one, _SAME) for one in kept):
+            kept.append(other)
+    return tuple(sorted(kept, key=lambda other: (other.changes, other.rms_fitted))), equal
 
 
-def _distinct(one: Explanation, other: Explanation) -> bool:
+def _of_joint(one: Explanation, i: int) -> tuple[int, int, float]:
+    """What an explanation says of joint i, from 0."""
+    return one.order[i], one.signs[i], one.offsets[i]
+
+
+def _distinct(one: Explanation, other: Explanation, apart: float = _APART) -> bool:
     """Whether two explanations differ by more than zeros that are hardly determined."""
     if one[:2] != other[:2] or (one.angle, one.length) != (other.angle, other.length):
         return True
-    return any(
-        abs(math.remainder(x - y, 2 * math.pi)) > _APART for x, y in zip(one.offsets, other.offsets, strict=True)
-    )
+    return any(abs(math.remainder(x - y, 2 * math.pi)) > apart for x, y in zip(one.offsets, other.offsets, strict=True))
 
 
 def _compared(fit: ReadingFit, one: Hypothesis, other: Hypothesis) -> tuple[bool, bool]:

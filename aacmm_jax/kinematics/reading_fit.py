@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ..core.numpy_or_jax import to_numpy
 from ..core.rotations import fitted_frame, rotation_matrix
 from ..core.units import DEG
-from .arm import Arm, is_length, joint_limits, locate, parameter_names, value_of, with_values
+from .arm import Arm, by_joint, is_length, joint_limits, locate, parameter_names, value_of, with_values
 from .chain import forward_pass, joint_motion
 from .jacobian import rotation_columns, stacked_jacobian_columns
 from .reading_search import Evidence, Hypothesis
@@ -98,6 +98,20 @@ class ReadingFit:
         # A reading may be whole revolutions away.
         readings = readings - 2 * np.pi * np.round((readings - (low + high) / 2) / (2 * np.pi))
         return int(np.sum((readings < low - _MARGIN) | (readings > high + _MARGIN)))
+
+    def within_limits(self, one: Explanation) -> Explanation:
+        """The same with zeros whole revolutions away: as many readings as can be are then within the joint limits, and
+        of these the zeros are the smallest."""
+        low, high = (np.full(self.arm.joints, x) for x in (-np.inf, np.inf))
+        if self.arm.limits is not None:
+            low, high = np.asarray(joint_limits(self.arm, None)).T
+        readings, offsets = one.hypothesis.readings(one.angle * self.evidence.q), np.array(one.offsets)
+        for i in np.flatnonzero(by_joint(self.arm, True, False)):
+            turns = 2 * np.pi * (np.arange(-2, 3) - round(offsets[i] / (2 * np.pi)))
+            moved = readings[:, i] + turns[:, None]
+            outside = np.sum((moved < low[i] - _MARGIN) | (moved > high[i] + _MARGIN), axis=1)
+            offsets[i] += turns[np.lexsort((np.abs(offsets[i] + turns), outside))[0]]
+        return one._replace(offsets=tuple(offsets.tolist()))
 
     def with_free_zeros(
         self, hypothesis: Hypothesis, angle: float, length: float

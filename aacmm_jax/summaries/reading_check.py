@@ -12,10 +12,13 @@ from ..data.capture import Capture
 from ..data.observations.measured_points import AbstractMeasured
 from ..kinematics.arm import Arm
 from ..kinematics.joint_travel import lost_by_standing, standing_joints
+from ..kinematics.parameters import ArmSpecification
 from ..kinematics.reading_check import ReadingCheck, check_readings
 from ..kinematics.reading_fit import Explanation
+from ..uncertainty.fixed_parameters import fixed_parameters
 
 _LISTED = 5
+_SIGMA = 0.05  # mm; of tips where nothing better is known
 _MUCH = 2.0  # a place of the tip that reduces the residuals by less is not spoken of
 _QUARTERS = 1e-9  # rad
 
@@ -79,24 +82,41 @@ def reading_check_summary(
     }
 
 
-def standing_rows(arm: Arm, capture: Capture) -> list[dict[str, Any]]:
+def standing_rows(
+    arm: Arm, capture: Capture, nominal: ArmSpecification | None = None, sigma: float = _SIGMA
+) -> list[dict[str, Any]]:
     """Joints that (nearly) stand still over all poses, with what they leave open, in one sentence each.
 
     Args:
         arm: One arm, nominal.
         capture: Poses of it.
+        nominal: The arm with the free parameters that a calibration of the capture would take; None: there is none.
+        sigma: Standard deviation of a tip coordinate, mm.
     """
     rows, found = [], standing_joints(arm, np.asarray(capture.readings))
     open_by = lost_by_standing(arm, capture, [one.joint for one in found]) if found else []
-    for one, lost in zip(found, open_by, strict=True):
+    last = max((i for i, lost in enumerate(open_by) if lost), default=None)
+    for i, (one, lost) in enumerate(zip(found, open_by, strict=True)):
         unit, size = ("mm", one.range) if one.joint in arm.prismatic else ("deg", one.range / DEG)
         says = f"Joint {one.joint} stands still ({size:.2g} {unit} over {pluralise(one.poses, 'pose')})"
         if lost:
-            says += f": {_listed(list(lost))} cannot be identified; move it, or hold them (--held)."
+            says += f": {_listed(list(lost))} cannot be identified"
+            says += f"; {_what_to_do([one.joint for one in found], capture, nominal, sigma)}." if i == last else "."
         else:
             says += ", which leaves nothing open that such poses could determine."
         rows.append({"joint": one.joint, f"range_{unit}": size, "poses": one.poses, "lost": list(lost), "says": says})
     return rows
+
+
+def _what_to_do(joints: list[int], capture: Capture, nominal: ArmSpecification | None, sigma: float) -> str:
+    move = "move it" if len(joints) == 1 else "move them"
+    if nominal is None:
+        return move
+    bounds = nominal.bounds()
+    fixed = fixed_parameters(bounds, capture, joints, sigma)
+    if not set(fixed) & set(bounds.space.names):
+        return f"{move}, or calibrate as it is: the parameters that are free by default leave nothing open"
+    return f"{move}, or calibrate with --held {','.join(fixed)} (then nothing is said of these)"
 
 
 def _row(one: Explanation, positions: str) -> dict[str, Any]:

@@ -117,7 +117,7 @@ REFUSED = {
     "mixed units": (
         lambda arm: kinds.MeasuredPoints("T", np.rad2deg(Q), POINTS),
         "observation 'T' pose 2 joint 6 is 56.982 rad, more than four revolutions: these look like degrees; convert "
-        "with numpy.deg2rad, or state the unit in the manifest.",
+        "with numpy.deg2rad.",
     ),
     "a name given twice": (
         lambda arm: [kinds.MeasuredPoints("T", Q, POINTS), kinds.MeasuredPoints("T", Q[:9], POINTS[:9])],

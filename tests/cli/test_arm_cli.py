@@ -127,6 +127,35 @@ def test_what_is_found_corrects_the_manifest(aacmm, tmp_path, few):
     assert corrected.columns == 6
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("header", "size", "angles"),
+    [
+        (" [deg]", 180 / np.pi, ""),
+        (" [rad]", 1.0, ""),
+        ("", 180 / np.pi, 'unit = "deg"'),
+        ("", 10_000 / np.pi, 'unit = "counts"\ncounts_per_turn = 20000'),
+    ],
+)
+def test_the_printed_table_passes_the_check(aacmm, tmp_path, few, header, size, angles):
+    """Column 3 runs the other way, and joint 4 has its zero a quarter of a revolution off."""
+    capture = aj.simulate(aj.load_arm("cheng2018-simulation"), {"A": (400, 200, 300), "B": (600, 0, 400)}, poses=15)
+    for name, q in capture.sockets.items():
+        columns = (np.asarray(q) - np.deg2rad([0, 0, 0, -90, 0, 0])) * [1, 1, -1, 1, 1, 1] * size
+        write(tmp_path / f"{name}.csv", [f"J{i}{header}" for i in range(1, 7)], columns)
+    sockets = '[[socket]]\nname = "{s}"\nfile = "{s}.csv"\n'
+    (tmp_path / "m.toml").write_text(
+        'arm = "cheng2018-simulation"\n' + (f"[angles]\n{angles}\n" if angles else "") + sockets
+    )
+    found = json.loads(aacmm("import", "m.toml", "--check", "--json").stdout)["check"]
+    assert (found["explained"], found["fits"]) == (True, False)
+    (tmp_path / "m.toml").write_text(f'arm = "cheng2018-simulation"\n{found["angles"]}{sockets}')
+    again = json.loads(aacmm("import", "m.toml", "--check", "--json").stdout)["check"]
+    assert (again["fits"], again["angles"]) == (True, None)
+    turns = np.array(tomllib.loads(found["angles"])["angles"]["offset"]) / (2 * np.pi * size)
+    assert np.all(np.abs(turns) <= 0.5 + 1e-6)
+
+
 def test_readings_that_nothing_explains(aacmm, tmp_path, few):
     write(tmp_path / "poses.csv", [], np.random.default_rng(0).uniform(-3, 3, (30, 6)))
     said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv", expect=1)

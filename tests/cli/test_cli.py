@@ -141,9 +141,14 @@ def test_debug_shows_the_traceback(aacmm_process):
     assert "Traceback" in aacmm_process("calibrate", "none.h5", "-o", "x.h5", "--debug", expect=1).stderr
 
 
-def test_float32_is_refused_at_import(aacmm_process, monkeypatch):
+def test_float32_is_refused_at_import(aacmm_process, monkeypatch, tmp_path):
     monkeypatch.setenv("JAX_ENABLE_X64", "0")
-    assert "needs 64-bit floats, but JAX_ENABLE_X64=0" in aacmm_process("show", "panda", expect=1).stderr
+    script = tmp_path / "aacmm"  # as pip writes the console script
+    script.write_text("from aacmm_jax.cli import main\n\nmain()\n")
+    by_script = subprocess.run([sys.executable, script, "show", "panda"], capture_output=True, text=True, check=False)
+    for done in (aacmm_process("show", "panda", expect=2), by_script):
+        assert done.stderr.startswith("Error: aacmm_jax needs 64-bit floats, but JAX_ENABLE_X64=0")
+        assert (done.returncode, done.stdout, "Traceback" in done.stderr) == (2, "", False)
 
 
 @pytest.mark.slow

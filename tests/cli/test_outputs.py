@@ -256,3 +256,18 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path):
         assert being_written.exists()
     assert (tmp_path / "a.txt").read_text() == "first"
     assert [path.name[:7] for path in tmp_path.glob(".*.part")] == [".b.txt."]
+
+
+@pytest.mark.parametrize("before", [(), ("--",)])
+def test_overwrite_is_an_option_only_before_two_hyphens(aacmm, inputs, before):
+    (inputs / "x.h5").write_bytes(FOREIGN)
+    said = aacmm(*SIMULATE, "-o", "x.h5", *before, "--overwrite", expect=2 if before else 0)
+    assert ((inputs / "x.h5").read_bytes() == FOREIGN) == bool(before), said.stderr
+
+
+@pytest.mark.parametrize(
+    "command", ["import", "simulate", "calibrate", "evaluate", "report", "export", "plan", "study"]
+)
+def test_help_of_o_says_what_is_kept(aacmm, command):
+    said = " ".join(aacmm(command, "--help").stdout.split())
+    assert "An existing file that aacmm did not write is kept unless --overwrite." in said

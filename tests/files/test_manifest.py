@@ -488,7 +488,11 @@ def test_bad_table(tmp_path, content, parts):
 def test_degrees_taken_for_radians(tmp_path, motion):
     record(tmp_path / "a.csv", np.rad2deg(motion))
     assert_refused(
-        lambda: read(tmp_path, SMALL), tmp_path / "capture.toml", "socket 'a' pose", "degrees", "state the unit"
+        lambda: read(tmp_path, SMALL),
+        tmp_path / "capture.toml",
+        "a.csv pose 2 joint 6",
+        "degrees",
+        'write unit = "deg" in [angles]',
     )
 
 

@@ -1,6 +1,7 @@
 """Order, signs, zeros and units of joint readings are found again, on recorded and on simulated data."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.kinematics import reading_check, reading_search
 from aacmm_jax.kinematics.reading_check import check_readings
+from aacmm_jax.kinematics.reading_fit import Explanation, ReadingFit
 from aacmm_jax.kinematics.reading_search import Evidence, Hypothesis, as_recorded, search
 
 DEG = np.pi / 180
@@ -224,3 +226,32 @@ def test_refusals(paper_arm, q, options, part):
 def test_as_recorded_changes_nothing():
     q = np.random.default_rng(0).normal(size=(4, 6))
     np.testing.assert_array_equal(as_recorded(6).readings(q), q)
+
+
+@pytest.mark.parametrize(
+    ("limits", "offset", "expected"),
+    [
+        (None, 1.5, -0.5),
+        (None, -0.5, -0.5),
+        ((-math.pi, math.pi), 1.5, -0.5),
+        ((0.0, 2 * math.pi), -0.5, 1.5),
+        ((-2 * math.pi, 2 * math.pi), 1.5, -0.5),
+    ],
+)
+def test_the_turn_of_a_zero_keeps_readings_within_the_limits(paper_arm, limits, offset, expected):
+    """Zeros in half turns."""
+    arm = paper_arm if limits is None else paper_arm.replace(limits=(limits,) * 6)
+    q = np.random.default_rng(0).uniform(0.6 * math.pi, 0.9 * math.pi, (5, 6))
+    if limits == (0.0, 2 * math.pi):
+        q = q - math.pi
+    evidence = reading_search.Evidence(q, np.zeros(5, dtype=int), np.zeros((5, 3)))
+    one = Explanation(PLAIN[:6], (1,) * 6, (0, 0, offset * math.pi, 0, 0, 0), 1.0, 1.0, 0.1, 0.1, 0)
+    found = ReadingFit(arm, evidence, 1000.0, False).within_limits(one)
+    assert found.offsets[2] == pytest.approx(expected * math.pi)
+
+
+def test_alternatives_leave_alone_a_joint_that_stands_still(paper_arm, few):
+    q = np.random.default_rng(5).uniform(-1.5, 1.5, (6, 6))
+    q[:, 4] = 0.4
+    found = check_readings(paper_arm, q, positions=np.asarray(paper_arm.position(q)), own_frame=True)
+    assert [(one.order, one.signs) for one in found.others] == [(PLAIN[:6], (-1, 1, 1, 1, 1, 1))]
