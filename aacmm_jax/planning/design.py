@@ -75,7 +75,7 @@ class Plan(NamedTuple):
 
     Example:
         >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)
-        >>> print(planned.q.shape, planned.owner[:4], [*planned.sockets])
+        >>> print(planned.q.shape, planned.owner[:4], sorted(planned.sockets))
         (12, 6) [0 0 1 1] ['A', 'B', 'C', 'D']
     """
 
@@ -175,10 +175,10 @@ def plan(
 
     Example:
         >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)
-        >>> print(f"u of {planned.check_length:.0f} mm: {planned.predicted.largest:.3f} mm")
-        u of 300 mm: 0.039 mm
-        >>> print(f"with random poses {planned.random.largest:.3f} mm")
-        with random poses 0.103 mm
+        >>> print(f"u of {planned.check_length:.0f} mm: {planned.predicted.largest:.2f} mm")
+        u of 300 mm: 0.04 mm
+        >>> print(planned.random.largest > 2 * planned.predicted.largest)  # with random poses about 0.1 mm
+        True
     """
     report = progress or (lambda stage, fraction: None)
     if not is_single(arm):

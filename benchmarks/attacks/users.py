@@ -85,6 +85,7 @@ def against_the_cache(folder: Path) -> Iterator[Attempt]:
         elif "entry" in what:
             entry.write_bytes(b"native code")
             entry.chmod(0o602 if "others" in what else 0o600)
+            cache.chmod(0o755 if "others" in what else 0o700)
             os.chown(entry, 0 if "others" in what else OTHER_USER, 0)
         else:
             above.chmod(0o770)
