@@ -22,7 +22,7 @@ from aacmm_jax.study.blocks import Layout, parts_of
 
 from .kills import differences
 from .outcomes import DONE, REFUSED, SAME, SILENT, UNEXPECTED, Attempt, is_sentence
-from .samples import BLOCK, make
+from .samples import BLOCK
 from .work_as import OTHER_USER, USER, as_user
 
 MODULES = ("json", "signal", "pickle", "runpy", "multiprocessing", "numpy", "jax", "h5py", "filelock", "aacmm_jax")
@@ -47,7 +47,11 @@ class Place:
         # One study, begun and finished, as root's, from which others are made.
         self.sample = folder / "sample"
         self.sample.mkdir()
-        make(self.sample)
+        # In a process of its own: this one forks, which JAX does not survive once it has computed.
+        program = "import pathlib, sys; from attacks.samples import make; make(pathlib.Path(sys.argv[1]))"
+        folders = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, sys.path)])
+        line = [sys.executable, "-c", program, str(self.sample)]
+        subprocess.run(line, env=os.environ | {"PYTHONPATH": folders}, check=True)
 
     def run(self, *words: object, user: int = USER, umask: int = 0o022) -> tuple[int, str]:
         """Exit code and standard error of a command of one of the users."""
