@@ -119,8 +119,10 @@ class OutputFile:
             own = _is_own(self.target, self.temporary)
             if own and self._same_kind is not None and os.path.getsize(self.target):
                 token = _current.set(None)  # it may be read, though it is an output
-                own = self._same_kind(self.target)
-                _current.reset(token)
+                try:
+                    own = self._same_kind(self.target)
+                finally:
+                    _current.reset(token)
         else:
             own = self.target.suffix.lower() not in _MARKED or _is_marked(self.target)
         if not own:

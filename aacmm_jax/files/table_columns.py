@@ -14,7 +14,8 @@ from .text_table import TextTable
 _OF_JOINTS = re.compile("q|j|a|ax|axis|axes|achse|joints?|jnt|jpos|gelenk|theta|th|\u03b8|enc|encoder|angle|winkel|rax")
 # Words in the names of other quantities that joints have.
 _OF_OTHERS = re.compile(
-    "qd+|d+q|dtheta|vel|velocity|velocities|speed|acc|acceleration|tau|torques?|effort|moments?|force|currents?|voltage|"
+    "qd+|d+q|dtheta|vel|velocity|velocities|speed|acc|acceleration|tau|torques?|effort|moments?|force|currents?|"
+    "voltage|"
     "power|temp|temperatures?|error|err|mode|limit|min|max|std|sigma|u|control|output|contact|collision|brake|tcp|pose|"
     "probe|direction"
 )
