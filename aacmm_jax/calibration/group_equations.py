@@ -10,9 +10,9 @@ from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import by_joint, is_length, value_of
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement
-from ..model.observed import Linear, Observed, certified_and_lengths, linear_rows, whitened, whitening_of
+from ..model.observed import Observed, certified_and_lengths, linear_rows, whitened, whitening_of
 from ..uncertainty.group_test import Block
-from ..uncertainty.observed_covariance import arm_errors, covariance_of_noise
+from ..uncertainty.tip_errors import arm_errors, covariance_of_noise
 from .record import CalibrationRecord
 
 PRIOR = "prior"  # name of its rows
@@ -193,7 +193,7 @@ def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, share
     return [Block(PRIOR, None, residual, derivatives, np.zeros((len(known), 0)))]
 
 
-def _in_columns(part: Linear, root: np.ndarray, steps: np.ndarray):
+def _in_columns(part: tuple, root: np.ndarray, steps: np.ndarray):
     """Whitened residuals ``(m, r)``, and their derivatives by chosen unknowns ``(m, r, k)``; 0 by the others."""
     white, jacobian = whitened(part, root)
     position = {int(index): i for i, index in enumerate(part.indices)}

@@ -8,11 +8,23 @@ from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, added_to, compiled, namespace, set_at
 from ..kinematics.parameters import Bounds, Parameters
+from ..model.elimination import observed_model, observed_rows
 from ..model.metrics import Repeatability, no_repeatability, repeatability
-from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
+from ..model.observed import Observed
 from ..model.robust import Loss
-from ..uncertainty import observed_covariance as propagation
-from ..uncertainty.covariance import ParameterCovariance, inverse_information
+from ..model.rows import PriorRows, Whitening
+from ..uncertainty.covariance import ParameterCovariance
+from ..uncertainty.linear_propagation import (
+    Influence,
+    UnknownsCovariance,
+    alone,
+    geometry_covariance,
+    of_shared_readings,
+    propagated,
+    row_covariances,
+)
+from ..uncertainty.linearisation import Linearisation
+from ..uncertainty.variance_components import Moments, moments, noise_from
 from .bounded_fit import RULES, fit
 from .observed_state import ObservedTask, State, scatter_at_start, state_at, whitening_at
 from .prior_fit import ByScales, PriorProblem, fit_with_prior
@@ -143,71 +155,59 @@ def _covariance(
     active: Any,
     steps: Float[AnyArray, " z"],
     by_scales: ByScales | None,
-) -> tuple[ParameterCovariance, Float[AnyArray, "g g"]]:
-    """Of the parameters, and of the geometry."""
-    xp, p = namespace(z, task), len(space.names)
-    on_bound = xp.concatenate([active != 0, xp.zeros(z.shape[0] - p, dtype=bool)])
-    model = observed_model(z, (space, task.observed, whitening, task.loss))
-    scaled = xp.where(on_bound, 0.0, steps)
-    information = model.gram * scaled[:, None] * scaled[None, :]
-    inverse, lost, determined = inverse_information(information, on_bound)
-    rows = propagation.stacked(state.linear, task.observed, whitening, z.shape[0])
-    rows = [scaled[:, None, None] * part for part in rows]
-    poses = sum((_flat(part) @ _flat(part).T for part in rows), xp.zeros_like(information))
-    unweighted = rows
-    if task.loss is not None:
-        rows = _weighted_rows(task.loss, state, whitening, rows)
-        plain = observed_model(z, (space, task.observed, whitening, None)).gram * scaled[:, None] * scaled[None, :]
-    else:
-        plain = information
-    relations = plain - poses
+) -> tuple[ParameterCovariance, dict[str, Float[AnyArray, "_ _"]]]:
+    """Of the parameters, and of the parts of the geometry."""
+    xp, p, observed = namespace(z, task), len(space.names), task.observed
+    layout, groups, height = observed.layout, len(observed.layout.groups), len(space.names) + observed.layout.shared
+    linear = Linearisation.of(observed, space, z, state.point, state.errors, whitening, task.loss)
+    influence = linear.influence(xp.concatenate([active != 0, xp.zeros(z.shape[0] - p, dtype=bool)]))
+    scaled = xp.where(active != 0, 0.0, steps[:p])
     noise = task.noise
     if task.noise_model == "given":
         assert noise is not None
     elif task.noise_model == "estimated":
-        found = propagation.moments(
-            *(state.linear, state.errors, unweighted, rows, whitening, inverse, state.sigma),
+        found = moments(
+            *(influence, state.point.rows, state.errors, whitening, state.sigma),
             robust=task.loss is not None,
-            prior=None if whitening.prior is None else _information_of(whitening.prior, scaled),
+            prior=None if whitening.prior is None else _information_of(whitening.prior, scaled, height),
         )
-        noise = propagation.noise_from(found)
+        noise = noise_from(found)
     else:
-        noise = propagation.noise_from(propagation.Moments(xp.zeros(()), state.sigma**2))
+        noise = noise_from(Moments(xp.zeros(()), state.sigma**2))
     if task.noise_model == "robust":
-        each = propagation.alone(state.linear, rows, whitening, inverse)
-        total = relations
-        for part, one in zip(rows, each, strict=True):
-            total = total + _flat(xp.einsum("zam,mab->zbm", part, one)) @ _flat(part).T
-        matrix = inverse @ total @ inverse
+        covariances, shared = alone(influence, groups), None
     else:
-        matrix = propagation.propagated(
-            state.linear, state.errors, rows, whitening, inverse, relations, noise, np.array(task.pose)
-        )
-    matrix = matrix if by_scales is None else matrix + by_scales.added(inverse)
-    matrix = matrix * steps[:, None] * steps[None, :]
-    # What the data leave open of the geometry (the turn of a ball bar about itself) has no uncertainty.
-    known = determined[p:]
-    of_geometry = xp.where(known[:, None] & known[None, :], matrix[p:, p:], np.nan)
-    return ParameterCovariance(matrix[:p, :p], determined[:p], lost[:p, :p], noise), of_geometry
+        covariances = row_covariances(state.point.rows, state.errors, whitening, noise)
+        number = np.array(task.pose)
+        of_group = [number[group.index] for group in layout.groups]
+        shared = of_shared_readings(influence, state.errors, whitening, noise, of_group)
+    added = None if by_scales is None else by_scales.added(influence.inverse)
+    found = propagated(influence, covariances, shared, whitening.prior, added)
+    matrix = found.head[:p, :p] * steps[:p, None] * steps[:p]
+    geometry = _of_geometry(linear, influence, found)
+    return ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise), geometry
 
 
-def _weighted_rows(loss: Loss, state: State, whitening: Whitening, rows: list[Any]) -> list[Any]:
-    """Rows as a robust loss counts them: the influence of a pose on the estimate."""
-    found = []
-    for part, root, row in zip(state.linear, whitening.roots, rows, strict=True):
-        xp = namespace(row)
-        white = xp.einsum("mab,bm->am", root, part.rows.values)
-        found.append(row * loss.cost_and_weight(white)[1][None, None])
+def _of_geometry(
+    linear: Linearisation, influence: Influence, covariance: UnknownsCovariance
+) -> dict[str, Float[AnyArray, "_ _"]]:
+    """Of each part; NaN for what the data leave open, such as the turn of a ball bar about itself."""
+    xp, observed, p = namespace(covariance), linear.observed, len(linear.space.names)
+    layout, found = observed.layout, {}
+    for name, rows in observed.positions.items():
+        of, component, first = layout.component_of(int(rows[0]))
+        if of is None:
+            known = influence.determined[p + rows]
+        else:
+            known = ~influence.open[of][component, first : first + len(rows)]
+        matrix = geometry_covariance(layout, covariance, p, rows) * np.outer(*(observed.steps[rows],) * 2)
+        found[name] = xp.where(known[:, None] & known[None, :], matrix, np.nan)
     return found
 
 
-def _information_of(prior: PriorRows, scaled: Float[AnyArray, " z"]) -> Float[AnyArray, "z z"]:
+def _information_of(prior: PriorRows, scaled: Float[AnyArray, " p"], height: int) -> Float[AnyArray, "h h"]:
     xp, own = namespace(scaled), np.arange(prior.mean.shape[0])
-    return added_to(xp.zeros((scaled.shape[0],) * 2), (own, own), (prior.weight * scaled[own]) ** 2)
-
-
-def _flat(rows: Float[AnyArray, "z r m"]) -> Float[AnyArray, "z k"]:
-    return rows.reshape(rows.shape[0], -1)
+    return added_to(xp.zeros((height, height)), (own, own), (prior.weight * scaled) ** 2)
 
 
 def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> ParameterCovariance:
@@ -228,21 +228,25 @@ def _metrics(
     after: State,
     whitening: Whitening,
     geometry: Float[AnyArray, " g"],
-    covariance: Float[AnyArray, "g g"],
+    covariance: dict[str, Float[AnyArray, "_ _"]],
     spent: Any,
 ) -> tuple[Repeatability, Repeatability, ObservedMetrics]:
     """Repeatability of the sockets, and how far each observation is from its geometry; ``spent`` is how many unknowns
     the data determine."""
     xp, observed = namespace(geometry, after.sigma), task.observed
-    rms, chi, total, weights = [], [], 0.0, []
-    for part, root in zip(after.linear, whitening.roots, strict=True):
-        white = xp.einsum("mab,bm->am", root, part.rows.values)
-        total = total + xp.sum(white**2)
-        chi.append(xp.sqrt(xp.mean(white**2)))
+    rms, weights, squares = [], [], []
+    for rows, root in zip(after.point.rows, whitening.roots, strict=True):
+        white = xp.einsum("mab,bm->am", root, rows.values)
+        squares.append(xp.sum(white**2, axis=0))
         weights.append(xp.ones(white.shape[1]) if task.loss is None else task.loss.cost_and_weight(white)[1])
+    each = zip(observed.by_observation(squares), observed.observations, strict=True)
+    chi = [xp.sqrt(xp.mean(square) / one.rows) for square, one in each]
+    total = sum(xp.sum(square) for square in squares)
     for state in (before, after):
-        rms.append(xp.stack([xp.sqrt(xp.mean(xp.sum(part.rows.values[:3] ** 2, axis=0))) for part in state.linear]))
+        distances = observed.by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in state.point.rows])
+        rms.append(xp.stack([xp.sqrt(xp.mean(square)) for square in distances]))
     degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
+    parts = observed.split(geometry)
     metrics = ObservedMetrics(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),
@@ -251,22 +255,20 @@ def _metrics(
         reduced_chi=xp.stack(chi),
         reduced_chi_of_all=xp.sqrt(total / degrees_of_freedom),
         sigma=after.sigma,
-        geometry=observed.split(geometry),
-        geometry_covariance={
-            name: covariance[rows[0] : rows[-1] + 1, rows[0] : rows[-1] + 1]
-            for name, rows in observed.positions.items()
-        },
-        weights=tuple(weights),
+        geometry={name: parts[name] for name in observed.names},
+        geometry_covariance={name: covariance[name] for name in observed.names},
+        weights=tuple(observed.by_observation(weights)),
     )
-    sockets = [i for i, kind in enumerate(metrics.kinds) if kind == "socket"]
-    return _repeatability(before, sockets), _repeatability(after, sockets), metrics
+    return _repeatability(before, observed), _repeatability(after, observed), metrics
 
 
-def _repeatability(state: State, sockets: list[int]) -> Repeatability:
+def _repeatability(state: State, observed: Observed) -> Repeatability:
     """Of the tips in sockets; NaN where there is none."""
-    if not sockets:
+    residuals = observed.by_observation([rows.values for rows in state.point.rows])
+    residuals = [values for values, one in zip(residuals, observed.observations, strict=True) if one.kind == "socket"]
+    if not residuals:
         return no_repeatability(state.sigma)
     # Distances from the centroid do not depend on where the socket is, so residuals do as well as tips.
-    tips = namespace(state.sigma).concatenate([state.linear[i].rows.values for i in sockets], axis=1)
-    found = repeatability(tips.T, tuple(state.linear[i].rows.values.shape[1] for i in sockets))
+    tips = namespace(state.sigma).concatenate(residuals, axis=1)
+    found = repeatability(tips.T, tuple(values.shape[1] for values in residuals))
     return eqx.tree_at(lambda r: r.sigma, found, state.sigma)

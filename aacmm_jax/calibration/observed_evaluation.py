@@ -14,17 +14,12 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
-from ..model.observed import (
-    Linear,
-    Observed,
-    Whitening,
-    linear_rows,
-    observed_model,
-    observed_rows,
-    whitening_of,
-)
-from ..uncertainty import observed_covariance as propagation
-from ..uncertainty.covariance import inverse_information
+from ..model.elimination import observed_model, observed_rows
+from ..model.observed import Observed
+from ..model.rows import PointRows, Whitening, rows_at, whitening_of
+from ..uncertainty.linear_propagation import geometry_covariance
+from ..uncertainty.linearisation import Linearisation
+from ..uncertainty.tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma, scatter_of
 from .bounded_fit import fit
 
 _MAX_STEPS = 300
@@ -49,26 +44,14 @@ class ObservedEvaluation(Module):
 class GeometryFit(NamedTuple):
     """The geometry that fits one arm best."""
 
-    observed: Observed
-    space: Parameters  # of one parameter, which does not change
-    free: np.ndarray  # which numbers are fitted
-    z: Float[AnyArray, " z"]
-    linear: list[Linear]
+    linear: Linearisation  # of one parameter, which does not change; lengths do not take part
+    free: np.ndarray  # which numbers of the geometry are fitted
     sigma: Float[AnyArray, ""]
-    whitening: Whitening
 
     @property
     def geometry(self) -> Float[AnyArray, " g"]:
         """The numbers of the geometry."""
-        return self.z[1:]
-
-    def covariance(self) -> Float[AnyArray, "g g"]:
-        """Of the geometry, by an arm without errors but the noise of its readings; 0 for what is kept."""
-        xp = namespace(self.z)
-        model = observed_model(self.z, (self.space, self.observed, self.whitening, None))
-        steps = np.where(self.free, np.concatenate([[1.0], self.observed.steps]), 0.0)
-        inverse, _, _ = inverse_information(model.gram * steps[:, None] * steps[None, :], xp.asarray(~self.free))
-        return (inverse * steps[:, None] * steps[None, :])[1:, 1:]
+        return self.linear.z[1:]
 
 
 def checked_geometry(observed: Observed, geometry: Mapping[str, Numbers] | None) -> dict[str, AnyArray]:
@@ -107,31 +90,29 @@ def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noi
     )
     sides = xp.where(free, -np.inf, z), xp.where(free, np.inf, z)
     steps = xp.asarray(np.concatenate([[1.0], observed.steps]))
-    equations = observed.equations - len(observed.ends)
+    spare = max(observed.equations - len(observed.ends) - int(free.sum()), 1)
 
-    def weighted(z: Any, first: bool) -> tuple[list[Linear], Any, Whitening]:
-        linear = linear_rows(space, observed, z)
-        errors = propagation.arm_errors(observed.forward(space, z[:1], z[1:]), linear, observed)
+    def weighted(z: Any, first: bool) -> tuple[PointRows, list[ArmErrors], Any, Whitening]:
+        point = rows_at(space, observed, z)
+        errors = arm_errors(point, observed)
         if first:
-            values = xp.concatenate([xp.reshape(part.rows.values[:_POSITION_ROWS], (-1,)) for part in linear])
+            values = xp.concatenate([xp.reshape(part.values[:_POSITION_ROWS], (-1,)) for part in point.rows])
             sigma = xp.sqrt(xp.mean(values**2)) + 1e-9
         else:
-            sigma = propagation.scatter_of(linear, errors, max(equations - int(free.sum()), 1))
+            sigma = scatter_of(point.rows, errors, spare)
         of_arm = [
-            propagation.covariance_of_sigma(error, sigma)
-            if noise is None
-            else propagation.covariance_of_noise(error, noise)
+            covariance_of_sigma(error, sigma) if noise is None else covariance_of_noise(error, noise)
             for error in errors
         ]
-        whitening = whitening_of(linear, observed, of_arm, xp.maximum(_LEAST * sigma, 1e-12))
-        return linear, sigma, whitening._replace(lengths=xp.zeros(len(observed.ends)))
+        whitening = whitening_of(point.rows, observed, of_arm, xp.maximum(_LEAST * sigma, 1e-12))
+        return point, errors, sigma, whitening._replace(lengths=xp.zeros(len(observed.ends)))
 
-    _, _, whitening = weighted(z, first=True)
+    whitening = weighted(z, first=True)[-1]
     for _ in range(2):  # with the weights of the start, and with those of that geometry
         args = (space, observed, whitening, None)
         z = fit(observed_rows, observed_model, z, args, sides, steps, _MAX_STEPS).parameters
-        linear, sigma, whitening = weighted(z, first=False)
-    return GeometryFit(observed, space, free, z, linear, sigma, whitening)
+        point, errors, sigma, whitening = weighted(z, first=False)
+    return GeometryFit(Linearisation.of(observed, space, z, point, errors, whitening, None), free[1:], sigma)
 
 
 @compiled(jit=eqx.filter_jit)
@@ -140,21 +121,16 @@ def evaluate_observations(
 ) -> tuple[ObservedEvaluation, Float[AnyArray, " l"], Float[AnyArray, " l"]]:
     """Residuals of all observations by an arm, the reference lengths as it measures them, and u of their errors."""
     found = fit_geometry(arm, observed, kept, noise)
-    xp = namespace(found.z)
+    linear = found.linear
+    xp = namespace(linear.z)
     parts = observed.split(found.geometry)
-    residuals = [part.rows.values for part in found.linear]
-    normalised = [
-        xp.einsum("mab,bm->am", root, values) for root, values in zip(found.whitening.roots, residuals, strict=True)
-    ]
+    residuals = observed.by_observation([part.values for part in linear.point.rows])
+    normalised = linear.white()
     measured = u = xp.zeros(0)
     if observed.ends:
         between = xp.stack([parts[end] - parts[start] for start, end in observed.ends])
         measured = xp.sqrt(xp.sum(between**2, axis=1))
-        direction = between / measured[:, None]
-        unit, positions = np.eye(len(observed.steps)), observed.positions
-        pull = np.stack([unit[positions[end]] - unit[positions[start]] for start, end in observed.ends])
-        rows = xp.einsum("lc,lcg->lg", direction, xp.asarray(pull))
-        u = xp.sqrt(xp.einsum("lg,gh,lh->l", rows, found.covariance(), rows) + observed.u**2)
+        u = xp.sqrt(_of_lengths(found, between / measured[:, None]) + observed.u**2)
     evaluation = ObservedEvaluation(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),
@@ -164,9 +140,23 @@ def evaluate_observations(
         rms_angle=xp.stack([_rms(xp, values[_POSITION_ROWS:]) for values in residuals]),
         reduced_chi=xp.stack([xp.sqrt(xp.mean(white**2)) for white in normalised]),
         sigma=found.sigma,
-        geometry=parts,
+        geometry={name: parts[name] for name in observed.names},
     )
     return evaluation, measured, u
+
+
+def _of_lengths(found: GeometryFit, directions: Float[AnyArray, "l 3"]) -> Float[AnyArray, " l"]:
+    """Variances of the distances between positions that the geometry has, by an arm without errors but the noise of
+    its readings."""
+    xp, observed, variances = namespace(directions), found.linear.observed, []
+    influence = found.linear.influence(np.concatenate([[True], ~found.free]))
+    covariance, positions = influence.covariance(), observed.positions
+    for (start, end), along in zip(observed.ends, directions, strict=True):
+        index = np.concatenate([positions[start], positions[end]])
+        both = geometry_covariance(observed.layout, covariance, 1, index) * np.outer(*(observed.steps[index],) * 2)
+        pull = xp.concatenate([-along, along])
+        variances.append(pull @ both @ pull)
+    return xp.stack(variances)
 
 
 def _rms(xp: Any, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, ""]:

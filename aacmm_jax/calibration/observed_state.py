@@ -16,10 +16,18 @@ from ..kinematics.chain import forward_pass
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
 from ..model.measurement import check_joints
-from ..model.observed import Linear, Observed, PriorRows, Whitening, linear_rows, residual_rows, whitening_of
+from ..model.observed import Observed
 from ..model.robust import Loss, LossName, check_loss
-from ..uncertainty import observed_covariance as propagation
+from ..model.rows import PointRows, PriorRows, Whitening, rows_at, whitening_of
 from ..uncertainty.covariance import NoiseModel
+from ..uncertainty.tip_errors import (
+    ArmErrors,
+    arm_errors,
+    covariance_of_noise,
+    covariance_of_sigma,
+    robust_scatter_of,
+    scatter_of,
+)
 from .checks import check_noise_model, check_start
 from .scale_anchor import ScaleAnchor, scale_anchor
 
@@ -46,8 +54,8 @@ class ObservedTask(NamedTuple):
 class State(NamedTuple):
     """Everything at one point of the solve."""
 
-    linear: list[Linear]
-    errors: list[propagation.ArmErrors]
+    point: PointRows
+    errors: list[ArmErrors]
     sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
 
 
@@ -175,47 +183,30 @@ def state_at(
 ) -> State:
     """The state at a point; ``sigma`` is estimated unless it is given, and ``effective`` is how many unknowns the data
     determine, by default all."""
-    return _state_of(task, space, z, linear_rows(space, task.observed, z), sigma, effective)
-
-
-def sigma_at(
-    task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], effective: Float[AnyArray, ""]
-) -> Float[AnyArray, ""]:
-    """The standard deviation of a tip coordinate that `state_at` estimates, without derivatives by the unknowns."""
-    rows = residual_rows(space, task.observed, z)
-    none = np.arange(0)
-    linear = [Linear(part, namespace(z).zeros((0, *part.values.shape)), none) for part in rows]
-    return _state_of(task, space, z, linear, None, effective).sigma
-
-
-def _state_of(
-    task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"], linear: list[Linear], sigma: Any, effective: Any
-) -> State:
-    p = len(space.names)
-    forward = task.observed.forward(space, z[:p], z[p:])
-    errors = propagation.arm_errors(forward, linear, task.observed)
+    point = rows_at(space, task.observed, z)
+    errors = arm_errors(point, task.observed)
     if sigma is None:
         xp = namespace(z, effective)
         spent = z.shape[0] if effective is None else effective
         degrees_of_freedom = xp.maximum(xp.asarray(task.observed.equations - spent, dtype=float), 1.0)
-        scatter = propagation.scatter_of if task.loss is None else propagation.robust_scatter_of
-        sigma = scatter(linear, errors, degrees_of_freedom)
-    return State(linear, errors, sigma)
+        scatter = scatter_of if task.loss is None else robust_scatter_of
+        sigma = scatter(point.rows, errors, degrees_of_freedom)
+    return State(point, errors, sigma)
 
 
 def whitening_at(task: ObservedTask, state: State, prior: PriorRows | None = None) -> Whitening:
     """The weights of everything by the state of a nearly right arm."""
     if task.noise is None:
-        of_arm = [propagation.covariance_of_sigma(errors, state.sigma) for errors in state.errors]
+        of_arm = [covariance_of_sigma(errors, state.sigma) for errors in state.errors]
     else:
-        of_arm = [propagation.covariance_of_noise(errors, task.noise) for errors in state.errors]
+        of_arm = [covariance_of_noise(errors, task.noise) for errors in state.errors]
     least = namespace(state.sigma).maximum(_LEAST * state.sigma, 1e-12)
-    return whitening_of(state.linear, task.observed, of_arm, least)._replace(prior=prior)
+    return whitening_of(state.point.rows, task.observed, of_arm, least)._replace(prior=prior)
 
 
 def scatter_at_start(task: ObservedTask, space: Parameters, z: Float[AnyArray, " z"]) -> Any:
     """Root mean square of the start's residuals in mm, for the first weights."""
     xp = namespace(z, task)
-    values = [part.rows.values[:3] for part in linear_rows(space, task.observed, z)]
+    values = [rows.values[:3] for rows in rows_at(space, task.observed, z).rows]
     flat = xp.concatenate([xp.reshape(value, (-1,)) for value in values])
     return xp.sqrt(xp.mean(flat**2)) + 1e-9

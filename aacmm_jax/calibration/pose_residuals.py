@@ -10,8 +10,8 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
 from ..kinematics.parameters import Parameters
-from ..model.observed import Linear, Observed, linear_rows, whitening_of
-from ..uncertainty import observed_covariance as propagation
+from ..model.observed import Observed, linear_rows, whitening_of
+from ..uncertainty import tip_errors as propagation
 from .evaluation import Evaluation
 from .group_equations import equations_of
 from .record import CalibrationRecord
@@ -75,7 +75,7 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
 
 def _residuals(
     observation: AbstractObservation,
-    linear: Linear,
+    linear: tuple,
     errors: propagation.ArmErrors,
     root: Float[np.ndarray, "m r r"],
     weight: Float[np.ndarray, " m"],

@@ -17,8 +17,9 @@ from ..core.linear_algebra import inverse_positive_definite, singular_values, so
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, while_loop
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import LEAST_STEPS, MIXED, ParameterPrior
-from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
+from ..model.elimination import observed_model, observed_rows, reduced
 from ..model.robust import Loss
+from ..model.rows import PriorRows, Whitening
 from ..solver.reason import MAX_STEPS, reasons
 from ..uncertainty.evidence import (
     Groups,
@@ -30,7 +31,7 @@ from ..uncertainty.evidence import (
     slope_of_expectation,
 )
 from .bounded_fit import Fit, fit
-from .observed_state import ObservedTask, State, sigma_at, whitening_at
+from .observed_state import ObservedTask, State, state_at, whitening_at
 from .results import PriorMetrics
 
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
@@ -110,15 +111,15 @@ class PriorProblem(NamedTuple):
         data = observed_model(z, (self.space, self.task.observed, self.whitening(scales, None), self.loss))
         pinned = (z <= self.sides[0]) | (z >= self.sides[1])
         deviation = (z[: self.prior.mean.shape[0]] - self.prior.mean)[index] / self.steps[index]
-        gram = data.gram * self.steps[:, None] * self.steps[None, :]
-        return eliminated(gram, data.gradient * self.steps, deviation, index, xp.asarray(pinned))
+        gram, gradient = reduced(data.gram.scaled(self.steps), data.gradient * self.steps)
+        return eliminated(gram, gradient, deviation, index, xp.asarray(pinned)[: gram.shape[0]])
 
     def sigma(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], effective: Any) -> Float[AnyArray, ""]:
         """The tips' standard deviation by the residuals; as in the reference where the noise is given."""
         if self.task.noise is not None:
             return self.reference.sigma
         spent = z.shape[0] - effective.shape[0] + namespace(effective).sum(effective)
-        return sigma_at(self.task, self.space, z, spent)
+        return state_at(self.task, self.space, z, effective=spent).sigma
 
     def updated(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """The scales that the result of the least squares with these scales leads to."""
@@ -156,8 +157,9 @@ class PriorProblem(NamedTuple):
         pull = (model.deviation * known)[:, None] * members.T
         alone = xp.asarray(~self.groups.expected)
         lost = known * (xp.where(alone, xp.minimum(xp.diagonal(covariance), _MOST_SPREAD), 0.0) @ members)
-        lost = set_at(xp.zeros(z.shape[0]), index, xp.where(model.pinned, 0.0, lost))
-        return ByScales(set_at(xp.zeros((z.shape[0], pull.shape[1])), index, pull), covariance, lost)
+        height = self.prior.mean.shape[0] + self.task.observed.layout.shared
+        lost = set_at(xp.zeros(height), index, xp.where(model.pinned, 0.0, lost))
+        return ByScales(set_at(xp.zeros((height, pull.shape[1])), index, pull), covariance, lost)
 
     def metrics(
         self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]
@@ -196,11 +198,11 @@ class ByScales(NamedTuple):
     of `benchmarks/NOTES.md`).
     """
 
-    pull: Float[AnyArray, "z g"]  # of the prior on the unknowns, by log variances, in natural steps
+    pull: Float[AnyArray, "h g"]  # of the prior on the head of the unknowns, by log variances, in natural steps
     covariance: Float[AnyArray, "g g"]  # of the log variances
-    lost: Float[AnyArray, " z"]  # information of the prior, less that of one with the expectation of its variance
+    lost: Float[AnyArray, " h"]  # information of the prior, less that of one with the expectation of its variance
 
-    def added(self, inverse: Float[AnyArray, "z z"]) -> Float[AnyArray, "z z"]:
+    def added(self, inverse: Float[AnyArray, "h h"]) -> Float[AnyArray, "h h"]:
         """To the covariance, given the inverse of the information."""
         xp = namespace(inverse, self)
         moved = inverse @ self.pull

@@ -24,8 +24,8 @@ from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
-from ..model.observed import Linear, Observed, linear_rows
-from ..uncertainty.observed_covariance import ArmErrors, arm_errors
+from ..model.observed import Observed, linear_rows
+from ..uncertainty.tip_errors import ArmErrors, arm_errors
 from .drawn_errors import DrawnErrors, draw_shared
 from .observed_state import configurations
 from .results import Calibration
@@ -94,7 +94,7 @@ class ObservedTruth(NamedTuple):
     """An arm and a geometry about which data are drawn, in NumPy: by them every residual is 0 but for its errors."""
 
     observed: Observed
-    linear: list[Linear]
+    linear: list[Any]
     errors: list[ArmErrors]
     roots: list[Float[np.ndarray, "m r r"]]  # of the covariance of what was measured
     geometry: dict[str, Float[np.ndarray, " k"]]

@@ -9,11 +9,11 @@ from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import by_joint
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement
-from ..model.observed import PriorRows, linear_rows, observed_model
-from ..uncertainty import observed_covariance as propagation
-from ..uncertainty.covariance import covariance_of, inverse_information
+from ..model.rows import PriorRows
+from ..uncertainty.covariance import covariance_of
+from ..uncertainty.linearisation import Linearisation
 from ..uncertainty.propagation import Propagated, in_units
-from .observed_state import ObservedTask, State, whitening_at
+from .observed_state import ObservedTask, state_at, whitening_at
 from .results import Calibration
 
 
@@ -55,25 +55,21 @@ def sensitivities_of_observations(task: ObservedTask, result: Calibration) -> Se
     p, observed = len(free), task.observed
     geometry = [np.asarray(metrics.geometry[part]) for part in observed.blocks]
     z = np.concatenate([np.asarray(result.parameters)[free], *geometry])
-    linear = linear_rows(space, observed, z)
-    state = State(
-        linear, propagation.arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed), metrics.sigma
-    )
+    state = state_at(task, space, z, metrics.sigma)
     rows = None if prior is None else PriorRows(prior.mean, prior.weight)
     whitening = whitening_at(task, state, rows)
+    linear = Linearisation.of(observed, space, z, state.point, state.errors, whitening, task.loss)
     fixed = np.concatenate([np.asarray(result.active)[free] != 0, np.zeros(len(z) - p, dtype=bool)])
-    scaled = np.where(fixed, 0.0, np.concatenate([space.scale, observed.steps]))
-    gram = observed_model(z, (space, observed, whitening, task.loss)).gram
-    inverse = inverse_information(gram * scaled[:, None] * scaled[None, :], fixed)[0]
-    by_rows = propagation.stacked(linear, observed, whitening, len(z))
+    influence = linear.influence(fixed)
+    gain = -(np.asarray(space.scale)[:, None] * influence.inverse[:p])
     tips, joints = [], []
-    for part, error, root, by_row, weights in zip(
-        linear, state.errors, whitening.roots, by_rows, metrics.weights, strict=True
-    ):
-        gain = (scaled[:p, None] * inverse[:p]) @ (scaled[:, None] * by_row.reshape(len(z), -1))
-        gain = np.einsum("pam,mab->pbm", gain.reshape(p, *by_row.shape[1:]) * weights, root)
-        tips.append(-np.einsum("pbm,bcm->pcm", gain, part.rows.by_tip))
-        joints.append(-np.einsum("pbm,bnm->pnm", gain, error.by_readings))
+    for number, (part, error, root) in enumerate(zip(state.point.rows, state.errors, whitening.roots, strict=True)):
+        by_row = influence.weighted_rows(number)
+        each = (gain @ by_row.reshape(len(by_row), -1)).reshape(p, *by_row.shape[1:])
+        each = np.einsum("pam,mab->pbm", each, root)
+        tips.append(np.einsum("pbm,bcm->pcm", each, part.by_tip))
+        joints.append(np.einsum("pbm,bnm->pnm", each, error.by_readings))
+    tips, joints = observed.by_observation(tips), observed.by_observation(joints)
     found = [np.zeros((len(names), *parts[0].shape[1:2], observed.q.shape[0])) for parts in (tips, joints)]
     for whole, parts in zip(found, (tips, joints), strict=True):
         whole[free] = np.concatenate(parts, axis=2)

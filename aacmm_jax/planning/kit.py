@@ -26,7 +26,7 @@ from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import reached, search_region
 from ..model.observed import Observed, certified_and_lengths, linear_rows, whitening_of
 from ..uncertainty.identifiability import observability
-from ..uncertainty.observed_covariance import arm_errors, covariance_of_noise, stacked
+from ..uncertainty.tip_errors import arm_errors, covariance_of_noise
 from ..uncertainty.volume import default_length
 from .design import Criterion, Progress, check_plannable, design_problem
 from .fedorov_exchange import Candidates, covariance_of, exchange

@@ -12,8 +12,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..core.linear_algebra import solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, cond, namespace, while_loop
+from .arrow import Arrow
 
 Flat = Float[AnyArray, "*slots p"]
 Number = Float[AnyArray, "*slots"]
@@ -37,12 +37,12 @@ class QuadraticModel(NamedTuple):
 
     cost: Float[AnyArray, "*slots"]  # |f|^2 / 2
     gradient: Float[AnyArray, "*slots p"]  # J^T f
-    gram: Float[AnyArray, "*slots p p"]  # J^T J
+    gram: Arrow | Float[AnyArray, "*slots p p"]  # J^T J
 
     def finite(self) -> Bool[AnyArray, "*slots"]:
         """Whether every number of it is finite."""
         xp = namespace(self)
-        sums = xp.sum(self.gradient, axis=-1) + xp.sum(self.gram, axis=(-2, -1))
+        sums = xp.sum(self.gradient, axis=-1) + Arrow.of(self.gram).sum()
         return xp.isfinite(self.cost) & xp.isfinite(sums)
 
 
@@ -76,7 +76,7 @@ class Box(NamedTuple):
 
         Away from bounds it is MINPACK's cosine between the residual and a column of J; it does not depend on units.
         """
-        h, xp = diagonal(model.gram), namespace(y)
+        h, xp = Arrow.of(model.gram).diagonal(), namespace(y)
         safe = xp.where(h > 0, h, 1.0)
         step = xp.where(h > 0, xp.sqrt(safe) * xp.abs(y - self.clip(y - model.gradient / safe)), 0.0)
         return xp.max(step, axis=-1) / xp.sqrt(2 * xp.maximum(model.cost, np.finfo(np.float64).tiny))
@@ -101,9 +101,9 @@ def propose(
     unknowns zigzag along a bound.
     """
     xp, pinned = namespace(y), box.pinned(y, model.gradient)
-    gram, downhill = scale[..., :, None] * model.gram * scale[..., None, :], -scale * model.gradient
+    gram, downhill = Arrow.of(model.gram).scaled(scale), -scale * model.gradient
     if radius is None:
-        z = _damped(gram, downhill, pinned, damping)
+        z = gram.damped_solution(downhill, pinned, damping)
     else:
         z, damping = _solve_within(gram, downhill, pinned, damping, radius)
     step, length = scale * z, norm(z)
@@ -112,15 +112,14 @@ def propose(
         landed = box.clip(y + step)
         through = landed != y + step
         shift = xp.where(through, landed - y, 0.0)
-        return xp.where(
-            through, shift, scale * _damped(gram, downhill - _times(gram, shift / scale), pinned | through, damping)
-        )
+        rest = downhill - gram.times(shift / scale)
+        return xp.where(through, shift, scale * gram.damped_solution(rest, pinned | through, damping))
 
     # One test for all slots: solving again changes nothing in a slot whose step stays inside.
     step = cond(xp.any(box.clip(y + step) != y + step), solve_again, lambda s: s, step)
     trial = box.clip(y + step)
     step = trial - y
-    predicted = -xp.sum(step * (model.gradient + 0.5 * _times(model.gram, step)), axis=-1)
+    predicted = -xp.sum(step * (model.gradient + 0.5 * Arrow.of(model.gram).times(step)), axis=-1)
     # A failed factorisation shows as NaN: stay, predict nothing, and let the damping grow.
     usable = xp.isfinite(predicted)
     nowhere = Step(y, xp.zeros_like(predicted), xp.full_like(length, np.inf))
@@ -128,9 +127,10 @@ def propose(
 
 
 def _solve_within(
-    gram: Float[AnyArray, "*slots p p"], right: Flat, fixed: Bool[AnyArray, "*slots p"], damping: Number, radius: Number
+    gram: Arrow, right: Flat, fixed: Bool[AnyArray, "*slots p"], damping: Number, radius: Number
 ) -> tuple[Flat, Number]:
-    """`_damped` with the damping raised as far as z needs it to be no longer than ``radius``; and that damping."""
+    """The damped solution, with the damping raised as far as it needs to be no longer than ``radius``; and that
+    damping."""
 
     xp = namespace(gram)
 
@@ -145,22 +145,10 @@ def _solve_within(
         # factorisation shows as NaN.
         factor = xp.where(xp.isfinite(ratio), xp.maximum(xp.sqrt(ratio), 1.05), 10.0)
         damping = xp.where((count == 0) | (ratio <= 1), damping, factor * damping)
-        return count + 1, _damped(gram, right, fixed, damping), damping
+        return count + 1, gram.damped_solution(right, fixed, damping), damping
 
     nothing = xp.full_like(right, np.nan)
     return while_loop(too_long, raised, (xp.zeros((), dtype=np.int32), nothing, damping))[1:]
-
-
-def _damped(
-    gram: Float[AnyArray, "*slots p p"], right: Flat, fixed: Bool[AnyArray, "*slots p"], damping: Number
-) -> Flat:
-    """Solution of (gram + damping I) z = right on the unknowns that are not fixed; 0 for those that are."""
-    p, xp = gram.shape[-1], namespace(gram)
-    identity = xp.eye(p, dtype=bool).reshape((1,) * (gram.ndim - 2) + (p, p))
-    inside = ~fixed
-    matrix = xp.where(inside[..., :, None] & inside[..., None, :], gram, 0.0)
-    matrix = matrix + xp.where(identity, xp.where(fixed, 1.0, damping[..., None])[..., None, :], 0.0)
-    return solve_positive_definite(matrix, xp.where(fixed, 0.0, right))
 
 
 def choose(predicate: Bool[AnyArray, "*slots"], new: PyTree, old: PyTree) -> PyTree:
@@ -175,19 +163,10 @@ def choose(predicate: Bool[AnyArray, "*slots"], new: PyTree, old: PyTree) -> PyT
     return jax.tree.map(pick, new, old)
 
 
-def diagonal(matrix: Float[AnyArray, "*slots p p"]) -> Flat:
-    """Diagonals of a batch of matrices."""
-    return namespace(matrix).diagonal(matrix, axis1=-2, axis2=-1)
-
-
 def norm(vector: Flat) -> Number:
     """Euclidean lengths of a batch of vectors."""
     xp = namespace(vector)
     return xp.sqrt(xp.sum(vector**2, axis=-1))
-
-
-def _times(matrix: Float[AnyArray, "*slots p p"], vector: Flat) -> Flat:
-    return (matrix @ vector[..., None])[..., 0]
 
 
 def expand(y: PyTree[Array], given: PyTree, absent: float) -> PyTree[Array]:

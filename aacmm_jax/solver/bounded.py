@@ -50,7 +50,10 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
         flat, _ = ravel_pytree(y)
-        return begin(flat, box_of(y, options))
+        if options.get("normal") is None:
+            return begin(flat, box_of(y, options))
+        form = jax.eval_shape(options["normal"], y, args).gram
+        return begin(flat, box_of(y, options), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form))
 
     def step(self, fn, y, args, options, state, tags):
         unravel: Callable = ravel_pytree(y)[1]

@@ -9,12 +9,15 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, while_loop
-from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, diagonal, norm, propose
+from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, norm, propose
+from .arrow import Arrow
 from .reason import GRADIENT, MAX_STEPS, NONFINITE, ROUNDING, RUNNING, STALLED, STEP
 
 _EPSILON = float(np.finfo(np.float64).eps)
@@ -46,13 +49,16 @@ class Progress(Module):
     reason: Int[AnyArray, "*slots"]  # number of a `Reason`
 
 
-def begin(y: Flat, box: Box) -> Progress:
-    """State before the first evaluation, which happens at the start clipped to the box."""
+def begin(y: Flat, box: Box, gram: Any = None) -> Progress:
+    """State before the first evaluation, which happens at the start clipped to the box; ``gram`` has the form of the
+    Gram matrices to come, by default that of a dense one."""
     y, xp = box.clip(y), namespace(y)
     zero, none = xp.zeros(y.shape[:-1]), xp.zeros(y.shape[:-1], dtype=np.int64)
     return Progress(
         y=y,
-        model=QuadraticModel(zero + np.inf, xp.zeros_like(y), xp.zeros((*y.shape, y.shape[-1]))),
+        model=QuadraticModel(
+            zero + np.inf, xp.zeros_like(y), xp.zeros((*y.shape, y.shape[-1])) if gram is None else gram
+        ),
         optimality=zero + np.inf,
         step=Step(y, zero, zero + np.inf),
         damping=zero,
@@ -74,7 +80,7 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
     y, model, optimality = choose(
         accept, (trial, evaluated, trial_optimality), (progress.y, progress.model, progress.optimality)
     )
-    curvature = xp.maximum(progress.curvature, diagonal(model.gram))
+    curvature = xp.maximum(progress.curvature, Arrow.of(model.gram).diagonal())
     scale = _scale(box, curvature)
 
     ratio = _ratio(progress, evaluated, accept)
@@ -147,11 +153,14 @@ def minimise(
     Returns:
         The last state; its reason is the step limit where that was reached.
     """
-    box = Box(lower, upper, scale)
+    box, form = Box(lower, upper, scale), None
+    if namespace(start, args) is not np:
+        form = jax.eval_shape(model, start, args).gram
+        form = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
     progress = while_loop(
         lambda progress: (progress.reason == RUNNING) & (progress.steps < max_steps),
         lambda progress: advance(progress, model(progress.step.trial, args), box, rules),
-        begin(start, box),
+        begin(start, box, form),
     )
     ended = namespace(progress).where(progress.reason == RUNNING, MAX_STEPS, progress.reason).astype(np.int32)
     return eqx.tree_at(lambda p: p.reason, progress, ended)

@@ -6,7 +6,7 @@ are moved, a few milliradians at most, to where the tips agree with that geometr
 to agree with a measured transform.)
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -17,8 +17,8 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
-from ..model.observed import Linear, Observed, Whitening, certified_and_lengths, linear_rows, whitened, whitening_of
-from .observed_covariance import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
+from ..model.observed import Observed, certified_and_lengths, linear_rows, whitened, whitening_of
+from .tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
 
 _ROUNDS = 15
 _LONGEST_STEP = 0.1  # rad, of a configuration
@@ -41,7 +41,7 @@ class Agreeing(NamedTuple):
 
     observed: Observed
     space: Parameters
-    linear: list[Linear]
+    linear: list
     errors: list[ArmErrors]
     relations: Float[np.ndarray, "l z"]  # derivatives of lengths and certified values
     u: Float[np.ndarray, " l"]  # their standard uncertainties, mm
@@ -111,15 +111,13 @@ def _with_parts(text: str, parts: list[str]) -> str:
     return f"{', '.join(first)} and {last} trade off"
 
 
-def _linear(observed: Observed, space: Parameters, z: Float[np.ndarray, " z"]) -> tuple[list[Linear], list[ArmErrors]]:
+def _linear(observed: Observed, space: Parameters, z: Float[np.ndarray, " z"]) -> tuple[list, list[ArmErrors]]:
     p = len(space.names)
     linear = linear_rows(space, observed, z)
     return linear, arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed)
 
 
-def _whitening(
-    observed: Observed, linear: list[Linear], of_arm: list[Float[AnyArray, "_ _ _"]], measured: bool = False
-) -> Whitening:
+def _whitening(observed: Observed, linear: list, of_arm: list[Float[AnyArray, "_ _ _"]], measured: bool = False) -> Any:
     if not measured:  # rows in mm, whatever the uncertainty of what was measured
         rows = [part.rows._replace(measured=np.zeros_like(part.rows.measured)) for part in linear]
         linear = [part._replace(rows=row) for part, row in zip(linear, rows, strict=True)]
@@ -127,7 +125,7 @@ def _whitening(
 
 
 def dense_rows(
-    linear: list[Linear], roots: tuple[Float[AnyArray, "_ _ _"], ...], size: int
+    linear: list, roots: tuple[Float[AnyArray, "_ _ _"], ...], size: int
 ) -> tuple[Float[np.ndarray, "r z"], Float[np.ndarray, " r"]]:
     """All derivatives as one matrix, and the residuals."""
     blocks, values = [], []
@@ -140,7 +138,7 @@ def dense_rows(
     return np.concatenate(blocks), np.concatenate(values)
 
 
-def _moved(observed: Observed, arm: Arm, linear: list[Linear], errors: list[ArmErrors]) -> Observed:
+def _moved(observed: Observed, arm: Arm, linear: list, errors: list[ArmErrors]) -> Observed:
     """With configurations one step of Gauss and Newton closer to the geometry, of all such steps the shortest."""
     new, units = [], reading_units(arm.geometry)
     for observation, part, error in zip(observed.observations, linear, errors, strict=True):

@@ -1,0 +1,279 @@
+"""The row builder: the residuals of every group of observations at a point, and their derivatives.
+
+A group's rows are evaluated at once: the kind says how they follow the tips, the rotation of the last frame and its
+own unknowns; the chain's analytic columns say how tips and rotations follow the parameters. Derivatives are kept by the
+head of the arrow (parameters and shared geometry), and by the private numbers of the component that a row belongs to.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..core.linear_algebra import inverse_cholesky
+from ..core.module import Module
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from ..data.observations.observation import Rows
+from ..kinematics.chain import ForwardPass
+from ..kinematics.jacobian import rotation_columns, shared_columns, stacked_jacobian_columns
+from ..kinematics.parameters import Parameters
+from .layout import Group
+from .observed import Observed, tips_of
+from .socket_sums import to_poses
+
+
+class PriorRows(NamedTuple):
+    """What is known of the parameters besides the observations: rows weight (x - mean), of standard deviation 1."""
+
+    mean: Float[AnyArray, " p"]
+    weight: Float[AnyArray, " p"]  # one over a standard deviation; 0 where nothing is known
+
+    def residual(self, z: Float[AnyArray, " z"]) -> Float[AnyArray, " p"]:
+        """The rows at a point."""
+        return self.weight * (z[: self.mean.shape[0]] - self.mean)
+
+
+class Whitening(NamedTuple):
+    """What makes rows of standard deviation 1 of the residuals."""
+
+    roots: tuple[Float[AnyArray, "_ _ _"], ...]  # of each group, inverse Cholesky factors
+    lengths: Float[AnyArray, " l"]  # one over a standard deviation
+    certified: dict[str, Float[AnyArray, " k"]]
+    prior: PriorRows | None = None
+
+
+class RowBlock(Module):
+    """Rows of one group, or of relations, in standard deviations, with r of them for each of m poses."""
+
+    white: Float[AnyArray, "r m"]
+    by_head: Float[AnyArray, "h r m"] | None  # by parameters and shared geometry; None: they depend on neither
+    by_own: Float[AnyArray, "k r m"] | None  # by the numbers of the component of each pose
+    of: int | None = eqx.field(static=True)  # class of these components
+    sizes: tuple[int, ...] = eqx.field(static=True)  # poses of each of them, in their order
+
+
+class PointRows(NamedTuple):
+    """All rows at one point of the unknowns, before anything is weighted."""
+
+    forward: ForwardPass
+    rows: list[Rows]  # of each group
+
+
+def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> PointRows:
+    """The residuals of every group, with their derivatives by tips and unknowns."""
+    p = len(space.names)
+    forward, found = observed.forward(space, z[:p], z[p:]), []
+    for group, stack in zip(observed.layout.groups, observed.stacks, strict=True):
+        unknowns = {
+            name: _columns_of_role(z[p:], role.first, role.size, group.counts)
+            for name, role in zip(stack.unknowns, group.roles, strict=False)
+        }
+        if stack.alike is None:  # TEMP
+            unknowns = {n: v[:, 0] for n, v in unknowns.items()}
+        # Through the class: a bound method of Equinox is a module made anew, which takes as long as a residual.
+        found.append(type(stack).residual(stack, tips_of(forward, group.index), unknowns))
+    return PointRows(forward, found)
+
+
+def _columns_of_role(
+    geometry: Float[AnyArray, " g"], first: tuple[int, ...], size: int, counts: tuple[int, ...]
+) -> Float[AnyArray, "k _"]:
+    """The numbers of a role: one column where all poses share them, else one for each pose."""
+    if len(set(first)) == 1:
+        return geometry[first[0] : first[0] + size][:, None]
+    index = np.asarray(first)[None, :] + np.arange(size)[:, None]
+    return to_poses(geometry[index], counts)
+
+
+def row_blocks(
+    space: Parameters, observed: Observed, z: Float[AnyArray, " z"], point: PointRows, whitening: Whitening
+) -> list[RowBlock]:
+    """The rows of every group with their derivatives, whitened; then those of lengths and certified values."""
+    forward, layout, p = point.forward, observed.layout, len(space.names)
+    xp = namespace(forward, z)
+    functions = None if forward.errors is None else forward.errors.functions
+    shared = shared_columns(functions, space.indices())
+    columns = stacked_jacobian_columns(forward, shared.few)
+    own_probe = np.array([kind == "probe" for kind, _ in shared.few])
+    turned = None
+    if any(rows.by_rotation is not None for rows in point.rows):
+        turned = rotation_columns(forward, shared.few)
+    found = []
+    for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
+        rows, poses = _whitened(rows, root), group.index
+        mine = columns[..., poses]
+        if group.targeted and own_probe.any():
+            mine = xp.where(own_probe[:, None, None], 0.0, mine)
+        by_parameters = times(rows.by_tip, mine)
+        if rows.by_rotation is not None:
+            assert turned is not None
+            by_parameters = by_parameters + times(rows.by_rotation, turned[..., poses])
+        by_parameters = shared.multiplied(by_parameters, forward, poses)
+        by_roles = [rows.by_unknowns[name] for name in stack.unknowns]
+        if group.targeted:
+            by_roles.append(times(rows.by_tip, xp.stack([axis[:, poses] for axis in forward.frame])))
+        by_head = _by_head(by_parameters, by_roles, group, layout.shared)
+        size = 0 if group.of is None else layout.classes[group.of][1]
+        found.append(RowBlock(rows.values, by_head, _by_own(by_roles, group, size), group.of, group.sizes))
+    return [*found, *_relations(observed, z[p:], whitening, p)]
+
+
+def _by_head(
+    by_parameters: Float[AnyArray, "p r m"], by_roles: list[Float[AnyArray, "_ r m"]], group: Group, shared: int
+) -> Float[AnyArray, "h r m"]:
+    """Derivatives by the parameters and by all shared numbers, of which the group uses some."""
+    if not shared:
+        return by_parameters
+    xp, pieces = namespace(by_parameters, by_roles), {}
+    owner = np.repeat(np.arange(len(group.members)), group.counts)
+    for derivative, role in zip(by_roles, group.roles, strict=True):
+        if not role.private:
+            for first in dict.fromkeys(role.first):
+                uses = np.array([other == first for other in role.first])
+                piece = derivative if uses.all() else xp.where(uses[owner], derivative, 0.0)
+                pieces[first] = pieces[first] + piece if first in pieces else piece
+    parts, reached = [by_parameters], 0
+    for first in sorted(pieces):
+        if first > reached:
+            parts.append(xp.zeros((first - reached, *by_parameters.shape[1:])))
+        parts.append(pieces[first])
+        reached = first + pieces[first].shape[0]
+    if reached < shared:
+        parts.append(xp.zeros((shared - reached, *by_parameters.shape[1:])))
+    return xp.concatenate(parts)
+
+
+def _by_own(by_roles: list[Float[AnyArray, "_ r m"]], group: Group, size: int) -> Float[AnyArray, "k r m"] | None:
+    """Derivatives by the numbers of the component of each pose, in their order."""
+    if group.of is None:
+        return None
+    private = [one for one, role in zip(by_roles, group.roles, strict=True) if role.private]
+    xp = namespace(private)
+    own = private[0] if len(private) == 1 else xp.concatenate(private)
+    if own.shape[0] == size:
+        return own
+    start = np.repeat(np.asarray(group.start), group.counts)
+    whole = xp.zeros((size, *own.shape[1:]))
+    for first in np.unique(start):
+        piece = xp.where(start == first, own, 0.0)
+        whole = set_at(whole, slice(first, first + own.shape[0]), whole[first : first + own.shape[0]] + piece)
+    return whole
+
+
+def relation_residuals(
+    observed: Observed, parts: dict[str, Float[AnyArray, " _"]], whitening: Whitening
+) -> tuple[Float[AnyArray, " l"], dict[str, Float[AnyArray, " k"]]]:
+    """Whitened residuals of reference lengths and of certified values."""
+    xp = namespace(parts, whitening)
+    vectors = _vectors(observed, parts)
+    lengths = whitening.lengths * (xp.sqrt(xp.sum(vectors**2, axis=1)) - observed.nominal)
+    certified = {
+        name: whitening.certified[name] * (parts[name] - value) for name, (value, _) in observed.certified().items()
+    }
+    return lengths, certified
+
+
+def _vectors(observed: Observed, parts: dict[str, AnyArray]) -> Float[AnyArray, "l 3"]:
+    xp = namespace(parts)
+    if not observed.ends:
+        return xp.zeros((0, 3))
+    return xp.stack([parts[end] - parts[start] for start, end in observed.ends])
+
+
+class _Relations(NamedTuple):
+    """Where the relations of one class, or of the shared geometry, stand."""
+
+    rows: np.ndarray  # their numbers: lengths, then numbers of certified parts
+    columns: np.ndarray  # of each of their derivatives, within the component or among the shared numbers
+    of_row: np.ndarray  # the row of each derivative
+    sizes: tuple[int, ...]
+
+
+def _relations(observed: Observed, geometry: Float[AnyArray, " g"], whitening: Whitening, p: int) -> list[RowBlock]:
+    """Rows of lengths and of certified values: of each class of components, and of the shared geometry."""
+    certified = observed.certified()
+    if not observed.ends and not certified:
+        return []
+    parts, layout, xp = observed.split(geometry), observed.layout, namespace(geometry, whitening)
+    lengths, values = relation_residuals(observed, parts, whitening)
+    white = xp.concatenate([lengths, *values.values()])
+    vectors = _vectors(observed, parts)
+    size = xp.sqrt(xp.sum(vectors**2, axis=1, keepdims=True))
+    slopes = vectors / size * whitening.lengths[:, None]
+    # Derivatives as a list of numbers, in the order in which `_places` lists where they stand.
+    numbers = xp.concatenate([(-slopes).ravel(), slopes.ravel(), *(whitening.certified[name] for name in certified)])
+    found = []
+    for of, places in _places(observed, tuple(certified)).items():
+        chosen, count = white[places.rows], len(places.rows)
+        height = p + layout.shared if of is None else layout.classes[of][1]
+        whole = xp.zeros((height, count))
+        row = {number: i for i, number in enumerate(places.rows.tolist())}
+        at = (places.columns[0] + (p if of is None else 0), np.array([row[n] for n in places.of_row.tolist()]))
+        whole = set_at(whole, at, numbers[places.columns[1]])[:, None]
+        by = (whole, None) if of is None else (None, whole)
+        found.append(RowBlock(chosen[None], *by, of, places.sizes))
+    return found
+
+
+def _places(observed: Observed, certified: tuple[str, ...]) -> dict[int | None, _Relations]:
+    """Of the relations of each class: their rows sorted by component, and where their derivatives stand."""
+    layout, positions = observed.layout, observed.positions
+    starts, ends = ([positions[pair[i]] for pair in observed.ends] for i in (0, 1))
+    own = [positions[name] for name in certified]
+    count = len(observed.ends)
+    index = np.concatenate([*starts, *ends, *own, np.zeros(0, dtype=int)]).astype(int)
+    of_length = np.repeat(np.arange(count), 3)
+    row = np.concatenate([of_length, of_length, count + np.arange(sum(map(len, own)))]).astype(int)
+    located = [layout.component_of(int(i)) for i in index]
+    found = {}
+    for of in dict.fromkeys(place[0] for place in located):
+        mine = np.array([i for i, place in enumerate(located) if place[0] == of])
+        component = {int(row[i]): located[i][1] for i in mine}
+        rows = np.array(sorted(component, key=lambda number: (component[number], number)))
+        number = 1 if of is None else layout.classes[of][0]
+        sizes = np.bincount([component[n] for n in rows.tolist()], minlength=number) if of is not None else []
+        columns = np.stack([np.array([located[i][2] for i in mine]), mine])
+        found[of] = _Relations(rows, columns, row[mine], tuple(int(size) for size in sizes))
+    return found
+
+
+def _whitened(rows: Rows, root: Float[AnyArray, "m r r"]) -> Rows:
+    """Rows in standard deviations: their few derivatives by tip and geometry cost less than those by all parameters."""
+    each = namespace(rows.values, root).moveaxis(root, 0, -1)
+    return rows._replace(
+        values=times(each, rows.values[None])[0],
+        by_tip=_product(each, rows.by_tip),
+        by_rotation=None if rows.by_rotation is None else _product(each, rows.by_rotation),
+        by_unknowns={name: times(each, derivative) for name, derivative in rows.by_unknowns.items()},
+    )
+
+
+def _product(one: Float[AnyArray, "r s m"], other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
+    """The product of two matrices a pose."""
+    xp = namespace(one, other)
+    return xp.moveaxis(times(one, xp.moveaxis(other, 1, 0)), 0, 1)
+
+
+def times(matrices: Float[AnyArray, "r c m"], columns: Float[AnyArray, "k c m"]) -> Float[AnyArray, "k r m"]:
+    """One matrix a pose times its columns, written as sums: XLA computes many products of small matrices several times
+    as slowly."""
+    xp = namespace(matrices, columns)
+    return xp.stack([sum(row[c][None] * columns[:, c] for c in range(columns.shape[1])) for row in matrices], axis=1)
+
+
+def whitening_of(
+    rows: list[Rows],
+    observed: Observed,
+    of_arm: list[Float[AnyArray, "_ _ _"]],
+    least: Float[AnyArray, ""],
+) -> Whitening:
+    """From the covariance of every row: what was measured, plus what the arm's own errors make of it (``of_arm``).
+
+    ``least`` (mm) is the smallest standard uncertainty of a certified value or length that counts as such: an exact one
+    would be a row of infinite weight.
+    """
+    xp = namespace([part.values for part in rows], of_arm, least)
+    roots = tuple(inverse_cholesky(part.measured + arm) for part, arm in zip(rows, of_arm, strict=True))
+    certified = {name: 1 / xp.maximum(u, least) for name, (_, u) in observed.certified().items()}
+    return Whitening(roots, 1 / xp.maximum(observed.u, least), certified)

@@ -1,0 +1,126 @@
+"""Information matrices in arrow form: a dense head, and many small blocks that only the head couples.
+
+The unknowns are the head (parameters and shared geometry), then the blocks, class by class of one size. With H the
+head, D the blocks and C what couples each with the head, the step of the head follows from the Schur complement
+H - sum C^T D^-1 C (Brown 1958; Triggs et al. 2000, section 6), and those of the blocks by substitution: linear in their
+number. An ordinary dense matrix is a head without blocks. Leading axes may be a batch.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from ..core.linear_algebra import inverse_cholesky, solve_positive_definite
+from ..core.numpy_or_jax import AnyArray, namespace
+
+
+class Arrow(NamedTuple):
+    """A symmetric matrix in arrow form; ``crossed`` and ``own`` have one entry for each class of blocks."""
+
+    head: Float[AnyArray, "*batch h h"]
+    crossed: tuple[Float[AnyArray, "*batch K k h"], ...] = ()
+    own: tuple[Float[AnyArray, "*batch K k k"], ...] = ()
+
+    @classmethod
+    def of(cls, matrix: "Arrow | Float[AnyArray, '*batch p p']") -> "Arrow":
+        """The matrix in this form."""
+        return matrix if isinstance(matrix, Arrow) else cls(matrix)
+
+    @property
+    def shape(self) -> tuple[tuple[int, int], ...]:
+        """Number and size of the blocks of each class."""
+        return tuple((own.shape[-3], own.shape[-1]) for own in self.own)
+
+    def split(self, vector: Shaped[AnyArray, "*batch z"]) -> tuple[AnyArray, list[AnyArray]]:
+        """The head of a vector, and its blocks ``(*batch, K, k)`` class by class."""
+        return split(vector, self.head.shape[-1], self.shape)
+
+    def diagonal(self) -> Float[AnyArray, "*batch z"]:
+        """The diagonal."""
+        return joined(*(_diagonal(part) for part in (self.head, *self.own)))
+
+    def sum(self) -> Float[AnyArray, "*batch"]:
+        """The sum of what is stored, which is finite where everything is."""
+        xp = namespace(self)
+        total = xp.sum(self.head, axis=(-2, -1))
+        for part in (*self.crossed, *self.own):
+            total = total + xp.sum(part, axis=(-3, -2, -1))
+        return total
+
+    def scaled(self, scale: Float[AnyArray, "*batch z"]) -> "Arrow":
+        """S A S with a diagonal S."""
+        head, parts = self.split(scale)
+        crossed = (c * s[..., None] * head[..., None, None, :] for c, s in zip(self.crossed, parts, strict=True))
+        own = (d * s[..., :, None] * s[..., None, :] for d, s in zip(self.own, parts, strict=True))
+        return Arrow(self.head * head[..., :, None] * head[..., None, :], tuple(crossed), tuple(own))
+
+    def times(self, vector: Float[AnyArray, "*batch z"]) -> Float[AnyArray, "*batch z"]:
+        """The product with a vector."""
+        head, parts = self.split(vector)
+        top, below = (self.head @ head[..., None])[..., 0], []
+        for crossed, own, part in zip(self.crossed, self.own, parts, strict=True):
+            flat = crossed.reshape(*crossed.shape[:-3], -1, crossed.shape[-1])
+            top = top + (part.reshape(*part.shape[:-2], 1, -1) @ flat)[..., 0, :]
+            of_head = (flat @ head[..., None])[..., 0]
+            below.append((own @ part[..., None])[..., 0] + of_head.reshape(part.shape))
+        return joined(top, *below)
+
+    def damped_solution(
+        self, right: Float[AnyArray, "*batch z"], fixed: Bool[AnyArray, "*batch z"], damping: Float[AnyArray, "*batch"]
+    ) -> Float[AnyArray, "*batch z"]:
+        """Solution x of (A + damping I) x = right in the unknowns that are not fixed; 0 for those that are."""
+        xp = namespace(self, right, fixed, damping)
+        right = xp.where(fixed, 0.0, right)
+        (head_fixed, fixed_of), (head_right, rights) = self.split(fixed), self.split(right)
+        head = _damped(self.head, head_fixed, damping)
+        followers = []
+        for crossed, own, still, part in zip(self.crossed, self.own, fixed_of, rights, strict=True):
+            whitening = inverse_cholesky(_damped(own, still, damping[..., None]))
+            crossed = xp.where(still[..., None] | head_fixed[..., None, None, :], 0.0, crossed)
+            by_head, alone = whitening @ crossed, (whitening @ part[..., None])[..., 0]
+            flat = by_head.reshape(*by_head.shape[:-3], -1, by_head.shape[-1])
+            transposed = xp.swapaxes(flat, -1, -2)
+            head = head - transposed @ flat
+            head_right = head_right - (transposed @ alone.reshape(*alone.shape[:-2], -1)[..., None])[..., 0]
+            followers.append((whitening, by_head, alone))
+        found = solve_positive_definite(head, head_right)
+        below = []
+        for whitening, by_head, alone in followers:
+            rest = alone - (by_head @ found[..., None, :, None])[..., 0]
+            below.append((xp.swapaxes(whitening, -1, -2) @ rest[..., None])[..., 0])
+        return joined(found, *below)
+
+
+def split(
+    vector: Shaped[AnyArray, "*batch z"], head: int, shape: Sequence[tuple[int, int]]
+) -> tuple[AnyArray, list[AnyArray]]:
+    """The head of a vector, and its blocks ``(*batch, K, k)`` class by class."""
+    parts, first = [], head
+    for count, size in shape:
+        parts.append(vector[..., first : first + count * size].reshape(*vector.shape[:-1], count, size))
+        first += count * size
+    return vector[..., :head], parts
+
+
+def joined(head: Float[AnyArray, "*batch h"], *parts: Float[AnyArray, "*batch K k"]) -> Float[AnyArray, "*batch z"]:
+    """The vector with this head and these blocks."""
+    if not parts:
+        return head
+    flat = [part.reshape(*part.shape[:-2], -1) for part in parts]
+    return namespace(head, parts).concatenate([head, *flat], axis=-1)
+
+
+def _diagonal(matrix: Float[AnyArray, "*batch k k"]) -> Float[AnyArray, "*batch k"]:
+    return namespace(matrix).diagonal(matrix, axis1=-2, axis2=-1)
+
+
+def _damped(
+    matrix: Float[AnyArray, "*batch k k"], fixed: Bool[AnyArray, "*batch k"], damping: Any
+) -> Float[AnyArray, "*batch k k"]:
+    """With the damping on the diagonal, and ones there for what is fixed and coupled with nothing."""
+    xp, inside = namespace(matrix, fixed), ~fixed
+    matrix = xp.where(inside[..., :, None] & inside[..., None, :], matrix, 0.0)
+    added = xp.where(fixed, 1.0, damping[..., None])
+    return matrix + added[..., :, None] * np.eye(matrix.shape[-1])

@@ -1,0 +1,203 @@
+"""A problem at one point: its rows, how they are weighed, and how the unknowns follow them.
+
+This is the only place that builds rows outside of a solve. A result keeps the linearisation of its last solve, and
+whatever judges or uses a result reads it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from ..data.noise import Noise
+from ..data.observations.observation import AbstractObservation
+from ..kinematics.parameters import Parameters
+from ..model.elimination import cost_and_weights
+from ..model.observed import Observed
+from ..model.robust import Loss
+from ..model.rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at, whitening_of
+from .linear_propagation import Influence
+from .tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
+
+
+class ObservationRows(NamedTuple):
+    """The rows of one observation, r for each of its m poses."""
+
+    observation: AbstractObservation
+    poses: slice  # among all
+    values: Float[AnyArray, "r m"]  # mm and rad
+    by_tip: Float[AnyArray, "r 3 m"]
+    by_readings: Float[AnyArray, "r n m"]  # mm (or rad) a rad, or a mm of prismatic joints
+    by_seat: Float[AnyArray, "r c m"]
+    measured: Float[AnyArray, "m r r"]  # covariance of what was measured
+    root: Float[AnyArray, "m r r"]  # inverse Cholesky factor of the covariance of the rows
+    weight: Float[AnyArray, " m"]  # by a robust loss
+
+
+class Linearisation(NamedTuple):
+    """A problem linear at a point."""
+
+    observed: Observed
+    space: Parameters
+    z: Float[AnyArray, " z"]  # parameters, then the unknown geometry
+    point: PointRows
+    errors: list[ArmErrors]
+    whitening: Whitening
+    blocks: list[RowBlock]  # whitened rows of groups, then of lengths and certified values
+    weights: list[Float[AnyArray, " m"] | None]
+
+    @classmethod
+    def at(
+        cls,
+        observed: Observed,
+        space: Parameters,
+        z: Float[AnyArray, " z"],
+        *,
+        noise: Noise | None = None,
+        sigma: Float[AnyArray, ""] | float = 1.0,
+        least: Float[AnyArray, ""] | float,
+        loss: Loss | None = None,
+        prior: PriorRows | None = None,
+    ) -> "Linearisation":
+        """At parameters and geometry, by the noise of readings and seat, or where that is None by the standard
+        deviation ``sigma`` of a tip coordinate; ``least`` is the smallest u of what is certified, mm."""
+        point = rows_at(space, observed, z)
+        errors = arm_errors(point, observed)
+        xp = namespace(z, sigma)
+        of_arm = [
+            covariance_of_sigma(one, xp.asarray(sigma)) if noise is None else covariance_of_noise(one, noise)
+            for one in errors
+        ]
+        whitening = whitening_of(point.rows, observed, of_arm, xp.asarray(least))._replace(prior=prior)
+        return cls.of(observed, space, z, point, errors, whitening, loss)
+
+    @classmethod
+    def of(
+        cls,
+        observed: Observed,
+        space: Parameters,
+        z: Float[AnyArray, " z"],
+        point: PointRows,
+        errors: list[ArmErrors],
+        whitening: Whitening,
+        loss: Loss | None,
+    ) -> "Linearisation":
+        """Of rows and weights that are known."""
+        blocks = row_blocks(space, observed, z, point, whitening)
+        _, weights = cost_and_weights(blocks, loss, len(observed.layout.groups))
+        return cls(observed, space, z, point, errors, whitening, blocks, weights)
+
+    @property
+    def height(self) -> int:
+        """Number of the head's unknowns: parameters and shared geometry."""
+        return len(self.space.names) + self.observed.layout.shared
+
+    @property
+    def steps(self) -> Float[AnyArray, " z"]:
+        """Natural steps of all unknowns."""
+        xp = namespace(self.z)
+        return xp.concatenate([self.space.scale, xp.asarray(self.observed.steps)])
+
+    def influence(self, fixed: Bool[AnyArray, " z"] | None = None) -> Influence:
+        """How the unknowns follow the rows, with some fixed, such as parameters on a bound."""
+        xp = namespace(self.z, fixed)
+        fixed = xp.zeros(self.z.shape[0], dtype=bool) if fixed is None else fixed
+        steps, classes = xp.where(fixed, 0.0, self.steps), self.observed.layout.classes
+        return Influence.of(
+            self.blocks, self.weights, classes, steps, self.whitening.prior, xp.asarray(fixed)[: self.height]
+        )
+
+    def parts(self) -> list[ObservationRows]:
+        """The rows, observation by observation."""
+        xp, observed = namespace(self.z), self.observed
+
+        def each(arrays: list[AnyArray]) -> list[AnyArray]:
+            return observed.by_observation(arrays)
+
+        rows = self.point.rows
+        weights = [
+            xp.ones(block.white.shape[1]) if weight is None else weight
+            for block, weight in zip(self.blocks, self.weights, strict=True)
+        ]
+        columns = (
+            each([part.values for part in rows]),
+            each([part.by_tip for part in rows]),
+            each([error.by_readings for error in self.errors]),
+            each([error.by_seat for error in self.errors]),
+            each([xp.moveaxis(part.measured, 0, -1) for part in rows]),
+            each([xp.moveaxis(root, 0, -1) for root in self.whitening.roots]),
+            each(weights[: len(rows)]),
+        )
+        found = []
+        for one, poses, *values in zip(observed.observations, observed.slices, *columns, strict=True):
+            values[4], values[5] = (xp.moveaxis(matrices, -1, 0) for matrices in values[4:6])
+            found.append(ObservationRows(one, poses, *values))
+        return found
+
+    def white(self) -> list[Float[AnyArray, "r m"]]:
+        """Whitened residuals of each observation."""
+        groups = len(self.observed.layout.groups)
+        return self.observed.by_observation([block.white for block in self.blocks[:groups]])
+
+    def by_head(self) -> list[Float[AnyArray, "h r m"]]:
+        """Whitened derivatives of each observation by parameters and shared geometry."""
+        groups = len(self.observed.layout.groups)
+        return self.observed.by_observation([_present(block.by_head) for block in self.blocks[:groups]])
+
+    def by_private(self) -> list[Float[AnyArray, "k r m"]]:
+        """Whitened derivatives of each observation by the private geometry that it alone uses."""
+        found: list[AnyArray] = [np.zeros((0, 0, 0))] * len(self.observed.observations)
+        for group, block in zip(self.observed.layout.groups, self.blocks, strict=False):
+            size = sum(role.size for role in group.roles if role.private)
+            first = 0
+            for i, (number, count) in enumerate(zip(group.members, group.counts, strict=True)):
+                mine = slice(first, first + count)
+                if block.by_own is None:
+                    found[number] = namespace(block.white).zeros((0, *block.white[:, mine].shape))
+                else:
+                    found[number] = block.by_own[group.start[i] : group.start[i] + size, :, mine]
+                first += count
+        return found
+
+    def dense(self) -> list[Float[AnyArray, "z r m"]]:
+        """Whitened derivatives of each observation by all unknowns; as large as all of them together."""
+        found = []
+        for number, (head, own) in enumerate(zip(self.by_head(), self.by_private(), strict=True)):
+            whole = namespace(head).zeros((self.z.shape[0], *head.shape[1:]))
+            whole = set_at(whole, slice(0, self.height), head)
+            index = len(self.space.names) + self._private_of(number)
+            found.append(set_at(whole, index, own) if len(index) else whole)
+        return found
+
+    def _private_of(self, number: int) -> np.ndarray:
+        """Indices of the private geometry of an observation."""
+        for group in self.observed.layout.groups:
+            if number in group.members:
+                at = group.members.index(number)
+                parts = [np.arange(role.size) + role.first[at] for role in group.roles if role.private]
+                return np.concatenate(parts) if parts else np.zeros(0, dtype=int)
+        raise IndexError(number)
+
+    def relations(self) -> tuple[Float[np.ndarray, "l z"], Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
+        """Derivatives of reference lengths and certified values by all unknowns, their residuals (mm, rad), and their
+        standard uncertainties."""
+        observed, p = self.observed, len(self.space.names)
+        positions, parts = observed.positions, observed.split(np.asarray(self.z)[p:])
+        unit, rows, residuals, u = np.eye(len(self.z)), [np.zeros((0, len(self.z)))], [np.zeros(0)], [np.zeros(0)]
+        for (start, end), nominal, own in zip(observed.ends, observed.nominal, observed.u, strict=True):
+            between = np.asarray(parts[end] - parts[start])
+            size = np.linalg.norm(between)
+            rows.append(((between / size) @ (unit[p + positions[end]] - unit[p + positions[start]]))[None])
+            residuals.append(np.reshape(size - nominal, 1))
+            u.append(np.reshape(own, 1))
+        for name, (value, own) in observed.certified().items():
+            rows.append(unit[p + positions[name]])
+            residuals.append(np.asarray(parts[name] - value))
+            u.append(np.asarray(own))
+        return np.concatenate(rows), np.concatenate(residuals), np.concatenate(u)
+
+
+def _present(rows: Float[AnyArray, "h r m"] | None) -> Float[AnyArray, "h r m"]:
+    assert rows is not None  # those of poses always depend on the parameters
+    return rows
