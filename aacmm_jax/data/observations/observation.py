@@ -83,7 +83,6 @@ class AbstractObservation(Module):
     by_pose: ClassVar[tuple[str, ...]] = ("q",)  # fields with one row a pose
     table: ClassVar[str]  # name of its tables in a manifest
     entries: ClassVar[tuple[Entry, ...]]
-    alike: ClassVar[Any] = None
     rows: eqx.AbstractClassVar[int]
     name: eqx.AbstractVar[str]
     target: eqx.AbstractVar[str]

@@ -54,7 +54,6 @@ class Socket(AbstractObservation):
         TARGET,
     )
     rows: ClassVar[int] = 3
-    alike: ClassVar[tuple] = ()
     q: Float[AnyArray, "m n"]
     name: str = eqx.field(static=True)
     target: str = eqx.field(static=True)
@@ -63,16 +62,6 @@ class Socket(AbstractObservation):
         self.name = checked_name(name, "a socket")
         self.q = checked_readings(f"socket '{name}'", q)
         self.target = checked_target(target)
-
-    @classmethod
-    def stacked(cls, observations):
-        import copy
-
-        changed = copy.copy(observations[0])
-        object.__setattr__(
-            changed, "q", namespace([o.q for o in observations]).concatenate([o.q for o in observations])
-        )
-        return changed
 
     @property
     def position(self) -> str:
@@ -90,7 +79,7 @@ class Socket(AbstractObservation):
         identity = each_pose(namespace(tips, unknowns).asarray(np.eye(3)), self.q.shape[0])
         position = unknowns[self.position]
         return Rows(
-            values=tips.position - position,
+            values=tips.position - position[:, None],
             by_tip=identity,
             by_unknowns={self.position: -identity},
             measured=no_covariance(3, self.q.shape[0]),
