@@ -235,7 +235,8 @@ def linear_rows(
 
 def _residual(observation: AbstractObservation, forward: ForwardPass, rows: slice, parts: dict[str, AnyArray]) -> Rows:
     # Through the class: a bound method of Equinox is a module made anew, which takes as long as a socket's residual.
-    return type(observation).residual(observation, _tips(forward, rows), parts)
+    unknowns = {name: parts[name][:, None] for name in observation.unknowns}
+    return type(observation).residual(observation, _tips(forward, rows), unknowns)
 
 
 def residual_rows(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> list[Rows]:

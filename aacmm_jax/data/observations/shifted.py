@@ -1,11 +1,11 @@
 """An observation with errors other than those it was recorded with: what repeated calibrations are made of."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from ...core.numpy_or_jax import AnyArray
+from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import AbstractObservation, Rows, Tips, Unknowns
 
 
@@ -64,6 +64,23 @@ class ShiftedObservation(AbstractObservation):
     @property
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         return {name: (self.values[name], u) for name, (_, u) in self.observation.certified.items()}
+
+    @property
+    def linear(self) -> bool:
+        return self.observation.linear
+
+    @property
+    def alike(self) -> Hashable | None:
+        inside = self.observation.alike
+        return None if inside is None else (type(self.observation), inside)
+
+    @classmethod
+    def stacked(cls, observations: Sequence["ShiftedObservation"]) -> "ShiftedObservation":
+        first = observations[0]
+        inside = first.observation.stacked([one.observation for one in observations])
+        q, shift = [one.q for one in observations], [one.shift for one in observations]
+        xp = namespace(q, shift)
+        return cls(inside, xp.concatenate(q), xp.concatenate(shift, axis=1), first.values)
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         return self.observation.start(tips, offset)
