@@ -10,7 +10,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from types import NoneType, UnionType
-from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import numpy as np
@@ -119,9 +119,9 @@ class AbstractObservation(Module):
         return None
 
     @classmethod
-    def stacked(cls, observations: Sequence[Self]) -> Self:
+    def stacked(cls, observations: Sequence["AbstractObservation"]) -> "AbstractObservation":
         """The poses of observations that are `alike` as those of one, whose residual takes a column of unknowns for
-        each pose: by the names of the first observation, in the order of its unknowns.
+        each pose, by the names of the first observation: the unknowns of all have one order.
 
         Only its residual means something: names, certified values and starts are those of each observation.
         """

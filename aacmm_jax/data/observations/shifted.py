@@ -1,6 +1,7 @@
 """An observation with errors other than those it was recorded with: what repeated calibrations are made of."""
 
 from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -75,12 +76,13 @@ class ShiftedObservation(AbstractObservation):
         return None if inside is None else (type(self.observation), inside)
 
     @classmethod
-    def stacked(cls, observations: Sequence["ShiftedObservation"]) -> "ShiftedObservation":
-        first = observations[0]
-        inside = first.observation.stacked([one.observation for one in observations])
-        q, shift = [one.q for one in observations], [one.shift for one in observations]
-        xp = namespace(q, shift)
-        return cls(inside, xp.concatenate(q), xp.concatenate(shift, axis=1), first.values)
+    def stacked(cls, observations: Sequence[AbstractObservation]) -> AbstractObservation:
+        shifted: list[Any] = list(observations)
+        inside, shift = [one.observation for one in shifted], [one.shift for one in shifted]
+        changed = super().stacked(observations)
+        object.__setattr__(changed, "observation", inside[0].stacked(inside))
+        object.__setattr__(changed, "shift", namespace(shift).concatenate(shift, axis=1))
+        return changed
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         return self.observation.start(tips, offset)
