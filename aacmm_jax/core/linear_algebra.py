@@ -33,6 +33,22 @@ def length_and_direction(
     return xp.where(square == 0, 0.0, size), vectors / size[None]
 
 
+def products_by_column(
+    matrices: Float[AnyArray, "r c p"], columns: Float[AnyArray, "c *k m"]
+) -> Float[AnyArray, "r *k m"]:
+    """Matrices times columns: one matrix for each of the m (p = m), or one for all (p = 1).
+
+    In JAX as sums over a few components: XLA computes many products of small matrices several times as slowly.
+    """
+    if matrices.shape[2] == 1 and namespace(matrices, columns) is np:
+        flat = matrices[:, :, 0] @ columns.reshape(len(columns), -1)
+        return flat.reshape(len(flat), *columns.shape[1:])
+    rows, components, p = matrices.shape
+    each = matrices.reshape(rows, components, *(1,) * (columns.ndim - 2), p)
+    products = [each[:, i] * columns[i][None] for i in range(components)]
+    return sum(products[1:], products[0])
+
+
 def solve_positive_definite(
     matrix: Float[AnyArray, "*batch p p"], right: Float[AnyArray, "*batch p"]
 ) -> Float[AnyArray, "*batch p"]:

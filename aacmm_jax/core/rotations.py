@@ -1,6 +1,7 @@
 """Rotations: their vectors (axis times angle, rad), matrices and derivatives, and the frame that fits points best.
 
 A frame is six numbers: the rotation vector, and the origin in mm. It takes coordinates y in the frame to R y + origin.
+Where a function takes vectors ``(3, ...)``, these are columns, and matrices of them are ``(3, 3, ...)``.
 """
 
 import numpy as np
@@ -10,6 +11,9 @@ from .linear_algebra import semidefinite_eigen
 from .numpy_or_jax import AnyArray, namespace
 
 _SMALL = 1e-6  # rad^2: below it the series are exact to rounding
+# The matrix W of a cross product, W v = w x v, by the components of w: its nine entries as rows.
+_CROSS = np.zeros((9, 3))
+_CROSS[[7, 2, 3], [0, 1, 2]], _CROSS[[5, 6, 1], [0, 1, 2]] = 1.0, -1.0
 
 
 def cross(u: Float[AnyArray, "... 3 m"], v: Float[AnyArray, "... 3 m"]) -> Float[AnyArray, "... 3 m"]:
@@ -18,16 +22,15 @@ def cross(u: Float[AnyArray, "... 3 m"], v: Float[AnyArray, "... 3 m"]) -> Float
     return namespace(u, v).stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=-2)
 
 
-def _skew(w: Float[AnyArray, " 3"]) -> Float[AnyArray, "3 3"]:
-    xp = namespace(w)
-    zero = xp.zeros_like(w[0])
-    return xp.stack([xp.stack([zero, -w[2], w[1]]), xp.stack([w[2], zero, -w[0]]), xp.stack([-w[1], w[0], zero])])
+def cross_matrix(w: Float[AnyArray, "3 ..."]) -> Float[AnyArray, "3 3 ..."]:
+    """The matrices that take vectors v to the cross products w x v."""
+    return (namespace(w).asarray(_CROSS) @ w.reshape(3, -1)).reshape(3, 3, *w.shape[1:])
 
 
-def _coefficients(w: Float[AnyArray, " 3"]) -> tuple[AnyArray, AnyArray, AnyArray]:
+def _coefficients(w: Float[AnyArray, "3 ..."]) -> tuple[AnyArray, AnyArray, AnyArray]:
     """sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 of the angle t; by series near 0."""
     xp = namespace(w)
-    square = xp.sum(w**2)
+    square = xp.sum(w**2, axis=0)
     small = square < _SMALL
     safe = xp.where(small, 1.0, square)
     t = xp.sqrt(safe)
@@ -38,25 +41,33 @@ def _coefficients(w: Float[AnyArray, " 3"]) -> tuple[AnyArray, AnyArray, AnyArra
     )
 
 
-def rotation_matrix(w: Float[AnyArray, " 3"]) -> Float[AnyArray, "3 3"]:
+def rotation_matrix(w: Float[AnyArray, "3 ..."]) -> Float[AnyArray, "3 3 ..."]:
     """The rotation by the angle ``|w|`` about the axis ``w`` (Rodrigues 1840)."""
     sine, cosine, _ = _coefficients(w)
-    skew = _skew(w)
-    return namespace(w).asarray(np.eye(3)) + sine * skew + cosine * (skew @ skew)
+    return _polynomial(w, sine, cosine)
 
 
-def rotation_derivative(w: Float[AnyArray, " 3"]) -> Float[AnyArray, "3 3"]:
+def rotation_derivative(w: Float[AnyArray, "3 ..."]) -> Float[AnyArray, "3 3 ..."]:
     """J with exp(w + dw) = exp(J dw) exp(w) to first order: the left Jacobian of the rotation group."""
     _, cosine, cubic = _coefficients(w)
-    skew = _skew(w)
-    return namespace(w).asarray(np.eye(3)) + cosine * skew + cubic * (skew @ skew)
+    return _polynomial(w, cosine, cubic)
+
+
+def _polynomial(
+    w: Float[AnyArray, "3 ..."], first: Float[AnyArray, "..."], second: Float[AnyArray, "..."]
+) -> Float[AnyArray, "3 3 ..."]:
+    """I + first W + second W^2, with W the matrix of the cross product by w, and W^2 = w w^T - |w|^2 I."""
+    xp = namespace(w, first, second)
+    identity = xp.asarray(np.eye(3).reshape(3, 3, *(1,) * (w.ndim - 1)))
+    diagonal = (1 - second * xp.sum(w**2, axis=0))[None, None]
+    return diagonal * identity + first[None, None] * cross_matrix(w) + second[None, None] * (w[:, None] * w[None])
 
 
 def inverse_frame(frame: Float[AnyArray, " 6"]) -> tuple[Float[AnyArray, " 6"], Float[AnyArray, "6 6"]]:
     """The outer frame as seen in the given one, and the derivatives of its six numbers by those of the given one."""
     xp, rotation, origin = namespace(frame), rotation_matrix(frame[:3]).T, frame[3:]
     identity, none = xp.asarray(np.eye(3)), xp.zeros((3, 3))
-    by_rotation = -rotation @ _skew(origin) @ rotation_derivative(frame[:3])
+    by_rotation = -rotation @ cross_matrix(origin) @ rotation_derivative(frame[:3])
     derivative = xp.concatenate(
         [xp.concatenate([-identity, none], axis=1), xp.concatenate([by_rotation, -rotation], axis=1)]
     )

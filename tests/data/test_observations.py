@@ -54,7 +54,11 @@ ALL = {
 def unknowns_of(observation):
     found = observation.start(TIPS, np.zeros(3))
     random = np.random.default_rng(2)
-    return {name: np.asarray(value) + 1e-2 * random.normal(size=np.shape(value)) for name, value in found.items()}
+    return columns({name: value + 1e-2 * random.normal(size=np.shape(value)) for name, value in found.items()})
+
+
+def columns(unknowns):
+    return {name: np.asarray(value)[:, None] for name, value in unknowns.items()}
 
 
 def test_every_kind_is_here():
@@ -72,9 +76,9 @@ def test_shapes_and_derivatives(name):
     assert rows.measured.shape == (POSES, observation.rows, observation.rows)
     assert set(rows.by_unknowns) == set(observation.unknowns)
     for part, units in observation.unknowns.items():
-        assert unknowns[part].shape == (len(units),)
+        assert unknowns[part].shape == (len(units), 1)
         for i in range(len(units)):
-            step = 1e-6 * max(1.0, abs(unknowns[part][i])) * np.eye(len(units))[i]
+            step = 1e-6 * max(1.0, abs(unknowns[part][i, 0])) * np.eye(len(units))[:, i : i + 1]
             plus, minus = (
                 observation.residual(TIPS, unknowns | {part: unknowns[part] + s * step}).values for s in (1, -1)
             )
@@ -116,7 +120,7 @@ SIMULATED = [
 def test_a_tip_in_the_centre_is_at_no_distance_in_no_direction(name, part):
     """A plan with a sphere of radius 0 begins there."""
     observation = to_numpy(ALL[name])
-    unknowns = unknowns_of(observation) | {part: TIPS.position[:, 0]}
+    unknowns = unknowns_of(observation) | {part: TIPS.position[:, :1]}
     with np.errstate(all="raise"):
         rows = observation.residual(TIPS, unknowns)
     assert np.isfinite(rows.values).all()
@@ -140,7 +144,7 @@ def test_starts_are_exact_for_exact_data(paper_arm):
             np.testing.assert_allclose(offset, (10, 20, 80), atol=1e-3)
             moved = tips.position + np.einsum("pcm,p->cm", np.stack(axes), offset - probe)
             tips = tips._replace(position=moved)
-        assert np.abs(observation.residual(tips, found).values).max() < 1e-3, observation.kind
+        assert np.abs(observation.residual(tips, columns(found)).values).max() < 1e-3, observation.kind
 
 
 @pytest.mark.slow
@@ -167,7 +171,7 @@ def test_platform_frames_are_exact_for_exact_data(seed):
     found = platform_frames(observations, tips)
     assert set(found) == {f"placement {name}" for name in placements} | {"index 1", "index 2"}
     for observation, own in zip(observations, tips, strict=True):
-        assert np.abs(observation.residual(own, found).values).max() < 1e-4, observation.name
+        assert np.abs(observation.residual(own, columns(found)).values).max() < 1e-4, observation.name
     expected = rotation_matrix(frames[3][:3])
     np.testing.assert_allclose(rotation_matrix(found["index 1"][:3]), expected, atol=1e-6)
     assert platform_frames(observations[:1], tips[:1]) == {}
@@ -209,7 +213,7 @@ def test_every_number_of_a_geometry_can_be_read(name):
     observation = to_numpy(ALL[name])
     for part, values in unknowns_of(observation).items():
         if part in observation.unknowns:
-            quantities = observation.quantities(part, values)
+            quantities = observation.quantities(part, values[:, 0])
             assert {quantity.unit for quantity in quantities} <= {"mm", "rad", "1"}
             assert len({quantity.says for quantity in quantities}) == len(quantities)
             count = sum(len(quantity.values) for quantity in quantities)

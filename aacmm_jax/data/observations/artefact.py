@@ -10,8 +10,10 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers
 from ...core.errors import InputError, nearest
+from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix, rotation_vector
+from .columns import each_pose, no_covariance
 from .frames import moved, placed
 from .observation import (
     FRAME,
@@ -29,9 +31,7 @@ from .observation import (
     checked_scalar,
     checked_target,
     checked_values,
-    each_pose,
     is_exact,
-    no_covariance,
     numbers,
 )
 
@@ -197,20 +197,22 @@ class Artefact(AbstractObservation):
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, owner, m = namespace(tips, unknowns, self.coordinates), np.array(self.owner), self.q.shape[0]
-        coordinates = unknowns[self.shape].reshape(-1, 3) if self.free else self.coordinates
-        points, by_frame = placed(unknowns[self.frame], coordinates[owner].T)
-        outer = xp.asarray(np.eye(3))
+        coordinates = self.coordinates.reshape(-1, 1)
+        if self.free:
+            coordinates = unknowns[self.shape]
+        p = coordinates.shape[1]
+        held = coordinates.reshape(-1, 3, p)[owner, :, np.arange(m) if p > 1 else 0].T
+        points, by_frame, rotation = placed(unknowns[self.frame], held)
         by_unknowns = {}
         if self.index is not None:
-            outer = rotation_matrix(unknowns[self.platform][:3])
-            points, by_platform = placed(unknowns[self.platform], points)
-            by_frame = xp.einsum("cd,kdm->kcm", outer, by_frame)
+            points, by_platform, outer = placed(unknowns[self.platform], points)
+            by_frame = products_by_column(outer, by_frame.swapaxes(0, 1)).swapaxes(0, 1)
+            rotation = products_by_column(outer, rotation)
             by_unknowns[self.platform] = -by_platform
         by_unknowns[self.frame] = -by_frame
         if self.free:
-            rotation = outer @ rotation_matrix(unknowns[self.frame][:3])
             chosen = xp.asarray((owner[None, :] == np.arange(len(self.names))[:, None]).astype(float))
-            each = -chosen[:, None, None, :] * rotation.T[None, :, :, None]
+            each = -chosen[:, None, None, :] * rotation.swapaxes(0, 1)[None]
             by_unknowns[self.shape] = each.reshape(-1, 3, m)
         return Rows(
             values=tips.position - points,

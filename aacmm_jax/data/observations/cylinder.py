@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float, Int
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import length_and_direction, semidefinite_eigen, solve_positive_definite
+from ...core.linear_algebra import length_and_direction, products_by_column, semidefinite_eigen, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace, scan
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
+from .columns import as_columns, variances
 from .frames import moved, turned_z
 from .observation import (
     READINGS,
@@ -84,6 +85,7 @@ class Cylinder(AbstractObservation):
         TARGET,
     )
     rows: ClassVar[int] = 1
+    stated: ClassVar[tuple[str, ...]] = ("diameter", "stylus", "u", "form")
     q: Float[AnyArray, "m n"]
     diameter: Float[AnyArray, ""] | None  # mm
     stylus: Float[AnyArray, ""]  # mm
@@ -166,19 +168,22 @@ class Cylinder(AbstractObservation):
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         return {self.size: (self.radius[None], self.u[None])} if self.free and self.radius is not None else {}
 
+    @property
+    def alike(self) -> Hashable | None:
+        return self.inside, self.free, self.diameter is None
+
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         axis, radius = fitted_cylinder(tips.position, self.radius)
         return {self.axis: axis} | ({self.size: radius[None]} if self.free else {})
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         distance, direction, by_axis = distances(tips.position, unknowns[self.axis])
-        xp, m = namespace(distance, unknowns, self.form), self.q.shape[0]
+        xp, m = namespace(distance), self.q.shape[0]
         radius: Any = unknowns[self.size][0] if self.free else self.radius
         by_unknowns = {self.axis: by_axis[:, None]}
         if self.free:
             by_unknowns[self.size] = -xp.ones((1, 1, m))
-        measured = xp.broadcast_to(xp.asarray(self.form**2), (m, 1, 1))
-        return Rows((distance - radius)[None], direction[None], by_unknowns, measured)
+        return Rows((distance - radius)[None], direction[None], by_unknowns, variances(self.form, m))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         where = f"cylinder '{self.name}'"
@@ -215,20 +220,20 @@ class Cylinder(AbstractObservation):
 
 
 def distances(
-    tips: Float[AnyArray, "3 m"], axis: Float[AnyArray, " 4"]
+    tips: Float[AnyArray, "3 m"], axis: Float[AnyArray, "4 ..."]
 ) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "4 m"]]:
-    """Distances of tips from an axis, mm, the unit vectors from the axis to the tips, and the derivatives of the
-    distances by the axis' numbers."""
-    xp = namespace(tips, axis)
+    """Distances of tips from an axis (or from one each), mm, the unit vectors from the axis to the tips, and the
+    derivatives of the distances by the axis' numbers."""
+    xp, axis = namespace(tips, axis), as_columns(axis)
     w = xp.concatenate([axis[:2], xp.zeros_like(axis[:1])])
-    turned = rotation_matrix(w)
-    between = turned.T[:2] @ tips - axis[2:, None]
+    across_axis = rotation_matrix(w)[:, :2]
+    between = products_by_column(across_axis.swapaxes(0, 1), tips) - axis[2:]
     distance, across = length_and_direction(between)
-    direction = turned[:, :2] @ across
-    # A small rotation v of the axes moves a tip by -v x t in them.
-    small = [rotation_derivative(w)[:, i : i + 1] + xp.zeros_like(tips) for i in range(2)]
-    by_rotation = [-xp.sum(direction * cross(v, tips), axis=0) for v in small]
-    return distance, direction, xp.concatenate([xp.stack(by_rotation), -across])
+    direction = products_by_column(across_axis, across)
+    # A small rotation v of the axes moves a tip t by -v x t in them, and the distance by -v.(t x direction).
+    small = rotation_derivative(w)[:, :2].swapaxes(0, 1)
+    by_rotation = -products_by_column(small, cross(tips, direction))
+    return distance, direction, xp.concatenate([by_rotation, -across])
 
 
 def fitted_cylinder(

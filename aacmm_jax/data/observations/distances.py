@@ -1,7 +1,7 @@
 """Distances of the tip from an unknown pivot: a telescoping ball bar, a draw wire."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,6 +12,7 @@ from ...core.arrays import Numbers, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import length_and_direction, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
+from .columns import variances
 from .frames import moved
 from .observation import (
     POINT,
@@ -108,6 +109,10 @@ class Distances(AbstractObservation):
     def fixes_scale(self) -> bool:
         return True
 
+    @property
+    def alike(self) -> Hashable | None:
+        return ()
+
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         xp = namespace(tips, self.values)
         middle = xp.mean(tips.position, axis=1, keepdims=True)
@@ -123,7 +128,7 @@ class Distances(AbstractObservation):
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.values), self.q.shape[0]
-        between = tips.position - unknowns[self.pivot][:, None]
+        between = tips.position - unknowns[self.pivot]
         distance, towards = length_and_direction(between)
         direction = towards[None]
         by_unknowns = {self.pivot: -direction.swapaxes(0, 1)}
@@ -131,8 +136,7 @@ class Distances(AbstractObservation):
         if self.constant:
             values = values + unknowns[self.zero][0]
             by_unknowns[self.zero] = -xp.ones((1, 1, m))
-        measured = xp.reshape(xp.asarray(self.u**2), (m, 1, 1))
-        return Rows((distance - values)[None], direction, by_unknowns, measured)
+        return Rows((distance - values)[None], direction, by_unknowns, variances(self.u, m))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         needs = "pivot and constant need five" if self.constant else "pivot needs four"

@@ -1,24 +1,44 @@
 """Residuals of tips from points that are known in an unknown frame, which several kinds of observations share."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
-from ...core.linear_algebra import solve_positive_definite
+from ...core.linear_algebra import products_by_column, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import cross, fitted_frame, rotation_derivative, rotation_matrix
+from ...core.rotations import cross_matrix, fitted_frame, rotation_derivative, rotation_matrix
+from .columns import as_columns, each_pose
 from .observation import Tips
 
 
-def placed(
-    frame: Float[AnyArray, " 6"], coordinates: Float[AnyArray, "3 m"]
-) -> tuple[Float[AnyArray, "3 m"], Float[AnyArray, "6 3 m"]]:
-    """Points of a frame in the frame around it, mm, and their derivatives by the six numbers of the frame."""
-    xp = namespace(frame, coordinates)
-    turned = rotation_matrix(frame[:3]) @ coordinates
-    axes = rotation_derivative(frame[:3])
-    identity = xp.broadcast_to(xp.asarray(np.eye(3))[:, :, None], (3, 3, coordinates.shape[1]))
-    by_rotation = [cross(axes[:, i : i + 1] + xp.zeros_like(turned), turned) for i in range(3)]
-    return turned + frame[3:, None], xp.concatenate([xp.stack(by_rotation), identity])
+class Placed(NamedTuple):
+    """Points of a frame as they are in the frame around it; p is 1 for one frame, m for a frame of each point."""
+
+    points: Float[AnyArray, "3 m"]  # mm
+    by_frame: Float[AnyArray, "6 3 m"]  # derivatives by the six numbers of the frame
+    rotation: Float[AnyArray, "3 3 p"]
+
+
+def placed(frame: Float[AnyArray, "6 ..."], coordinates: Float[AnyArray, "3 m"]) -> Placed:
+    """Points (mm) of a frame, ``(6,)`` or ``(6, 1)``, or of a frame each ``(6, m)``, in the frame around it."""
+    xp, columns, m = namespace(frame, coordinates), as_columns(frame), coordinates.shape[1]
+    rotation = rotation_matrix(columns[:3])
+    turned = products_by_column(rotation, coordinates)
+    # A change of component k turns the points by a small rotation about column k of the derivative.
+    small = cross_matrix(rotation_derivative(columns[:3]))  # (3, 3, k, p)
+    by_rotation = products_by_column(xp.moveaxis(small, 2, 0).reshape(9, 3, -1), turned).reshape(3, 3, m)
+    identity = each_pose(xp.asarray(np.eye(3)), m)
+    return Placed(turned + columns[3:], xp.concatenate([by_rotation, identity]), rotation)
+
+
+def turned_covariances(
+    rotation: Float[AnyArray, "3 3 p"], covariance: Float[AnyArray, "m 3 3"]
+) -> Float[AnyArray, "m 3 3"]:
+    """Covariances R C R^T of what is turned, by one rotation (p = 1) or by one each (p = m)."""
+    # As one product with the nine numbers of a covariance: for one rotation that takes an eighth of the time of two.
+    both = (rotation[:, None, :, None] * rotation[None, :, None, :]).reshape(9, 9, -1)
+    return products_by_column(both, covariance.reshape(-1, 9).T).T.reshape(-1, 3, 3)
 
 
 def seen_from(frame: Float[AnyArray, " 6"], points: Float[AnyArray, "m 3"]) -> Float[AnyArray, "m 3"]:

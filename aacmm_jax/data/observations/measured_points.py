@@ -1,7 +1,7 @@
 """Points of the tip as an instrument saw them: a laser tracker, a coordinate measuring machine, a camera."""
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,8 +11,9 @@ from jaxtyping import Float
 from ...core.arrays import Numbers
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import fitted_frame, rotation_matrix
-from .frames import frame_and_offset, placed, seen_from
+from ...core.rotations import fitted_frame
+from .columns import each_pose
+from .frames import frame_and_offset, placed, seen_from, turned_covariances
 from .observation import (
     FRAME,
     READINGS,
@@ -28,7 +29,6 @@ from .observation import (
     checked_readings,
     checked_target,
     checked_values,
-    each_pose,
     numbers,
     offset_of,
 )
@@ -64,8 +64,12 @@ class AbstractMeasured(AbstractObservation):
     def fixes_scale(self) -> bool:
         return True
 
+    @property
+    def alike(self) -> Hashable | None:
+        return ()
+
     @abc.abstractmethod
-    def without_errors(self, tips: Tips, unknowns: Unknowns) -> "AbstractMeasured":
+    def without_errors(self, tips: Tips, unknowns: Mapping[str, Float[AnyArray, " k"]]) -> "AbstractMeasured":
         """The same observation, had the instrument measured exactly these tips."""
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -138,17 +142,16 @@ class MeasuredPoints(AbstractMeasured):
         return {self.frame: frame, offset_of(self.target): found}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        xp, frame = namespace(tips, unknowns, self.points), unknowns[self.frame]
-        points, by_frame = placed(frame, self.points.T)
-        rotation = rotation_matrix(frame[:3])
+        xp = namespace(tips, unknowns, self.points)
+        seen = placed(unknowns[self.frame], self.points.T)
         return Rows(
-            values=tips.position - points,
+            values=tips.position - seen.points,
             by_tip=each_pose(xp.asarray(np.eye(3)), self.q.shape[0]),
-            by_unknowns={self.frame: -by_frame},
-            measured=rotation @ self.covariance @ rotation.T,
+            by_unknowns={self.frame: -seen.by_frame},
+            measured=turned_covariances(seen.rotation, self.covariance),
         )
 
-    def without_errors(self, tips: Tips, unknowns: Unknowns) -> "MeasuredPoints":
+    def without_errors(self, tips: Tips, unknowns: Mapping[str, Float[AnyArray, " k"]]) -> "MeasuredPoints":
         return eqx.tree_at(lambda o: o.points, self, seen_from(unknowns[self.frame], tips.position.T))
 
 

@@ -9,9 +9,11 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
+from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix, rotation_vector
-from .frames import frame_and_offset, placed, seen_from
+from .columns import each_pose, variances
+from .frames import frame_and_offset, placed, seen_from, turned_covariances
 from .measured_points import MEASURED, AbstractMeasured
 from .observation import (
     FRAME,
@@ -66,6 +68,7 @@ class MeasuredTransforms(AbstractMeasured):
         Entry("rotations", "measured axes of the target, as columns", "1", ("pose", "axis", "axis_2"), required=True),
         Entry("u_angle", "standard uncertainty of an orientation about each axis", "rad", required=True),
     )
+    stated: ClassVar[tuple[str, ...]] = ("u_angle",)
     rows: ClassVar[int] = 6
     q: Float[AnyArray, "m n"]
     points: Float[AnyArray, "m 3"]
@@ -123,26 +126,26 @@ class MeasuredTransforms(AbstractMeasured):
         return {self.frame: frame, offset_of(self.target): found, self.orientation: rotation_vector(turned)}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        xp, frame, m = namespace(tips, unknowns, self.points), unknowns[self.frame], self.q.shape[0]
-        points, by_frame = placed(frame, self.points.T)
-        station, target = rotation_matrix(frame[:3]), rotation_matrix(unknowns[self.orientation])
-        axes = xp.stack(tips.axes, axis=1)  # (3, 3, m)
-        predicted = xp.einsum("cim,ij->cjm", axes, target)
-        seen = xp.einsum("ci,mij->cjm", station, self.rotations)
-        angle, left, right = _logarithm(xp.einsum("cjm,djm->cdm", predicted, seen))
-        by_station = -xp.einsum("cdm,dk->kcm", right, rotation_derivative(frame[:3]))
-        inside = xp.einsum("cim,ik->ckm", axes, rotation_derivative(unknowns[self.orientation]))
-        by_orientation = xp.einsum("cdm,dkm->kcm", left, inside)
+        xp, m = namespace(tips, unknowns, self.points), self.q.shape[0]
+        frame, orientation = unknowns[self.frame], unknowns[self.orientation]
+        place = placed(frame, self.points.T)
+        axes = xp.stack(tips.axes)  # (i, 3, m): the axis i
+        # The target's axes j as the arm has them, and as they were seen: (j, 3, m) and (3, j, m).
+        predicted = products_by_column(rotation_matrix(orientation).swapaxes(0, 1), axes)
+        seen = products_by_column(place.rotation, xp.moveaxis(self.rotations, 0, -1))
+        angle, left, right = _logarithm(products_by_column(predicted.swapaxes(0, 1), seen.swapaxes(0, 1)))
+        by_station = -products_by_column(rotation_derivative(frame[:3]).swapaxes(0, 1), right.swapaxes(0, 1))
+        inside = products_by_column(rotation_derivative(orientation).swapaxes(0, 1), axes)
+        by_orientation = products_by_column(left, inside.swapaxes(0, 1)).swapaxes(0, 1)
         none = xp.zeros((3, 3, m))
-        identity = xp.broadcast_to(xp.asarray(np.eye(3))[:, :, None], (3, 3, m))
-        covariance = station @ self.covariance @ station.T
-        angular = xp.broadcast_to(self.u_angle**2 * xp.asarray(np.eye(3)), (m, 3, 3))
+        covariance = turned_covariances(place.rotation, self.covariance)
+        angular = variances(self.u_angle, m) * xp.asarray(np.eye(3))[None]
         square = xp.zeros((m, 3, 3))
         return Rows(
-            values=xp.concatenate([tips.position - points, angle]),
-            by_tip=xp.concatenate([identity, none]),
+            values=xp.concatenate([tips.position - place.points, angle]),
+            by_tip=xp.concatenate([each_pose(xp.asarray(np.eye(3)), m), none]),
             by_unknowns={
-                self.frame: xp.concatenate([-by_frame, xp.concatenate([by_station, none])], axis=1),
+                self.frame: xp.concatenate([-place.by_frame, xp.concatenate([by_station, none])], axis=1),
                 self.orientation: xp.concatenate([none, by_orientation], axis=1),
             },
             measured=xp.concatenate(
@@ -151,7 +154,7 @@ class MeasuredTransforms(AbstractMeasured):
             by_rotation=xp.concatenate([none, left]),
         )
 
-    def without_errors(self, tips: Tips, unknowns: Unknowns) -> "MeasuredTransforms":
+    def without_errors(self, tips: Tips, unknowns: Mapping[str, Float[AnyArray, " k"]]) -> "MeasuredTransforms":
         xp, frame = namespace(tips, unknowns), unknowns[self.frame]
         station, target = rotation_matrix(frame[:3]), rotation_matrix(unknowns[self.orientation])
         axes = xp.moveaxis(xp.stack(tips.axes, axis=1), -1, 0)  # (m, 3, 3)

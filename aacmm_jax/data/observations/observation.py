@@ -8,7 +8,7 @@ calibration) is the same for all kinds.
 import abc
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from types import NoneType, UnionType
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
@@ -21,13 +21,15 @@ from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.module import Module
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
+from .columns import joined_poses, taken
 
 MOST_POSES = 100_000  # to simulate, as in a study
 
 POINT = ("mm",) * 3
 FRAME = ("rad",) * 3 + POINT
 
-Unknowns = Mapping[str, Float[AnyArray, " k"]]
+# The numbers of each unknown as columns: one for all poses (p = 1), or one for each pose (p = m).
+Unknowns = Mapping[str, Float[AnyArray, "k p"]]
 
 
 class Tips(NamedTuple):
@@ -81,6 +83,7 @@ class AbstractObservation(Module):
 
     kind: ClassVar[str]
     by_pose: ClassVar[tuple[str, ...]] = ("q",)  # fields with one row a pose
+    stated: ClassVar[tuple[str, ...]] = ()  # fields with one number, or None; where stacked, with one a pose
     table: ClassVar[str]  # name of its tables in a manifest
     entries: ClassVar[tuple[Entry, ...]]
     rows: eqx.AbstractClassVar[int]
@@ -104,6 +107,33 @@ class AbstractObservation(Module):
         """Unknowns that have a certified value: the values, and their standard uncertainties."""
         return {}
 
+    @property
+    def linear(self) -> bool:
+        """Whether the residual is linear in all unknowns, with derivatives that do not depend on tips and unknowns."""
+        return False
+
+    @property
+    def alike(self) -> Hashable | None:
+        """What observations of this class, with as many unknowns of the same units, must have in common to be `stacked`
+        and evaluated together; None for one that is evaluated alone."""
+        return None
+
+    @classmethod
+    def stacked(cls, observations: Sequence["AbstractObservation"]) -> "AbstractObservation":
+        """The poses of observations that are `alike` as those of one, whose residual takes a column of unknowns for
+        each pose, by the names of the first observation: the unknowns of all have one order.
+
+        Only its residual means something: names, certified values and starts are those of each observation.
+        """
+        first = observations[0]
+        changed, poses = copy.copy(first), [one.q.shape[0] for one in observations]
+        for field in (*cls.by_pose, *cls.stated):
+            values = [getattr(one, field) for one in observations]
+            if field in cls.stated and values[0] is not None:
+                values = [namespace(value).broadcast_to(value, (m,)) for value, m in zip(values, poses, strict=True)]
+            object.__setattr__(changed, field, joined_poses(values))
+        return changed
+
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         """A part of the unknown geometry as a person reads it; a kind whose numbers need another form says so itself,
         such as a plane with its normal."""
@@ -115,7 +145,8 @@ class AbstractObservation(Module):
 
     @abc.abstractmethod
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        """The residuals at these tips and this geometry."""
+        """The residuals at these tips and this geometry; derivatives by unknowns are those by the numbers of one
+        column, and those by each pose's own where each has one."""
 
     def stored(self) -> dict[str, Any]:
         """The values of the entries, from which `rebuilt` makes the same observation; without those that have none."""
@@ -161,7 +192,7 @@ class AbstractObservation(Module):
         changed = copy.copy(self)
         for field in self.by_pose:
             values = getattr(self, field)
-            chosen = tuple(values[i] for i in poses) if isinstance(values, tuple) else _taken(values, np.asarray(poses))
+            chosen = tuple(values[i] for i in poses) if isinstance(values, tuple) else taken(values, np.asarray(poses))
             object.__setattr__(changed, field, chosen)
         return changed
 
@@ -313,22 +344,6 @@ def _squares_on_the_diagonal(array: Float[AnyArray, "..."], poses: int) -> Float
     """Of one number, of three, or of three a pose."""
     array = namespace(array).broadcast_to(array if array.ndim else array[None], (poses, 3))
     return array[:, :, None] ** 2 * np.eye(3)[None]
-
-
-@numpy_if_known
-def _taken(values: AnyArray, rows: Int[np.ndarray, " k"]) -> AnyArray:
-    """The rows of an array."""
-    return values[rows]
-
-
-def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r c m"]:
-    """The same matrix for every pose."""
-    return namespace(matrix).broadcast_to(matrix[:, :, None], (*matrix.shape, poses))
-
-
-def no_covariance(rows: int, poses: int) -> Float[np.ndarray, "m r r"]:
-    """Of observations in which nothing was measured but the poses."""
-    return np.zeros((poses, rows, rows))
 
 
 def numbers(what: str, *shape: int) -> Callable[[Any], np.ndarray]:

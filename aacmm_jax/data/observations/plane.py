@@ -1,7 +1,7 @@
 """Planes: the tip touches one, or two parallel ones at a certified distance."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,9 +10,10 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import semidefinite_eigen
+from ...core.linear_algebra import products_by_column, semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_derivative, rotation_matrix
+from .columns import variances
 from .frames import moved, turned_z
 from .observation import (
     READINGS,
@@ -62,6 +63,7 @@ class Plane(AbstractObservation):
         TARGET,
     )
     rows: ClassVar[int] = 1
+    stated: ClassVar[tuple[str, ...]] = ("form",)
     q: Float[AnyArray, "m n"]
     form: Float[AnyArray, ""]
     name: str = eqx.field(static=True)
@@ -83,6 +85,10 @@ class Plane(AbstractObservation):
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.place: PLANE}
 
+    @property
+    def alike(self) -> Hashable | None:
+        return ()
+
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         return _normal_and_distance(values)
 
@@ -91,8 +97,7 @@ class Plane(AbstractObservation):
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         distance, normal, by_plane = heights(tips.position, unknowns[self.place])
-        xp = namespace(distance, self.form)
-        measured = xp.broadcast_to(xp.asarray(self.form**2), (self.q.shape[0], 1, 1))
+        measured = variances(self.form, self.q.shape[0])
         return Rows(distance[None], _each(normal, self.q.shape[0]), {self.place: by_plane[:, None]}, measured)
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -250,7 +255,7 @@ class ParallelPlanes(AbstractObservation):
         by_unknowns = {self.place: by_plane[:, None]}
         if self.free:
             by_unknowns[self.separation] = -side[None, None]
-        measured = xp.broadcast_to(xp.asarray(self.form**2), (m, 1, 1))
+        measured = variances(self.form, m)
         return Rows((height - side * distance)[None], _each(normal, m), by_unknowns, measured)
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -265,19 +270,22 @@ def _normal_and_distance(values: Float[np.ndarray, " 3"]) -> tuple[Quantity, ...
     return (Quantity("normal", normal, "1"), Quantity("distance from the origin", values[2:], "mm"))
 
 
-def _each(normal: Float[AnyArray, " 3"], poses: int) -> Float[AnyArray, "1 3 m"]:
-    return namespace(normal).broadcast_to(normal[None, :, None], (1, 3, poses))
+def _each(normal: Float[AnyArray, "3 p"], poses: int) -> Float[AnyArray, "1 3 m"]:
+    return namespace(normal).broadcast_to(normal[None], (1, 3, poses))
 
 
 def heights(
-    tips: Float[AnyArray, "3 m"], plane: Float[AnyArray, " 3"]
-) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " 3"], Float[AnyArray, "3 m"]]:
-    """Heights of tips over a plane, mm, its unit normal, and the derivatives of the heights by the plane's numbers."""
+    tips: Float[AnyArray, "3 m"], plane: Float[AnyArray, "3 p"]
+) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 p"], Float[AnyArray, "3 m"]]:
+    """Heights of tips over a plane (or over one each), mm, its unit normal, and the derivatives of the heights by the
+    plane's numbers."""
     xp = namespace(tips, plane)
     w = xp.concatenate([plane[:2], xp.zeros_like(plane[:1])])
-    normal = rotation_matrix(w)[:, 2]
-    turned = cross(rotation_derivative(w)[:, :2], xp.stack([normal, normal], axis=1))  # (3, 2)
-    return normal @ tips - plane[2], normal, xp.concatenate([turned.T @ tips, -xp.ones_like(tips[:1])])
+    normal, axes = rotation_matrix(w)[:, 2], rotation_derivative(w)
+    # The normal, and its derivatives by the two components.
+    rows = xp.stack([normal, *(cross(axes[:, i], normal) for i in range(2))])
+    height, *by_turn = products_by_column(rows, tips)
+    return height - plane[2], normal, xp.stack([*by_turn, -xp.ones_like(height)])
 
 
 def fitted_plane(tips: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 3"]:

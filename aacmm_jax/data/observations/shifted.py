@@ -1,11 +1,12 @@
 """An observation with errors other than those it was recorded with: what repeated calibrations are made of."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from ...core.numpy_or_jax import AnyArray
+from ...core.numpy_or_jax import AnyArray, namespace
 from .observation import AbstractObservation, Rows, Tips, Unknowns
 
 
@@ -64,6 +65,24 @@ class ShiftedObservation(AbstractObservation):
     @property
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         return {name: (self.values[name], u) for name, (_, u) in self.observation.certified.items()}
+
+    @property
+    def linear(self) -> bool:
+        return self.observation.linear
+
+    @property
+    def alike(self) -> Hashable | None:
+        inside = self.observation.alike
+        return None if inside is None else (type(self.observation), inside)
+
+    @classmethod
+    def stacked(cls, observations: Sequence[AbstractObservation]) -> AbstractObservation:
+        shifted: list[Any] = list(observations)
+        inside, shift = [one.observation for one in shifted], [one.shift for one in shifted]
+        changed = super().stacked(observations)
+        object.__setattr__(changed, "observation", inside[0].stacked(inside))
+        object.__setattr__(changed, "shift", namespace(shift).concatenate(shift, axis=1))
+        return changed
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         return self.observation.start(tips, offset)

@@ -1,7 +1,7 @@
 """A socket: the tip is at one point, whose position is unknown."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers
 from ...core.numpy_or_jax import AnyArray, namespace
+from .columns import each_pose, no_covariance
 from .frames import moved
 from .observation import (
     POINT,
@@ -24,8 +25,6 @@ from .observation import (
     checked_name,
     checked_readings,
     checked_target,
-    each_pose,
-    no_covariance,
     numbers,
 )
 
@@ -72,14 +71,21 @@ class Socket(AbstractObservation):
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.position: POINT}
 
+    @property
+    def linear(self) -> bool:
+        return True
+
+    @property
+    def alike(self) -> Hashable | None:
+        return ()
+
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         return {self.position: namespace(tips).mean(tips.position, axis=1)}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         identity = each_pose(namespace(tips, unknowns).asarray(np.eye(3)), self.q.shape[0])
-        position = unknowns[self.position]
         return Rows(
-            values=tips.position - position[:, None],
+            values=tips.position - unknowns[self.position],
             by_tip=identity,
             by_unknowns={self.position: -identity},
             measured=no_covariance(3, self.q.shape[0]),

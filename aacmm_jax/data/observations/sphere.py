@@ -1,7 +1,7 @@
 """A sphere: the tip touches it, so it is at one distance from an unknown centre."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,6 +12,7 @@ from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import length_and_direction, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
+from .columns import each_pose, no_covariance
 from .frames import moved
 from .observation import (
     POINT,
@@ -28,9 +29,7 @@ from .observation import (
     checked_readings,
     checked_scalar,
     checked_target,
-    each_pose,
     is_exact,
-    no_covariance,
     numbers,
 )
 
@@ -67,6 +66,7 @@ class Sphere(AbstractObservation):
         Entry("stylus", "diameter of the tip's ball", "mm"),
         TARGET,
     )
+    stated: ClassVar[tuple[str, ...]] = ("diameter", "stylus", "u")
     q: Float[AnyArray, "m n"]
     diameter: Float[AnyArray, ""] | None  # mm
     stylus: Float[AnyArray, ""]  # mm
@@ -138,6 +138,14 @@ class Sphere(AbstractObservation):
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         return {self.size: (self.radius[None], self.u[None])} if self.free and self.radius is not None else {}
 
+    @property
+    def linear(self) -> bool:
+        return self.point
+
+    @property
+    def alike(self) -> Hashable | None:
+        return self.point, self.free, self.diameter is None
+
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
         xp = namespace(tips)
         if self.point:
@@ -150,7 +158,7 @@ class Sphere(AbstractObservation):
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.u), self.q.shape[0]
-        between = tips.position - unknowns[self.centre][:, None]
+        between = tips.position - unknowns[self.centre]
         if self.point:
             identity = each_pose(xp.asarray(np.eye(3)), m)
             return Rows(between, identity, {self.centre: -identity}, no_covariance(3, m))
