@@ -31,7 +31,8 @@ from ..uncertainty.evidence import (
     slope_of_expectation,
 )
 from .bounded_fit import Fit, fit
-from .observed_state import ObservedTask, State, state_at, whitening_at
+from .solve_state import State, state_at, whitening_at
+from .task import Task
 from .results import PriorMetrics
 
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
@@ -55,7 +56,7 @@ class PriorProblem(NamedTuple):
     steps.
     """
 
-    task: ObservedTask
+    task: Task
     space: Parameters
     prior: ParameterPrior
     sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]]

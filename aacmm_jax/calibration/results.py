@@ -266,7 +266,11 @@ class Calibration(AbstractSingleResult):
     length_before: Float[AnyArray, " l"]  # measured reference lengths, mm: at the start
     length_after: Float[AnyArray, " l"]  # by the calibrated arm
     stage1: Identification
-    method: str = eqx.field(static=True)
+    method: str = eqx.field(static=True)  # "two-stage" or "joint", as it was asked for or chosen
+    observed: ObservedMetrics  # how the observations agree, sockets first
+    # Whether the result is stage 1 divided by k; not where a bound or a fixed length stood against that, and everything
+    # was solved at once, as with the method "joint".
+    divided: Bool[AnyArray, ""]
     shared: SharedErrors | None = None  # errors that poses share, which the covariance contains; None: none were found
 
     @property
@@ -277,11 +281,6 @@ class Calibration(AbstractSingleResult):
     def k(self) -> Float[AnyArray, "*batch"] | None:
         """k = measured / nominal of stage 1."""
         return None if self.scale is None else self.scale.value
-
-    @property
-    def observed(self) -> ObservedMetrics | None:
-        """How the observations agree, where the capture has others than sockets, or a robust loss."""
-        return self.stage1.observed
 
     @property
     def noise_model(self) -> NoiseModel:

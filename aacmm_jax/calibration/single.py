@@ -1,43 +1,34 @@
 """Stage 1 (`identify`), both stages (`calibrate`), and the joint solve."""
 
 import warnings
-from functools import partial
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from ..core._compat import inside_trace
 from ..core.arguments import check_finite, checked_arguments
-from ..core.arrays import Numbers, as_array, is_concrete
+from ..core.arrays import Numbers, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from ..kinematics.parameters import Bounds, based_on
+from ..kinematics.parameters import Bounds
 from ..kinematics.priors import Prior
-from ..model.measurement import Measurement, check_joints
-from ..model.metrics import repeatability
-from ..model.residuals import JointWeights, joint_normal_equations, joint_residual
 from ..model.robust import LossName
-from ..uncertainty import propagation, scale_uncertainty
-from ..uncertainty.active_bounds import with_active_bounds
-from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
-from .bounded_fit import Fit, fit
-from .checks import check_enough, check_identifiable, check_method, check_noise_model, check_single, check_start
+from ..uncertainty.covariance import NoiseModel
+from .checks import check_identifiable, check_method, check_single
 from .encoder_noise import with_noise_by_joint
 from .joint_model import with_joint_model
-from .observed import calibrate_observed, identify_observed
-from .observed_state import observed_task
 from .results import Calibration, Identification
-from .scale_anchor import default_method, scale_anchor, scale_from_slides, warn_of_a_known_scale
-from .second_stage import adjust_anchor, clip_to_bounds, divide_by_k, must_adjust_anchor
-from .sensitivities import sensitivities_of_observations, sensitivities_of_sockets
+from .scale_anchor import default_method, scale_from_slides, warn_of_a_known_scale
+from .sensitivities import Sensitivities
 from .shared_errors import with_shared_errors
-from .task import Task, fit_repeatability
+from .stages import Stages, identified, in_two_stages, jointly
+from .task import Task, task_of
 
 _MAX_STEPS = 300
 
@@ -97,48 +88,41 @@ def identify(
         >>> print(f"scale anchor {stage1.hold}, DE {stage1.de:.4f} mm")
         scale anchor d_3, DE 0.0124 mm
     """
-    if capture.observations or robust is not None or prior is not None:
-        check_single(arm, capture, bounds, "identify_many")
-        check_finite(arm=arm, capture=capture, noise=noise)
-        alone = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
-        task = observed_task(arm, alone, bounds, start, noise, hold, noise_model, max_steps, robust, prior)
-        result = to_jax(identify_observed(to_numpy(task)))
-    else:
-        task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "identify_many")
-        result = to_jax(_identify(to_numpy(task)))
+    task = _task("identify_many", arm, capture, bounds, start, noise, hold, noise_model, max_steps, robust, prior)
+    capture = to_numpy(capture)
+    result = to_jax(_identified(to_numpy(task), capture))
     if not replace_noise or noise_model in ("common", "robust") or robust is not None:
         return result
     options = {"hold": hold, "start": start, "prior": prior, "max_steps": max_steps, "replace_noise": False}
     return with_noise_by_joint(result, capture, lambda found: identify(arm, capture, bounds, noise=found, **options))
 
 
-def _prepare_task(
+def _task(
+    many: str,
     arm: Arm,
     capture: Capture,
     bounds: Bounds,
     start: Numbers | None,
     noise: Noise | None,
     hold: str | None,
-    noise_model: NoiseModel | None,
-    max_steps: int,
-    many: str,
+    *options: Any,
 ) -> Task:
+    """The checked task of stage 1, in which lengths take no part."""
     check_single(arm, capture, bounds, many)
     for sentence in () if inside_trace() else capture.repeated.sentences():
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
     check_finite(arm=arm, capture=capture, noise=noise)
-    space = based_on(bounds.space, arm)
-    bounds = Bounds(space, bounds.lower, bounds.upper)
-    vector = space.vector() if start is None else as_array(start, "the start")
-    if max_steps < 1:
-        raise InputError(f"max_steps is {max_steps}; give at least 1.")
-    check_joints(capture, space)
-    check_start(bounds, vector, "the start" if start is not None else "the arm")
-    # Repeatability does not determine the scale: where lengths are free, it determines one parameter less.
-    check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
-    noise_model = check_noise_model(noise_model, noise, arm.joints)
-    anchor = scale_anchor(space, space.base, hold, noise, capture)
-    return Task(Measurement.of(capture, space.base), bounds, vector, noise, anchor, noise_model, max_steps)
+    return task_of(arm, without_lengths(capture), bounds, start, noise, hold, *options)
+
+
+def without_lengths(capture: Capture) -> Capture:
+    """The capture without its reference lengths."""
+    return eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
+
+
+@compiled(jit=eqx.filter_jit)
+def _identified(task: Task, capture: Capture) -> Identification:
+    return identified(task, capture).solution.identification
 
 
 @checked_arguments
@@ -164,13 +148,12 @@ def calibrate(
     """Both stages: identify from repeatability, then fix the scale with the reference lengths.
 
     "two-stage" divides the arm of stage 1 by k = measured / nominal. Fixed parameters stay as they are, to the bit, and
-    the result is inside the box: where the division cannot give that, stage 1 is repeated with its anchor adjusted
-    until k = 1 (`calibration.second_stage`). Where fixed lengths set the scale, k changes nothing, and an
+    the result is inside the box: where a bound or a fixed length stands against the division, everything is solved at
+    once instead, and ``divided`` of the result is false. Where fixed lengths set the scale, k changes nothing, and an
     `IdentifiabilityWarning` says so. The uncertainty of k, ``scale.u``, takes parameters on a bound as exact.
 
-    "joint" goes on from there with one least squares of repeatability and lengths together, each weighted by its
-    standard deviation: that of a tip coordinate from stage 1's residuals; that of a length from its u and from the
-    scatter of the poses at its ends.
+    "joint" is one least squares of everything, each weighted by its standard deviation: that of a tip coordinate from
+    the residuals, that of a length from its u.
 
     Args:
         arm: as for `identify`, like all arguments that are not named here.
@@ -219,29 +202,27 @@ def calibrate(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
             "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
         )
-    sensitivities = None
+    options = noise_model, max_steps, robust, prior
+    first = None if general else _task("calibrate_many", arm, capture, bounds, start, noise, hold, *options)
     if general:
         check_single(arm, capture, bounds, "calibrate_many")
         check_finite(arm=arm, capture=capture, noise=noise)
-        task = observed_task(arm, capture, bounds, start, noise, None, noise_model, max_steps, robust, prior)
-        if check_identifiability or strict:
-            check_identifiable(capture, task.bounds, prior, strict)
-        task = to_numpy(task)
-        result = calibrate_observed(task)
-        sensitivities = partial(sensitivities_of_observations, task, result)
-    else:
-        task = _prepare_task(arm, capture, bounds, start, noise, hold, noise_model, max_steps, "calibrate_many")
-        if check_identifiability or strict:
-            check_identifiable(capture, task.bounds, None, strict)
-        result, propagated = _calibrate_sockets(task, method, hold)
-        if propagated is not None:
-            sensitivities = partial(sensitivities_of_sockets, result, to_numpy(task.measurement), propagated)
-    if replace_noise and noise_model not in ("common", "robust") and robust is None:
-        options = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
-        options |= {"check_identifiability": False, "replace_noise": False, "shared_errors": shared_errors}
-        found = with_noise_by_joint(
-            result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **options)
+    elif hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
+        raise InputError(
+            "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
+            "hold."
         )
+    task = task_of(arm, capture, bounds, start, noise, None, *options)
+    if check_identifiability or strict:
+        check_identifiable(capture, task.bounds, prior, strict)
+    if method == "two-stage" and first is not None and not inside_trace():
+        warn_of_a_known_scale(first.anchor.set_by, bool(arm.prismatic))
+    first, task, capture = to_numpy((first, task, capture))
+    result, sensitivities = _calibrated(first, task, capture, method)
+    if replace_noise and noise_model not in ("common", "robust") and robust is None:
+        again = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
+        again |= {"check_identifiability": False, "replace_noise": False, "shared_errors": shared_errors}
+        found = with_noise_by_joint(result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **again))
         if found is not result:
             return found
     if shared_errors and sensitivities is not None:
@@ -249,184 +230,32 @@ def calibrate(
     return to_jax(result)
 
 
-def _calibrate_sockets(task: Task, method: str, hold: str | None) -> tuple[Calibration, propagation.Propagated | None]:
-    """From sockets and reference lengths alone; and how its covariance was propagated, as far as values are known."""
-    arm, bounds = task.space.base, task.bounds
-    if hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
-        raise InputError(
-            "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
-            "hold."
-        )
-    if method == "two-stage" and not inside_trace():
-        warn_of_a_known_scale(task.anchor.set_by, bool(arm.prismatic))
-    task = to_numpy(task)
-    if method == "joint":
-        return _calibrate_jointly(task)
-    result, propagated, adjust = _calibrate_by_division(task)
-    if not task.anchor.can_scale or (is_concrete(adjust) and not bool(adjust)):
-        return result, propagated
-    if is_concrete(adjust):
-        return _calibrate_by_adjustment(task, result)
-    return jax.lax.cond(adjust, lambda: _calibrate_by_adjustment(task, result)[0], lambda: result), None
+def _calibrated(
+    first: Task | None, task: Task, capture: Capture, method: str
+) -> tuple[Calibration, Callable[[], Sensitivities] | None]:
+    """Both stages, or the joint solve; and how the parameters follow the data, where values are known.
 
-
-@compiled(jit=eqx.filter_jit)
-def _identify(task: Task) -> Identification:
-    return _solve_stage1(task)[0]
-
-
-def _solve_stage1(task: Task) -> tuple[Identification, propagation.Propagated]:
-    xp = namespace(task)
-    space, start, hold = task.space, task.start, task.anchor.hold
-    measurement = task.measurement.weighted(space.arm(start).geometry, task.noise)
-    found = fit_repeatability(task, measurement, start, hold)
-    parameters = found.parameters
-    kept = np.array([name == hold for name in space.names])
-    fitted = int((~kept).sum())
-    identified = space.arm(parameters)
-    tips = identified.position(measurement.q)
-    after = repeatability(tips, measurement.sizes, fitted=fitted)
-    active = xp.where(xp.asarray(kept), 0, task.bounds.active(parameters))
-    propagated = propagation.propagate_solve(
-        identified, space, measurement, (active != 0) | xp.asarray(kept), after.sigma, task.noise_model, task.noise
-    )
-    identification = Identification(
-        arm=identified,
-        parameters=parameters,
-        de=after.de,
-        deltam=after.deltam,
-        active=active,
-        steps=found.steps,
-        result=found.result,
-        optimality=found.optimality,
-        scale=scale_uncertainty.propagated_scale(tips, measurement, propagated, after.sigma)
-        if measurement.ends
-        else None,
-        parameter_covariance=with_active_bounds(
-            propagated.parameter_covariance, identified, space, measurement, active, task.bounds, after.sigma, hold
-        ),
-        before=repeatability(space.arm(start).position(measurement.q), measurement.sizes),
-        after=after,
-        reduced_chi=_reduced_chi(measurement, tips, fitted),
-        bounds=task.bounds,
-        anchor=task.anchor,
-        noise_model=task.noise_model,
-        fitted_degrees_of_freedom=residual_degrees_of_freedom(task.noise_model, measurement.sizes, fitted),
-    )
-    return identification, propagated
-
-
-def _reduced_chi(measurement: Measurement, tips: Float[AnyArray, "N 3"], fitted: int) -> Float[AnyArray, ""] | None:
-    if measurement.weights is None:
-        return None
-    whitened, spare = (
-        measurement.whitened(measurement.centred(tips)),
-        3 * sum(n - 1 for n in measurement.sizes) - fitted,
-    )
-    return namespace(whitened).sqrt(namespace(whitened).sum(whitened**2) / max(spare, 1))
-
-
-def _make_calibration(
-    task: Task,
-    stage1: Identification,
-    method: str,
-    found: Fit,
-    parameter_covariance: ParameterCovariance,
-    sigma: Float[AnyArray, ""],
-    conditional_on: Int[AnyArray, " p"] | None = None,
-) -> Calibration:
-    """The result of a calibration, of which ``found`` is what came after stage 1; tips scatter by ``sigma`` (mm).
-
-    ``conditional_on`` are the active bounds that its covariance takes as exact; by default those that are active.
+    ``first`` is stage 1's task where reference lengths alone fix the scale.
     """
-    assert stage1.scale is not None
-    space = task.space
-    start, calibrated, active = space.arm(task.start), space.arm(found.parameters), task.bounds.active(found.parameters)
-    measurement = task.measurement.weighted(start.geometry, task.noise)
-    tips = calibrated.position(measurement.q)
-    after = repeatability(tips, measurement.sizes, fitted=len(space.names))
-    exact = active if conditional_on is None else conditional_on
-    return Calibration(
-        arm=calibrated,
-        parameters=found.parameters,
-        scale=stage1.scale,
-        de=after.de,
-        deltam=after.deltam,
-        active=active,
-        steps=stage1.steps + found.steps,
-        result=found.result,
-        parameter_covariance=with_active_bounds(
-            parameter_covariance, calibrated, space, measurement, exact, task.bounds, sigma
-        ),
-        before=stage1.before,
-        after=after,
-        length_before=measurement.distances(start.position(measurement.q)),
-        length_after=measurement.distances(tips),
-        stage1=stage1,
-        method=method,
-    )
+    if namespace((first, task, capture)) is not np:
+        return _traced(first, task, capture, method), None
+    with np.errstate(all="ignore"):
+        stage1 = None if first is None else identified(first, capture)
+        if method == "joint" or stage1 is None:
+            found = jointly(task, capture, stage1, method)
+            return found.calibration, found.sensitivities
+        found = in_two_stages(stage1, capture)
+        if bool(found.stands_against):
+            found = jointly(task, capture, stage1, method)
+        return found.calibration, found.sensitivities
 
 
-@compiled(jit=eqx.filter_jit)
-def _calibrate_by_division(task: Task) -> tuple[Calibration, propagation.Propagated, Bool[AnyArray, ""]]:
-    """Stage 1 and the division by k; and whether the anchor must be adjusted instead."""
-    xp = namespace(task)
-    stage1, propagated = _solve_stage1(task)
-    assert stage1.scale is not None
-    space, bounds, anchor = task.space, task.bounds, task.anchor
-    scaled = divide_by_k(anchor, space, stage1.parameters, stage1.scale.value)
-    adjust = must_adjust_anchor(anchor, bounds, stage1.active, scaled)
-    if anchor.can_scale:
-        scaled = clip_to_bounds(space, bounds.lower, bounds.upper, scaled)
-        measurement = task.measurement.weighted(space.arm(task.start).geometry, task.noise)
-        propagated = scale_uncertainty.propagate_division(
-            propagated, stage1.arm, space, measurement, stage1.after.sigma, scaled, anchor.partners
-        )
-    # Divided, a length may have left its bound, which stage 1's covariance takes as exact all the same.
-    active = bounds.active(scaled)
-    exact = xp.where(active != 0, active, stage1.active)
-    divided = Fit(scaled, xp.zeros_like(stage1.steps), stage1.result, stage1.optimality)
-    covariance = propagated.parameter_covariance
-    calibration = _make_calibration(task, stage1, "two-stage", divided, covariance, stage1.after.sigma, exact)
-    return calibration, propagated, adjust
-
-
-@compiled(jit=eqx.filter_jit)
-def _calibrate_by_adjustment(task: Task, by_division: Calibration) -> tuple[Calibration, propagation.Propagated]:
-    """Stage 2 where the division leaves the box, or would need a fixed length to move."""
-    xp = namespace(task, by_division)
-    stage1, space, name = by_division.stage1, task.space, task.anchor.adjusted
-    assert name is not None
-    measurement = task.measurement.weighted(space.arm(by_division.parameters).geometry, task.noise)
-    adjusted = adjust_anchor(task, measurement, by_division.parameters)
-    arm, active = space.arm(adjusted.parameters), task.bounds.active(adjusted.parameters)
-    # Stage 1's own does not do: bounds that do not act on this solution may have acted on that one.
-    sigma = repeatability(arm.position(measurement.q), measurement.sizes, fitted=len(space.names) - 1).sigma
-    is_anchor = xp.asarray([other == name for other in space.names])
-    solved = propagation.propagate_solve(
-        arm, space, measurement, (active != 0) | is_anchor, sigma, task.noise_model, task.noise
-    )
-    fixed = xp.any((active != 0) & is_anchor)
-    found = scale_uncertainty.propagate_adjustment(solved, arm, space, measurement, sigma, name, fixed)
-    return _make_calibration(task, stage1, "two-stage", adjusted, found.parameter_covariance, sigma), found
-
-
-@compiled(jit=eqx.filter_jit)
-def _calibrate_jointly(task: Task) -> tuple[Calibration, propagation.Propagated]:
-    """One weighted least squares of poses and lengths, from the arm of stage 1 divided by k."""
-    stage1, _ = _solve_stage1(task)
-    assert stage1.scale is not None
-    space, k = task.space, stage1.scale.value
-    parameters = divide_by_k(task.anchor, space, stage1.parameters, k)
-    scaled = space.arm(parameters)
-    measurement = task.measurement.weighted(scaled.geometry, task.noise)
-    sigma = stage1.after.sigma / k
-    joint_weights = JointWeights.of(scaled.position(measurement.q), measurement, sigma)
-    args = (space, measurement, joint_weights.sigma, joint_weights.whitening)
-    bounds = task.bounds.lower, task.bounds.upper
-    found = fit(joint_residual, joint_normal_equations, parameters, args, bounds, space.scale, task.max_steps)
-    active = task.bounds.active(found.parameters)
-    solved = propagation.propagate_solve(
-        space.arm(found.parameters), space, measurement, active != 0, sigma, task.noise_model, task.noise, joint_weights
-    )
-    return _make_calibration(task, stage1, "joint", found, solved.parameter_covariance, stage1.after.sigma), solved
+@eqx.filter_jit
+def _traced(first: Task | None, task: Task, capture: Capture, method: str) -> Calibration:
+    stage1 = None if first is None else identified(first, capture)
+    if method == "joint" or stage1 is None:
+        return jointly(task, capture, stage1, method).calibration
+    found = in_two_stages(stage1, capture)
+    if not stage1.solution.identification.anchor.can_scale:
+        return found.calibration
+    return jax.lax.cond(found.stands_against, lambda: jointly(task, capture, stage1, method).calibration, lambda: found.calibration)

@@ -1,8 +1,10 @@
 """The scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
 
 The uncertainty of k comes from the lengths and the scatter at their ends (here, `scale_and_weights`), and from the
-identified parameters (`uncertainty.scale_uncertainty`).
+identified parameters (`calibration.scale_fix`).
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,11 +16,11 @@ from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
-from ..data.capture import Capture
+from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
 from ..kinematics.arm import Arm, is_length, is_single, parameter_names
 from ..kinematics.parameters import Parameters
-from .measurement import Measurement, length_covariance
 from .metrics import repeatability
+from .socket_sums import means_over_sockets
 
 # Names of fixed lengths that free ones can replace, and for each free parameter its weight in place of each of them.
 Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
@@ -123,39 +125,83 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
     if sigma is not None and is_concrete(sigma) and not 0 <= sigma < np.inf:
         raise InputError(f"sigma is {float(sigma):g} mm; a standard deviation must be zero or positive, and finite.")
     scatter = None if sigma is None else as_array(sigma, "sigma", like=np.zeros(0))
-    return to_jax(_fixed(*to_numpy((arm, Measurement.of(capture, arm), scatter))))
+    check_one_capture(capture)
+    check_sockets_only(capture, "fix_scale")
+    check_readings(capture, arm)
+    return to_jax(_fixed(*to_numpy((arm, capture, scatter))))
 
 
 @compiled(jit=eqx.filter_jit)
-def _fixed(arm: Arm, measurement: Measurement, sigma: Float[AnyArray, ""] | None) -> ScaleFix:
-    tips = arm.position(measurement.q)
-    scatter = repeatability(tips, measurement.sizes).sigma if sigma is None else sigma
-    scale = scale_of(tips, measurement, scatter)
+def _fixed(arm: Arm, capture: Capture, sigma: Float[AnyArray, ""] | None) -> ScaleFix:
+    tips = arm.position(capture.q)
+    scatter = repeatability(tips, capture.sizes).sigma if sigma is None else sigma
+    scale, _ = scale_and_weights(ends_of_sockets(tips, capture, scatter))
     return ScaleFix(divided_arm(arm, scale.value), scale)
 
 
-def scale_of(tips: Float[AnyArray, "N 3"], measurement: Measurement, sigma: Float[AnyArray, ""]) -> Scale:
-    """k from tips, given the standard deviation of a tip coordinate (NaN where unknown)."""
-    return scale_and_weights(tips, measurement, sigma)[0]
+class MeasuredEnds(NamedTuple):
+    """Positions between which lengths were measured, with their own covariances, as one arm has them; mm."""
+
+    positions: Float[AnyArray, "e 3"]
+    covariances: Float[AnyArray, "e 3 3"]  # by the scatter of the poses at each
+    ends: np.ndarray  # (l, 2): which of them each length joins
+    nominal: Float[AnyArray, " l"]
+    u: Float[AnyArray, " l"]
+
+    @property
+    def vectors(self) -> Float[AnyArray, "l 3"]:
+        """From the start to the end of each length."""
+        return self.positions[self.ends[:, 1]] - self.positions[self.ends[:, 0]]
+
+    @property
+    def measured(self) -> Float[AnyArray, " l"]:
+        """The measured lengths."""
+        return namespace(self.positions).linalg.norm(self.vectors, axis=-1)
+
+    @property
+    def by_positions(self) -> Float[AnyArray, "l e 3"]:
+        """Derivatives of the measured lengths."""
+        xp, unit = namespace(self.positions), np.eye(len(self.positions))
+        pull = xp.asarray(unit[self.ends[:, 1]] - unit[self.ends[:, 0]])
+        return pull[:, :, None] * (self.vectors / self.measured[:, None])[:, None, :]
+
+    def covariance(self, scale_factor: Float[AnyArray, "..."] | float = 1.0) -> Float[AnyArray, "l l"]:
+        """Of measured minus nominal lengths, mm^2, by an arm that is ``scale_factor`` times too large.
+
+        Each length's own u, and the scatter at each end. Lengths that share a socket share its scatter, so they are
+        correlated.
+        """
+        xp, by = namespace(self.positions, self.u, scale_factor), self.by_positions
+        scatter = xp.einsum("lec,ecd,med->lm", by, self.covariances, by)
+        # The least variance, (1e-12 mm)^2, only keeps a noise-free simulation's weights finite.
+        return xp.diag((scale_factor * self.u) ** 2 + 1e-24) + scatter
 
 
-def scale_and_weights(
-    tips: Float[AnyArray, "N 3"], measurement: Measurement, sigma: Float[AnyArray, ""]
-) -> tuple[Scale, Float[AnyArray, " l"]]:
-    """k from tips, and its derivative by each measured length, 1/mm."""
-    xp = namespace(tips, sigma)
-    measured = measurement.distances(tips)
-    ratio = measured / measurement.nominal
-    known = xp.where(xp.isnan(sigma), 0.0, sigma)
-    centroids = measurement.centroids(tips)
-    plain = xp.diagonal(length_covariance(centroids, measurement, known, ratio))
-    weight = measurement.nominal**2 / plain
+def ends_of_sockets(
+    tips: Float[AnyArray, "N 3"], capture: Capture, sigma: Float[AnyArray, ""]
+) -> MeasuredEnds:
+    """The ends of a capture's lengths, at the means of their tips, given the standard deviation of a coordinate."""
+    xp, pairs = namespace(tips, sigma), capture.ends()
+    used, ends = np.unique(pairs, return_inverse=True)
+    means = means_over_sockets(tips.T, capture.sizes).T
+    covariances = sigma**2 * xp.asarray(np.eye(3)[None] / np.asarray(capture.sizes, dtype=float)[used, None, None])
+    nominal, u = (xp.stack([getattr(one, name) for one in capture.lengths]) for name in ("value", "u"))
+    return MeasuredEnds(means[used], covariances, ends.reshape(pairs.shape), nominal, u)
+
+
+def scale_and_weights(measured: MeasuredEnds) -> tuple[Scale, Float[AnyArray, " l"]]:
+    """k, and its derivative by each measured length, 1/mm; NaN where the scatter is unknown."""
+    xp = namespace(measured)
+    length = measured.measured
+    ratio = length / measured.nominal
+    known = measured._replace(covariances=xp.where(xp.isnan(measured.covariances), 0.0, measured.covariances))
+    weight = measured.nominal**2 / xp.diagonal(known.covariance(ratio))
     weight_of = weight / xp.sum(weight)
     value = xp.sum(weight_of * ratio)
-    relative = weight_of / measurement.nominal
-    predicted = relative @ length_covariance(centroids, measurement, sigma, value) @ relative
+    relative = weight_of / measured.nominal
+    predicted = relative @ measured.covariance(value) @ relative
     observed = xp.sum(weight_of * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
-    return Scale(value, xp.sqrt(xp.maximum(predicted, observed)), measured, measurement.nominal), relative
+    return Scale(value, xp.sqrt(xp.maximum(predicted, observed)), length, measured.nominal), relative
 
 
 @checked_arguments

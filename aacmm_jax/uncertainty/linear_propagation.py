@@ -34,6 +34,7 @@ class Influence(NamedTuple):
 
     blocks: list[RowBlock]  # of poses, then of relations; whitened, not weighted
     weights: list[Float[AnyArray, " m"] | None]  # by a robust loss
+    fixed: Bool[AnyArray, " h"]  # numbers of the head that follow nothing
     rows: list[Float[AnyArray, "h r m"]]  # A of every block
     parts: list[Float[AnyArray, "K k"]]  # steps of the components' numbers, class by class
     information: Float[AnyArray, "h h"]  # 1/G, with that of a prior
@@ -78,7 +79,7 @@ class Influence(NamedTuple):
             information = added_to(information, (index, index), (prior.weight * head[index]) ** 2)
         inverse, lost, determined = inverse_information(information, fixed)
         left = [_left_open(matrix, inverse_) for matrix, inverse_ in zip(arrow.own, own, strict=True)]
-        return cls(blocks, weights, rows, parts, information, inverse, lost, determined, own, follow, left)
+        return cls(blocks, weights, fixed, rows, parts, information, inverse, lost, determined, own, follow, left)
 
     def covariance(self) -> UnknownsCovariance:
         """Of the unknowns, where every row has the variance 1 that its weight says."""
@@ -104,6 +105,56 @@ class Influence(NamedTuple):
         steps = self.parts[block.of]
         owner = np.repeat(np.arange(len(block.sizes)), block.sizes)
         return block.by_own * (steps[0][:, None, None] if len(block.sizes) == 1 else steps.T[:, None, owner])
+
+
+def rows_of_functions(
+    influence: Influence,
+    head: Float[AnyArray, "q h"],
+    components: list[Float[AnyArray, "q K k"]],
+) -> list[Float[AnyArray, "q r m"]]:
+    """How linear functions of the unknowns follow the whitened rows of every block; ``head`` and ``components`` are
+    their derivatives by the unknowns, natural steps."""
+    xp = namespace(influence.inverse, head)
+    for part, follow in zip(components, influence.follow, strict=True):
+        head = head - xp.einsum("qKk,Kkh->qh", part, follow)
+    gain, found = -head @ influence.inverse, []
+    for number, block in enumerate(influence.blocks):
+        a, own = influence.weighted_rows(number), influence.own_rows(number)
+        rows = (gain @ _flat(a)).reshape(-1, *a.shape[1:])
+        if own is not None:
+            each = xp.einsum("qKk,Kkl->Klq", components[block.of], influence.own[block.of])
+            rows = rows - followed(influence.weighted(number, own), each, block.sizes)
+        found.append(rows)
+    return found
+
+
+def covariance_of_rows(
+    rows: list[Float[AnyArray, "q r m"]], covariances: list[Float[AnyArray, "r r m"]]
+) -> Float[AnyArray, "q q"]:
+    """Covariance of functions that follow rows so; relations, which come after the poses, have variance 1."""
+    total: Any = 0.0
+    for number, one in enumerate(rows):
+        by = products(one, covariances[number]) if number < len(covariances) else one
+        total = total + _flat(by) @ _flat(one).T
+    return total
+
+
+def covariance_with(
+    influence: Influence, rows: list[Float[AnyArray, "1 r m"]], covariances: list[Float[AnyArray, "r r m"]]
+) -> tuple[Float[AnyArray, " h"], list[Float[AnyArray, "K k"]]]:
+    """Covariance of the unknowns with a function that follows the rows so; natural steps."""
+    xp = namespace(influence.inverse, rows)
+    of_head, of_own = xp.zeros(influence.inverse.shape[0]), [xp.zeros(one.shape[:2]) for one in influence.own]
+    for number, (block, one) in enumerate(zip(influence.blocks, rows, strict=True)):
+        by = products(one, covariances[number]) if number < len(covariances) else one
+        of_head = of_head + _flat(influence.weighted_rows(number)) @ by.reshape(-1)
+        own = influence.own_rows(number)
+        if own is not None:
+            sums = sums_by_component(influence.weighted(number, own), by, block.sizes)
+            of_own[block.of] = of_own[block.of] + sums[..., 0]
+    head = -influence.inverse @ of_head
+    each = zip(influence.own, influence.follow, of_own, strict=True)
+    return head, [-(own @ part[..., None])[..., 0] - follow @ head for own, follow, part in each]
 
 
 def _left_open(matrix: Float[AnyArray, "K k k"], inverse: Float[AnyArray, "K k k"]) -> Bool[AnyArray, "K k"]:
@@ -200,29 +251,28 @@ def _information(influence: Influence, number: int) -> Float[AnyArray, "h h"]:
 
 
 def of_shared_readings(
-    influence: Influence,
+    rows: list[Float[AnyArray, "q r m"]],
     errors: list[ArmErrors],
     whitening: Whitening,
     noise: Noise,
     reading: list[np.ndarray],
-) -> Float[AnyArray, "h h"] | None:
-    """What poses with one reading add to the sum over poses, since they share its errors.
+) -> Float[AnyArray, "q q"] | None:
+    """What poses with one reading add to a sum over poses of what follows their rows, since they share its errors.
 
     ``reading`` is the number of the reading of each pose of each group; None where all are different.
     """
-    numbers = np.concatenate(reading)
-    counts = np.bincount(numbers)
+    counts = np.bincount(np.concatenate(reading))
     if counts.max() < 2:
         return None
     moved, owners = [], []
-    for number, (error, root, mine) in enumerate(zip(errors, whitening.roots, reading, strict=True)):
+    for one, error, root, mine in zip(rows, errors, whitening.roots, reading, strict=False):
         poses = np.flatnonzero(counts[mine] > 1)
         if not len(poses):
             continue
         xp = namespace(root, error.by_readings)
         spread = xp.broadcast_to(noise.of_readings(error.kinds), (error.by_readings.shape[1],))
         readings = xp.einsum("mab,bnm->anm", root[poses], error.by_readings[..., poses] * spread[None, :, None])
-        moved.append(xp.einsum("ham,anm->hnm", influence.weighted_rows(number)[..., poses], readings))
+        moved.append(xp.einsum("ham,anm->hnm", one[..., poses], readings))
         owners.append(mine[poses])
     xp = namespace(moved)
     each, owner = xp.concatenate(moved, axis=2), np.unique(np.concatenate(owners), return_inverse=True)[1]

@@ -13,10 +13,11 @@ from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
 from ..kinematics.parameters import Parameters
-from ..model.elimination import cost_and_weights
+from ..model.elimination import cost_and_weights, sums_by_component
 from ..model.observed import Observed
 from ..model.robust import Loss
 from ..model.rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at, whitening_of
+from ..solver.arrow import joined
 from .linear_propagation import Influence
 from .tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
 
@@ -107,6 +108,17 @@ class Linearisation(NamedTuple):
         return Influence.of(
             self.blocks, self.weights, classes, steps, self.whitening.prior, xp.asarray(fixed)[: self.height]
         )
+
+    def with_fitted_geometry(self) -> Float[AnyArray, " z"]:
+        """The unknowns with the private geometry as its rows have it by this head; exact where they are linear."""
+        xp, influence = namespace(self.z), self.influence()
+        steps = [xp.zeros(own.shape[:2]) for own in influence.own]
+        for number, block in enumerate(self.blocks):
+            own = influence.own_rows(number)
+            if own is not None:
+                sums = sums_by_component(influence.weighted(number, own), block.white[None], block.sizes)
+                steps[block.of] = steps[block.of] - (influence.own[block.of] @ sums)[..., 0]
+        return self.z + self.steps * joined(xp.zeros(self.height), *steps)
 
     def parts(self) -> list[ObservationRows]:
         """The rows, observation by observation."""

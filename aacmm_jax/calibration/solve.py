@@ -1,23 +1,24 @@
-"""Identification from observations of all kinds: one least squares of the parameters and every unknown geometry."""
+"""The engine's solve: one least squares of the parameters and of every unknown geometry, and its uncertainty."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, added_to, compiled, namespace, set_at
-from ..kinematics.parameters import Bounds, Parameters
+from ..data.noise import Noise
+from ..kinematics.parameters import Bounds
 from ..model.elimination import observed_model, observed_rows
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
 from ..model.robust import Loss
-from ..model.rows import PriorRows, Whitening
 from ..uncertainty.covariance import ParameterCovariance
 from ..uncertainty.linear_propagation import (
     Influence,
     UnknownsCovariance,
     alone,
+    covariance_of_rows,
     geometry_covariance,
     of_shared_readings,
     propagated,
@@ -26,26 +27,52 @@ from ..uncertainty.linear_propagation import (
 from ..uncertainty.linearisation import Linearisation
 from ..uncertainty.variance_components import Moments, moments, noise_from
 from .bounded_fit import RULES, fit
-from .observed_state import ObservedTask, State, scatter_at_start, state_at, whitening_at
-from .prior_fit import ByScales, PriorProblem, fit_with_prior
-from .results import Calibration, Identification, ObservedMetrics
+from .prior_fit import PriorProblem, fit_with_prior
+from .results import Identification, ObservedMetrics
+from .solve_state import State, scatter_at_start, state_at, whitening_at
+from .task import Task
 
 # Of the solves whose result only gives the weights of the next, or its start: a few standard uncertainties' millionths.
 _ROUGH = RULES._replace(rtol=1e-5)
 
 
+class Solution(NamedTuple):
+    """An identification, and what its uncertainty follows from."""
+
+    identification: Identification
+    linear: Linearisation
+    influence: Influence
+    covariances: list[Float[AnyArray, "r r m"]]  # of the whitened rows of every group
+    reading: list[np.ndarray]  # number of the reading of each pose of each group; equal ones were read at once
+    state: State
+
+    def covariance_of(self, rows: list[Float[AnyArray, "q r m"]]) -> Float[AnyArray, "q q"]:
+        """Of functions that follow the rows of every block so."""
+        identification = self.identification
+        total = covariance_of_rows(rows, self.covariances)
+        if identification.noise_model == "robust":
+            return total
+        shared = of_shared_readings(
+            rows, self.state.errors, self.linear.whitening, identification.noise, self.reading
+        )
+        return total if shared is None else total + shared
+
+
 @compiled(jit=eqx.filter_jit)
-def identify_observed(task: ObservedTask) -> Identification:
+def identify_task(task: Task) -> Identification:
+    """The identification of a task alone."""
+    return solve(task).identification
+
+
+def solve(task: Task) -> Solution:
     """The parameters and the unknown geometry that agree best with everything observed.
 
-    Solved at least twice: with the weights of the start, and with those of that solution. Where the noise is not given,
-    tips are taken to scatter as much as the residuals then do (`observed_covariance.scatter_of`). With a prior the last
-    solve is repeated until the weights agree with what it leads to (`prior_fit`).
+    Solved at least twice where weights depend on the arm: with those of the start, and with those of that solution.
+    Where the noise is not given, tips are taken to scatter as much as the residuals then do (`tip_errors.scatter_of`).
+    With a prior the last solve is repeated until the weights agree with what it leads to (`prior_fit`).
     """
     xp = namespace(task)
-    names = task.bounds.space.names
-    free = np.flatnonzero([name != task.anchor.hold for name in names])
-    space = Parameters(task.bounds.space.arm(task.start), tuple(names[i] for i in free))
+    names, free, space = task.bounds.space.names, task.free, task.space
     p = len(free)
     geometry = task.observed.start(space, task.start[free])
     count, endless = geometry.shape[0], xp.full(geometry.shape, np.inf)
@@ -60,7 +87,8 @@ def identify_observed(task: ObservedTask) -> Identification:
     state, found = before, None
     # Once more with the weights of a nearly right arm. Far from the solution a robust loss would see nothing but bad
     # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
-    losses = [None, None] if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
+    losses = [None] * (1 if task.needs_no_weights else 2)
+    losses = losses if task.loss is None else [None, Loss("huber"), task.loss, task.loss]
     prior = None if task.prior is None else task.prior.of(space.names, task.bounds.space.vector()[free])
     rows, of_prior, effective, by_scales = None, None, None, None
     for number, loss in enumerate(losses, 1):
@@ -84,14 +112,20 @@ def identify_observed(task: ObservedTask) -> Identification:
         state = state_at(task, space, z, scatter_at_start(task, space, z) if known else None)
     assert found is not None
     whitening = whitening_at(task, state, rows)
-    reduced = Bounds(space, *(side[:p] for side in sides))
-    active = reduced.active(z[:p])
-    covariance, of_geometry = _covariance(task, space, z, state, whitening, active, steps, by_scales)
+    active = Bounds(space, *(side[:p] for side in sides)).active(z[:p])
+    linear = Linearisation.of(task.observed, space, z, state.point, state.errors, whitening, task.loss)
+    influence = linear.influence(xp.concatenate([active != 0, xp.zeros(count, dtype=bool)]))
+    noise = _noise_of(task, linear, influence, state)
+    covariances, shared, reading = _of_rows(task, linear, influence, noise)
+    added = None if by_scales is None else by_scales.added(influence.inverse)
+    unknowns = propagated(influence, covariances, shared, whitening.prior, added)
+    matrix = unknowns.head[:p, :p] * steps[:p, None] * steps[:p]
+    covariance = ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise)
     parameters = set_at(task.start, free, z[:p])
     arm = task.bounds.space.arm(parameters)
-    spent = len(names) + count if effective is None else effective
-    metrics = _metrics(task, before, state, whitening, z[p:], of_geometry, spent)
-    return Identification(
+    spent = p + count if effective is None else effective
+    metrics = observed_metrics(task, before, state, linear, of_geometry(linear, influence, unknowns), spent)
+    identification = Identification(
         arm=arm,
         parameters=parameters,
         de=metrics[1].de,
@@ -108,87 +142,56 @@ def identify_observed(task: ObservedTask) -> Identification:
         bounds=task.bounds,
         anchor=task.anchor,
         noise_model=task.noise_model,
-        fitted_degrees_of_freedom=float("inf")
-        if task.noise_model == "given"
-        else float(task.observed.equations - p - count),
+        fitted_degrees_of_freedom=_degrees_of_freedom(task, p + count),
         observed=metrics[2],
         prior_metrics=of_prior,
     )
+    return Solution(identification, linear, influence, covariances, reading, state)
 
 
-def calibrate_observed(task: ObservedTask) -> Calibration:
-    """`identify_observed` of everything that the capture holds, as the result of a calibration."""
-    found = identify_observed(task)
-    observed, geometry = task.observed, found.observed
-    assert geometry is not None
-    xp = namespace(found)
-
-    def lengths(parts: dict[str, AnyArray]) -> Float[AnyArray, " l"]:
-        vectors = [parts[end] - parts[start] for start, end in observed.ends]
-        return xp.linalg.norm(xp.stack(vectors), axis=1) if vectors else xp.zeros(0)
-
-    return Calibration(
-        arm=found.arm,
-        parameters=found.parameters,
-        scale=None,
-        de=found.de,
-        deltam=found.deltam,
-        active=found.active,
-        steps=found.steps,
-        result=found.result,
-        parameter_covariance=found.parameter_covariance,
-        before=found.before,
-        after=found.after,
-        length_before=lengths(observed.split(observed.start(task.bounds.space, task.start))),
-        length_after=lengths(geometry.geometry),
-        stage1=found,
-        method="joint",
-    )
-
-
-def _covariance(
-    task: ObservedTask,
-    space: Parameters,
-    z: Float[AnyArray, " z"],
-    state: State,
-    whitening: Whitening,
-    active: Any,
-    steps: Float[AnyArray, " z"],
-    by_scales: ByScales | None,
-) -> tuple[ParameterCovariance, dict[str, Float[AnyArray, "_ _"]]]:
-    """Of the parameters, and of the parts of the geometry."""
-    xp, p, observed = namespace(z, task), len(space.names), task.observed
-    layout, groups, height = observed.layout, len(observed.layout.groups), len(space.names) + observed.layout.shared
-    linear = Linearisation.of(observed, space, z, state.point, state.errors, whitening, task.loss)
-    influence = linear.influence(xp.concatenate([active != 0, xp.zeros(z.shape[0] - p, dtype=bool)]))
-    scaled = xp.where(active != 0, 0.0, steps[:p])
-    noise = task.noise
+def _degrees_of_freedom(task: Task, unknowns: int) -> float:
+    """Of a noise model: of all equations, or of poses where each has a variance of its own."""
     if task.noise_model == "given":
-        assert noise is not None
-    elif task.noise_model == "estimated":
-        found = moments(
-            *(influence, state.point.rows, state.errors, whitening, state.sigma),
-            robust=task.loss is not None,
-            prior=None if whitening.prior is None else _information_of(whitening.prior, scaled, height),
-        )
-        noise = noise_from(found)
-    else:
-        noise = noise_from(Moments(xp.zeros(()), state.sigma**2))
+        return float("inf")
+    spare = float(task.observed.equations - unknowns)
     if task.noise_model == "robust":
-        covariances, shared = alone(influence, groups), None
-    else:
-        covariances = row_covariances(state.point.rows, state.errors, whitening, noise)
-        number = np.array(task.pose)
-        of_group = [number[group.index] for group in layout.groups]
-        shared = of_shared_readings(influence, state.errors, whitening, noise, of_group)
-    added = None if by_scales is None else by_scales.added(influence.inverse)
-    found = propagated(influence, covariances, shared, whitening.prior, added)
-    matrix = found.head[:p, :p] * steps[:p, None] * steps[:p]
-    geometry = _of_geometry(linear, influence, found)
-    return ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise), geometry
+        spare *= task.observed.q.shape[0] / task.observed.equations
+    return max(spare, 1.0)
 
 
-def _of_geometry(
+def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: State) -> Noise:
+    """The noise of the tips' errors by the noise model: given, or estimated."""
+    xp, whitening = namespace(linear.z), linear.whitening
+    if task.noise_model == "given":
+        assert task.noise is not None
+        return task.noise
+    if task.noise_model == "estimated":
+        prior = None
+        if whitening.prior is not None:
+            own = np.arange(whitening.prior.mean.shape[0])
+            squares = (whitening.prior.weight * linear.steps[own] * ~influence.fixed[own]) ** 2
+            prior = added_to(xp.zeros((linear.height, linear.height)), (own, own), squares)
+        robust = task.loss is not None
+        return noise_from(moments(influence, state.point.rows, state.errors, whitening, state.sigma, robust, prior))
+    return noise_from(Moments(xp.zeros(()), state.sigma**2))
+
+
+def _of_rows(
+    task: Task, linear: Linearisation, influence: Influence, noise: Noise
+) -> tuple[list[Float[AnyArray, "r r m"]], Float[AnyArray, "h h"] | None, list[np.ndarray]]:
+    """Covariances of the whitened rows of every pose, what shared readings add to the information that these make, and
+    the number of the reading of each pose."""
+    number = np.array(task.pose)
+    groups = task.observed.layout.groups
+    reading = [number[group.index] for group in groups]
+    if task.noise_model == "robust":
+        return alone(influence, len(groups)), None, reading
+    covariances = row_covariances(linear.point.rows, linear.errors, linear.whitening, noise)
+    rows = [influence.weighted_rows(number) for number in range(len(groups))]
+    return covariances, of_shared_readings(rows, linear.errors, linear.whitening, noise, reading), reading
+
+
+def of_geometry(
     linear: Linearisation, influence: Influence, covariance: UnknownsCovariance
 ) -> dict[str, Float[AnyArray, "_ _"]]:
     """Of each part; NaN for what the data leave open, such as the turn of a ball bar about itself."""
@@ -205,11 +208,6 @@ def _of_geometry(
     return found
 
 
-def _information_of(prior: PriorRows, scaled: Float[AnyArray, " p"], height: int) -> Float[AnyArray, "h h"]:
-    xp, own = namespace(scaled), np.arange(prior.mean.shape[0])
-    return added_to(xp.zeros((height, height)), (own, own), (prior.weight * scaled) ** 2)
-
-
 def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> ParameterCovariance:
     """With the scale anchor, which is exact."""
     xp = namespace(covariance)
@@ -222,23 +220,23 @@ def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> P
     )
 
 
-def _metrics(
-    task: ObservedTask,
+def observed_metrics(
+    task: Task,
     before: State,
     after: State,
-    whitening: Whitening,
-    geometry: Float[AnyArray, " g"],
+    linear: Linearisation,
     covariance: dict[str, Float[AnyArray, "_ _"]],
     spent: Any,
 ) -> tuple[Repeatability, Repeatability, ObservedMetrics]:
     """Repeatability of the sockets, and how far each observation is from its geometry; ``spent`` is how many unknowns
     the data determine."""
-    xp, observed = namespace(geometry, after.sigma), task.observed
-    rms, weights, squares = [], [], []
-    for rows, root in zip(after.point.rows, whitening.roots, strict=True):
-        white = xp.einsum("mab,bm->am", root, rows.values)
-        squares.append(xp.sum(white**2, axis=0))
-        weights.append(xp.ones(white.shape[1]) if task.loss is None else task.loss.cost_and_weight(white)[1])
+    xp, observed = namespace(after.sigma), task.observed
+    groups, rms = len(observed.layout.groups), []
+    squares = [xp.sum(block.white**2, axis=0) for block in linear.blocks[:groups]]
+    weights = [
+        xp.ones(square.shape) if weight is None else weight
+        for square, weight in zip(squares, linear.weights, strict=False)
+    ]
     each = zip(observed.by_observation(squares), observed.observations, strict=True)
     chi = [xp.sqrt(xp.mean(square) / one.rows) for square, one in each]
     total = sum(xp.sum(square) for square in squares)
@@ -246,7 +244,7 @@ def _metrics(
         distances = observed.by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in state.point.rows])
         rms.append(xp.stack([xp.sqrt(xp.mean(square)) for square in distances]))
     degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
-    parts = observed.split(geometry)
+    parts = observed.split(linear.z[len(linear.space.names) :])
     metrics = ObservedMetrics(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),
@@ -259,16 +257,17 @@ def _metrics(
         geometry_covariance={name: covariance[name] for name in observed.names},
         weights=tuple(observed.by_observation(weights)),
     )
-    return _repeatability(before, observed), _repeatability(after, observed), metrics
+    return repeatability_of(before, observed), repeatability_of(after, observed, after.sigma), metrics
 
 
-def _repeatability(state: State, observed: Observed) -> Repeatability:
-    """Of the tips in sockets; NaN where there is none."""
-    residuals = observed.by_observation([rows.values for rows in state.point.rows])
-    residuals = [values for values, one in zip(residuals, observed.observations, strict=True) if one.kind == "socket"]
-    if not residuals:
+def repeatability_of(state: State, observed: Observed, sigma: Float[AnyArray, ""] | None = None) -> Repeatability:
+    """Of the tips in sockets, NaN where there is none; ``sigma`` is the scatter of a tip coordinate as it is known."""
+    each = zip(observed.observations, observed.slices, strict=True)
+    slices = [rows for one, rows in each if one.kind == "socket"]
+    xp = namespace(state.sigma)
+    if not slices:
         return no_repeatability(state.sigma)
-    # Distances from the centroid do not depend on where the socket is, so residuals do as well as tips.
-    tips = namespace(state.sigma).concatenate(residuals, axis=1)
-    found = repeatability(tips.T, tuple(values.shape[1] for values in residuals))
-    return eqx.tree_at(lambda r: r.sigma, found, state.sigma)
+    tip = state.point.forward.tip
+    tips = xp.concatenate([tip[:, rows] for rows in slices], axis=1)
+    found = repeatability(tips.T, tuple(rows.stop - rows.start for rows in slices))
+    return found if sigma is None else eqx.tree_at(lambda r: r.sigma, found, sigma)

@@ -1,0 +1,146 @@
+"""Stage 2 of a calibration: the arm of stage 1 divided by k, with fixed parameters as they are and within bounds.
+
+Stage 1 leaves the scale to its anchor, a length kept at its start, and k = measured / nominal is its error. If no bound
+acts on a length, repeatability does not change with the scale, so the arm divided by k is the result; fixed lengths
+that free ones replace exactly (d_n by a probe along the same axis) can stay. Where a bound or another fixed length
+stands against the division, everything is solved at once instead (`calibrate`). Where fixed lengths set the scale by
+themselves, nothing is changed and k only compares them with the reference lengths.
+
+The division is a linear map of what stage 1 found, so its covariance is mapped along, with that of k, which follows the
+certified lengths, and the same poses as the parameters do.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from ..data.capture import Capture
+from ..data.observations.socket import position_of
+from ..kinematics.parameters import Bounds, Parameters
+from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
+from ..uncertainty.linear_propagation import UnknownsCovariance, geometry_covariance, rows_of_functions
+from .scale_anchor import ScaleAnchor
+from .solve import Solution
+
+_ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
+
+
+class ScaleFound(NamedTuple):
+    """k of stage 1, and how it follows the data."""
+
+    scale: Scale
+    rows: list[Float[AnyArray, "1 r m"]]  # its derivatives by the whitened rows of every block
+    by_lengths: Float[AnyArray, " l"]  # by the certified lengths, 1/mm
+    variance_of_lengths: Float[AnyArray, ""]  # of these, and what their disagreement adds
+
+
+def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
+    """k by the reference lengths of a capture, between positions that an identification has found.
+
+    Its standard uncertainty includes that of the identified parameters, and takes those on a bound as exact.
+    """
+    linear, influence = solution.linear, solution.influence
+    observed, xp = linear.observed, namespace(linear.z)
+    p, layout, positions = len(linear.space.names), observed.layout, observed.positions
+    pairs = [(position_of(length.start), position_of(length.end)) for length in capture.lengths]
+    used = list(dict.fromkeys(name for pair in pairs for name in pair))
+    alone = UnknownsCovariance(influence.inverse, influence.own)  # of a given arm
+    ends = MeasuredEnds(
+        positions=xp.stack([linear.z[p + positions[name]] for name in used]),
+        covariances=xp.stack([geometry_covariance(layout, alone, p, positions[name]) for name in used]),
+        ends=np.array([[used.index(name) for name in pair] for pair in pairs]),
+        nominal=xp.stack([length.value for length in capture.lengths]),
+        u=xp.stack([length.u for length in capture.lengths]),
+    )
+    scale, relative = scale_and_weights(ends)
+    by_positions = xp.einsum("l,lec->ec", relative, ends.by_positions)
+    head = xp.zeros((1, linear.height))
+    components = [xp.zeros((1, count, size)) for count, size in layout.classes]
+    for name, derivative in zip(used, by_positions, strict=True):
+        of, component, first = layout.component_of(int(positions[name][0]))
+        if of is None:
+            head = set_at(head, (0, p + positions[name]), derivative)
+        else:
+            components[of] = set_at(components[of], (0, component, slice(first, first + 3)), derivative)
+    rows = rows_of_functions(influence, head, components)
+    by_lengths = -relative * scale.measured / scale.nominal
+    predicted = relative @ ends.covariance(scale.value) @ relative
+    added = xp.sum((by_lengths * ends.u) ** 2) + xp.maximum(scale.u**2 - predicted, 0.0)
+    u = xp.sqrt(solution.covariance_of(rows)[0, 0] + added)
+    return ScaleFound(eqx.tree_at(lambda s: s.u, scale, u), rows, by_lengths, added)
+
+
+class Division(NamedTuple):
+    """The parameters of stage 1 divided by k."""
+
+    parameters: Float[AnyArray, " p"]
+    stands_against: Bool[AnyArray, ""]  # whether a bound or a fixed length does not allow it
+
+
+def divided(
+    anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], parameters: Any, k: Any
+) -> Division:
+    """Of one problem or of a batch; ``active`` is what was on a bound in stage 1."""
+    space = bounds.space
+    if not anchor.can_scale:
+        return Division(parameters, namespace(parameters).zeros(parameters.shape[:-1], dtype=bool))
+    xp, scaled = namespace(parameters, k), divide_lengths(space, parameters, k, anchor.partners)
+    lengths = np.broadcast_to(divisible(space), scaled.shape)
+    concerned = (scaled < bounds.lower - _ROUNDING) | (scaled > bounds.upper + _ROUNDING)
+    if anchor.hold is not None:  # without an anchor it is the active bounds that set the scale of stage 1
+        concerned = concerned | (active != 0)
+    if anchor.partners is None:
+        concerned = xp.ones_like(concerned)
+    against = xp.any(concerned & lengths, axis=-1) & xp.all(xp.isfinite(scaled), axis=-1)
+    return Division(_clipped(space, bounds.lower, bounds.upper, scaled), against)
+
+
+def _clipped(
+    space: Parameters,
+    lower: Float[AnyArray, "... p"],
+    upper: Float[AnyArray, "... p"],
+    scaled: Float[AnyArray, "... p"],
+) -> Float[AnyArray, "... p"]:
+    """Divided lengths within their bounds, and on a bound that only rounding separates them from.
+
+    So short a step would not bring a solve onto the bound, which then counts as inactive, in derivatives too.
+    """
+    xp = namespace(lower, upper, scaled)
+    inside = xp.clip(scaled, lower, upper)
+    inside = xp.where(inside - lower <= _ROUNDING, lower, xp.where(upper - inside <= _ROUNDING, upper, inside))
+    return xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled)
+
+
+class DividedUncertainty(NamedTuple):
+    """Of the divided parameters, mm and rad."""
+
+    covariance: Float[AnyArray, "p p"]
+    rows: list[Float[AnyArray, "p r m"]]  # how they follow the whitened rows of every block
+
+
+def divided_uncertainty(solution: Solution, found: ScaleFound, anchor: ScaleAnchor, divided: Any) -> DividedUncertainty:
+    """Of parameters that were divided by k.
+
+    x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_lengths`), so
+    dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
+    """
+    linear, influence, k = solution.linear, solution.influence, found.scale.value
+    xp, free, p = namespace(divided, k), len(linear.space.names), divided.shape[0]
+    space = solution.identification.bounds.space
+    index = np.array([space.names.index(name) for name in linear.space.names], dtype=int)
+    head = xp.concatenate([xp.asarray(np.eye(free)), xp.zeros((free, linear.height - free))], axis=1)
+    head = head * xp.where(influence.fixed[:free], 0.0, linear.steps[:free])[:, None]
+    components = [xp.zeros((free, *own.shape[:2])) for own in influence.own]
+    of_free = rows_of_functions(influence, head, components)
+    divides = xp.asarray(divisible(space) & anchor.can_scale)
+    by_k = xp.where(divides, (divided + replaced_lengths(space, anchor.partners)) / k, 0.0)
+    change = xp.where(divides, 1 / k, 1.0)
+    rows = []
+    for one, of_k in zip(of_free, found.rows, strict=True):
+        whole = set_at(xp.zeros((p, *one.shape[1:])), index, one)
+        rows.append(change[:, None, None] * whole - by_k[:, None, None] * of_k)
+    matrix = solution.covariance_of(rows) + found.variance_of_lengths * by_k[:, None] * by_k[None, :]
+    return DividedUncertainty(matrix, rows)
