@@ -53,6 +53,14 @@ def rotation_derivative(w: Float[AnyArray, "3 ..."]) -> Float[AnyArray, "3 3 ...
     return _polynomial(w, cosine, cubic)
 
 
+def rotation_and_derivative(
+    w: Float[AnyArray, "3 ..."],
+) -> tuple[Float[AnyArray, "3 3 ..."], Float[AnyArray, "3 3 ..."]]:
+    """`rotation_matrix` and `rotation_derivative`, from the same sines and cosines."""
+    sine, cosine, cubic = _coefficients(w)
+    return _polynomial(w, sine, cosine), _polynomial(w, cosine, cubic)
+
+
 def _polynomial(
     w: Float[AnyArray, "3 ..."], first: Float[AnyArray, "..."], second: Float[AnyArray, "..."]
 ) -> Float[AnyArray, "3 3 ..."]:

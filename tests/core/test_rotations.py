@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aacmm_jax.core.rotations import fitted_frame, inverse_frame, rotation_derivative, rotation_matrix, rotation_vector
+from aacmm_jax.core.rotations import (
+    fitted_frame,
+    inverse_frame,
+    rotation_and_derivative,
+    rotation_derivative,
+    rotation_matrix,
+    rotation_vector,
+)
 
 
 @pytest.fixture(params=[1e-9, 1e-4, 0.5, 3.1, np.pi - 1e-7])
@@ -32,6 +39,17 @@ def test_derivative(vectors):
             change = rotation_matrix(w + shift) @ rotation_matrix(w - shift).T
             numerical = Rotation.from_matrix(change).as_rotvec() / (2 * step)
             np.testing.assert_allclose(rotation_derivative(w)[:, k], numerical, atol=1e-8)
+
+
+@pytest.mark.parametrize("library", [np, jnp], ids=["numpy", "jax"])
+def test_vectors_that_are_columns(vectors, library):
+    """One matrix each, of many vectors at once as of one."""
+    found = rotation_and_derivative(library.asarray(vectors.T))
+    for function, matrices in zip((rotation_matrix, rotation_derivative), found, strict=True):
+        expected = np.stack([function(w) for w in vectors], axis=-1)
+        np.testing.assert_allclose(matrices, expected, atol=1e-15)
+        np.testing.assert_allclose(function(library.asarray(vectors.T)), expected, atol=1e-15)
+        np.testing.assert_array_equal(function(vectors[0][:, None])[..., 0], function(vectors[0]))
 
 
 compiled_frame = jax.jit(fitted_frame)

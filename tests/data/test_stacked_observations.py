@@ -67,6 +67,11 @@ SPHERES = [ALL[name] for name in ("sphere", "certified sphere", "exact sphere", 
 SEEN = unknowns_of(to_numpy(TRANSFORMS))
 
 
+def test_every_kind_that_stacks_is_here():
+    """A new kind that is alike others needs a row."""
+    assert {one.kind for one in ALL.values() if one.alike is not None} == {row[0].kind for row in STACKS.values()}
+
+
 def tips_of(poses):
     return Tips(TIPS.position[:, poses], tuple(axis[:, poses] for axis in TIPS.axes))
 

@@ -23,7 +23,8 @@ def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r 
 def variances(u: Float[AnyArray, "..."], poses: int) -> Float[AnyArray, "m 1 1"]:
     """Covariances of one residual a pose, from one standard uncertainty for all or from one each."""
     xp = namespace(u)
-    return xp.broadcast_to(xp.reshape(xp.asarray(u**2), (-1, 1, 1)), (poses, 1, 1))
+    square = xp.reshape(xp.asarray(u**2), (-1, 1, 1))
+    return square if len(square) == poses else xp.broadcast_to(square, (poses, 1, 1))
 
 
 def no_covariance(rows: int, poses: int) -> Float[np.ndarray, "m r r"]:

@@ -14,7 +14,7 @@ from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import length_and_direction, products_by_column, semidefinite_eigen, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace, scan
-from ...core.rotations import cross, rotation_derivative, rotation_matrix
+from ...core.rotations import cross, rotation_and_derivative, rotation_matrix
 from .columns import as_columns, variances
 from .frames import moved, turned_z
 from .observation import (
@@ -226,13 +226,13 @@ def distances(
     derivatives of the distances by the axis' numbers."""
     xp, axis = namespace(tips, axis), as_columns(axis)
     w = xp.concatenate([axis[:2], xp.zeros_like(axis[:1])])
-    across_axis = rotation_matrix(w)[:, :2]
+    rotation, axes = rotation_and_derivative(w)
+    across_axis = rotation[:, :2]
     between = products_by_column(across_axis.swapaxes(0, 1), tips) - axis[2:]
     distance, across = length_and_direction(between)
     direction = products_by_column(across_axis, across)
     # A small rotation v of the axes moves a tip t by -v x t in them, and the distance by -v.(t x direction).
-    small = rotation_derivative(w)[:, :2].swapaxes(0, 1)
-    by_rotation = -products_by_column(small, cross(tips, direction))
+    by_rotation = -products_by_column(axes[:, :2].swapaxes(0, 1), cross(tips, direction))
     return distance, direction, xp.concatenate([by_rotation, -across])
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ...core.linear_algebra import products_by_column, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import cross_matrix, fitted_frame, rotation_derivative, rotation_matrix
+from ...core.rotations import cross_matrix, fitted_frame, rotation_and_derivative, rotation_matrix
 from .columns import as_columns, each_pose
 from .observation import Tips
 
@@ -23,10 +23,10 @@ class Placed(NamedTuple):
 def placed(frame: Float[AnyArray, "6 ..."], coordinates: Float[AnyArray, "3 m"]) -> Placed:
     """Points (mm) of a frame, ``(6,)`` or ``(6, 1)``, or of a frame each ``(6, m)``, in the frame around it."""
     xp, columns, m = namespace(frame, coordinates), as_columns(frame), coordinates.shape[1]
-    rotation = rotation_matrix(columns[:3])
+    rotation, axes = rotation_and_derivative(columns[:3])
     turned = products_by_column(rotation, coordinates)
     # A change of component k turns the points by a small rotation about column k of the derivative.
-    small = cross_matrix(rotation_derivative(columns[:3]))  # (3, 3, k, p)
+    small = cross_matrix(axes)  # (3, 3, k, p)
     by_rotation = products_by_column(xp.moveaxis(small, 2, 0).reshape(9, 3, -1), turned).reshape(3, 3, m)
     identity = each_pose(xp.asarray(np.eye(3)), m)
     return Placed(turned + columns[3:], xp.concatenate([by_rotation, identity]), rotation)

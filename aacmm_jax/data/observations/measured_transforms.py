@@ -11,7 +11,7 @@ from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import cross, rotation_derivative, rotation_matrix, rotation_vector
+from ...core.rotations import cross, rotation_and_derivative, rotation_derivative, rotation_matrix, rotation_vector
 from .columns import each_pose, variances
 from .frames import frame_and_offset, placed, seen_from, turned_covariances
 from .measured_points import MEASURED, AbstractMeasured
@@ -131,11 +131,12 @@ class MeasuredTransforms(AbstractMeasured):
         place = placed(frame, self.points.T)
         axes = xp.stack(tips.axes)  # (i, 3, m): the axis i
         # The target's axes j as the arm has them, and as they were seen: (j, 3, m) and (3, j, m).
-        predicted = products_by_column(rotation_matrix(orientation).swapaxes(0, 1), axes)
+        target, by_target = rotation_and_derivative(orientation)
+        predicted = products_by_column(target.swapaxes(0, 1), axes)
         seen = products_by_column(place.rotation, xp.moveaxis(self.rotations, 0, -1))
         angle, left, right = _logarithm(products_by_column(predicted.swapaxes(0, 1), seen.swapaxes(0, 1)))
         by_station = -products_by_column(rotation_derivative(frame[:3]).swapaxes(0, 1), right.swapaxes(0, 1))
-        inside = products_by_column(rotation_derivative(orientation).swapaxes(0, 1), axes)
+        inside = products_by_column(by_target.swapaxes(0, 1), axes)
         by_orientation = products_by_column(left, inside.swapaxes(0, 1)).swapaxes(0, 1)
         none = xp.zeros((3, 3, m))
         covariance = turned_covariances(place.rotation, self.covariance)

@@ -145,8 +145,10 @@ class AbstractObservation(Module):
 
     @abc.abstractmethod
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        """The residuals at these tips and this geometry; derivatives by unknowns are those by the numbers of one
-        column, and those by each pose's own where each has one."""
+        """The residuals at these tips and this geometry, whose numbers are columns: one for all poses, or one each.
+
+        Derivatives by unknowns are those of a pose by the numbers of its own column. A kind that is `stacked` takes
+        its `stated` numbers, too, as one for all poses or one each."""
 
     def stored(self) -> dict[str, Any]:
         """The values of the entries, from which `rebuilt` makes the same observation; without those that have none."""

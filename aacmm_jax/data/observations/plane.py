@@ -12,7 +12,7 @@ from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import products_by_column, semidefinite_eigen
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import cross, rotation_derivative, rotation_matrix
+from ...core.rotations import cross, rotation_and_derivative, rotation_matrix
 from .columns import variances
 from .frames import moved, turned_z
 from .observation import (
@@ -281,7 +281,8 @@ def heights(
     plane's numbers."""
     xp = namespace(tips, plane)
     w = xp.concatenate([plane[:2], xp.zeros_like(plane[:1])])
-    normal, axes = rotation_matrix(w)[:, 2], rotation_derivative(w)
+    rotation, axes = rotation_and_derivative(w)
+    normal = rotation[:, 2]
     # The normal, and its derivatives by the two components.
     rows = xp.stack([normal, *(cross(axes[:, i], normal) for i in range(2))])
     height, *by_turn = products_by_column(rows, tips)
