@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.parameters import Parameters
-from ..model.measurement import Measurement, length_covariance
+from ..model.measurement import Measurement
 from ..model.observed import Observed
 from ..model.residuals import measured_lengths
 from ..uncertainty.group_test import Block

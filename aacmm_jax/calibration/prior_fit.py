@@ -31,9 +31,9 @@ from ..uncertainty.evidence import (
     slope_of_expectation,
 )
 from .bounded_fit import Fit, fit
+from .results import PriorMetrics
 from .solve_state import State, state_at, whitening_at
 from .task import Task
-from .results import PriorMetrics
 
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
 # Largest change of the log of a variance that no further round is worth, where derivatives pass through, and elsewhere.

@@ -22,7 +22,7 @@ from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
 from .left_out import CrossValidation
 from .results import Calibration, Identification, NoisyEncoder, ObservedMetrics, PriorMetrics
-from .second_stage import LARGEST_LOG_K
+from .scale_fix import LARGEST_LOG_K
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
 

@@ -27,7 +27,7 @@ from ..kinematics.parameters import Parameters
 from ..model.observed import Observed, linear_rows
 from ..uncertainty.tip_errors import ArmErrors, arm_errors
 from .drawn_errors import DrawnErrors, draw_shared
-from .observed_state import configurations
+from .task import configurations
 from .results import Calibration
 
 

@@ -25,6 +25,7 @@ from ..uncertainty.linear_propagation import UnknownsCovariance, geometry_covari
 from .scale_anchor import ScaleAnchor
 from .solve import Solution
 
+LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
 _ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
 
 
@@ -80,9 +81,7 @@ class Division(NamedTuple):
     stands_against: Bool[AnyArray, ""]  # whether a bound or a fixed length does not allow it
 
 
-def divided(
-    anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], parameters: Any, k: Any
-) -> Division:
+def divided(anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], parameters: Any, k: Any) -> Division:
     """Of one problem or of a batch; ``active`` is what was on a bound in stage 1."""
     space = bounds.space
     if not anchor.can_scale:

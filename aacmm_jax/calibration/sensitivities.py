@@ -45,6 +45,4 @@ def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) 
 
 def _of_residuals(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) -> list[Float[np.ndarray, "q r m"]]:
     """Derivatives by the residuals before they are whitened."""
-    return [
-        np.einsum("qam,mab->qbm", one, root) for one, root in zip(rows, linear.whitening.roots, strict=False)
-    ]
+    return [np.einsum("qam,mab->qbm", one, root) for one, root in zip(rows, linear.whitening.roots, strict=False)]

@@ -27,7 +27,7 @@ from .results import Calibration, Identification
 from .scale_anchor import default_method, scale_from_slides, warn_of_a_known_scale
 from .sensitivities import Sensitivities
 from .shared_errors import with_shared_errors
-from .stages import Stages, identified, in_two_stages, jointly
+from .stages import identified, in_two_stages, jointly
 from .task import Task, task_of
 
 _MAX_STEPS = 300
@@ -222,7 +222,9 @@ def calibrate(
     if replace_noise and noise_model not in ("common", "robust") and robust is None:
         again = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
         again |= {"check_identifiability": False, "replace_noise": False, "shared_errors": shared_errors}
-        found = with_noise_by_joint(result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **again))
+        found = with_noise_by_joint(
+            result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **again)
+        )
         if found is not result:
             return found
     if shared_errors and sensitivities is not None:
@@ -258,4 +260,6 @@ def _traced(first: Task | None, task: Task, capture: Capture, method: str) -> Ca
     found = in_two_stages(stage1, capture)
     if not stage1.solution.identification.anchor.can_scale:
         return found.calibration
-    return jax.lax.cond(found.stands_against, lambda: jointly(task, capture, stage1, method).calibration, lambda: found.calibration)
+    return jax.lax.cond(
+        found.stands_against, lambda: jointly(task, capture, stage1, method).calibration, lambda: found.calibration
+    )

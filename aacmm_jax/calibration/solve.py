@@ -52,9 +52,7 @@ class Solution(NamedTuple):
         total = covariance_of_rows(rows, self.covariances)
         if identification.noise_model == "robust":
             return total
-        shared = of_shared_readings(
-            rows, self.state.errors, self.linear.whitening, identification.noise, self.reading
-        )
+        shared = of_shared_readings(rows, self.state.errors, self.linear.whitening, identification.noise, self.reading)
         return total if shared is None else total + shared
 
 

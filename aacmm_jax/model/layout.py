@@ -60,13 +60,15 @@ class Layout(NamedTuple):
     shared: int  # numbers of the shared blocks
     classes: tuple[tuple[int, int], ...]  # number and size of the components of each class
     groups: tuple[Group, ...]
-    # Class, component and number of each reference length; then of each certified part: (class or None, index).
-    lengths: tuple[int | None, ...]
 
     @property
-    def count(self) -> int:
-        """Numbers of the unknown geometry."""
-        return sum(len(units) for _, units in self.parts)
+    def positions(self) -> dict[str, np.ndarray]:
+        """Indices of the numbers of each part among all of them."""
+        found, first = {}, 0
+        for name, units in self.parts:
+            found[name] = np.arange(first, first + len(units))
+            first += len(units)
+        return found
 
     def component_of(self, index: int) -> tuple[int | None, int, int]:
         """Class, component, and place in it of a number of the geometry; None, 0 and itself of a shared one."""
@@ -136,14 +138,12 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
             members = sorted(members, key=lambda number: component_of[joined[number]])
         groups.append(_group(members, used, units, private, first, ends_of, observations, of, classes, component_of,
                              joined, sum(len(units[name]) for name in shared)))  # fmt: skip
-    layout = Layout(
+    return Layout(
         parts=tuple((name, units[name]) for name in order),
         shared=sum(len(units[name]) for name in shared),
         classes=tuple(classes),
         groups=tuple(groups),
-        lengths=(),
     )
-    return layout._replace(lengths=tuple(layout.component_of(first[start])[0] for start, _ in ends))
 
 
 def _of_kind(number: int, kind: tuple, coupled: set[int], size: np.ndarray, joined: list[int]) -> bool:

@@ -102,10 +102,7 @@ class Observed(Module):
     @property
     def positions(self) -> dict[str, np.ndarray]:
         """Indices of the numbers of each part among all of them."""
-        ends = np.cumsum([len(units) for units in self.blocks.values()])
-        return {
-            name: np.arange(end - len(units), end) for (name, units), end in zip(self.blocks.items(), ends, strict=True)
-        }
+        return self.layout.positions
 
     @property
     def steps(self) -> np.ndarray:

@@ -5,6 +5,7 @@ own unknowns; the chain's analytic columns say how tips and rotations follow the
 head of the arrow (parameters and shared geometry), and by the private numbers of the component that a row belongs to.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from ..data.observations.observation import Rows
 from ..kinematics.chain import ForwardPass
 from ..kinematics.jacobian import rotation_columns, shared_columns, stacked_jacobian_columns
 from ..kinematics.parameters import Parameters
-from .layout import Group
+from .layout import Group, Layout
 from .observed import Observed, tips_of
 from .socket_sums import to_poses
 
@@ -182,9 +183,10 @@ def _vectors(observed: Observed, parts: dict[str, AnyArray]) -> Float[AnyArray, 
 class _Relations(NamedTuple):
     """Where the relations of one class, or of the shared geometry, stand."""
 
-    rows: np.ndarray  # their numbers: lengths, then numbers of certified parts
-    columns: np.ndarray  # of each of their derivatives, within the component or among the shared numbers
-    of_row: np.ndarray  # the row of each derivative
+    rows: np.ndarray  # their numbers: lengths, then numbers of certified parts; component by component
+    numbers: np.ndarray  # of their derivatives, as `_relations` lists these
+    columns: np.ndarray  # where each of these stands, within the component or among the shared numbers
+    of_row: np.ndarray  # place of its row among ``rows``
     sizes: tuple[int, ...]
 
 
@@ -202,25 +204,25 @@ def _relations(observed: Observed, geometry: Float[AnyArray, " g"], whitening: W
     # Derivatives as a list of numbers, in the order in which `_places` lists where they stand.
     numbers = xp.concatenate([(-slopes).ravel(), slopes.ravel(), *(whitening.certified[name] for name in certified)])
     found = []
-    for of, places in _places(observed, tuple(certified)).items():
-        chosen, count = white[places.rows], len(places.rows)
+    for of, places in _places(observed.layout, observed.ends, tuple(certified)).items():
         height = p + layout.shared if of is None else layout.classes[of][1]
-        whole = xp.zeros((height, count))
-        row = {number: i for i, number in enumerate(places.rows.tolist())}
-        at = (places.columns[0] + (p if of is None else 0), np.array([row[n] for n in places.of_row.tolist()]))
-        whole = set_at(whole, at, numbers[places.columns[1]])[:, None]
+        whole = xp.zeros((height, len(places.rows)))
+        at = places.columns + (p if of is None else 0), places.of_row
+        whole = set_at(whole, at, numbers[places.numbers])[:, None]
         by = (whole, None) if of is None else (None, whole)
-        found.append(RowBlock(chosen[None], *by, of, places.sizes))
+        found.append(RowBlock(white[places.rows][None], *by, of, places.sizes))
     return found
 
 
-def _places(observed: Observed, certified: tuple[str, ...]) -> dict[int | None, _Relations]:
+@lru_cache(maxsize=32)
+def _places(
+    layout: Layout, ends: tuple[tuple[str, str], ...], certified: tuple[str, ...]
+) -> dict[int | None, _Relations]:
     """Of the relations of each class: their rows sorted by component, and where their derivatives stand."""
-    layout, positions = observed.layout, observed.positions
-    starts, ends = ([positions[pair[i]] for pair in observed.ends] for i in (0, 1))
+    positions, count = layout.positions, len(ends)
+    starts, stops = ([positions[pair[i]] for pair in ends] for i in (0, 1))
     own = [positions[name] for name in certified]
-    count = len(observed.ends)
-    index = np.concatenate([*starts, *ends, *own, np.zeros(0, dtype=int)]).astype(int)
+    index = np.concatenate([*starts, *stops, *own]).astype(int)
     of_length = np.repeat(np.arange(count), 3)
     row = np.concatenate([of_length, of_length, count + np.arange(sum(map(len, own)))]).astype(int)
     located = [layout.component_of(int(i)) for i in index]
@@ -228,11 +230,15 @@ def _places(observed: Observed, certified: tuple[str, ...]) -> dict[int | None, 
     for of in dict.fromkeys(place[0] for place in located):
         mine = np.array([i for i, place in enumerate(located) if place[0] == of])
         component = {int(row[i]): located[i][1] for i in mine}
-        rows = np.array(sorted(component, key=lambda number: (component[number], number)))
-        number = 1 if of is None else layout.classes[of][0]
-        sizes = np.bincount([component[n] for n in rows.tolist()], minlength=number) if of is not None else []
-        columns = np.stack([np.array([located[i][2] for i in mine]), mine])
-        found[of] = _Relations(rows, columns, row[mine], tuple(int(size) for size in sizes))
+        rows = sorted(component, key=lambda number: (component[number], number))
+        sizes = np.bincount([component[n] for n in rows], minlength=0 if of is None else layout.classes[of][0])
+        found[of] = _Relations(
+            rows=np.array(rows),
+            numbers=mine,
+            columns=np.array([located[i][2] for i in mine]),
+            of_row=np.array([rows.index(number) for number in row[mine].tolist()]),
+            sizes=() if of is None else tuple(int(size) for size in sizes),
+        )
     return found
 
 

@@ -177,9 +177,7 @@ class MeasuredEnds(NamedTuple):
         return xp.diag((scale_factor * self.u) ** 2 + 1e-24) + scatter
 
 
-def ends_of_sockets(
-    tips: Float[AnyArray, "N 3"], capture: Capture, sigma: Float[AnyArray, ""]
-) -> MeasuredEnds:
+def ends_of_sockets(tips: Float[AnyArray, "N 3"], capture: Capture, sigma: Float[AnyArray, ""]) -> MeasuredEnds:
     """The ends of a capture's lengths, at the means of their tips, given the standard deviation of a coordinate."""
     xp, pairs = namespace(tips, sigma), capture.ends()
     used, ends = np.unique(pairs, return_inverse=True)

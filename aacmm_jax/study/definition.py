@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..calibration.checks import check_enough
-from ..calibration.observed_state import check_observed
+from ..calibration.task import check_observed
 from ..calibration.scale_anchor import default_method, scale_anchor
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG, M

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..core.linear_algebra import inverse_positive_definite
+from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import AnyArray, added_to, namespace
 from ..data.noise import Noise
 from ..data.observations.observation import Rows
@@ -20,6 +20,8 @@ from ..model.layout import Layout
 from ..model.rows import PriorRows, RowBlock, Whitening
 from .covariance import inverse_information
 from .tip_errors import ArmErrors, products
+
+_LEAST_REDUNDANCY = 0.05  # determinant of a pose's part of the residuals' projector
 
 
 class UnknownsCovariance(NamedTuple):
@@ -196,9 +198,15 @@ def alone(influence: Influence, groups: int) -> list[Float[AnyArray, "r r m"]]:
             own = influence.weighted(number, own)
             per_pose = influence.own[block.of][np.repeat(np.arange(len(block.sizes)), block.sizes)]
             leverage = leverage + xp.einsum("kam,mkl,lbm->mab", own, per_pose, own)
-        redundancy = inverse_positive_definite(1.05 * xp.asarray(np.eye(a.shape[1]))[None] - leverage)
-        left = xp.einsum("mab,bm->ma", redundancy, block.white)
-        found.append(xp.moveaxis(left[:, :, None] * left[:, None, :], 0, -1))
+        identity = xp.asarray(np.eye(a.shape[1]))
+        # Where a pose determines its own geometry nearly alone, its residual says nothing: it has the common variance.
+        whitening = inverse_cholesky(identity[None] - leverage)
+        determinant = 1 / xp.prod(xp.diagonal(whitening, axis1=1, axis2=2), axis=1) ** 2
+        enough = determinant > _LEAST_REDUNDANCY
+        whitening = xp.where(enough[:, None, None], whitening, identity)
+        left = xp.einsum("mba,mbc,cm->ma", whitening, whitening, block.white)
+        own = xp.where(enough[:, None, None], left[:, :, None] * left[:, None, :], identity)
+        found.append(xp.moveaxis(own, 0, -1))
     return found
 
 
