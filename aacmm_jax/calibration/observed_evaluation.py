@@ -14,7 +14,7 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
-from ..model.elimination import observed_model, observed_rows
+from ..model.elimination import Args, observed_model, observed_rows
 from ..model.observed import Observed
 from ..model.rows import PointRows, Whitening, rows_at, whitening_of
 from ..uncertainty.linear_propagation import geometry_covariance
@@ -109,7 +109,7 @@ def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noi
 
     whitening = weighted(z, first=True)[-1]
     for _ in range(2):  # with the weights of the start, and with those of that geometry
-        args = (space, observed, whitening, None)
+        args = Args(space, observed, whitening)
         z = fit(observed_rows, observed_model, z, args, sides, steps, _MAX_STEPS).parameters
         point, errors, sigma, whitening = weighted(z, first=False)
     return GeometryFit(Linearisation.of(observed, space, z, point, errors, whitening, None), free[1:], sigma)

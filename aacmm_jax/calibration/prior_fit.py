@@ -17,7 +17,7 @@ from ..core.linear_algebra import inverse_positive_definite, singular_values, so
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, while_loop
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import LEAST_STEPS, MIXED, ParameterPrior
-from ..model.elimination import observed_model, observed_rows, reduced
+from ..model.elimination import Args, observed_model, observed_rows, reduced
 from ..model.robust import Loss
 from ..model.rows import PriorRows, Whitening
 from ..solver.reason import MAX_STEPS, reasons
@@ -100,7 +100,7 @@ class PriorProblem(NamedTuple):
     def fit(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], *, differentiable: bool) -> Fit:
         """The least squares with these scales."""
         xp, index = namespace(scales, z), self.prior.index
-        args = (self.space, self.task.observed, self.whitening(scales, self.rows(scales)), self.loss)
+        args = Args(self.space, self.task.observed, self.whitening(scales, self.rows(scales)), self.loss)
         tight = xp.clip(stop_gradient(self.sd(scales)), _LEAST_SCALE, 1.0)
         step = set_at(self.steps, index, self.steps[index] * tight)
         functions, limit = (observed_rows, observed_model), self.task.max_steps
@@ -109,7 +109,7 @@ class PriorProblem(NamedTuple):
     def model(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> PriorModel:
         """The model of the parameters that have a prior, linear at a point."""
         xp, index = namespace(scales, z), self.prior.index
-        data = observed_model(z, (self.space, self.task.observed, self.whitening(scales, None), self.loss))
+        data = observed_model(z, Args(self.space, self.task.observed, self.whitening(scales, None), self.loss))
         pinned = (z <= self.sides[0]) | (z >= self.sides[1])
         deviation = (z[: self.prior.mean.shape[0]] - self.prior.mean)[index] / self.steps[index]
         gram, gradient = reduced(data.gram.scaled(self.steps), data.gradient * self.steps)

@@ -6,13 +6,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray, added_to, compiled, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, added_to, compiled, namespace, set_at, stop_gradient
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds
-from ..model.elimination import observed_model, observed_rows
+from ..model.elimination import Args, observed_model, observed_rows, with_linear_geometry
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
 from ..model.robust import Loss
+from ..model.rows import Whitening
+from ..solver.levenberg_marquardt import Rules
 from ..uncertainty.covariance import ParameterCovariance
 from ..uncertainty.linear_propagation import (
     Influence,
@@ -26,7 +28,7 @@ from ..uncertainty.linear_propagation import (
 )
 from ..uncertainty.linearisation import Linearisation
 from ..uncertainty.variance_components import Moments, moments, noise_from
-from .bounded_fit import RULES, fit
+from .bounded_fit import RULES, Fit, fit
 from .prior_fit import PriorProblem, fit_with_prior
 from .results import Identification, ObservedMetrics
 from .solve_state import State, scatter_at_start, state_at, whitening_at
@@ -100,11 +102,10 @@ def solve(task: Task) -> Solution:
                 of_prior, effective, by_scales = problem.metrics(scales, z)
                 state = state_at(task, space, z, effective=effective)
                 break
-        args = (space, task.observed, whitening_at(task, state, rows), loss)
-        functions = observed_rows, observed_model
+        whitening = unweighted(task) if task.needs_no_weights else whitening_at(task, state, rows)
         rules = RULES if number == len(losses) else _ROUGH
-        found = fit(*functions, z, args, sides, steps, task.max_steps, rules=rules, differentiable=task.differentiable)
-        z, evaluations = found.parameters, evaluations + found.steps
+        z, found = _fitted(Args(space, task.observed, whitening, loss), z, sides, steps, task, rules)
+        evaluations = evaluations + found.steps
         # Where the noise is given, only the last scatter matters, and its iteration costs as much as a few steps.
         known = task.noise is not None and number < len(losses)
         state = state_at(task, space, z, scatter_at_start(task, space, z) if known else None)
@@ -145,6 +146,36 @@ def solve(task: Task) -> Solution:
         prior_metrics=of_prior,
     )
     return Solution(identification, linear, influence, covariances, reading, state)
+
+
+def unweighted(task: Task) -> Whitening:
+    """Of a problem whose rows all weigh the same."""
+    return Whitening((None,) * len(task.observed.layout.groups), np.zeros(0), {})
+
+
+def _fitted(
+    args: Args,
+    z: Float[AnyArray, " z"],
+    sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]],
+    steps: Float[AnyArray, " z"],
+    task: Task,
+    rules: Rules,
+) -> tuple[Float[AnyArray, " z"], Fit]:
+    """One least squares from a point; components that rows are linear in are no unknowns of it, but of a robust one."""
+    layout = args.observed.layout
+    linear = sum(count * size for count, size in layout.classes[len(layout.classes) - layout.linear :])
+    count = z.shape[0] - (linear if args.loss is None else 0)
+    if count < z.shape[0]:
+        args = args._replace(linear=stop_gradient(z[count:]))
+    sides = sides[0][:count], sides[1][:count]
+    functions = observed_rows, observed_model
+    found = fit(
+        *functions, z[:count], args, sides, steps[:count], task.max_steps, rules=rules,
+        differentiable=task.differentiable,
+    )  # fmt: skip
+    if args.linear is None:
+        return found.parameters, found
+    return with_linear_geometry(found.parameters, args), found
 
 
 def _degrees_of_freedom(task: Task, unknowns: int) -> float:

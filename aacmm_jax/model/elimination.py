@@ -6,24 +6,40 @@ the rows depend on the head as A~ = A - C^T D^-1 B, the eliminated derivatives, 
 sum A~ A~^T, the Schur complement of the arrow.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.linear_algebra import inverse_positive_definite, semidefinite_eigen
+from ..core.linear_algebra import inverse_cholesky, inverse_positive_definite, semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, added_to, namespace
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
 from ..solver.arrow import Arrow, joined
 from .observed import Observed
 from .robust import Loss
-from .rows import PriorRows, RowBlock, Whitening, relation_residuals, row_blocks, rows_at
+from .rows import PriorRows, RowBlock, Whitening, row_blocks, rows_at
+from .socket_sums import means_over_sockets, sums_over_sockets, to_poses
 
 _LONG = 40  # poses of a component, from which a product of matrices each is the fastest sum over them
 _NULL = 1e-12  # eigenvalues of a component's information below this, of the largest, are zero
 
-Args = tuple[Parameters, Observed, Whitening, Loss | None]
+
+class Args(NamedTuple):
+    """What a least squares is of besides its unknowns."""
+
+    space: Parameters
+    observed: Observed
+    whitening: Whitening
+    loss: Loss | None = None
+    # Where it is given, the components whose rows are linear in them (`Layout.linear`) are no unknowns of the solve: for
+    # each head they are where they fit best. These are their numbers about which rows are linear, at the end of all.
+    linear: Float[AnyArray, " l"] | None = None
+
+    @property
+    def eliminated(self) -> int:
+        """How many classes of components the solve has no unknowns of."""
+        return 0 if self.linear is None else self.observed.layout.linear
 
 
 def sums_by_component(
@@ -141,7 +157,10 @@ def arrow_of(
         for block in blocks:
             if block.of != number:
                 continue
-            assert block.by_own is not None
+            if block.by_own is None:
+                each = _of_points(block)
+                c, d, g = c + each[0], d + each[1], g + each[2]
+                continue
             if block.by_head is not None:
                 c = c + sums_by_component(block.by_own, block.by_head, block.sizes)
             both = xp.concatenate([block.by_own, block.white[None]])
@@ -153,37 +172,98 @@ def arrow_of(
     return Arrow(head, tuple(crossed), tuple(own)), slopes
 
 
+def _of_points(block: RowBlock) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """C, D and B w of rows that are coordinates less those of their point."""
+    assert block.by_head is not None
+    xp = namespace(block.white)
+    crossed = -xp.moveaxis(sums_over_sockets(block.by_head, block.sizes), -1, 0)
+    own = xp.asarray(np.asarray(block.sizes, dtype=float)[:, None, None] * np.eye(block.white.shape[0]))
+    return xp.swapaxes(crossed, -1, -2), own, -sums_over_sockets(block.white, block.sizes).T
+
+
+def _fitted(block: RowBlock) -> RowBlock:
+    """With the component where it fits these residuals best."""
+    xp, white = namespace(block.white), block.white
+    # Twice: the rounding error that one pass leaves in a mean (1e-13 mm) would otherwise be multiplied by the sums of
+    # the derivatives, and exceed the gradient near a perfect fit.
+    for _ in range(2):
+        if block.by_own is None:
+            white = white - to_poses(means_over_sockets(white, block.sizes), block.sizes)
+        else:
+            sums = sums_by_component(block.by_own, xp.concatenate([block.by_own, white[None]]), block.sizes)
+            step = inverse_positive_definite(sums[..., :-1]) @ sums[..., -1:]
+            white = white - followed(block.by_own, step, block.sizes)[0]
+    return RowBlock(white, block.by_head, block.by_own, block.of, block.sizes)
+
+
+def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
+    """The rows at a point; those of components without unknowns are where these fit best."""
+    space, observed, whitening, _, linear = args
+    whole = z if linear is None else namespace(z, linear).concatenate([z, linear])
+    blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole), whitening)
+    first = len(observed.layout.classes) - args.eliminated
+    return [_fitted(block) if block.of is not None and block.of >= first else block for block in blocks]
+
+
 def observed_model(z: Float[AnyArray, " z"], args: Args) -> QuadraticModel:
     """Cost, gradient and information of `observed_rows`."""
-    space, observed, whitening, loss = args
-    layout, p = observed.layout, len(space.names)
-    blocks = row_blocks(space, observed, z, rows_at(space, observed, z), whitening)
-    cost, weights = cost_and_weights(blocks, loss, len(layout.groups))
+    layout, p, prior = args.observed.layout, len(args.space.names), args.whitening.prior
+    blocks = _blocks(z, args)
+    cost, weights = cost_and_weights(blocks, args.loss, len(layout.groups))
     blocks = [weighted(block, weight) for block, weight in zip(blocks, weights, strict=True)]
-    arrow, slopes = arrow_of(blocks, layout.classes, p + layout.shared, whitening.prior)
+    arrow, slopes = arrow_of(blocks, layout.classes, p + layout.shared, prior)
     xp = namespace(arrow)
+    # Residuals of components without unknowns are at right angles to these.
     slope: Any = sum(
         (_flat(block.by_head) @ block.white.reshape(-1) for block in blocks if block.by_head is not None),
         xp.zeros(p + layout.shared),
     )
-    if whitening.prior is not None:
-        residual = whitening.prior.residual(z)
+    if prior is not None:
+        residual = prior.residual(z)
         cost = cost + 0.5 * xp.sum(residual**2)
-        slope = added_to(slope, np.arange(p), whitening.prior.weight * residual)
-    return QuadraticModel(cost, joined(slope, *slopes), arrow)
+        slope = added_to(slope, np.arange(p), prior.weight * residual)
+    kept = len(layout.classes) - args.eliminated
+    head = arrow.head
+    for crossed, own in zip(arrow.crossed[kept:], arrow.own[kept:], strict=True):
+        by_head = (inverse_cholesky(own) @ crossed).reshape(-1, crossed.shape[-1])
+        head = head - by_head.T @ by_head
+    return QuadraticModel(cost, joined(slope, *slopes[:kept]), Arrow(head, arrow.crossed[:kept], arrow.own[:kept]))
 
 
 def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
     """Whitened residuals of observations, lengths, certified values and the prior; half their sum of squares is what
     is minimised."""
-    space, observed, whitening, loss = args
-    found = []
-    for rows, root in zip(rows_at(space, observed, z).rows, whitening.roots, strict=True):
-        white = namespace(rows.values, root).einsum("mab,bm->am", root, rows.values)
-        found.append(white if loss is None else loss.transformed(white))
-    length, certified = relation_residuals(observed, observed.split(z[len(space.names) :]), whitening)
-    prior = () if whitening.prior is None else (whitening.prior.residual(z),)
-    return (*found, length, *certified.values(), *prior)
+    groups, found = len(args.observed.layout.groups), []
+    for number, block in enumerate(_blocks(z, args)):
+        transformed = args.loss is not None and number < groups
+        found.append(args.loss.transformed(block.white) if transformed else block.white)
+    prior = args.whitening.prior
+    return tuple(found) if prior is None else (*found, prior.residual(z))
+
+
+def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> Float[AnyArray, " z"]:
+    """All unknowns, with the components that the solve has no unknowns of where they fit best."""
+    space, observed, whitening, _, linear = args
+    assert linear is not None
+    xp, layout = namespace(z, linear), observed.layout
+    whole = xp.concatenate([z, linear])
+    first = len(layout.classes) - layout.linear
+    fitted = [xp.zeros(shape) for shape in layout.classes[first:]]
+    point = rows_at(space, observed, whole)
+    for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
+        if group.of is None or group.of < first:
+            continue
+        # The rows are tips less positions, so that their weighted mean is what the position lacks.
+        if root is None:
+            step = means_over_sockets(rows.values, group.sizes).T
+        else:
+            weight = xp.moveaxis(xp.swapaxes(root, -1, -2) @ root, 0, -1)
+            white = xp.einsum("abm,bm->am", weight, rows.values)
+            sums = means_over_sockets(weight, group.sizes), means_over_sockets(white, group.sizes)
+            inverse = inverse_positive_definite(xp.moveaxis(sums[0], -1, 0))
+            step = (inverse @ sums[1].T[..., None])[..., 0]
+        fitted[group.of - first] = step
+    return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)])
 
 
 def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, "h h"], Float[AnyArray, " h"]]:

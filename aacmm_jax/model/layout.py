@@ -59,6 +59,7 @@ class Layout(NamedTuple):
     parts: tuple[tuple[str, Units], ...]  # names and units of the numbers, shared ones first
     shared: int  # numbers of the shared blocks
     classes: tuple[tuple[int, int], ...]  # number and size of the components of each class
+    linear: int  # how many of the classes, the last ones, have rows linear in their numbers: positions of sockets
     groups: tuple[Group, ...]
 
     @property
@@ -92,65 +93,112 @@ def unknowns_of(observation: AbstractObservation) -> dict[str, Units]:
 
 def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[str, str]]) -> Layout:
     """The layout of a problem; ``ends`` are the names of the positions at the ends of its reference lengths."""
-    used = [unknowns_of(observation) for observation in observations]
-    units, users = {}, {}
-    for number, parts in enumerate(used):
-        units |= parts
-        for name in parts:
-            users.setdefault(name, []).append(number)
-    private = {name: numbers[0] for name, numbers in users.items() if len(numbers) == 1}
-    # A length with one shared end says something of what is shared alone.
-    private = {
-        name: number
-        for name, number in private.items()
-        if all(name not in pair or (pair[0] in private and pair[1] in private) for pair in ends)
-    }
-    joined = _joined(len(used), [(private[a], private[b]) for a, b in ends if a in private and b in private])
-    size = np.zeros(len(used), dtype=int)
-    for name, number in private.items():
-        size[joined[number]] += len(units[name])
-    private = {name: joined[number] for name, number in private.items() if size[joined[number]] <= _LARGEST_COMPONENT}
-    coupled = {joined[number] for number in range(len(used)) if joined[number] != number}
-    gathered: dict[object, list[int]] = {}
-    for number, (observation, parts) in enumerate(zip(observations, used, strict=True)):
-        gathered.setdefault(_key(number, observation, parts, private, coupled, size, joined), []).append(number)
-    shared = [name for name in units if name not in private]
-    order, classes, class_of, component_of = list(shared), [], {}, {}
-    for key, members in gathered.items():
-        own = [name for name in used[members[0]] if name in private]
-        kind = ("coupled", int(size[joined[members[0]]])) if joined[members[0]] in coupled else key
-        if not own or kind in class_of:
-            continue
-        class_of[kind] = len(classes)
-        everyone = members if kind is key else [n for n in range(len(used)) if _of_kind(n, kind, coupled, size, joined)]
-        roots = list(dict.fromkeys(joined[number] for number in everyone))
-        component_of |= {root: place for place, root in enumerate(roots)}
-        for root in roots:
-            order += [name for number in everyone if joined[number] == root for name in used[number] if name in private]
-        classes.append((len(roots), int(size[joined[members[0]]])))
-    first = dict(zip(order, np.cumsum([0, *(len(units[name]) for name in order)]).tolist(), strict=False))
-    ends_of = np.cumsum([observation.q.shape[-2] for observation in observations]).tolist()
-    groups = []
-    for key, members in gathered.items():
-        kind = ("coupled", int(size[joined[members[0]]])) if joined[members[0]] in coupled else key
-        of = class_of.get(kind)
+    return _Problem(observations, ends).layout()
+
+
+class _Problem:
+    """What `layout_of` knows of each observation."""
+
+    def __init__(self, observations: Sequence[AbstractObservation], ends: Sequence[tuple[str, str]]):
+        self.observations = observations
+        self.used = [unknowns_of(observation) for observation in observations]
+        self.units: dict[str, Units] = {}
+        users: dict[str, list[int]] = {}
+        for number, parts in enumerate(self.used):
+            self.units |= parts
+            for name in parts:
+                users.setdefault(name, []).append(number)
+        alone = {name: numbers[0] for name, numbers in users.items() if len(numbers) == 1}
+        # A length with one shared end says something of what is shared alone.
+        half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
+        alone = {name: number for name, number in alone.items() if name not in half}
+        # The first observation of the component of each.
+        self.component = _connected(len(observations), [(alone[a], alone[b]) for a, b in ends if a in alone])
+        self.size = np.zeros(len(observations), dtype=int)  # numbers of the component that an observation is first of
+        for name, number in alone.items():
+            self.size[self.component[number]] += len(self.units[name])
+        self.private = {name for name, number in alone.items() if self.numbers_of(number) <= _LARGEST_COMPONENT}
+        self.coupled = {one for number, one in enumerate(self.component) if one != number}
+
+    def numbers_of(self, number: int) -> int:
+        """How many numbers the component of an observation has."""
+        return int(self.size[self.component[number]])
+
+    def own(self, number: int) -> list[str]:
+        """The private parts of an observation."""
+        return [name for name in self.used[number] if name in self.private]
+
+    def kind(self, number: int) -> object:
+        """What the components of one class have in common; None without private parts."""
+        if not self.own(number):
+            return None
+        if self.component[number] in self.coupled:
+            return "coupled", self.numbers_of(number)
+        return self.key(number)
+
+    def key(self, number: int) -> object:
+        """What observations that are evaluated together have in common; the number itself of one that is alone."""
+        one, alike = self.observations[number], self.observations[number].alike
+        together = self.component[number] in self.coupled and bool(self.own(number))
+        if alike is None or one.q.shape[-2] > _MOST_STACKED:
+            return number, together
+        roles = tuple((units, name in self.private) for name, units in self.used[number].items())
+        return type(one), alike, bool(one.target), roles, self.numbers_of(number) if together else 0
+
+    def is_linear(self, number: int) -> bool:
+        """Whether an observation is linear in a component that is its own."""
+        one = self.observations[number]
+        return one.linear and len(self.used[number]) == 1 and self.component[number] not in self.coupled
+
+    def layout(self) -> Layout:
+        """The layout."""
+        everything = range(len(self.observations))
+        members: dict[object, list[int]] = {}
+        for number in everything:
+            members.setdefault(self.key(number), []).append(number)
+        of_class: dict[object, list[int]] = {}
+        for number in everything:
+            if self.own(number):
+                of_class.setdefault(self.kind(number), []).append(number)
+        kinds = sorted(of_class, key=lambda kind: self.is_linear(of_class[kind][0]))
+        shared = [name for name in self.units if name not in self.private]
+        order, classes, place = list(shared), [], {}
+        for kind in kinds:
+            components = list(dict.fromkeys(self.component[number] for number in of_class[kind]))
+            place |= {one: i for i, one in enumerate(components)}
+            by_component: dict[int, list[str]] = {one: [] for one in components}
+            for number in of_class[kind]:
+                by_component[self.component[number]] += self.own(number)
+            order += [name for names in by_component.values() for name in names]
+            classes.append((len(components), self.numbers_of(of_class[kind][0])))
+        parts = tuple((name, self.units[name]) for name in order)
+        count = sum(len(self.units[name]) for name in shared)
+        linear = sum(self.is_linear(of_class[kind][0]) for kind in kinds)
+        layout = Layout(parts, count, tuple(classes), linear, ())
+        number_of = {kind: i for i, kind in enumerate(kinds)}
+        ordered = (sorted(some, key=lambda number: place.get(self.component[number], 0)) for some in members.values())
+        groups = (self._group(some, layout, number_of.get(self.kind(some[0])), place) for some in ordered)
+        return layout._replace(groups=tuple(groups))
+
+    def _group(self, members: list[int], layout: Layout, of: int | None, place: dict[int, int]) -> Group:
+        positions = layout.positions
+        roles = tuple(
+            Role(tuple(int(positions[name][0]) for name in names), len(self.units[names[0]]), names[0] in self.private)
+            for names in zip(*(self.used[number] for number in members), strict=True)
+        )
+        stops = np.cumsum([one.q.shape[-2] for one in self.observations]).tolist()
+        counts = [self.observations[number].q.shape[-2] for number in members]
+        poses = tuple((stops[number] - count, stops[number]) for number, count in zip(members, counts, strict=True))
+        sizes, start = (), ()
         if of is not None:
-            members = sorted(members, key=lambda number: component_of[joined[number]])
-        groups.append(_group(members, used, units, private, first, ends_of, observations, of, classes, component_of,
-                             joined, sum(len(units[name]) for name in shared)))  # fmt: skip
-    return Layout(
-        parts=tuple((name, units[name]) for name in order),
-        shared=sum(len(units[name]) for name in shared),
-        classes=tuple(classes),
-        groups=tuple(groups),
-    )
+            components = [place[self.component[number]] for number in members]
+            sizes = tuple(np.bincount(components, weights=counts, minlength=layout.classes[of][0]).astype(int).tolist())
+            own = next(role for role in roles if role.private)
+            start = tuple(layout.component_of(index)[2] for index in own.first)
+        return Group(tuple(members), poses, roles, bool(self.observations[members[0]].target), of, sizes, start)
 
 
-def _of_kind(number: int, kind: tuple, coupled: set[int], size: np.ndarray, joined: list[int]) -> bool:
-    return joined[number] in coupled and int(size[joined[number]]) == kind[1]
-
-
-def _joined(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
+def _connected(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
     """For each of some things the first of those that pairs connect it with."""
     found = list(range(count))
 
@@ -164,50 +212,3 @@ def _joined(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
         low, high = sorted((root(one), root(other)))
         found[high] = low
     return [root(number) for number in range(count)]
-
-
-def _key(
-    number: int,
-    observation: AbstractObservation,
-    parts: dict[str, Units],
-    private: dict[str, int],
-    coupled: set[int],
-    size: np.ndarray,
-    joined: list[int],
-) -> object:
-    """What observations that are evaluated together have in common; the number itself of one that is alone."""
-    alike = observation.alike
-    roles = tuple((units, name in private) for name, units in parts.items())
-    together = joined[number] in coupled and any(name in private for name in parts)
-    whole = int(size[joined[number]]) if together else 0
-    if alike is None or observation.q.shape[-2] > _MOST_STACKED:
-        return number, whole
-    return type(observation), alike, bool(observation.target), roles, whole
-
-
-def _group(
-    members: list[int],
-    used: list[dict[str, Units]],
-    units: dict[str, Units],
-    private: dict[str, int],
-    first: dict[str, int],
-    ends_of: list[int],
-    observations: Sequence[AbstractObservation],
-    of: int | None,
-    classes: list[tuple[int, int]],
-    component_of: dict[int, int],
-    joined: list[int],
-    shared: int,
-) -> Group:
-    names = list(zip(*(used[number] for number in members), strict=True))
-    roles = tuple(Role(tuple(first[name] for name in each), len(units[each[0]]), each[0] in private) for each in names)
-    counts = [observations[number].q.shape[-2] for number in members]
-    sizes, start = (), ()
-    if of is not None:
-        begin = shared + sum(count * size for count, size in classes[:of])
-        components = [component_of[joined[number]] for number in members]
-        sizes = tuple(np.bincount(components, weights=counts, minlength=classes[of][0]).astype(int).tolist())
-        own = next(role for role in roles if role.private)
-        start = tuple((index - begin) % classes[of][1] for index in own.first)
-    poses = tuple((ends_of[number] - observations[number].q.shape[-2], ends_of[number]) for number in members)
-    return Group(tuple(members), poses, roles, bool(observations[members[0]].target), of, sizes, start)

@@ -38,7 +38,8 @@ class PriorRows(NamedTuple):
 class Whitening(NamedTuple):
     """What makes rows of standard deviation 1 of the residuals."""
 
-    roots: tuple[Float[AnyArray, "_ _ _"], ...]  # of each group, inverse Cholesky factors
+    # Of each group, inverse Cholesky factors; None where all rows of a problem weigh the same, in mm.
+    roots: tuple[Float[AnyArray, "_ _ _"] | None, ...]
     lengths: Float[AnyArray, " l"]  # one over a standard deviation
     certified: dict[str, Float[AnyArray, " k"]]
     prior: PriorRows | None = None
@@ -49,7 +50,9 @@ class RowBlock(Module):
 
     white: Float[AnyArray, "r m"]
     by_head: Float[AnyArray, "h r m"] | None  # by parameters and shared geometry; None: they depend on neither
-    by_own: Float[AnyArray, "k r m"] | None  # by the numbers of the component of each pose
+    # By the numbers of the component of each pose. None where it has none, or where the rows are coordinates less those
+    # of a point, all of one weight.
+    by_own: Float[AnyArray, "k r m"] | None
     of: int | None = eqx.field(static=True)  # class of these components
     sizes: tuple[int, ...] = eqx.field(static=True)  # poses of each of them, in their order
 
@@ -100,8 +103,15 @@ def row_blocks(
         turned = rotation_columns(forward, shared.few)
     found = []
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
-        rows, poses = _whitened(rows, root), group.index
+        poses = group.index
         mine = columns[..., poses]
+        if root is None and stack.linear:  # a tip less a point
+            by_parameters = shared.multiplied(mine, forward, poses)
+            by_head = _by_head(by_parameters, [rows.values[None]], group, layout.shared)
+            found.append(RowBlock(rows.values, by_head, None, group.of, group.sizes))
+            continue
+        assert root is not None
+        rows = _whitened(rows, root)
         if group.targeted and own_probe.any():
             mine = xp.where(own_probe[:, None, None], 0.0, mine)
         by_parameters = times(rows.by_tip, mine)
