@@ -64,8 +64,9 @@ def identify_task(task: Task) -> Identification:
     return solve(task).identification
 
 
-def solve(task: Task) -> Solution:
-    """The parameters and the unknown geometry that agree best with everything observed.
+def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
+    """The parameters and the unknown geometry that agree best with everything observed; from ``near``, where parameters
+    close to the solution are known, else from the start.
 
     Solved at least twice where weights depend on the arm: with those of the start, and with those of that solution.
     Where the noise is not given, tips are taken to scatter as much as the residuals then do (`tip_errors.scatter_of`).
@@ -83,8 +84,11 @@ def solve(task: Task) -> Solution:
     steps = xp.concatenate([space.scale, xp.asarray(task.observed.steps)])
     first = xp.concatenate([task.start[free], geometry])
     before = state_at(task, space, first, scatter_at_start(task, space, first))
-    z, evaluations = first, xp.zeros((), dtype=int)
-    state, found = before, None
+    z, evaluations, state, found = first, xp.zeros((), dtype=int), before, None
+    if near is not None:
+        near = xp.clip(near, task.bounds.lower, task.bounds.upper)[free]
+        z = xp.concatenate([near, task.observed.start(space, near)])
+        state = state_at(task, space, z)
     # Once more with the weights of a nearly right arm. Far from the solution a robust loss would see nothing but bad
     # poses, so it begins where least squares ends, and one with several minima where Huber's, which has one, ends.
     losses = [None] * (1 if task.needs_no_weights else 2)

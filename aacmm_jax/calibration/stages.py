@@ -201,7 +201,13 @@ def measured_lengths(parts: dict[str, Any], capture: Capture) -> Float[AnyArray,
 
 def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str) -> Stages:
     """Everything that the capture holds in one least squares; ``stage1`` is where lengths alone fix the scale."""
-    solution = solve(task)
+    near = None
+    if stage1 is not None and stage1.found is not None:
+        identification = stage1.solution.identification
+        near = divided(
+            stage1.task.anchor, task.bounds, identification.active, identification.parameters, stage1.found.scale.value
+        ).parameters
+    solution = solve(task, near)
     found = solution.identification
     assert found.observed is not None
     matrix = found.parameter_covariance.matrix + _of_bounds(task, solution, capture)

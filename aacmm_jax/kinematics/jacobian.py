@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..core._compat import SymbolicZero
 from ..core.numpy_or_jax import AnyArray, compiled, namespace
@@ -192,7 +192,7 @@ class SharedColumns(NamedTuple):
     order: Int[np.ndarray, " p"] | None  # of these and the coefficients among all; None where they are in order
 
     def multiplied(
-        self, columns: Float[AnyArray, "b r m"], forward: ForwardPass, rows: slice
+        self, columns: Float[AnyArray, "b r m"], forward: Any, rows: Any
     ) -> Float[AnyArray, "p r m"]:
         """Columns of all parameters at some of the configurations, from the few."""
         if not len(self.functions):
@@ -243,21 +243,52 @@ def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...])
     return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*still.shape[:-2], 0, *still.shape[-2:]))
 
 
-def tip_and_columns(
-    geometry: Geometry, motion: JointMotion, indices: tuple[tuple[str, int], ...]
-) -> tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... p 3 N"]]:
-    """The tip and `stacked_jacobian_columns`, in the way that is fastest for a batch in JAX on each platform."""
+class PoseColumns(NamedTuple):
+    """Tips and last frames of poses, and their derivatives by some parameters."""
 
-    def computed(forward_pass: Callable, *operands: Any) -> tuple[AnyArray, AnyArray]:
+    tip: Float[AnyArray, "... 3 N"]
+    frame: tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"]]
+    columns: Float[AnyArray, "... p 3 N"]  # of the tip
+    turned: Float[AnyArray, "... p 3 N"] | None  # of the last frame's orientation, as rotation vectors
+
+
+def pose_columns(
+    geometry: Geometry, motion: JointMotion, indices: tuple[tuple[str, int], ...], rotations: bool
+) -> PoseColumns:
+    """Of one chain without corrections; under `jax.vmap` in the way that is fastest for a batch on each platform.
+
+    No derivative passes.
+    """
+
+    def computed(forward_pass: Callable, *operands: Any) -> PoseColumns:
         forward = forward_pass(*operands)
-        return forward.tip, stacked_jacobian_columns(forward, indices)
+        turned = rotation_columns(forward, indices) if rotations else None
+        return PoseColumns(forward.tip, forward.frame, stacked_jacobian_columns(forward, indices), turned)
 
-    return jax.lax.platform_dependent(
-        geometry,
-        motion,
-        cpu=partial(computed, forward_pass_by_joints),
-        default=partial(computed, forward_pass),
-    )
+    @jax.custom_batching.custom_vmap
+    def of_one(geometry: Geometry, motion: JointMotion) -> PoseColumns:
+        return computed(forward_pass, geometry, motion)
+
+    def of_many(size: int, batched: Any, geometry: Geometry, motion: JointMotion) -> tuple[PoseColumns, Any]:
+        del size
+
+        def chain(leaf: Array, many: bool) -> Array:  # (w, 1, n), or (w, N, 3) of a tip for each pose
+            leaf = leaf if many else leaf[None]
+            return leaf if leaf.ndim > 2 else leaf[:, None]
+
+        geometry = jax.tree.map(chain, geometry, batched[0])
+        # Joints first, then the batch, configurations last.
+        motion = jax.tree.map(lambda leaf, many: jnp.moveaxis(leaf, 0, 1) if many else leaf, motion, batched[1])
+        found = jax.lax.platform_dependent(
+            geometry,
+            motion,
+            cpu=partial(computed, forward_pass_by_joints),
+            default=partial(computed, forward_pass),
+        )
+        return found, jax.tree.map(lambda _: True, found)
+
+    of_one.def_vmap(of_many)
+    return of_one(geometry, motion)
 
 
 def _plain_tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:

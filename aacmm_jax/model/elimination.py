@@ -19,7 +19,7 @@ from ..solver.arrow import Arrow, joined
 from .observed import Observed
 from .robust import Loss
 from .rows import PriorRows, RowBlock, Whitening, row_blocks, rows_at
-from .socket_sums import means_over_sockets, sums_over_sockets, to_poses
+from .socket_sums import counts, means_over_sockets, sums_over_sockets, to_poses
 
 _LONG = 40  # poses of a component, from which a product of matrices each is the fastest sum over them
 _NULL = 1e-12  # eigenvalues of a component's information below this, of the largest, are zero
@@ -35,6 +35,7 @@ class Args(NamedTuple):
     # Where it is given, the components whose rows are linear in them (`Layout.linear`) are no unknowns of the solve: for
     # each head they are where they fit best. These are their numbers about which rows are linear, at the end of all.
     linear: Float[AnyArray, " l"] | None = None
+    batch: bool = False  # whether it is evaluated in the way that is fastest in a batch, and not differentiated
 
     @property
     def eliminated(self) -> int:
@@ -176,9 +177,21 @@ def _of_points(block: RowBlock) -> tuple[AnyArray, AnyArray, AnyArray]:
     """C, D and B w of rows that are coordinates less those of their point."""
     assert block.by_head is not None
     xp = namespace(block.white)
-    crossed = -xp.moveaxis(sums_over_sockets(block.by_head, block.sizes), -1, 0)
+    crossed = -xp.moveaxis(sums_over_sockets(block.by_head, block.sizes), (0, 1, 2), (2, 1, 0))
     own = xp.asarray(np.asarray(block.sizes, dtype=float)[:, None, None] * np.eye(block.white.shape[0]))
-    return xp.swapaxes(crossed, -1, -2), own, -sums_over_sockets(block.white, block.sizes).T
+    return crossed, own, -sums_over_sockets(block.white, block.sizes).T
+
+
+def _shifts(block: RowBlock) -> Float[AnyArray, "h _"]:
+    """What components that follow the head take from its information: a product of this with its transpose."""
+    assert block.by_head is not None
+    height, xp = block.by_head.shape[0], namespace(block.by_head)
+    if block.by_own is None:
+        shifts = sums_over_sockets(block.by_head, block.sizes) / np.sqrt(counts(block.sizes, 3))
+        return shifts.reshape(height, -1)
+    sums = sums_by_component(block.by_own, xp.concatenate([block.by_own, block.by_head]), block.sizes)
+    size = block.by_own.shape[0]
+    return xp.moveaxis(inverse_cholesky(sums[..., :size]) @ sums[..., size:], -1, 0).reshape(height, -1)
 
 
 def _fitted(block: RowBlock) -> RowBlock:
@@ -198,9 +211,9 @@ def _fitted(block: RowBlock) -> RowBlock:
 
 def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
     """The rows at a point; those of components without unknowns are where these fit best."""
-    space, observed, whitening, _, linear = args
+    space, observed, whitening, _, linear, batch = args
     whole = z if linear is None else namespace(z, linear).concatenate([z, linear])
-    blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole), whitening)
+    blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole, batch), whitening)
     first = len(observed.layout.classes) - args.eliminated
     return [_fitted(block) if block.of is not None and block.of >= first else block for block in blocks]
 
@@ -211,7 +224,8 @@ def observed_model(z: Float[AnyArray, " z"], args: Args) -> QuadraticModel:
     blocks = _blocks(z, args)
     cost, weights = cost_and_weights(blocks, args.loss, len(layout.groups))
     blocks = [weighted(block, weight) for block, weight in zip(blocks, weights, strict=True)]
-    arrow, slopes = arrow_of(blocks, layout.classes, p + layout.shared, prior)
+    kept = len(layout.classes) - args.eliminated
+    arrow, slopes = arrow_of(blocks, layout.classes[:kept], p + layout.shared, prior)
     xp = namespace(arrow)
     # Residuals of components without unknowns are at right angles to these.
     slope: Any = sum(
@@ -222,12 +236,12 @@ def observed_model(z: Float[AnyArray, " z"], args: Args) -> QuadraticModel:
         residual = prior.residual(z)
         cost = cost + 0.5 * xp.sum(residual**2)
         slope = added_to(slope, np.arange(p), prior.weight * residual)
-    kept = len(layout.classes) - args.eliminated
     head = arrow.head
-    for crossed, own in zip(arrow.crossed[kept:], arrow.own[kept:], strict=True):
-        by_head = (inverse_cholesky(own) @ crossed).reshape(-1, crossed.shape[-1])
-        head = head - by_head.T @ by_head
-    return QuadraticModel(cost, joined(slope, *slopes[:kept]), Arrow(head, arrow.crossed[:kept], arrow.own[:kept]))
+    for block in blocks[: len(layout.groups)]:
+        if block.of is not None and block.of >= kept:
+            shifts = _shifts(block)
+            head = head - shifts @ shifts.T
+    return QuadraticModel(cost, joined(slope, *slopes), arrow._replace(head=head))
 
 
 def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
@@ -243,7 +257,7 @@ def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
 
 def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> Float[AnyArray, " z"]:
     """All unknowns, with the components that the solve has no unknowns of where they fit best."""
-    space, observed, whitening, _, linear = args
+    space, observed, whitening, _, linear, _ = args
     assert linear is not None
     xp, layout = namespace(z, linear), observed.layout
     whole = xp.concatenate([z, linear])

@@ -19,7 +19,7 @@ from ..data.observations.observation import AbstractObservation, Tips, offset_of
 from ..data.observations.platform import platform_frames
 from ..data.observations.socket import Socket, position_of
 from ..kinematics.arm import Arm
-from ..kinematics.chain import ForwardPass, JointMotion, forward_pass, joint_motion
+from ..kinematics.chain import ForwardPass, Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
 from .layout import Group, Layout, layout_of, unknowns_of
 
@@ -140,6 +140,10 @@ class Observed(Module):
 
     def forward(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> ForwardPass:
         """All poses by an arm, each with the tip that it held."""
+        return forward_pass(self.chain(space, vector, geometry), self.motion)
+
+    def chain(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> Geometry:
+        """The chain with the tip that each pose held."""
         arm = space.geometry(vector)
         if any(observation.target for observation in self.observations):
             xp, parts = namespace(arm, geometry), self.split(geometry)
@@ -151,7 +155,7 @@ class Observed(Module):
                 for observation in self.observations
             ]
             arm = arm._replace(probe=xp.concatenate(offsets))
-        return forward_pass(arm, self.motion)
+        return arm
 
     def start(self, space: Parameters, vector: Float[AnyArray, " p"]) -> Float[AnyArray, " g"]:
         """The unknown geometry as the observations say, one after the other, by an arm that is nearly right; the frames

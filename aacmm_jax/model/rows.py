@@ -16,8 +16,14 @@ from ..core.linear_algebra import inverse_cholesky
 from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.observations.observation import Rows
-from ..kinematics.chain import ForwardPass
-from ..kinematics.jacobian import rotation_columns, shared_columns, stacked_jacobian_columns
+from ..kinematics.chain import ForwardPass, forward_pass
+from ..kinematics.jacobian import (
+    PoseColumns,
+    pose_columns,
+    rotation_columns,
+    shared_columns,
+    stacked_jacobian_columns,
+)
 from ..kinematics.parameters import Parameters
 from .layout import Group, Layout
 from .observed import Observed, tips_of
@@ -60,14 +66,20 @@ class RowBlock(Module):
 class PointRows(NamedTuple):
     """All rows at one point of the unknowns, before anything is weighted."""
 
-    forward: ForwardPass
+    forward: ForwardPass | PoseColumns
     rows: list[Rows]  # of each group
 
 
-def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> PointRows:
-    """The residuals of every group, with their derivatives by tips and unknowns."""
-    p = len(space.names)
-    forward, found = observed.forward(space, z[:p], z[p:]), []
+def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], batch: bool = False) -> PointRows:
+    """The residuals of every group, with their derivatives by tips and unknowns; in a ``batch`` in the way that is
+    fastest there, through which no derivative passes."""
+    p, found = len(space.names), []
+    chain = observed.chain(space, z[:p], z[p:])
+    if batch and chain.corrections is None:
+        rotations = any(one.rotates for one in observed.stacks)
+        forward = pose_columns(chain, observed.motion, space.indices(), rotations)
+    else:
+        forward = forward_pass(chain, observed.motion)
     for group, stack in zip(observed.layout.groups, observed.stacks, strict=True):
         unknowns = {
             name: _columns_of_role(z[p:], role.first, role.size, group.counts)
@@ -94,13 +106,15 @@ def row_blocks(
     """The rows of every group with their derivatives, whitened; then those of lengths and certified values."""
     forward, layout, p = point.forward, observed.layout, len(space.names)
     xp = namespace(forward, z)
-    functions = None if forward.errors is None else forward.errors.functions
-    shared = shared_columns(functions, space.indices())
-    columns = stacked_jacobian_columns(forward, shared.few)
+    if isinstance(forward, PoseColumns):
+        shared = shared_columns(None, space.indices())
+        columns, turned = forward.columns, forward.turned
+    else:
+        shared = shared_columns(None if forward.errors is None else forward.errors.functions, space.indices())
+        columns = stacked_jacobian_columns(forward, shared.few)
+        rotates = any(rows.by_rotation is not None for rows in point.rows)
+        turned = rotation_columns(forward, shared.few) if rotates else None
     own_probe = np.array([kind == "probe" for kind, _ in shared.few])
-    turned = None
-    if any(rows.by_rotation is not None for rows in point.rows):
-        turned = rotation_columns(forward, shared.few)
     found = []
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
         poses = group.index

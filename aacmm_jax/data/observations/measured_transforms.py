@@ -70,6 +70,7 @@ class MeasuredTransforms(AbstractMeasured):
     )
     stated: ClassVar[tuple[str, ...]] = ("u_angle",)
     rows: ClassVar[int] = 6
+    rotates: ClassVar[bool] = True
     q: Float[AnyArray, "m n"]
     points: Float[AnyArray, "m 3"]
     rotations: Float[AnyArray, "m 3 3"]

@@ -86,6 +86,7 @@ class AbstractObservation(Module):
     stated: ClassVar[tuple[str, ...]] = ()  # fields with one number, or None; where stacked, with one a pose
     table: ClassVar[str]  # name of its tables in a manifest
     entries: ClassVar[tuple[Entry, ...]]
+    rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
     rows: eqx.AbstractClassVar[int]
     name: eqx.AbstractVar[str]
     target: eqx.AbstractVar[str]

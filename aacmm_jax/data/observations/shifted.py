@@ -45,6 +45,11 @@ class ShiftedObservation(AbstractObservation):
         return self.observation.rows
 
     @property
+    def rotates(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether its residual depends on the rotation of the last frame."""
+        return self.observation.rotates
+
+    @property
     def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """That of the observation."""
         return self.observation.name
