@@ -39,8 +39,9 @@ class Observed(Module):
     layout: Layout = eqx.field(static=True)
 
     @classmethod
-    def of(cls, capture: Capture, arm: Arm | None) -> "Observed":
-        """What a capture observed, by an arm with such joints; None where only what is unknown matters.
+    def of(cls, capture: Capture, arm: Arm | None, *, lengths: bool = True) -> "Observed":
+        """What a capture observed, by an arm with such joints; None where only what is unknown matters. Without its
+        reference ``lengths`` sockets are independent of each other.
 
         Raises `InputError` for a batch of captures.
         """
@@ -52,16 +53,16 @@ class Observed(Module):
         sockets = tuple(Socket(name, readings) for name, readings in capture.sockets.items())
         observations = to_numpy((*sockets, *capture.observations))
         q = xp.concatenate([observation.q for observation in observations])
-        lengths = capture.lengths
-        ends = tuple((position_of(length.start), position_of(length.end)) for length in lengths)
+        known = capture.lengths if lengths else ()
+        ends = tuple((position_of(length.start), position_of(length.end)) for length in known)
         layout = layout_of(observations, ends)
         return cls(
             observations=observations,
             stacks=_stacks(observations, layout),
             q=q,
             motion=None if arm is None else joint_motion(to_numpy(arm.geometry), q),
-            nominal=xp.stack([length.value for length in lengths]) if lengths else np.zeros(0),
-            u=xp.stack([length.u for length in lengths]) if lengths else np.zeros(0),
+            nominal=xp.stack([length.value for length in known]) if known else np.zeros(0),
+            u=xp.stack([length.u for length in known]) if known else np.zeros(0),
             ends=ends,
             layout=layout,
         )
