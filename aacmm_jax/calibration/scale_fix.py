@@ -22,8 +22,8 @@ from ..data.observations.socket import position_of
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
 from ..uncertainty.linear_propagation import UnknownsCovariance, geometry_covariance, rows_of_functions
+from .conclusion import Solution
 from .scale_anchor import ScaleAnchor
-from .solve import Solution
 
 LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
 _ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding

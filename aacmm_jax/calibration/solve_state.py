@@ -28,6 +28,17 @@ class State(NamedTuple):
     sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
 
 
+class Begun(NamedTuple):
+    """Where a solve begins."""
+
+    space: Parameters
+    sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]]  # bounds of all unknowns
+    steps: Float[AnyArray, " z"]  # natural steps
+    before: State  # at the start
+    z: Float[AnyArray, " z"]  # where it begins: there, or near the solution
+    state: State  # there
+
+
 def state_at(
     task: Task,
     space: Parameters,

@@ -32,8 +32,8 @@ class Args(NamedTuple):
     observed: Observed
     whitening: Whitening
     loss: Loss | None = None
-    # Where it is given, the components whose rows are linear in them (`Layout.linear`) are no unknowns of the solve: for
-    # each head they are where they fit best. These are their numbers about which rows are linear, at the end of all.
+    # Where it is given, the components whose rows are linear in them (`Layout.linear`) are no unknowns of the solve:
+    # for each head they are where they fit best. These are numbers, at the end of all, that residuals are counted from.
     linear: Float[AnyArray, " l"] | None = None
     batch: bool = False  # whether it is evaluated in the way that is fastest in a batch, and not differentiated
 
@@ -258,13 +258,14 @@ def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
 def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> Float[AnyArray, " z"]:
     """All unknowns, with the components that the solve has no unknowns of where they fit best."""
     space, observed, whitening, _, linear, _ = args
-    assert linear is not None
+    if linear is None:
+        return z
     xp, layout = namespace(z, linear), observed.layout
     whole = xp.concatenate([z, linear])
     first = len(layout.classes) - layout.linear
     fitted = [xp.zeros(shape) for shape in layout.classes[first:]]
     point = rows_at(space, observed, whole)
-    for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
+    for group, rows, root in zip(layout.groups, point.rows, whitening.roots, strict=True):
         if group.of is None or group.of < first:
             continue
         # The rows are tips less positions, so that their weighted mean is what the position lacks.
