@@ -29,7 +29,7 @@ from .batch_kernel import Form, Problems, pick, solve_chunk, without_lengths
 from .checks import check_method, check_noise_model
 from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
 from .results import ManyCalibrations, ManyIdentifications
-from .scale_anchor import ScaleAnchor, default_method, scale_anchor, scale_from_slides
+from .scale_anchor import default_method, scale_anchor, scale_from_slides
 from .scale_fix import divided
 from .task import NO_ANCHOR, check_observed, configurations, unknown_parameters
 

@@ -15,26 +15,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core.numpy_or_jax import AnyArray
+from ..core.numpy_or_jax import AnyArray, set_at
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.priors import Prior
-from ..model.elimination import observed_model, with_linear_geometry
+from ..model.elimination import observed_model, own_covariances, with_linear_geometry
 from ..model.observed import Observed
 from ..model.robust import Loss
 from ..model.rows import Whitening
+from ..model.scale import scale_and_weights
 from ..solver.active_set import Box, choose
 from ..solver.levenberg_marquardt import Rules, advance
 from ..solver.levenberg_marquardt import begin as begin_steps
 from ..solver.reason import MAX_STEPS, RUNNING, numbers_of, reasons
 from ..uncertainty.covariance import NoiseModel
 from .bounded_fit import RULES, Fit
-from .conclusion import Solution, concluded
+from .conclusion import concluded, repeatability_of
 from .scale_anchor import ScaleAnchor
-from .scale_fix import measured_scale
-from .solve import ROUGH, args_of, begin, fitted_with_prior, losses_of, prior_of, state_after, weights
+from .scale_fix import ends_between
+from .solve import ROUGH, args_of, begin, box_of, fitted_with_prior, losses_of, prior_of, state_after, weights
+from .solve_state import whitening_at
 from .task import Task
 
 
@@ -83,17 +85,16 @@ def solve_chunk(
     z, whitening = _in_groups(form, chunk, lambda *of: _first(one(*of), of[0].near))
     first = _of_first(form, chunk, one)
     steps, reason, losses = jnp.zeros(form.capacity, dtype=jnp.int64), None, losses_of(first)
+    solved = (z, whitening, z)
     for number, loss in enumerate(losses, 1):
         last = number == len(losses)
         if last and prior_of(first) is not None:
             break
-        rules = RULES if last else ROUGH
-        z, more, reason = _solve_all(form, chunk, one, loss, rules, z, whitening, count)
-        steps = steps + more
+        y, more, reason = _solve_all(form, chunk, one, loss, RULES if last else ROUGH, z, whitening, count)
+        steps, solved = steps + more, (z, whitening, y)
         if not last:
-            whitening = _in_groups(form, chunk, lambda *of: _next_weights(one(*of[:2]), losses, *of[2:]), z)
-    fields = _in_groups(form, chunk, lambda *of: _concluded(form, one(*of[:2]), of[0], *of[2:]), z, steps, reason)
-    return fields
+            z, whitening = _in_groups(form, chunk, partial(_again, one, losses[number - 1 :]), *solved)
+    return _in_groups(form, chunk, partial(_concluded, form, one, losses[-1]), steps, reason, *solved)
 
 
 def _prepared(form: Form, problems: Problems) -> _Chunk:
@@ -187,51 +188,84 @@ def _first(task: Task, near: Float[AnyArray, " p"] | None) -> tuple[Float[AnyArr
     return begun.z, weights(task, begun, begun.state, losses_of(task)[0])
 
 
-def _next_weights(task: Task, losses: list[Loss | None], z: Float[AnyArray, " z"]) -> Whitening:
-    """After a least squares."""
-    begun = begin(task)
-    return weights(task, begun, state_after(task, begun, z, False), losses[-1])
+def _whole(
+    task: Task, loss: Loss | None, z: Float[AnyArray, " z"], whitening: Whitening, y: Float[AnyArray, " n"]
+) -> Float[AnyArray, " z"]:
+    """All unknowns after a least squares that began at z and ended at y."""
+    return with_linear_geometry(y, args_of(task, whitening, loss, z)[0])
+
+
+def _again(
+    one: Callable,
+    losses: list[Loss | None],
+    problem: Problems,
+    observed: Observed,
+    z: Float[AnyArray, " z"],
+    whitening: Whitening,
+    y: Float[AnyArray, " n"],
+) -> tuple[Float[AnyArray, " z"], Whitening]:
+    """Where the next least squares begins, and its weights; ``losses`` are that of the last, and those to come."""
+    task = one(problem, observed)
+    z, begun = _whole(task, losses[0], z, whitening, y), begin(task)
+    return z, weights(task, begun, state_after(task, begun, z, False), losses[1])
 
 
 def _concluded(
     form: Form,
-    task: Task,
+    one: Callable,
+    loss: Loss | None,
     problem: Problems,
-    z: Float[AnyArray, " z"],
+    observed: Observed,
     steps: Int[AnyArray, ""],
     reason: Int[AnyArray, ""] | None,
+    z: Float[AnyArray, " z"],
+    whitening: Whitening,
+    y: Float[AnyArray, " n"],
 ) -> dict[str, Any]:
-    """The fields of one problem; with a prior after its last least squares, which ``reason`` None says is to come."""
+    """The fields of one problem after its last least squares; that with a prior is still to come."""
+    task = one(problem, observed)
     begun, prior, of_prior = begin(task), prior_of(task), None
     if prior is not None:
-        state = state_after(task, begun, z, False) if losses_of(task)[1:] else begun.state
+        state = begun.state
+        if len(losses_of(task)) > 1:
+            z = _whole(task, losses_of(task)[-2], z, whitening, y)
+            state = state_after(task, begun, z, False)
         z, state, found, of_prior = fitted_with_prior(task, prior, begun, state, z)
         found = found._replace(steps=steps + found.steps)
     else:
         assert reason is not None
+        z = _whole(task, loss, z, whitening, y)
         state, found = state_after(task, begun, z, True), Fit(z, steps, reasons(reason), jnp.zeros(()))
-    solution = concluded(task, begun, z, state, found, of_prior)
-    return _fields(form, solution, problem.capture)
-
-
-def _fields(form: Form, solution: Solution, capture: Capture) -> dict[str, Any]:
-    found = solution.identification
-    assert found.observed is not None
+    free, spent = task.free, z.shape[0] if of_prior is None else of_prior.effective
+    parameters, tips = set_at(task.start, free, z[: len(free)]), repeatability_of(state, task.observed)
+    side = Bounds(begun.space, *(side[: len(free)] for side in begun.sides)).active(z[: len(free)])
+    if task.needs_no_weights:
+        whitening, sigma = weights(task, begun, state, None), state.sigma
+        white = [rows.values / sigma for rows in state.point.rows]
+    else:
+        whitening, sigma = whitening_at(task, state, None if of_prior is None else of_prior.rows), 1.0
+        each = zip(whitening.roots, state.point.rows, strict=True)
+        white = [jnp.einsum("mab,bm->am", root, rows.values) for root, rows in each if root is not None]
+    spare = jnp.maximum(task.observed.equations - spent, 1.0)
     fields = {
-        "parameters": found.parameters,
-        "de": found.de,
-        "deltam": found.deltam,
-        "sigma": found.after.sigma,
+        "parameters": parameters,
+        "de": tips.de,
+        "deltam": tips.deltam,
+        "sigma": state.sigma,
         "steps": found.steps,
         "reason": numbers_of(found.result),
-        "active": found.active,
-        "reduced_chi": found.observed.reduced_chi_of_all,
-        "prior": found.prior,
+        "active": set_at(jnp.zeros(parameters.shape, dtype=side.dtype), free, side),
+        "reduced_chi": jnp.sqrt(sum(jnp.sum(one**2) for one in white) / spare),
+        "prior": None if of_prior is None else of_prior.metrics,
         "k": None,
     }
-    if capture.lengths and not form.with_lengths:
-        fields["k"] = measured_scale(solution, capture).scale.value
-    return fields | ({"covariance": found.covariance} if form.covariance else {})
+    if problem.capture.lengths and not form.with_lengths:
+        own = [sigma**2 * one for one in own_covariances(task.observed, state.point, whitening)]
+        ends = ends_between(task.observed, z[len(free) :], own, problem.capture)
+        fields["k"] = scale_and_weights(ends)[0].value
+    if form.covariance:
+        fields["covariance"] = concluded(task, begun, z, state, found, of_prior).identification.covariance
+    return fields
 
 
 def _solve_all(
@@ -243,8 +277,8 @@ def _solve_all(
     z: Float[AnyArray, "c z"],
     whitening: Whitening,
     count: Int[Array, ""],
-) -> tuple[Float[AnyArray, "c z"], Int[Array, " c"], Int[Array, " c"]]:
-    """One least squares of every problem: the unknowns, evaluations, and numbers of the reasons."""
+) -> tuple[Float[AnyArray, "c n"], Int[Array, " c"], Int[Array, " c"]]:
+    """One least squares of every problem: its unknowns, evaluations, and numbers of the reasons."""
     capacity, slots = form.capacity, form.slots
 
     def of_slot(work: Callable) -> Callable:
@@ -265,13 +299,11 @@ def _solve_all(
         return call
 
     def start_and_box(task: Task, args: Any, first: AnyArray, _: Any) -> tuple[AnyArray, Box]:
-        begun = begin(task)
         size = first.shape[0]
-        return first, Box(begun.sides[0][:size], begun.sides[1][:size], begun.steps[:size])
+        return first, Box(*(side[:size] for side in box_of(task)))
 
     starts = of_slot(start_and_box)
     evaluate = of_slot(lambda task, args, first, trial: observed_model(trial, args))
-    finish = of_slot(lambda task, args, first, trial: with_linear_geometry(trial, args))
     first = jnp.arange(slots)
     shapes = jax.eval_shape(lambda index: evaluate(index, starts(index)[0]).gram, first)
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
@@ -306,11 +338,4 @@ def _solve_all(
         jnp.zeros(capacity, dtype=jnp.int64),
         jnp.zeros(capacity, dtype=jnp.int32),
     )
-    solutions = jax.lax.while_loop(more, once, (began, first, jnp.asarray(slots), empty))[3]
-
-    def group(row: Int[Array, ""]) -> AnyArray:
-        index = row * slots + first
-        return finish(index, solutions[0][index])
-
-    whole = jax.lax.map(group, jnp.arange(capacity // slots))
-    return whole.reshape(capacity, -1), solutions[1], solutions[2]
+    return jax.lax.while_loop(more, once, (began, first, jnp.asarray(slots), empty))[3]

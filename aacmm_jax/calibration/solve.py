@@ -48,20 +48,23 @@ def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
 def begin(task: Task, near: Float[AnyArray, " p"] | None = None) -> Begun:
     """Where a solve begins: at the start, or near the solution."""
     xp, free, space = namespace(task), task.free, task.space
-    geometry = task.observed.start(space, task.start[free])
-    endless = xp.full(geometry.shape, np.inf)
-    sides = (
-        xp.concatenate([task.bounds.lower[free], -endless]),
-        xp.concatenate([task.bounds.upper[free], endless]),
-    )
-    steps = xp.concatenate([space.scale, xp.asarray(task.observed.steps)])
-    z = xp.concatenate([task.start[free], geometry])
+    (*sides, steps) = box_of(task)
+    z = xp.concatenate([task.start[free], task.observed.start(space, task.start[free])])
     before = state = state_at(task, space, z, scatter_at_start(task, space, z))
     if near is not None:
         near = xp.clip(near, task.bounds.lower, task.bounds.upper)[free]
         z = xp.concatenate([near, task.observed.start(space, near)])
         state = state_at(task, space, z)
-    return Begun(space, sides, steps, before, z, state)
+    return Begun(space, (sides[0], sides[1]), steps, before, z, state)
+
+
+def box_of(task: Task) -> tuple[Float[AnyArray, " z"], Float[AnyArray, " z"], Float[AnyArray, " z"]]:
+    """Lower and upper bounds of all unknowns, of which the geometry has none, and their natural steps."""
+    xp, steps = namespace(task), task.observed.steps
+    endless = np.full(len(steps), np.inf)
+    lower, upper = (side[task.free] for side in (task.bounds.lower, task.bounds.upper))
+    scale = xp.concatenate([task.space.scale, xp.asarray(steps)])
+    return xp.concatenate([lower, -endless]), xp.concatenate([upper, endless]), scale
 
 
 def losses_of(task: Task) -> list[Loss | None]:
