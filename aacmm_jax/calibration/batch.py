@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,21 +16,22 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
+from ..core.numpy_or_jax import to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, check_columns
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
-from ..model.measurement import check_joints
-from ..model.robust import LossName
-from ..solver.reason import reasons
-from .batch_kernel import Problems, Shape, solve_chunk
-from .checks import check_enough, check_method
+from ..model.observed import Observed
+from ..model.robust import Loss, LossName, check_loss
+from ..solver.reason import numbers_of, reasons
+from .batch_kernel import Form, Problems, pick, solve_chunk, without_lengths
+from .checks import check_method, check_noise_model
 from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
-from .observed_batch import solve_observed
 from .results import ManyCalibrations, ManyIdentifications
-from .scale_anchor import ScaleAnchor, default_method, scale_anchor, scale_from_slides
-from .second_stage import divide_by_k, fix_scale_many, select_problems
+from .scale_anchor import default_method, scale_anchor, scale_from_slides
+from .scale_fix import divided
+from .task import NO_ANCHOR, check_observed, configurations, unknown_parameters
 
 # Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
 # 7,000 poses: five times slower where they do not); a GPU needs thousands.
@@ -101,14 +103,8 @@ def identify_many(
         [0.0124 0.0124 0.0124] [ True  True  True]
     """
     given = BatchOptions(**options)
-    if capture.observations or given.robust is not None or given.prior is not None:
-        return _solve_observed("identify", arm, capture, lower, upper, start, given)
-    if given.covariance:
-        raise InputError(
-            "covariances of many identifications from sockets alone are not computed; use jax.vmap of identify, or "
-            "calibrate_many with method='joint'."
-        )
-    return _batch_task("identify", arm, capture, lower, upper, start, given).identify()
+    batch = _Batch.of("identify", arm, capture, lower, upper, start, given, with_lengths=False)
+    return batch.identify()
 
 
 @checked_arguments
@@ -144,7 +140,7 @@ def calibrate_many(
         [0.99924 0.99922] [ True  True]
     """
     given = BatchOptions(**options)
-    _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
+    bounds, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
     by_slides = scale_from_slides(arm, capture, space, given.noise)
     general = bool(capture.observations) or any((given.robust, given.prior, given.covariance, by_slides))
     method = default_method(arm, general) if method is None else method
@@ -154,44 +150,58 @@ def calibrate_many(
             "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
         )
     if general:
-        found = _solve_observed("calibrate", arm, capture, lower, upper, start, given._replace(hold=None))
-        fields = {name: getattr(found, name) for name in _SHARED}
-        return ManyCalibrations(k=None, stage1=found, method="joint", **fields)
-    return _batch_task("calibrate", arm, capture, lower, upper, start, given).calibrate(method)
+        everything = given._replace(hold=None)
+        found = _Batch.of("calibrate", arm, capture, lower, upper, start, everything, with_lengths=True).identify()
+        return _of_joint(found, found, None, "joint")
+    batch = _Batch.of("calibrate", arm, capture, lower, upper, start, given._replace(covariance=False), False)
+    stage1 = batch.identify()
+    return _divided(batch, stage1, method)
 
 
 _SHARED = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi", "prior")
 
 
-def _batch_task(
-    single: str,
-    arm: Arm,
-    capture: Capture,
-    lower: Bounds | Numbers,
-    upper: Numbers | None,
-    start: Numbers | None,
-    options: BatchOptions,
-) -> "BatchTask":
-    """The task that a user's arguments state; ``single`` is the function that solves one problem."""
-    bounds, space = _checked_box(single, arm, capture, lower, upper, start, options)
-    return BatchTask.of(arm, capture, bounds, start, space, options)
+def _of_joint(
+    found: ManyIdentifications, stage1: ManyIdentifications, k: Float[np.ndarray, " b"] | None, method: str
+) -> ManyCalibrations:
+    fields = {name: getattr(found, name) for name in _SHARED}
+    apart = np.zeros(len(found.de), dtype=bool)
+    return ManyCalibrations(k=k, stage1=stage1, method=method, divided=apart, **fields)
 
 
-def _solve_observed(
-    single: str,
-    arm: Arm,
-    capture: Capture,
-    lower: Bounds | Numbers,
-    upper: Numbers | None,
-    start: Numbers | None,
-    options: BatchOptions,
-) -> ManyIdentifications:
-    """The same for captures with observations."""
-    bounds, space = _checked_box(single, arm, capture, lower, upper, start, options)
-    problems, _, size = _lay_out(arm, capture, bounds, start, space, None)
-    _check_options(arm, options)
-    given = problems.start, problems.lower, problems.upper
-    return solve_observed(arm, capture, given, size, space, options)
+def _divided(batch: "_Batch", stage1: ManyIdentifications, method: str) -> ManyCalibrations:
+    """Both stages: everything divided by k, and solved at once where something stands against that, or with "joint"."""
+    assert stage1.k is not None
+    anchor, shape = batch.form.anchor, stage1.parameters.shape
+    sides = (np.broadcast_to(side, shape) for side in (stage1.bounds.lower, stage1.bounds.upper))
+    bounds = Bounds(stage1.space, *sides)
+    division = divided(anchor, bounds, stage1.active, stage1.parameters, stage1.k)
+    # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
+    scaled = np.array(division.parameters, order="C")
+    if method == "joint":
+        found = batch.jointly(np.arange(len(scaled)), scaled)
+        joint = _of_joint(found, stage1, stage1.k, method)
+        return eqx.tree_at(lambda one: one.steps, joint, stage1.steps + found.steps)
+    # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
+    factor = stage1.k if anchor.can_scale else np.ones_like(stage1.k)
+    columns = {
+        "parameters": scaled,
+        "de": stage1.de / factor,
+        "deltam": stage1.deltam / factor,
+        "steps": np.array(stage1.steps),
+        "reason": np.array(numbers_of(stage1.result)),
+        "active": np.asarray(bounds.active(scaled)) if anchor.can_scale else np.array(stage1.active),
+        "divided": ~np.asarray(division.stands_against),
+    }
+    rows = np.flatnonzero(division.stands_against)
+    if len(rows):
+        found = batch.jointly(rows, scaled[rows])
+        for name in ("parameters", "de", "deltam", "active"):
+            columns[name][rows] = getattr(found, name)
+        columns["steps"][rows] += found.steps
+        columns["reason"][rows] = numbers_of(found.result)
+    result = to_jax(reasons(np.asarray(columns.pop("reason"))))
+    return ManyCalibrations(k=stage1.k, result=result, stage1=stage1, method=method, **columns)
 
 
 def _checked_box(
@@ -227,6 +237,7 @@ def _checked_box(
 
 def _check_options(arm: Arm, options: BatchOptions) -> None:
     """Refuse options that mean nothing."""
+    check_loss(options.robust)
     if options.noise is not None:
         check_finite(noise=options.noise)
         options.noise.check(arm.joints)
@@ -236,129 +247,108 @@ def _check_options(arm: Arm, options: BatchOptions) -> None:
             raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
 
 
-class BatchTask(NamedTuple):
+class _Batch(NamedTuple):
     """A batch of identifications, checked: the problems on the host, and how a chunk of them is run on a device."""
 
-    arm: Arm
-    capture: Capture
     problems: Problems
-    shape: Shape
-    chunks: list[range]
-    capacity: int  # problems of one call of the compiled program
-    devices: list[Any]
-    workers: int
+    form: Form
+    size: int
     space: Parameters
-    anchor: ScaleAnchor
     options: BatchOptions
 
     @classmethod
     def of(
         cls,
+        single: str,
         arm: Arm,
         capture: Capture,
-        bounds: tuple[Numbers, Numbers],
+        lower: Bounds | Numbers,
+        upper: Numbers | None,
         start: Numbers | None,
-        space: Parameters,
         options: BatchOptions,
-        anchor: ScaleAnchor | None = None,
-        sigma: Float[np.ndarray, " b"] | None = None,
-    ) -> "BatchTask":
-        """Everything checked and laid out. ``anchor`` is one that is known; ``sigma`` is of a joint solve, see
-        `Problems`."""
-        problems, batched, size = _lay_out(arm, capture, bounds, start, space, sigma)
-        anchor = scale_anchor(space, arm, options.hold, options.noise, capture) if anchor is None else anchor
-        check_joints(capture, space)
+        with_lengths: bool,
+    ) -> "_Batch":
+        """Everything checked and laid out; ``single`` is the function that solves one problem. Reference lengths take
+        part in the least squares ``with_lengths``."""
+        bounds, space = _checked_box(single, arm, capture, lower, upper, start, options)
         _check_options(arm, options)
-        check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
-        devices = devices_of(options.devices)
-        slots = options.slots or _default_slots(devices, sum(capture.sizes))
-        workers = options.workers or default_workers(devices)
-        chunks = cut_into_chunks(size, slots, workers, options.chunk)
-        shape = Shape(
-            sizes=capture.sizes,
-            ends=tuple((int(a), int(b)) for a, b in capture.ends()),
-            indices=space.indices(),
-            solved=tuple(name != anchor.hold for name in space.names),
-            scale=tuple(np.asarray(space.scale).tolist()),
-            batched=batched,
-            slots=slots,
-            max_steps=options.max_steps,
-        )
-        capacity = round_up(max(map(len, chunks)), slots)
+        check_columns(arm, capture.columns)
+        box, size = _lay_out(arm, capture, bounds, start, space)
         space = based_on(space, arm)
-        return cls(arm, capture, problems, shape, chunks, capacity, devices, workers, space, anchor, options)
+        arm, capture = to_numpy((space.base, capture))
+        problems = Problems(arm, capture, *box, near=None)
+        return cls(problems, _form(problems, space, options, with_lengths), size, space, options)
 
     def identify(self) -> ManyIdentifications:
-        """Stage 1 of all problems."""
-        found = run_chunks(self.run, self.chunks, self.devices, self.workers)
-        parameters, de, deltam, sigma, k, steps, reason, active = (
-            np.concatenate(column) for column in zip(*found, strict=True)
-        )
+        """All problems."""
+        options, devices = self.options, devices_of(self.options.devices)
+        slots = options.slots or _default_slots(devices, len(self.form.pose))
+        workers = options.workers or default_workers(devices)
+        chunks = cut_into_chunks(self.size, slots, workers, options.chunk)
+        form = self.form._replace(slots=slots, capacity=round_up(max(map(len, chunks)), slots))
+
+        def run(chunk: range, device: Any) -> dict[str, Any]:
+            # Filled up to the capacity with copies of the first problem, which are never begun.
+            rows = np.full(form.capacity, chunk.start)
+            rows[: len(chunk)] = chunk
+            with jax.default_device(device):
+                part = _selected(self.problems, form.axes, rows)
+                given = jax.device_put((part, np.asarray(len(chunk)), options.noise, options.prior), device)
+                found = solve_chunk(form, *given)
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], found)
+
+        found = run_chunks(run, chunks, devices, workers)
+        fields = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
         return ManyIdentifications(
-            parameters=parameters,
-            de=de,
-            deltam=deltam,
-            sigma=sigma,
-            k=k if self.shape.ends else None,
-            steps=steps,
-            result=reasons(jnp.asarray(reason)),
-            active=active,
+            result=reasons(jnp.asarray(fields.pop("reason"))),
             bounds=Bounds(self.space, self.problems.lower, self.problems.upper),
-            anchor=self.anchor,
+            anchor=form.anchor,
+            **fields,
         )
 
-    def calibrate(self, method: str) -> ManyCalibrations:
-        """Both stages of all problems."""
-        stage1 = self.identify()
-        assert stage1.k is not None
-        if method == "two-stage":
-            found = fix_scale_many(self.anchor, stage1, self.identify_again)
-            return ManyCalibrations(k=stage1.k, stage1=stage1, method=method, **found)
-        scaled = divide_by_k(self.anchor, stage1.space, stage1.parameters, stage1.k)
-        box = self.problems.lower, self.problems.upper
-        joint = self.with_start(self.arm, self.capture, box, scaled, None, stage1.sigma / stage1.k).identify()
-        return ManyCalibrations(
-            parameters=joint.parameters,
-            k=stage1.k,
-            de=joint.de,
-            deltam=joint.deltam,
-            steps=stage1.steps + joint.steps,
-            result=joint.result,
-            active=joint.active,
-            stage1=stage1,
-            method=method,
-        )
+    def jointly(self, rows: np.ndarray, near: Float[np.ndarray, "b p"]) -> ManyIdentifications:
+        """Some of the problems, with all that the capture holds in one least squares, from parameters near to it."""
+        part = _selected(self.problems, self.form.axes, rows)._replace(near=near)
+        form = _form(part, self.space, self.options._replace(hold=None), with_lengths=True)
+        return self._replace(problems=part, form=form, size=len(rows)).identify()
 
-    def identify_again(self, rows: np.ndarray, start: np.ndarray, hold: str | None) -> ManyIdentifications:
-        """Stage 1 of some of the problems, from another start and with another anchor."""
-        problems = self.problems
-        arm, capture, *box = select_problems(rows, self.arm, self.capture, problems.lower, problems.upper)
-        again = self.with_start(arm, capture, (box[0], box[1]), start, hold)
-        # Of the capacity of the whole batch, whatever the number of problems: one compiled program for all of them.
-        return again._replace(capacity=max(again.capacity, self.capacity)).identify()
 
-    def with_start(
-        self,
-        arm: Arm,
-        capture: Capture,
-        bounds: tuple[np.ndarray, np.ndarray],
-        start: np.ndarray,
-        hold: str | None,
-        sigma: Float[np.ndarray, " b"] | None = None,
-    ) -> "BatchTask":
-        """The task for the same batch, or for a part of it, from another start and with another anchor."""
-        anchor = self.anchor._replace(hold=hold)
-        return BatchTask.of(arm, capture, bounds, start, self.space, self.options, anchor, sigma)
+def _form(problems: Problems, space: Parameters, options: BatchOptions, with_lengths: bool) -> Form:
+    """What is the same for all problems. Raises `InputError` where the data cannot determine the unknowns."""
+    arm, capture, start, lower, upper, near = problems
+    box = (None if side is None or side.ndim == 1 else 0 for side in (start, lower, upper, near))
+    of_arm = jax.tree.map(lambda leaf: 0 if leaf.ndim > 1 else None, arm)
+    axes = Problems(of_arm, jax.tree.map(lambda leaf: 0, capture) if capture.q.ndim > 2 else None, *box)
+    first = _selected(problems, axes, 0)
+    one = first.capture if with_lengths else without_lengths(first.capture)
+    scaled = bool(one.lengths) or any(observation.fixes_scale for observation in one.observations)
+    hold = None if scaled and options.hold == "longest" else options.hold
+    anchor = NO_ANCHOR
+    if not scaled or hold:
+        anchor = scale_anchor(space, arm, hold, options.noise, first.capture)
+    of_first = Parameters(first.arm, space.names)
+    observed = Observed.of(one, first.arm)
+    known = unknown_parameters(of_first, anchor, options.prior, options.noise)
+    check_observed(observed, of_first, np.asarray(first.start), known)
+    return Form(
+        names=space.names,
+        anchor=anchor,
+        with_lengths=with_lengths,
+        noise_model=check_noise_model(None, options.noise, arm.joints),
+        loss=None if options.robust is None else Loss(options.robust),
+        # Only covariances need to know which readings are one, and each answer is a program.
+        pose=configurations(observed.q) if options.covariance else tuple(range(observed.q.shape[0])),
+        max_steps=options.max_steps,
+        covariance=options.covariance,
+        slots=0,
+        capacity=0,
+        axes=axes,
+    )
 
-    def run(self, chunk: range, device: Any) -> tuple[np.ndarray, ...]:
-        """Solve one chunk, filled up to the capacity with copies of its first problem, which are never begun."""
-        rows = np.full(self.capacity, chunk.start)
-        rows[: len(chunk)] = chunk
-        part = jax.tree.map(lambda leaf, many: leaf[rows] if many else leaf, self.problems, self.shape.batched)
-        with jax.default_device(device):
-            given = jax.device_put((part, np.asarray(len(chunk)), self.options.noise), device)
-            solved = solve_chunk(*given, self.shape, self.capacity)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], solved)
+
+def _selected(problems: Problems, axes: Problems, rows: Any) -> Problems:
+    """The problems of some rows; what all share stays as it is."""
+    return Problems(*(pick(tree, axis, rows) for tree, axis in zip(problems, axes, strict=True)))
 
 
 def _default_slots(devices: Sequence[Any], poses: int) -> int:
@@ -368,14 +358,9 @@ def _default_slots(devices: Sequence[Any], poses: int) -> int:
 
 
 def _lay_out(
-    arm: Arm,
-    capture: Capture,
-    bounds: tuple[Numbers, Numbers],
-    start: Numbers | None,
-    space: Parameters,
-    sigma: Float[np.ndarray, " b"] | None,
-) -> tuple[Problems, Problems, int]:
-    """The batch on the host, which leaves are batched, and its size. Raises `InputError` where shapes do not fit."""
+    arm: Arm, capture: Capture, bounds: tuple[Numbers, Numbers], start: Numbers | None, space: Parameters
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
+    """Start, lower and upper bounds, and the size of the batch. Raises `InputError` where shapes do not fit."""
     p = len(space.names)
     given = {"start": space.vector(arm) if start is None else start, "lower": bounds[0], "upper": bounds[1]}
     boxes = {what: np.asarray(as_array(value, what)) for what, value in given.items()}
@@ -384,16 +369,10 @@ def _lay_out(
             raise InputError(
                 f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free."
             )
-    lengths = [[np.asarray(getattr(r, key)) for r in capture.lengths] for key in ("value", "u")]
-    nominal, u = (np.stack(values, axis=-1) if values else np.zeros(0) for values in lengths)
-    geometry = jax.tree.map(np.asarray, based_on(space, arm).base.geometry)
-    q = np.asarray(capture.q)
-    problems = Problems(boxes["start"], boxes["lower"], boxes["upper"], geometry, q, nominal, u, sigma)
-    ranks = Problems(1, 1, 1, jax.tree.map(lambda _: 1, geometry), 2, 1, 1, None if sigma is None else 0)
-    batched = jax.tree.map(lambda leaf, rank: leaf.ndim > rank, problems, ranks)
-    sizes = {
-        leaf.shape[0] for leaf, many in zip(jax.tree.leaves(problems), jax.tree.leaves(batched), strict=True) if many
-    }
+    sizes = {value.shape[0] for value in boxes.values() if value.ndim > 1}
+    sizes |= {leaf.shape[0] for leaf in jax.tree.leaves(arm) if leaf.ndim > 1}
+    sizes |= {capture.q.shape[0]} if capture.q.ndim > 2 else set()
+    sizes |= {np.shape(one.value)[0] for one in capture.lengths if np.ndim(one.value)}
     if not sizes:
         raise InputError(
             "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use "
@@ -410,7 +389,4 @@ def _lay_out(
         raise InputError(
             f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
         )
-    if sigma is None:  # the joint solve is weighted in the arm that it starts from, wherever that is
-        start = np.clip(boxes["start"], boxes["lower"], boxes["upper"])
-        problems, batched = problems._replace(start=start), batched._replace(start=start.ndim > 1)
-    return problems, batched, sizes.pop()
+    return (boxes["start"], boxes["lower"], boxes["upper"]), sizes.pop()

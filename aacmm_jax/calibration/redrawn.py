@@ -27,8 +27,8 @@ from ..kinematics.parameters import Parameters
 from ..model.observed import Observed, linear_rows
 from ..uncertainty.tip_errors import ArmErrors, arm_errors
 from .drawn_errors import DrawnErrors, draw_shared
-from .task import configurations
 from .results import Calibration
+from .task import configurations
 
 
 class Trials(NamedTuple):

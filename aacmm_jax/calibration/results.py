@@ -366,6 +366,7 @@ class ManyCalibrations(AbstractManyResults):
     active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, in the last solve
     stage1: ManyIdentifications
     method: str = eqx.field(static=True)
+    divided: Bool[np.ndarray, " b"]  # as in a `Calibration`
     covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
     reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
     prior: PriorMetrics | None = None  # with a batch axis

@@ -20,10 +20,11 @@ from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.capture import Capture
 from ..data.observations.socket import position_of
 from ..kinematics.parameters import Bounds, Parameters
+from ..model.observed import Observed
 from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
-from ..uncertainty.linear_propagation import UnknownsCovariance, geometry_covariance, rows_of_functions
+from ..uncertainty.linear_propagation import rows_of_functions
+from .conclusion import Solution
 from .scale_anchor import ScaleAnchor
-from .solve import Solution
 
 LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
 _ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
@@ -44,23 +45,13 @@ def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
     Its standard uncertainty includes that of the identified parameters, and takes those on a bound as exact.
     """
     linear, influence = solution.linear, solution.influence
-    observed, xp = linear.observed, namespace(linear.z)
-    p, layout, positions = len(linear.space.names), observed.layout, observed.positions
-    pairs = [(position_of(length.start), position_of(length.end)) for length in capture.lengths]
-    used = list(dict.fromkeys(name for pair in pairs for name in pair))
-    alone = UnknownsCovariance(influence.inverse, influence.own)  # of a given arm
-    ends = MeasuredEnds(
-        positions=xp.stack([linear.z[p + positions[name]] for name in used]),
-        covariances=xp.stack([geometry_covariance(layout, alone, p, positions[name]) for name in used]),
-        ends=np.array([[used.index(name) for name in pair] for pair in pairs]),
-        nominal=xp.stack([length.value for length in capture.lengths]),
-        u=xp.stack([length.u for length in capture.lengths]),
-    )
+    p, layout, positions = len(linear.space.names), linear.observed.layout, linear.observed.positions
+    xp, ends = namespace(linear.z), ends_between(linear.observed, linear.z[p:], influence.own, capture)
     scale, relative = scale_and_weights(ends)
     by_positions = xp.einsum("l,lec->ec", relative, ends.by_positions)
     head = xp.zeros((1, linear.height))
     components = [xp.zeros((1, count, size)) for count, size in layout.classes]
-    for name, derivative in zip(used, by_positions, strict=True):
+    for name, derivative in zip(_used(capture), by_positions, strict=True):
         of, component, first = layout.component_of(int(positions[name][0]))
         if of is None:
             head = set_at(head, (0, p + positions[name]), derivative)
@@ -72,6 +63,29 @@ def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
     added = xp.sum((by_lengths * ends.u) ** 2) + xp.maximum(scale.u**2 - predicted, 0.0)
     u = xp.sqrt(solution.covariance_of(rows)[0, 0] + added)
     return ScaleFound(eqx.tree_at(lambda s: s.u, scale, u), rows, by_lengths, added)
+
+
+def _used(capture: Capture) -> list[str]:
+    """Names of the positions at the ends of reference lengths."""
+    return list(dict.fromkeys(position_of(name) for one in capture.lengths for name in (one.start, one.end)))
+
+
+def ends_between(
+    observed: Observed, geometry: Float[AnyArray, " g"], own: list[Float[AnyArray, "K k k"]], capture: Capture
+) -> MeasuredEnds:
+    """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
+    xp, used, covariances = namespace(geometry), _used(capture), []
+    for name in used:
+        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        assert of is not None  # a length's ends are sockets, which no other observation shares
+        covariances.append(own[of][component, first : first + 3, first : first + 3])
+    return MeasuredEnds(
+        positions=xp.stack([geometry[observed.positions[name]] for name in used]),
+        covariances=xp.stack(covariances),
+        ends=np.array([[used.index(position_of(name)) for name in (one.start, one.end)] for one in capture.lengths]),
+        nominal=xp.stack([length.value for length in capture.lengths]),
+        u=xp.stack([length.u for length in capture.lengths]),
+    )
 
 
 class Division(NamedTuple):

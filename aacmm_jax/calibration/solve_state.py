@@ -13,6 +13,7 @@ from ..uncertainty.tip_errors import (
     covariance_of_noise,
     covariance_of_sigma,
     robust_scatter_of,
+    root_of_sum,
     scatter_of,
 )
 from .task import Task
@@ -26,6 +27,17 @@ class State(NamedTuple):
     point: PointRows
     errors: list[ArmErrors]
     sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
+
+
+class Begun(NamedTuple):
+    """Where a solve begins."""
+
+    space: Parameters
+    sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]]  # bounds of all unknowns
+    steps: Float[AnyArray, " z"]  # natural steps
+    before: State  # at the start
+    z: Float[AnyArray, " z"]  # where it begins: there, or near the solution
+    state: State  # there
 
 
 def state_at(
@@ -43,8 +55,12 @@ def state_at(
         xp = namespace(z, effective)
         spent = z.shape[0] if effective is None else effective
         degrees_of_freedom = xp.maximum(xp.asarray(task.observed.equations - spent, dtype=float), 1.0)
-        scatter = scatter_of if task.loss is None else robust_scatter_of
-        sigma = scatter(point.rows, errors, degrees_of_freedom)
+        if task.needs_no_weights:
+            squares: Any = sum(xp.sum(part.values**2) for part in point.rows)
+            sigma = root_of_sum(squares / degrees_of_freedom)
+        else:
+            scatter = scatter_of if task.loss is None else robust_scatter_of
+            sigma = scatter(point.rows, errors, degrees_of_freedom)
     return State(point, errors, sigma)
 
 

@@ -15,10 +15,11 @@ from ..model.observed import Observed
 from ..uncertainty.active_bounds import of_active_bounds
 from ..uncertainty.linear_propagation import covariance_with, rows_of_functions
 from ..uncertainty.linearisation import Linearisation
+from .conclusion import Solution, repeatability_of
 from .results import Calibration, ObservedMetrics
 from .scale_fix import Division, ScaleFound, divided, divided_uncertainty, measured_scale
 from .sensitivities import Sensitivities, sensitivities_of_rows, tips_of_rows
-from .solve import Solution, repeatability_of, solve
+from .solve import solve
 from .solve_state import state_at
 from .task import Task
 

@@ -13,12 +13,14 @@ from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky, inverse_positive_definite, semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, added_to, namespace
+from ..data.observations.observation import Rows
 from ..kinematics.parameters import Parameters
 from ..solver.active_set import QuadraticModel
 from ..solver.arrow import Arrow, joined
+from .layout import Group
 from .observed import Observed
 from .robust import Loss
-from .rows import PriorRows, RowBlock, Whitening, row_blocks, rows_at
+from .rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at
 from .socket_sums import counts, means_over_sockets, sums_over_sockets, to_poses
 
 _LONG = 40  # poses of a component, from which a product of matrices each is the fastest sum over them
@@ -32,8 +34,8 @@ class Args(NamedTuple):
     observed: Observed
     whitening: Whitening
     loss: Loss | None = None
-    # Where it is given, the components whose rows are linear in them (`Layout.linear`) are no unknowns of the solve: for
-    # each head they are where they fit best. These are their numbers about which rows are linear, at the end of all.
+    # Where it is given, the components whose rows are linear in them (`Layout.linear`) are no unknowns of the solve:
+    # for each head they are where they fit best. These are numbers, at the end of all, that residuals are counted from.
     linear: Float[AnyArray, " l"] | None = None
     batch: bool = False  # whether it is evaluated in the way that is fastest in a batch, and not differentiated
 
@@ -258,26 +260,41 @@ def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
 def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> Float[AnyArray, " z"]:
     """All unknowns, with the components that the solve has no unknowns of where they fit best."""
     space, observed, whitening, _, linear, _ = args
-    assert linear is not None
+    if linear is None:
+        return z
     xp, layout = namespace(z, linear), observed.layout
     whole = xp.concatenate([z, linear])
     first = len(layout.classes) - layout.linear
     fitted = [xp.zeros(shape) for shape in layout.classes[first:]]
     point = rows_at(space, observed, whole)
-    for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
-        if group.of is None or group.of < first:
-            continue
-        # The rows are tips less positions, so that their weighted mean is what the position lacks.
-        if root is None:
-            step = means_over_sockets(rows.values, group.sizes).T
-        else:
-            weight = xp.moveaxis(xp.swapaxes(root, -1, -2) @ root, 0, -1)
-            white = xp.einsum("abm,bm->am", weight, rows.values)
-            sums = means_over_sockets(weight, group.sizes), means_over_sockets(white, group.sizes)
-            inverse = inverse_positive_definite(xp.moveaxis(sums[0], -1, 0))
-            step = (inverse @ sums[1].T[..., None])[..., 0]
-        fitted[group.of - first] = step
+    for group, rows, root in zip(layout.groups, point.rows, whitening.roots, strict=True):
+        if group.of is not None and group.of >= first:
+            fitted[group.of - first] = _of_rows(rows, root, group)[1]
     return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)])
+
+
+def _of_rows(
+    rows: Rows, root: Float[AnyArray, "m 3 3"] | None, group: Group
+) -> tuple[Float[AnyArray, "K 3 3"], Float[AnyArray, "K 3"]]:
+    """Information on positions from tips less positions, and what these lack: a weighted mean of the residuals."""
+    xp = namespace(rows.values)
+    if root is None:
+        number = np.asarray(group.sizes, dtype=float)[:, None, None]
+        return xp.asarray(number * np.eye(3)), means_over_sockets(rows.values, group.sizes).T
+    weight = xp.moveaxis(xp.swapaxes(root, -1, -2) @ root, 0, -1)
+    right = sums_over_sockets(xp.einsum("abm,bm->am", weight, rows.values), group.sizes).T
+    information = xp.moveaxis(sums_over_sockets(weight, group.sizes), -1, 0)
+    return information, (inverse_positive_definite(information) @ right[..., None])[..., 0]
+
+
+def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) -> list[Float[AnyArray, "K 3 3"]]:
+    """Covariances of the positions of sockets by a given arm, as entries of a list of all classes."""
+    layout = observed.layout
+    found: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)
+    for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
+        if group.of is not None and stack.linear:
+            found[group.of] = inverse_positive_definite(_of_rows(rows, root, group)[0])
+    return found
 
 
 def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, "h h"], Float[AnyArray, " h"]]:

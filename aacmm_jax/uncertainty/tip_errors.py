@@ -118,6 +118,12 @@ def scatter_of(
     return xp.exp(root + xp.clip(step, -0.1, 0.1))
 
 
+def root_of_sum(value: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
+    """The square root of a sum of squares; its derivative at 0, where it has none, is set to 0."""
+    xp, zero = namespace(value), value == 0
+    return xp.where(zero, 0.0, xp.sqrt(xp.where(zero, 1.0, value)))
+
+
 def robust_scatter_of(
     rows: list[Rows], errors: list[ArmErrors], degrees_of_freedom: Float[AnyArray, ""] | float
 ) -> Float[AnyArray, ""]:
