@@ -225,7 +225,7 @@ def record_of(
         steps=int(calibration.steps),
         converged=bool(calibration.converged),
         reason=_reason(calibration, stage1),
-        observed=None if stage1.observed is None else jax.tree.map(np.asarray, stage1.observed),
+        observed=jax.tree.map(np.asarray, calibration.observed),
         robust=robust,
         prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
         noisy_encoders=calibration.noisy_encoders,
