@@ -127,7 +127,7 @@ def linearisation_of(
     z, sigma = np.concatenate([np.asarray(space.vector()), *geometry]), np.asarray(metrics.sigma)
     found = Linearisation.at(observed, space, z, noise=noise, sigma=sigma, least=LEAST_U)
     weights = [np.asarray(one) for one in metrics.weights]
-    if record.robust is None:
+    if all(np.all(one == 1) for one in weights):
         return found
     of_groups = [np.concatenate([weights[number] for number in group.members]) for group in observed.layout.groups]
     return found._replace(weights=[*of_groups, *found.weights[len(of_groups) :]])
