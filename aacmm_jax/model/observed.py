@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, added_to, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.measured_points import AbstractMeasured
@@ -29,7 +28,7 @@ from .robust import Loss
 _STEPS = {"mm": 1.0, "rad": 1e-3}  # natural steps, as those of the arm's parameters
 
 
-class Observed(Module):
+class Observed(eqx.Module):
     """Everything that a capture observed, as arrays: sockets first, then its other observations."""
 
     observations: tuple[AbstractObservation, ...]

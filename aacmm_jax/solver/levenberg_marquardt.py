@@ -12,7 +12,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, while_loop
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, diagonal, norm, propose
 from .reason import GRADIENT, MAX_STEPS, NONFINITE, ROUNDING, RUNNING, STALLED, STEP
@@ -31,7 +30,7 @@ class Rules(NamedTuple):
     initial_damping: float | None = None
 
 
-class Progress(Module):
+class Progress(eqx.Module):
     """State of one solve, or of a batch of them in slots, between two evaluations."""
 
     y: Flat  # accepted
