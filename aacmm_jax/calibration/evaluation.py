@@ -12,7 +12,6 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -24,7 +23,7 @@ from ..model.observed import Observed
 from .observed_evaluation import ObservedEvaluation, checked_geometry, evaluate_observations
 
 
-class Evaluation(Module):
+class Evaluation(eqx.Module):
     """Metrics of one arm on one capture, mm; of a batch of arms with its axes first.
 
     Example:

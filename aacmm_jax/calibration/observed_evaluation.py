@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError, nearest
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, compiled, namespace
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
@@ -27,7 +26,7 @@ _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip co
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 
 
-class ObservedEvaluation(Module):
+class ObservedEvaluation(eqx.Module):
     """How the observations of a capture agree with one arm; in their order, sockets first."""
 
     names: tuple[str, ...] = eqx.field(static=True)
