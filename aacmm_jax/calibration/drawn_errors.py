@@ -49,7 +49,8 @@ def functions_of(
         return np.zeros((len(q), 0)), np.zeros(0, dtype=int)
     wider: Arm = to_numpy(with_further_corrections(arm, names))
     assert wider.corrections is not None
-    terms = [term for name in names if (term := term_of(name, arm.joints)) is not None]
+    joints = arm.joints
+    terms = [term for name in names if (term := term_of(name, joints)) is not None]
     values = function_values(wider.corrections.nominal, terms, q, np.asarray(wider.gravity)).T
     return values, np.array([term.joint - 1 for term in terms])
 

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -24,7 +23,7 @@ from ..model.socket_sums import to_poses
 from .observed_evaluation import ObservedEvaluation, checked_geometry, described, fit_geometry
 
 
-class Evaluation(Module):
+class Evaluation(eqx.Module):
     """Metrics of one arm on one capture, mm; of a batch of arms with its axes first.
 
     Example:
@@ -41,8 +40,8 @@ class Evaluation(Module):
     # u of error: the length's own u, and the scatter of the poses at its ends; NaN where unknown
     u: Float[AnyArray, "*batch l"]
     distances: Float[AnyArray, "*batch N"]  # of every pose's tip from its socket's position
-    # Residuals of all observations; None of a capture of sockets alone, which `repeatability` describes, unless geometry
-    # or noise is given.
+    # Residuals of all observations; None of a capture of sockets alone, which `repeatability` describes, unless
+    # geometry or noise is given.
     observed: ObservedEvaluation | None = None
 
 
@@ -93,7 +92,7 @@ def evaluate(
     return work(arm, *subject)
 
 
-class _Lengths(Module):
+class _Lengths(eqx.Module):
     """The reference lengths of a capture, which are measured and not fitted."""
 
     nominal: Float[AnyArray, " l"]  # mm

@@ -7,12 +7,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import to_numpy
+from ..data.noise import Noise
 from ..kinematics.arm import by_joint, is_length, value_of
 from ..kinematics.parameters import Parameters
-from ..model.measurement import Measurement
-from ..model.observed import Observed, certified_and_lengths, linear_rows, whitened, whitening_of
+from ..model.observed import Observed
 from ..uncertainty.group_test import Block
-from ..uncertainty.tip_errors import arm_errors, covariance_of_noise
+from ..uncertainty.linearisation import Linearisation
+from .batch_kernel import without_lengths
 from .record import CalibrationRecord
 
 PRIOR = "prior"  # name of its rows
@@ -73,10 +74,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
     kinds = by_joint(record.calibrated.arm, "theta", "d")  # where a reading is added
     extra = (*(f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)), *PROBE)
     steps = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
-    if record.observed is None:
-        return Equations(_of_sockets(record, extra), [], extra, steps)
-    rows, relations = _of_observations(record, extra)
-    return Equations(rows, relations, extra, steps)
+    return Equations(*_rows_and_relations(record, extra), extra, steps)
 
 
 def equations_in_chunks(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
@@ -115,70 +113,83 @@ def wider(relations: Sequence[Block], added: int) -> list[Block]:
     return [block._replace(shared=np.pad(block.shared, ((0, 0), (0, added)))) for block in relations]
 
 
-def _of_sockets(record: CalibrationRecord, extra: tuple[str, ...]) -> list[Rows]:
-    """Of sockets whose positions are eliminated: thousands of them must not take seconds."""
-    capture = record.recording.capture
-    arm = record.calibrated.arm
-    arm, measurement, noise = to_numpy((arm, Measurement.of(capture, arm), record.noise))
-    names = tuple(name for name in record.names if name != scale_anchor_of(record))
-    every = (*names, *(name for name in extra if name not in names))
-    slopes = np.asarray(arm.jacobian(measurement.q, every)) * np.asarray(Parameters(arm, every).scale)
-    weights = measurement.weighted(arm.geometry, noise).weights
-    assert weights is not None
-    root = np.moveaxis(np.asarray(weights.root), -1, 0)
-    tips = np.asarray(measurement.centred(np.asarray(arm.position(measurement.q))))
-    residual, by = np.einsum("nab,nb->na", root, tips), root @ slopes
-    columns = [every.index(name) for name in extra]
-    inverse, found, end = np.linalg.inv(root), [], 0
-    for name, size in zip(capture.names, capture.sizes, strict=True):
-        end += size
-        of = slice(end - size, end)
-        if size > 1:
-            shared = by[of][..., : len(names)]
-            extra_of, poses = by[of][..., columns], np.arange(end - size, end)
-            found.append(Rows(name, residual[of], shared, root[of], extra_of, inverse[of], root[of], poses))
-    return found
-
-
-def _of_observations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple[list[Rows], list[Block]]:
+def linearisation_of(
+    record: CalibrationRecord, names: Sequence[str], *, noise: Noise | None, lengths: bool = True
+) -> Linearisation:
+    """A calibration linear at its solution, by some parameters, weighted by the noise, or where that is None by the
+    scatter of its tips; with reference lengths as relations, or without."""
     assert record.observed is not None
+    capture = record.recording.capture if lengths else without_lengths(record.recording.capture)
     arm = record.calibrated.arm
-    observed, arm, noise = to_numpy((Observed.of(record.recording.capture, arm), arm, record.noise))
-    names = tuple(name for name in record.names if name != record.hold)
+    observed, arm, noise = to_numpy((Observed.of(capture, arm), arm, noise))
+    space, metrics = Parameters(arm, tuple(names)), record.observed
+    geometry = [np.asarray(metrics.geometry[part]) for part in observed.blocks]
+    z, sigma = np.concatenate([np.asarray(space.vector()), *geometry]), np.asarray(metrics.sigma)
+    found = Linearisation.at(observed, space, z, noise=noise, sigma=sigma, least=LEAST_U)
+    weights = [np.asarray(one) for one in metrics.weights]
+    if all(np.all(one == 1) for one in weights):
+        return found
+    of_groups = [np.concatenate([weights[number] for number in group.members]) for group in observed.layout.groups]
+    return found._replace(weights=[*of_groups, *found.weights[len(of_groups) :]])
+
+
+def lengths_in_solve(record: CalibrationRecord) -> bool:
+    """Whether reference lengths took part in the least squares, and not only as the scale afterwards."""
+    return record.method == "joint" and bool(record.recording.capture.lengths)
+
+
+def _kept(record: CalibrationRecord) -> str | None:
+    """The length that the equations keep: none where anything but repeatability says what the scale is."""
+    if lengths_in_solve(record):
+        return None
+    known = record.prior is not None or any(one.fixes_scale for one in record.recording.capture.observations)
+    return record.hold if known else scale_anchor_of(record)
+
+
+def _rows_and_relations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple[list[Rows], list[Block]]:
+    anchor = _kept(record)
+    names = tuple(name for name in record.names if name != anchor)
     every = (*names, *(name for name in extra if name not in names))
-    space, p, free = Parameters(arm, every), len(every), len(names)
-    geometry = [np.asarray(record.observed.geometry[part]) for part in observed.blocks]
-    z = np.concatenate([np.asarray(space.vector()), *geometry])
-    linear = linear_rows(space, observed, z)
-    errors = arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed)
-    whitening = whitening_of(
-        linear, observed, [covariance_of_noise(error, noise) for error in errors], np.array(LEAST_U)
-    )
-    steps = np.concatenate([np.asarray(space.scale), observed.steps])
-    common = np.concatenate([np.arange(free), p + _common(observed)])
-    columns = np.array([every.index(name) for name in extra])
+    linear = linearisation_of(record, every, noise=record.noise, lengths=lengths_in_solve(record))
+    observed, p, free = linear.observed, len(every), len(names)
+    steps, columns = np.asarray(linear.steps), np.array([every.index(name) for name in extra])
+    common = _common(observed)
     rows = []
-    for name, part, root, weights, of in zip(
-        record.observed.names, linear, whitening.roots, record.observed.weights, observed.slices, strict=True
-    ):
-        root = np.sqrt(np.asarray(weights))[:, None, None] * np.asarray(root)
-        own = np.array([i for i in part.indices if i >= p and i not in common], dtype=int)
-        white, by = _in_columns(part, root, steps)
-        in_mm = np.linalg.pinv(root)[:, :3]
-        by_tip = root @ np.moveaxis(np.asarray(part.rows.by_tip), -1, 0)
-        poses = np.arange(of.start, of.stop)
-        rows.append(Rows(name, white, by(common), by(own), by(columns), in_mm, by_tip, poses))
-    derivatives, u = certified_and_lengths(observed, z, p)
-    parts = observed.split(z[p:])
-    residual = [np.linalg.norm(parts[end] - parts[start]) for start, end in observed.ends] - np.asarray(
-        observed.nominal
-    )
-    residual = [residual, *(parts[name] - np.asarray(value) for name, (value, _) in observed.certified().items())]
+    parts = zip(linear.parts(), linear.white(), linear.by_head(), linear.by_private(), linear.private(), strict=True)
+    for part, white, head, private, index in parts:
+        weight = np.sqrt(np.asarray(part.weight))
+        root = weight[:, None, None] * np.asarray(part.root)
+        by = np.moveaxis(np.asarray(head) * weight, (0, 1, 2), (2, 1, 0)) * steps[: linear.height]
+        own = np.moveaxis(np.asarray(private) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + index]
+        among = np.isin(index, common)
+        shared = np.zeros((*by.shape[:2], free + len(common)))
+        shared[..., :free] = by[..., :free]
+        shared[..., free : free + observed.layout.shared] = by[..., p:]
+        shared[..., free + np.searchsorted(common, index[among])] = own[..., among]
+        rows.append(
+            Rows(
+                part.observation.name,
+                (np.asarray(white) * weight).T,
+                shared,
+                own[..., ~among],
+                by[..., columns],
+                np.linalg.pinv(root)[:, :3],
+                root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
+                np.arange(part.poses.start, part.poses.stop),
+            )
+        )
+    rows = [one for one in rows if not _only_pose(record, one)]
+    derivatives, residual, u = linear.relations()
     u = np.maximum(u, LEAST_U)
-    every_row = Block(
-        "", None, np.concatenate(residual) / u, (derivatives * steps)[:, common] / u[:, None], np.zeros((len(u), 0))
-    )
-    return rows, [*([every_row] if len(u) else []), *_of_prior(record, z, steps[:free], len(common))]
+    chosen = np.concatenate([np.arange(free), p + common])
+    block = Block("", None, residual / u, (derivatives * steps)[:, chosen] / u[:, None], np.zeros((len(u), 0)))
+    prior = _of_prior(record, np.asarray(linear.z), steps[:free], len(chosen))
+    return rows, [*([block] if len(u) else []), *prior]
+
+
+def _only_pose(record: CalibrationRecord, rows: Rows) -> bool:
+    """Whether it is a socket with one pose, which shows no scatter, and which no length in the solve needs."""
+    return len(rows.poses) == 1 and rows.own.shape[2] == 3 and not lengths_in_solve(record)
 
 
 def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, shared: int) -> list[Block]:
@@ -193,31 +204,12 @@ def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, share
     return [Block(PRIOR, None, residual, derivatives, np.zeros((len(known), 0)))]
 
 
-def _in_columns(part: tuple, root: np.ndarray, steps: np.ndarray):
-    """Whitened residuals ``(m, r)``, and their derivatives by chosen unknowns ``(m, r, k)``; 0 by the others."""
-    white, jacobian = whitened(part, root)
-    position = {int(index): i for i, index in enumerate(part.indices)}
-
-    def by(chosen: np.ndarray) -> np.ndarray:
-        found = np.zeros((*white.T.shape, len(chosen)))
-        for column, index in enumerate(chosen):
-            if int(index) in position:
-                found[..., column] = np.asarray(jacobian[position[int(index)]]).T * steps[index]
-        return found
-
-    return np.asarray(white).T, by
-
-
 def _common(observed: Observed) -> np.ndarray:
     """Indices of the geometry that several observations, reference lengths or certified values depend on."""
-    users: dict[str, int] = {}
-    for observation in observed.observations:
-        for part in observation.unknowns:
-            users[part] = users.get(part, 0) + 1
-    alone = {part for part, number in users.items() if number == 1}
-    alone -= {end for ends in observed.ends for end in ends} | observed.certified().keys()
-    chosen = [rows for part, rows in observed.positions.items() if part not in alone]
-    return np.concatenate(chosen) if chosen else np.zeros(0, dtype=int)
+    related = {end for ends in observed.ends for end in ends} | observed.certified().keys()
+    private = [observed.positions[part] for part in observed.blocks if part in related]
+    own = np.concatenate(private) if private else np.zeros(0, dtype=int)
+    return np.union1d(np.arange(observed.layout.shared), own)
 
 
 def scale_anchor_of(record: CalibrationRecord) -> str | None:

@@ -8,15 +8,13 @@ from jaxtyping import Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
-from ..kinematics.parameters import Parameters
-from ..model.measurement import Measurement
 from ..model.observed import Observed
-from ..model.residuals import measured_lengths
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import consistency
 from .drawn_errors import covariance_of_lengths
-from .group_equations import LEAST_U, PRIOR, Rows, scale_anchor_of
+from .group_equations import LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
 from .record import CalibrationRecord
+from .scale_fix import ends_between, positions_at_ends
 
 _EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
 # A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
@@ -51,7 +49,8 @@ def length_test(
     Returns:
         None where there are too few to contradict each other.
     """
-    related = lengths_of_sockets(record, rows) if record.observed is None else _of_observations(record, rows, relations)
+    afterwards = bool(record.recording.capture.lengths) and not lengths_in_solve(record)
+    related = lengths_of_sockets(record, rows) if afterwards else _of_observations(record, rows, relations)
     if related is None:
         return None
     plain = _tested(record, related, related.covariance, spare)
@@ -108,18 +107,23 @@ def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Relat
     names, anchor = _names_of_lengths(record), scale_anchor_of(record)
     if not names:
         return None
-    arm = record.calibrated.arm
-    arm, measurement, noise = to_numpy((arm, Measurement.of(record.recording.capture, arm), record.noise))
-    measurement, space = measurement.weighted(arm.geometry, noise), Parameters(arm, record.names)
-    distance, slopes = measured_lengths(np.asarray(space.vector()), space, measurement)
-    error, slopes = np.asarray(distance - measurement.nominal), np.asarray(slopes) * np.asarray(space.scale)
+    capture, kept = record.recording.capture, np.array([name != anchor for name in record.names])
+    linear = linearisation_of(record, record.names, noise=record.noise, lengths=False)
+    influence, observed, p = linear.influence(), linear.observed, len(record.names)
+    ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.own, capture)
+    error = ends.measured - ends.nominal
     if np.max(np.abs(error)) < _EXACT:
         return None
-    centroids = measurement.centroids(np.asarray(arm.position(measurement.q)))
-    covariance = np.asarray(length_covariance(centroids, measurement, np.ones(())))
-    kept, scale = np.array([name != anchor for name in record.names]), None
+    # Positions follow the arm as the means of their tips do.
+    followers = []
+    for name in positions_at_ends(capture):
+        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        assert of is not None
+        followers.append(-influence.follow[of][component, first : first + 3])
+    slopes = np.einsum("lec,ech->lh", ends.by_positions, np.stack(followers))[:, :p]
+    covariance, scale = np.asarray(ends.covariance(np.ones(()))), None
     if anchor is not None:
-        by_anchor = np.asarray(arm.jacobian(measurement.q, (anchor,)))
+        by_anchor = np.asarray(record.calibrated.arm.jacobian(capture.readings, (anchor,)))
         scale = np.concatenate([(each.by_tip @ by_anchor[each.poses]).ravel() for each in rows]), slopes[:, ~kept][:, 0]
     further = rows[0].shared.shape[2] - int(kept.sum())  # unknowns of sockets with very many poses
     relations = Block("", None, error, np.pad(slopes[:, kept], ((0, 0), (0, further))), np.zeros((len(error), 0)))
@@ -139,7 +143,7 @@ def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations:
     poses, (related,), scale = [each.block("") for each in rows], lengths, None
     poses += [block for block in relations if block.fixture == PRIOR]
     measured = any(one.fixes_scale and not one.certified for one in capture.observations)
-    if anchor is not None and record.hold is None and not measured:
+    if anchor is not None and (record.hold is None or lengths_in_solve(record)) and not measured:
         column = record.names.index(anchor)
         scale = np.concatenate([block.shared[:, column] for block in poses]), related.shared[:, column]
         *poses, related = (b._replace(shared=np.delete(b.shared, column, axis=1)) for b in (*poses, related))

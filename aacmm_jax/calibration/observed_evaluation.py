@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError, nearest
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
@@ -33,7 +32,7 @@ _SMALLEST = 1e-300  # mm^2: the derivative of the root of 0 is infinite
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 
 
-class ObservedEvaluation(Module):
+class ObservedEvaluation(eqx.Module):
     """How the observations of a capture agree with one arm; in their order, sockets first."""
 
     names: tuple[str, ...] = eqx.field(static=True)

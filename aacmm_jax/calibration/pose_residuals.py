@@ -6,14 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
-from ..kinematics.parameters import Parameters
-from ..model.observed import Observed, linear_rows, whitening_of
-from ..uncertainty import tip_errors as propagation
+from ..uncertainty.linearisation import ObservationRows
 from .evaluation import Evaluation
-from .group_equations import equations_of
+from .group_equations import equations_of, linearisation_of
 from .record import CalibrationRecord
 
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
@@ -45,53 +42,25 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
         record: The calibration.
 
     Returns:
-        One for each observation; none where the record has no `ObservedMetrics`.
+        One for each observation.
     """
-    metrics = record.observed
-    if metrics is None:
-        return ()
-    capture, arm = record.recording.capture, to_numpy(record.calibrated.arm)
-    observed, space = Observed.of(capture, arm), Parameters(arm, record.names)
-    vector = np.asarray(space.vector())
-    geometry = np.concatenate([np.asarray(metrics.geometry[part]) for part in observed.blocks])
-    z = np.concatenate([vector, geometry])
-    linear = linear_rows(space, observed, z)
-    errors = propagation.arm_errors(observed.forward(space, vector, geometry), linear, observed)
-    noise, sigma = to_numpy(record.given_noise), np.asarray(metrics.sigma)
-    of_arm = [
-        propagation.covariance_of_sigma(error, sigma)
-        if noise is None
-        else propagation.covariance_of_noise(error, noise)
-        for error in errors
-    ]
-    roots = whitening_of(linear, observed, of_arm, np.maximum(1e-4 * sigma, 1e-12)).roots
-    return tuple(
-        _residuals(observation, part, error, np.asarray(root), np.asarray(weight))
-        for observation, part, error, root, weight in zip(
-            observed.observations, linear, errors, roots, metrics.weights, strict=True
-        )
-    )
+    linear = linearisation_of(record, record.names, noise=record.given_noise)
+    return tuple(_residuals(part) for part in linear.parts())
 
 
-def _residuals(
-    observation: AbstractObservation,
-    linear: tuple,
-    errors: propagation.ArmErrors,
-    root: Float[np.ndarray, "m r r"],
-    weight: Float[np.ndarray, " m"],
-) -> ObservationResiduals:
-    values = np.asarray(linear.rows.values)
-    moved = np.asarray(errors.by_readings)[:_POSITION_ROWS]
+def _residuals(part: ObservationRows) -> ObservationResiduals:
+    values = np.asarray(part.values)
+    moved = np.asarray(part.by_readings)[:_POSITION_ROWS]
     lever = np.linalg.norm(moved, axis=0)
-    white = np.einsum("mab,bm->am", root, values)
-    variances = np.diagonal(np.asarray(linear.rows.measured), axis1=1, axis2=2)
+    white = np.einsum("mab,bm->am", part.root, values)
+    variances = np.diagonal(np.asarray(part.measured), axis1=1, axis2=2)
     turned = values.shape[0] > _POSITION_ROWS
     return ObservationResiduals(
-        observation=observation,
+        observation=part.observation,
         distance=np.linalg.norm(values[:_POSITION_ROWS], axis=0),
         angle=np.linalg.norm(values[_POSITION_ROWS:], axis=0) if turned else None,
         normalised=np.sqrt(np.mean(white**2, axis=0)),
-        weight=weight,
+        weight=np.asarray(part.weight),
         u=float(np.sqrt(np.mean(variances[:, :_POSITION_ROWS]))),
         u_angle=float(np.sqrt(np.mean(variances[:, _POSITION_ROWS:]))) if turned else None,
         by_joint=-np.einsum("rm,rnm->nm", values[:_POSITION_ROWS], moved) / np.maximum(lever, _LEAST_LEVER) ** 2,

@@ -15,7 +15,7 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, parameter_names, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
-from ..solver.reason import SCALE, Reason
+from ..solver.reason import MAX_STEPS, SCALE, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.shared_errors import SharedErrors
 from .checks import largest_plausible_residual, plausible
@@ -25,6 +25,8 @@ from .results import Calibration, Identification, NoisyEncoder, ObservedMetrics,
 from .scale_fix import LARGEST_LOG_K
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
+_CORRELATED = 0.1  # smallest eigenvalue of correlations, below which parameters slide along each other
+_MOST_NAMED, _LEAST_SHARE = 4, 0.3  # of the parameters that do, and of the largest share
 
 
 class OtherPoses(NamedTuple):
@@ -225,7 +227,7 @@ def record_of(
         steps=int(calibration.steps),
         converged=bool(calibration.converged),
         reason=_reason(calibration, stage1),
-        observed=None if stage1.observed is None else jax.tree.map(np.asarray, stage1.observed),
+        observed=jax.tree.map(np.asarray, calibration.observed),
         robust=robust,
         prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
         noisy_encoders=calibration.noisy_encoders,
@@ -247,11 +249,30 @@ def _other_poses(arm: Arm, capture: Capture, observed: ObservedMetrics | None) -
 
 
 def _reason(calibration: Calibration | Identification, stage1: Identification) -> str:
-    """Why the calibration ended, in words; where bounds set the scale, with their names."""
+    """Why the calibration ended, in words; where bounds set the scale, or parameters trade off, with their names."""
     result = calibration.result if bool(stage1.converged) else stage1.result
+    sentence, number = Reason[result], int(member_numbers(result))
     sides = [f"{name} ({side})" for name, side in calibration.active_names().items()]
-    sentence = Reason[result]
-    return f"{sentence.rstrip('.')}: {shorten(sides)}." if int(member_numbers(result)) == SCALE and sides else sentence
+    if number == SCALE and sides:
+        return f"{sentence.rstrip('.')}: {shorten(sides)}."
+    together = _trading_off(calibration) if number in (MAX_STEPS, STALLED) else []
+    if len(together) < 2:
+        return sentence
+    return f"{sentence.partition(';')[0]}; {', '.join(together)} trade off: hold one of them, or give it a prior."
+
+
+def _trading_off(calibration: Calibration | Identification) -> list[str]:
+    """The parameters of the combination that is known best beside what is known of each: those that slide along each
+    other where a solve does not end, the first most; none where they are hardly correlated."""
+    covariance = np.asarray(calibration.covariance)
+    sd = np.sqrt(np.diag(covariance))
+    moving = np.flatnonzero(sd > 0)
+    if not len(moving) or not np.all(np.isfinite(covariance)):
+        return []
+    values, vectors = np.linalg.eigh(covariance[np.ix_(moving, moving)] / sd[moving] / sd[moving, None])
+    share = np.abs(vectors[:, 0])
+    leading = [i for i in np.argsort(-share)[:_MOST_NAMED] if share[i] > _LEAST_SHARE * share.max()]
+    return [calibration.space.names[moving[i]] for i in leading] if values[0] < _CORRELATED else []
 
 
 @checked_arguments

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
@@ -28,7 +27,7 @@ from .scale_anchor import ScaleAnchor
 _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
 
 
-class AbstractResult(Module):
+class AbstractResult(eqx.Module):
     """What the results of stage 1 and of a calibration have in common, of one problem and of many."""
 
     result: eqx.AbstractVar[Reason]
@@ -65,7 +64,7 @@ class AbstractResult(Module):
         return np.asarray(good) if is_concrete(good) else good
 
 
-class PriorMetrics(Module):
+class PriorMetrics(eqx.Module):
     """What a prior was, and what the data made of it: group by group, and parameter by parameter."""
 
     groups: tuple[str, ...] = eqx.field(static=True)
@@ -175,7 +174,7 @@ class AbstractSingleResult(AbstractResult):
             )
 
 
-class ObservedMetrics(Module):
+class ObservedMetrics(eqx.Module):
     """How the observations of a capture agree with their geometry, and that geometry; in their order, sockets first."""
 
     names: tuple[str, ...] = eqx.field(static=True)

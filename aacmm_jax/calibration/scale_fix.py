@@ -51,7 +51,7 @@ def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
     by_positions = xp.einsum("l,lec->ec", relative, ends.by_positions)
     head = xp.zeros((1, linear.height))
     components = [xp.zeros((1, count, size)) for count, size in layout.classes]
-    for name, derivative in zip(_used(capture), by_positions, strict=True):
+    for name, derivative in zip(positions_at_ends(capture), by_positions, strict=True):
         of, component, first = layout.component_of(int(positions[name][0]))
         if of is None:
             head = set_at(head, (0, p + positions[name]), derivative)
@@ -65,7 +65,7 @@ def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
     return ScaleFound(eqx.tree_at(lambda s: s.u, scale, u), rows, by_lengths, added)
 
 
-def _used(capture: Capture) -> list[str]:
+def positions_at_ends(capture: Capture) -> list[str]:
     """Names of the positions at the ends of reference lengths."""
     return list(dict.fromkeys(position_of(name) for one in capture.lengths for name in (one.start, one.end)))
 
@@ -74,7 +74,7 @@ def ends_between(
     observed: Observed, geometry: Float[AnyArray, " g"], own: list[Float[AnyArray, "K k k"]], capture: Capture
 ) -> MeasuredEnds:
     """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
-    xp, used, covariances = namespace(geometry), _used(capture), []
+    xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
     for name in used:
         of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
         assert of is not None  # a length's ends are sockets, which no other observation shares

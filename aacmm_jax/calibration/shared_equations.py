@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import Residuals
-from .group_equations import LEAST_U, PRIOR, Rows, residual_rms
+from .group_equations import LEAST_U, PRIOR, Rows, lengths_in_solve, residual_rms
 from .length_consistency import lengths_of_sockets
 from .record import CalibrationRecord
 from .sensitivities import Sensitivities
@@ -100,7 +100,7 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
     record, rows = problem.record, problem.rows
     blocks = [*(each.block("") for each in rows), *relations]
     values = np.array([float(length.value) for length in record.recording.capture.lengths])
-    if record.observed is not None:
+    if lengths_in_solve(record) or not len(values):
         u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)
         return problem._replace(left=_without_scale(Residuals.of(blocks), sum(map(_size, rows)), values / u))
     related = lengths_of_sockets(record, rows)

@@ -39,7 +39,7 @@ from ..uncertainty.shared_errors import (
     second_moments,
 )
 from .drawn_errors import functions_of, places_of
-from .group_equations import EXACT, PRIOR, Rows, equations_in_chunks, residual_rms
+from .group_equations import EXACT, PRIOR, Rows, equations_in_chunks, lengths_in_solve, residual_rms
 from .record import CalibrationRecord, record_of
 from .results import Calibration
 from .sensitivities import Sensitivities
@@ -103,7 +103,7 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
     known = [block for block in relations if block.fixture == PRIOR]
     of_poses = problem_of_poses(record, rows, known, sensitivities)
     whole = sum(float(np.sum(each.residual**2)) for each in rows)
-    if record.observed is not None and capture.lengths and of_poses.left.cost < _MOST_OF_POSES * whole:
+    if lengths_in_solve(record) and of_poses.left.cost < _MOST_OF_POSES * whole:
         relations = [*relations, scale_of_lengths(record, relations)]
         of_poses = problem_of_poses(record, rows, [*known, relations[-1]], sensitivities)
     if of_poses.left.degrees_of_freedom < _FEWEST:
@@ -131,8 +131,7 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
 
 def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
     """Without poses that lost most of their weight to a robust loss: what is left of their errors is no noise."""
-    if record.observed is None:
-        return list(rows)
+    assert record.observed is not None
     weights, found = np.concatenate([np.asarray(one) for one in record.observed.weights]), []
     for each in rows:
         kept = weights[each.poses] > _TRUSTED

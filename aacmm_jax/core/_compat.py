@@ -3,10 +3,8 @@
 A new version of one of them is tried against this module; ruff forbids those names everywhere else (pyproject.toml).
 """
 
-import contextlib
 from collections.abc import Callable
 from os import _exit as end_process  # noqa: F401 - at once, whatever threads still do
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -73,27 +71,3 @@ def members(like: Any, numbers: Any) -> Any:
 def named_members(enumeration: Any) -> list[tuple[str, Any]]:
     """Every member of an enumeration with its name."""
     return [(name, getattr(enumeration, name)) for name in enumeration._name_to_item]
-
-
-def _replace_damaged_programs() -> None:
-    """Have JAX compile a program again whose entry in the compilation cache is damaged, and replace the entry.
-
-    JAX by itself warns of it in every process and keeps it, because it never writes an entry that is already there.
-    """
-    from jax._src import compilation_cache
-
-    read = compilation_cache.get_executable_and_time
-
-    def read_or_remove(cache_key: str, *arguments: Any, **options: Any) -> Any:
-        try:
-            return read(cache_key, *arguments, **options)
-        except Exception:  # of zlib, zstandard or XLA
-            folder = Path(jax.config.jax_compilation_cache_dir or "")  # pyright: ignore[reportAttributeAccessIssue]
-            with contextlib.suppress(OSError):
-                (folder / f"{cache_key}-cache").unlink()
-            return None, None
-
-    compilation_cache.get_executable_and_time = read_or_remove
-
-
-_replace_damaged_programs()

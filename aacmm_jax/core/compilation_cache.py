@@ -3,6 +3,11 @@
 They are native code, which is run as it is read. So a folder is not used where anybody else can write to it, or can
 have written what is in it, be it the default one or one that JAX_COMPILATION_CACHE_DIR names. AACMM_JAX_CACHE=0 leaves
 JAX's setting alone, unchecked.
+
+JAX never replaces an entry, so one that was cut off as it was written (the process was killed, the disk was full) would
+make it warn in every process for ever. In the default folder, which exists because of this package, such entries are
+removed: each import reads those that are newer than the file `checked`, which it dates by the newest. A folder that
+the user names is JAX's and the user's own.
 """
 
 import contextlib
@@ -10,6 +15,8 @@ import os
 import stat
 import sys
 import warnings
+import zlib
+from importlib import import_module
 from pathlib import Path
 
 from .file_owners import POSIX, is_ours, others_may_rename, others_may_write
@@ -17,6 +24,8 @@ from .file_owners import POSIX, is_ours, others_may_rename, others_may_write
 _LEAST_SECONDS = "0.1"  # shorter compilations are not kept: reading them would take as long
 _FOLDER, _TURNED_OFF = "JAX_COMPILATION_CACHE_DIR", "AACMM_JAX_CACHE"
 _SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+_ENTRY, _CHECKED = "-cache", "checked"  # how JAX's names end, and a file of ours
+_ZLIB = b"\x78"  # begins what JAX compresses where it has no Zstandard
 
 
 def set_up() -> None:
@@ -51,6 +60,8 @@ def set_up() -> None:
         folder_set = str(folder)
         os.environ[_FOLDER] = folder_set
     if given is None and not unsafe:
+        with contextlib.suppress(OSError):  # read-only, or another process was faster
+            _remove_damaged(folder)
         if jax is not None and _SHORTEST not in os.environ:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", float(_LEAST_SECONDS))
         os.environ.setdefault(_SHORTEST, _LEAST_SECONDS)
@@ -96,3 +107,40 @@ def _unsafe(folder: Path) -> str:
                 if found.st_uid != owner or changeable or entry.is_symlink():
                     return f"others can have written {entry.name} in it"
     return ""
+
+
+def _remove_damaged(folder: Path) -> None:
+    """Remove the entries written since the last check that end too early.
+
+    To read 1,000 takes about a second, and they took minutes to compile. An entry that another process is just writing
+    may be removed too; it is then compiled once more.
+    """
+    checked = folder / _CHECKED
+    before = checked.stat().st_mtime_ns if checked.exists() else -1
+    with os.scandir(folder) as entries:
+        written = {entry.path: entry.stat().st_mtime_ns for entry in entries if entry.name.endswith(_ENTRY)}
+    new = [Path(path) for path, time in written.items() if time > before]
+    for entry in new:
+        if not _complete(entry.read_bytes()):
+            entry.unlink()
+    if new:
+        checked.touch(mode=0o600)
+        os.utime(checked, ns=(max(written.values()), max(written.values())))
+
+
+def _complete(content: bytes) -> bool:
+    """Whether an entry of the cache can be decompressed; also true where this process lacks what tells it."""
+    if not content or content.startswith(_ZLIB):
+        try:
+            zlib.decompress(content)
+        except zlib.error:
+            return False
+        return True
+    for name in ("compression.zstd", "zstandard"):  # the first is Python's own since 3.14
+        with contextlib.suppress(ImportError):
+            zstandard = import_module(name)
+            try:
+                zstandard.decompress(content)
+            except zstandard.ZstdError:
+                return False
+    return True

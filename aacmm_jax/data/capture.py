@@ -13,10 +13,9 @@ from jaxtyping import Array, Float, Int
 from ..core.arguments import checked_arguments, items_of, shown
 from ..core.arrays import Numbers, is_concrete, joined
 from ..core.errors import InputError, nearest
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.text import shorten
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, by_joint
 from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
 from .observations.observation import AbstractObservation, checked_name, checked_readings
 from .observations.socket import Socket
@@ -27,7 +26,7 @@ from .visits import checked_visits, visits_of
 _MOST_RADIANS = 8 * np.pi
 
 
-class Capture(Module):
+class Capture(eqx.Module):
     """Poses grouped by the socket in which the tip rested, reference lengths between sockets, and other observations.
 
     A socket's position is unknown and is eliminated by the centroid of its poses; one pose at an end is enough for a
@@ -387,18 +386,20 @@ def _form(observations: tuple[AbstractObservation, ...]) -> tuple[Any, ...]:
 
 def check_readings(capture: Capture, arm: Arm, *, advice: str = "convert with numpy.deg2rad") -> None:
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees, with advice on them."""
+    joints, columns = arm.joints, arm.columns
     of_sockets = [(f"socket '{name}'", readings) for name, readings in capture.sockets.items()]
     for where, readings in [*of_sockets, *((f"observation '{one.name}'", one.q) for one in capture.observations)]:
-        if not is_concrete(readings) or readings.shape[-1] not in (arm.joints, arm.columns):
+        if not is_concrete(readings) or readings.shape[-1] not in (joints, columns):
             continue
-        check_temperatures(where, np.asarray(readings)[..., arm.joints :])
+        check_temperatures(where, np.asarray(readings)[..., joints:])
         check_revolutions(where, readings, arm, advice)
 
 
 def check_revolutions(where: str, readings: AnyArray, arm: Arm, advice: str) -> None:
     """Raise `InputError` where readings of revolute joints look like degrees."""
-    angular = np.array([i not in arm.prismatic for i in range(1, arm.joints + 1)])
-    size = np.where(angular, np.abs(np.asarray(readings)[..., : arm.joints]), 0.0).reshape(-1, arm.joints)
+    angular = np.array(by_joint(arm, True, False))
+    joints = len(angular)
+    size = np.where(angular, np.abs(np.asarray(readings)[..., :joints]), 0.0).reshape(-1, joints)
     if size.size and size.max() > _MOST_RADIANS:
         row, column = np.argwhere(size == size.max())[0] + 1
         raise InputError(

@@ -6,7 +6,6 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_floats, is_concrete
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm
@@ -16,7 +15,7 @@ from ..kinematics.jacobian import reading_columns
 _MOST = {"encoder_arcsec": 36_000.0, "linear_encoder": 100.0, "seating": 100.0}  # ten degrees; mm
 
 
-class Noise(Module):
+class Noise(eqx.Module):
     """Standard deviations of independent errors: of each joint reading, and of each coordinate of the seated tip.
 
     Args:

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from ..core.arguments import shown
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray
 from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 
@@ -26,7 +25,7 @@ def check_temperatures(where: str, temperatures: Float[np.ndarray, "..."]) -> No
         )
 
 
-class ReferenceLength(Module):
+class ReferenceLength(eqx.Module):
     """A physical artefact: the certified distance between two sockets.
 
     Args:

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, as_floats, in_chunks
 from ..core.errors import InputError, nearest
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.text import pluralise
 from .chain import Corrections, Geometry, JointKinds, tip_pose
@@ -27,7 +26,7 @@ DOWN = (0.0, 0.0, -1.0)
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
 
-class Arm(Module):
+class Arm(eqx.Module):
     """A serial arm with a probe; T = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] of each joint, revolute by default.
 
     A prismatic joint slides along its axis: T = Rz(theta) Tz(q + d) Tx(a) Rx(alpha) [Ry(beta)], with readings in mm.
@@ -155,17 +154,18 @@ class Arm(Module):
     @property
     def geometry(self) -> Geometry:
         """The parameters and the kinds of the joints, without the limits."""
-        kinds = JointKinds(tuple(i in self.prismatic for i in range(1, self.joints + 1))) if self.prismatic else None
+        prismatic = self.prismatic  # read once: Equinox looks attributes up in Python
+        kinds = JointKinds(tuple(i in prismatic for i in range(1, self.joints + 1))) if prismatic else None
         corrected = (self.coefficients, self.gravity, self.corrections)
         return Geometry(self.alpha, self.a, self.d, self.theta, self.beta, self.probe, kinds, *corrected)
 
     def position(self, q: Numbers) -> Float[AnyArray, "... 3"]:
         """Tip in the base frame, mm, at readings q, rad, or mm of prismatic joints: ``(..., n) -> (..., 3)``."""
-        return self._evaluated(tip_position, q)
+        return _evaluated(tip_position, self, q)
 
     def pose(self, q: Numbers) -> Float[AnyArray, "... 4 4"]:
         """Homogeneous transform of the last frame, with the tip (mm) as its origin: ``(..., n) -> (..., 4, 4)``."""
-        return self._evaluated(tip_pose, q)
+        return _evaluated(tip_pose, self, q)
 
     def jacobian(self, q: Numbers, names: Sequence[str] | None = None) -> Float[AnyArray, "... 3 p"]:
         """Exact derivative of the tip by named parameters: analytic, equal to ``jax.jacfwd`` to rounding.
@@ -184,7 +184,9 @@ class Arm(Module):
         names = (
             parameter_names(self) if names is None else (names,) if isinstance(names, str) else items_of(names, "names")
         )
-        return self._evaluated(partial(tip_jacobian, indices=tuple(locate(self, n, extra=("q",)) for n in names)), q)
+        joints, corrections = self.joints, correction_names(self)
+        indices = tuple(located(joints, corrections, name, extra=("q",)) for name in names)
+        return _evaluated(partial(tip_jacobian, indices=indices), self, q)
 
     def replace(self, **changes: Any) -> "Arm":
         """The same arm with some values replaced, checked as a new arm is; also on traced values.
@@ -212,23 +214,29 @@ class Arm(Module):
             arguments[kind] = xp.where(chosen, value[..., None], array)
         return Arm(**arguments)
 
-    def _evaluated(self, function: Callable, q: Numbers) -> Any:
-        """A function of the geometry and q: by NumPy, which compiles nothing, for a moderate number of known values."""
-        q = self._checked(q)
-        shape = np.broadcast_shapes(q.shape[:-1], *(leaf.shape[:-1] for leaf in jax.tree.leaves(self.geometry)))
-        if math.prod(shape) > _LARGEST:
-            return function(self.geometry, q)
-        values = function(*to_numpy((self.geometry, q)))
-        return values if namespace(self.geometry, q) is np else to_jax(values)
 
-    def _checked(self, q: Numbers) -> Float[AnyArray, "... n"]:
-        array = as_array(q, "q", like=self.alpha)
-        if array.shape[-1:] not in ((self.joints,), (self.columns,)):
-            other = ", and a thermometer" if self.thermometer else ""
-            raise InputError(
-                f"q has shape {array.shape}, but the arm has {self.joints} joints{other}; the last axis is the joint."
-            )
-        return array
+def _evaluated(function: Callable, arm: Arm, q: Numbers) -> Any:
+    """A function of the geometry and q: by NumPy, which compiles nothing, for a moderate number of known values."""
+    geometry = arm.geometry
+    known = to_numpy(geometry)
+    q = checked_readings(arm, q, like=known.alpha)
+    shape = np.broadcast_shapes(q.shape[:-1], *(leaf.shape[:-1] for leaf in jax.tree.leaves(geometry)))
+    if math.prod(shape) > _LARGEST:
+        return function(geometry, q)
+    values = function(*to_numpy((known, q)))
+    return values if namespace(geometry, q) is np else to_jax(values)
+
+
+def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Float[AnyArray, "... n"]:
+    """Readings as an array like the arm's or another, or `InputError` where they do not have the arm's columns."""
+    alpha = arm.alpha
+    array, joints = as_array(q, "q", like=alpha if like is None else like), alpha.shape[-1]
+    if array.shape[-1:] not in ((joints,), (joints + arm.thermometer,)):
+        other = ", and a thermometer" if arm.thermometer else ""
+        raise InputError(
+            f"q has shape {array.shape}, but the arm has {joints} joints{other}; the last axis is the joint."
+        )
+    return array
 
 
 def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) -> Arm:
@@ -250,7 +258,8 @@ def _joint_numbers(numbers: Iterable[int], joints: int) -> tuple[int, ...]:
 
 def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
     """One of two values for each joint: that of revolute joints, or that of prismatic ones."""
-    return [linear if i in arm.prismatic else angular for i in range(1, arm.joints + 1)]
+    prismatic = arm.prismatic
+    return [linear if i in prismatic else angular for i in range(1, arm.joints + 1)]
 
 
 def readings_unit(arm: Arm) -> str:
@@ -309,7 +318,8 @@ def parameter_names(arm: Arm) -> tuple[str, ...]:
         ('alpha_1', 'alpha_2', 'alpha_3', 'alpha_4', 'alpha_5', 'alpha_6', 'a_1')
     """
     kinds = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",))
-    by_joint = [f"{kind}_{i}" for kind in kinds for i in range(1, arm.joints + 1)]
+    joints = arm.joints
+    by_joint = [f"{kind}_{i}" for kind in kinds for i in range(1, joints + 1)]
     return (*by_joint, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))
 
 
@@ -320,9 +330,10 @@ def without_corrections(arm: Arm) -> Arm:
 
 def correction_names(arm: Arm) -> tuple[str, ...]:
     """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
-    if arm.corrections is None:
+    corrections = arm.corrections
+    if corrections is None:
         return ()
-    functions = arm.corrections.functions
+    functions = corrections.functions
     return (*functions.names, *(f"gravity_{axis}" for axis in _AXES if functions.by_gravity.any()))
 
 

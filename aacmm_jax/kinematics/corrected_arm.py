@@ -129,7 +129,8 @@ def function_values(
 
 def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
     """The same arm with more corrections than it has, by the names of their coefficients, which are 0."""
-    added = tuple(term for term in (term_of(name, arm.joints) for name in names) if term is not None)
+    joints = arm.joints
+    added = tuple(term for term in (term_of(name, joints) for name in names) if term is not None)
     if arm.corrections is None:
         return arm.replace(corrections=Corrections(KnownFunctions(added), arm.geometry), gravity=np.array(DOWN))
     assert arm.coefficients is not None

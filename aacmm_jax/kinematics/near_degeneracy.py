@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .arm import is_length
-from .priors import unit_of_coefficient
+from .corrections.kinds import unit_of_coefficient
 
 LEAST_MOVEMENT = 2e-3  # mm at the tips per natural step
 SHARE_OF_BOUNDS = 0.5  # of a half-width, that a standard uncertainty may reach

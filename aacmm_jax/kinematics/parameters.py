@@ -15,7 +15,6 @@ from jaxtyping import Float, Int
 from ..core.arguments import checked_arguments, items_of, real_number
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.random_keys import random_key
 from .arm import (
@@ -36,7 +35,7 @@ from .inverse_kinematics import SocketPoses
 from .priors import Prior
 
 
-class Parameters(Module):
+class Parameters(eqx.Module):
     """The free parameters of an arm, in order, and the arm that supplies the fixed ones.
 
     ``vector(arm)`` reads them into ``(p,)`` (mm and rad mixed); ``arm(vector)`` writes them back.
@@ -201,17 +200,17 @@ class Parameters(Module):
             raise InputError(
                 f"vector has shape {vector.shape}, but {len(self.names)} parameters are free; give one value each."
             )
-        base = self.base
-        if base.beta is None and any(kind == "beta" for kind, _ in self.indices()):
+        base, indices = self.base, _indices(self.base, self.names)
+        if base.beta is None and any(kind == "beta" for kind, _ in indices):
             base = with_arrays(base, beta=0.0 * base.alpha)
-        return with_arrays(base, **with_values(base.geometry, vector, self.indices()))
+        return with_arrays(base, **with_values(base.geometry, vector, indices))
 
     def geometry(self, vector: Float[AnyArray, "... p"]) -> Geometry:
         """The geometry of ``arm(vector)``, unchecked: what an iteration evaluates."""
-        base = self.base.geometry
-        if base.beta is None and any(kind == "beta" for kind, _ in self.indices()):
+        base, indices = self.base.geometry, _indices(self.base, self.names)
+        if base.beta is None and any(kind == "beta" for kind, _ in indices):
             base = base._replace(beta=0.0 * base.alpha)
-        return base._replace(**with_values(base, vector, self.indices()))
+        return base._replace(**with_values(base, vector, indices))
 
 
 @lru_cache(maxsize=256)
@@ -241,7 +240,7 @@ def based_on(space: Parameters, arm: Arm) -> Parameters:
     return Parameters(base=arm, names=space.names)
 
 
-class Bounds(Module):
+class Bounds(eqx.Module):
     """Bounds of the free parameters.
 
     Args:

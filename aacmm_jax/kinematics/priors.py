@@ -10,18 +10,16 @@ from jaxtyping import Float
 from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError, nearest
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, is_length, natural_steps, parameter_names
 from .corrections.harmonics import Harmonics, orders_of
-from .corrections.kind import Term
-from .corrections.kinds import all_kinds, coefficient_of, is_kind
+from .corrections.kinds import all_kinds, coefficient_of, is_kind, unit_of_coefficient
 
 _BROAD = 10.0  # standard deviation at which the search for a learned one begins, in natural steps
 LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
 
 
-class Prior(Module):
+class Prior(eqx.Module):
     """Gaussian priors of parameters: a mean and a standard deviation, as a maker states a nominal value and tolerance.
 
     A group is "all", "lengths", "angles", a kind of joint correction as a model names it ("gravity", "gear", "coupled",
@@ -140,7 +138,7 @@ class Prior(Module):
 MIXED = "mm and mrad"
 
 
-class ParameterPrior(Module):
+class ParameterPrior(eqx.Module):
     """The prior of a vector of free parameters."""
 
     mean: Float[AnyArray, " p"]  # mm and rad
@@ -219,9 +217,3 @@ def _unit(names: Iterable[str]) -> str:
         return own.pop()
     lengths = {is_length(name) for name in names}
     return MIXED if len(lengths) == 2 else "mm" if True in lengths else "rad"
-
-
-def unit_of_coefficient(name: str) -> str:
-    """Unit of a joint correction's coefficient, of a joint that rotates; empty for other parameters."""
-    found = coefficient_of(name)
-    return "" if found is None else found.kind.unit_of(Term(*found))

@@ -4,7 +4,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
 from ..data.noise import Noise, tip_covariances
@@ -19,7 +18,7 @@ LEAST_SIGMA = 1e-9
 _FEW = 1000  # sockets
 
 
-class Measurement(Module):
+class Measurement(eqx.Module):
     """A capture as arrays: all poses, socket after socket, and the reference lengths.
 
     ``sizes`` and ``ends`` are static: they fix the shape of the problem, as the number of poses does. ``motion`` is

@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.arguments import items_of
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
 from .socket_sums import largest_of_sockets, means_over_sockets, to_poses
 
@@ -16,7 +16,7 @@ _OUTLIER = 8.0  # median distances; see `pose_outliers`
 _LEAST_DISTANCE = 1e-6  # mm: below it distances are rounding
 
 
-class Repeatability(Module):
+class Repeatability(eqx.Module):
     """How well the poses of a capture agree, over all sockets and socket by socket; mm.
 
     Example:

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.module import Module
+
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.measured_points import AbstractMeasured
@@ -26,7 +26,7 @@ from .layout import Group, Layout, layout_of, unknowns_of
 _STEPS = {"mm": 1.0, "rad": 1e-3}  # natural steps, as those of the arm's parameters
 
 
-class Observed(Module):
+class Observed(eqx.Module):
     """Everything that a capture observed, as arrays: sockets first, then its other observations."""
 
     observations: tuple[AbstractObservation, ...]

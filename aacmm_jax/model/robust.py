@@ -15,7 +15,6 @@ from jaxtyping import Float
 from ..core.arguments import shown
 from ..core.distributions import chi_square_quantile, chi_square_tail
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace
 
 LossName = Literal["huber", "cauchy", "tukey"]
@@ -81,7 +80,7 @@ def bounded_square(rows: int) -> tuple[float, float]:
     return most, 1 - chi_square_tail(most, rows + 2) + most * chi_square_tail(most, rows) / rows
 
 
-class Loss(Module):
+class Loss(eqx.Module):
     """A robust loss by its name."""
 
     name: LossName = eqx.field(static=True)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-from ..core.module import Module
+
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.observations.observation import Rows
 from ..kinematics.chain import ForwardPass, forward_pass
@@ -51,7 +51,7 @@ class Whitening(NamedTuple):
     prior: PriorRows | None = None
 
 
-class RowBlock(Module):
+class RowBlock(eqx.Module):
     """Rows of one group, or of relations, in standard deviations, with r of them for each of m poses."""
 
     white: Float[AnyArray, "r m"]

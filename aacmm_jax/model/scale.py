@@ -14,7 +14,6 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
 from ..kinematics.arm import Arm, is_length, is_single, parameter_names
@@ -26,7 +25,7 @@ from .socket_sums import means_over_sockets
 Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
 
 
-class Scale(Module):
+class Scale(eqx.Module):
     """k = measured / nominal with its standard uncertainty, and the lengths it was found from (mm).
 
     Example:
@@ -41,7 +40,7 @@ class Scale(Module):
     nominal: Float[AnyArray, " l"]
 
 
-class ScaleFix(Module):
+class ScaleFix(eqx.Module):
     """Result of stage 2 on its own: the arm divided by k, and k."""
 
     arm: Arm

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..kinematics.arm import Arm, joint_limits, without_corrections
+from ..kinematics.arm import Arm, checked_readings, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import dh_frames, geometry_of
 from ..kinematics.workspace import arm_reach, skeleton
 from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, new_figure, save_figure
@@ -37,7 +37,7 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
         >>> axes.figure.savefig("poses.svg")
     """
     axes = _axes_in_space(axes)
-    configurations = np.atleast_2d(np.asarray(arm._checked(q)))
+    configurations = np.atleast_2d(np.asarray(checked_readings(arm, q)))
     first = {"color": DARK, "linewidth": 3, "marker": "o", "markersize": 4}
     others = {"color": LIGHT, "linewidth": 0.8}
     for index, line in reversed(list(enumerate(skeleton(arm, configurations)))):

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, while_loop
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, norm, propose
 from .arrow import Arrow
@@ -34,7 +33,7 @@ class Rules(NamedTuple):
     initial_damping: float | None = None
 
 
-class Progress(Module):
+class Progress(eqx.Module):
     """State of one solve, or of a batch of them in slots, between two evaluations."""
 
     y: Flat  # accepted

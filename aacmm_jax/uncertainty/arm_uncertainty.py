@@ -7,10 +7,9 @@ from jaxtyping import Bool, Float
 from ..core.arrays import Numbers, is_concrete
 from ..core.distributions import student_quantile
 from ..core.errors import InputError
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, checked_readings
 from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
@@ -18,7 +17,7 @@ from .shared_errors import SharedErrors
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 
-class Uncertainty(Module):
+class Uncertainty(eqx.Module):
     """Standard uncertainties of a calibrated arm, in mm and rad.
 
     They are the calibration's contribution; with ``reading=True`` the noise of the readings is added, as given to the
@@ -160,7 +159,7 @@ class Uncertainty(Module):
         return xp.where(self._is_open(derivatives)[..., None], np.inf, covariance)
 
     def _checked(self, q: Numbers) -> Float[AnyArray, "... n"]:
-        q = self.arm._checked(q)
+        q = checked_readings(self.arm, q)
         if is_concrete(q) and not np.all(np.isfinite(np.asarray(q))):
             raise InputError("a joint angle is not finite; give angles in rad.")
         return q

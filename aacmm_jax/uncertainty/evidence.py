@@ -6,6 +6,9 @@ of (x - mean) / s is V = (I + K)^-1, its expectation m = V diag(s) A (x_data - m
 of parameter i the data determine. The log evidence has the derivative (sum of m_i^2 - sum of gamma_i) / 2 by the log
 variance of a group, so the learned variance is that at which both sums are equal (MacKay 1992, Neural Computation 4,
 415-447; Bishop 2006, Pattern Recognition and Machine Learning, section 3.5.2).
+
+A parameter on a bound keeps its m, and counts in V and gamma as if it were free. So the learned variance does not jump
+where a parameter reaches its bound; else there may be none that leads to itself.
 """
 
 from typing import NamedTuple
@@ -14,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.linear_algebra import inverse_cholesky, inverse_positive_definite, solve_positive_definite
-from ..core.numpy_or_jax import AnyArray, namespace, while_loop
+from ..core.numpy_or_jax import AnyArray, cond, namespace, while_loop
 from .covariance import inverse_information
 
 _ROUNDS = 300
@@ -30,8 +33,8 @@ _ROUNDING = 1e-10  # of the log evidence, relative
 class PriorModel(NamedTuple):
     """The k parameters that have a prior, in natural steps, with everything else eliminated from the information."""
 
-    information: Float[AnyArray, "k k"]  # of the data; 0 for pinned parameters
-    right: Float[AnyArray, " k"]  # information times (x_data - mean)
+    information: Float[AnyArray, "k k"]  # of the data
+    right: Float[AnyArray, " k"]  # information times (x_data - mean), with the pinned where they are; 0 for these
     deviation: Float[AnyArray, " k"]  # x - mean at the point where the model is linear
     pinned: Bool[AnyArray, " k"]  # on a bound, where the deviation is known
 
@@ -50,7 +53,7 @@ def eliminated(
     crossed, own = gram[np.ix_(index, others)], pinned[index]
     information = gram[np.ix_(index, index)] - crossed @ inverse @ crossed.T
     slope = gradient[index] - crossed @ (inverse @ gradient[others])
-    information = xp.where(own[:, None] | own[None, :], 0.0, 0.5 * (information + information.T))
+    information = 0.5 * (information + information.T)
     free = xp.where(own, 0.0, deviation)
     return PriorModel(information, xp.where(own, 0.0, information @ free - slope), deviation, own)
 
@@ -67,16 +70,21 @@ def _posterior(model: PriorModel, sd: Float[AnyArray, " k"]) -> _Posterior:
     whitening = inverse_cholesky(xp.asarray(np.eye(sd.shape[0])) + relative)
     covariance = whitening.T @ whitening
     # Not 1 - V_ii, which loses what little the data say of a parameter with a small standard deviation.
-    effective = xp.where(model.pinned, 1.0, xp.sum(covariance * relative, axis=1))
+    effective = xp.sum(covariance * relative, axis=1)
     return _Posterior(covariance, effective, -2 * xp.sum(xp.log(xp.diagonal(whitening))))
 
 
 def effective_parameters(model: PriorModel, sd: Float[AnyArray, " k"]) -> Float[AnyArray, " k"]:
-    """How much of each parameter the data determine, 0 to 1, with a prior of these standard deviations.
-
-    One on a bound counts in full, as does one without a prior.
-    """
+    """How much of each parameter the data determine, 0 to 1, with a prior of these standard deviations."""
     return _posterior(model, sd).effective
+
+
+def _given_pinned(covariance: Float[AnyArray, "k k"], pinned: Bool[AnyArray, " k"]) -> Float[AnyArray, "k k"]:
+    """The covariance of the others where pinned parameters are known; 0 for these."""
+    xp = namespace(covariance, pinned)
+    both, unit = pinned[:, None] & pinned[None, :], xp.asarray(np.eye(len(pinned)))
+    known = xp.where(both, inverse_positive_definite(xp.where(both, covariance, unit)), 0.0)
+    return xp.where(pinned[:, None] | pinned[None, :], 0.0, covariance - covariance @ known @ covariance)
 
 
 class Groups(NamedTuple):
@@ -102,22 +110,24 @@ class _Evidence(NamedTuple):
 def _evidence(model: PriorModel, groups: Groups, now: Float[AnyArray, " g"]) -> _Evidence:
     xp = namespace(model, now)
     members, unit = xp.asarray(groups.members), np.eye(groups.members.shape[1])
-    logs = now @ members
-    sd = xp.exp(0.5 * logs)
+
+    sd = xp.exp(0.5 * (now @ members))
     covariance, effective, log_determinant = _posterior(model, sd)
-    scaled = xp.where(model.pinned, 0.0, sd * model.right)
-    mean = xp.where(model.pinned, model.deviation / sd, covariance @ scaled)
+    pinned = model.pinned
+    of_free = cond(xp.any(pinned), _given_pinned, lambda covariance, _: covariance, covariance, pinned)
+    scaled = sd * model.right
+    mean = xp.where(pinned, model.deviation / sd, of_free @ scaled)
     by_group = mean[:, None] * members.T
-    follow = xp.where(model.pinned[:, None], -by_group, 2 * covariance @ by_group - by_group)
+    follow = 2 * of_free @ by_group - by_group
     second = members @ (mean[:, None] * follow) + members @ covariance**2 @ members.T
     second = second - xp.asarray(np.eye(len(members))) * (members @ xp.diagonal(covariance))[:, None]
-    informed = (xp.asarray(unit) - covariance) ** 2 + xp.asarray(unit) * xp.where(model.pinned, 1.0, 0.0)[:, None]
+    informed = (xp.asarray(unit) - covariance) ** 2 + xp.asarray(unit) * xp.where(pinned, 1.0, 0.0)[:, None]
     spent, away = members @ effective, (now - groups.first) * groups.expected.astype(float)
     certain = xp.asarray(np.diag(groups.expected * 2 / _EXPECTED_VARIANCE))
     return _Evidence(
         value=scaled @ mean
         - log_determinant
-        - xp.sum(xp.where(model.pinned, mean**2 + logs, 0.0))
+        - xp.sum(xp.where(pinned, mean**2, 0.0))
         - xp.sum(away**2) / _EXPECTED_VARIANCE,
         slope=members @ mean**2 - spent + slope_of_expectation(groups, now),
         second=second - certain,

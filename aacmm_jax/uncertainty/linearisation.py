@@ -172,24 +172,23 @@ class Linearisation(NamedTuple):
                 first += count
         return found
 
+    def private(self) -> list[np.ndarray]:
+        """Indices of the private geometry of each observation, in the order of `by_private`."""
+        found: list[np.ndarray] = [np.zeros(0, dtype=int)] * len(self.observed.observations)
+        for group in self.observed.layout.groups:
+            for i, number in enumerate(group.members):
+                parts = [np.arange(role.size) + role.first[i] for role in group.roles if role.private]
+                found[number] = np.concatenate(parts) if parts else found[number]
+        return found
+
     def dense(self) -> list[Float[AnyArray, "z r m"]]:
         """Whitened derivatives of each observation by all unknowns; as large as all of them together."""
         found = []
-        for number, (head, own) in enumerate(zip(self.by_head(), self.by_private(), strict=True)):
+        for head, own, index in zip(self.by_head(), self.by_private(), self.private(), strict=True):
             whole = namespace(head).zeros((self.z.shape[0], *head.shape[1:]))
             whole = set_at(whole, slice(0, self.height), head)
-            index = len(self.space.names) + self._private_of(number)
-            found.append(set_at(whole, index, own) if len(index) else whole)
+            found.append(set_at(whole, len(self.space.names) + index, own) if len(index) else whole)
         return found
-
-    def _private_of(self, number: int) -> np.ndarray:
-        """Indices of the private geometry of an observation."""
-        for group in self.observed.layout.groups:
-            if number in group.members:
-                at = group.members.index(number)
-                parts = [np.arange(role.size) + role.first[at] for role in group.roles if role.private]
-                return np.concatenate(parts) if parts else np.zeros(0, dtype=int)
-        raise IndexError(number)
 
     def relations(self) -> tuple[Float[np.ndarray, "l z"], Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
         """Derivatives of reference lengths and certified values by all unknowns, their residuals (mm, rad), and their

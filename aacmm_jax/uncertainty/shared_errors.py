@@ -14,7 +14,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.module import Module
 from ..core.numpy_or_jax import AnyArray
 from .evidence import Groups, PriorModel, learned_log_variances
 from .residual_tests import Residuals
@@ -28,7 +27,7 @@ _LARGEST = 30.0  # standard deviation of an effect, of that of a tip coordinate
 _LEAST_LOG = 2 * np.log(1e-4)  # smallest log variance of a learned group, in natural steps
 
 
-class SharedErrors(Module):
+class SharedErrors(eqx.Module):
     """Errors that poses share and the model of a calibration does not have, as its residuals show them.
 
     Its covariance contains them. Functions of the readings that joints follow besides the model ("gravity",

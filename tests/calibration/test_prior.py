@@ -147,6 +147,27 @@ def test_learned_scales(paper_arm, space, bounds):
     assert np.all(u_of(found) < 1.05 * u_of(calibrate(paper_arm, capture, bounds, method="joint")))
 
 
+@pytest.mark.parametrize("name", ["a_1", "alpha_2"])
+def test_learned_scales_settle_where_a_bound_is_reached(name):
+    """A bound that is met with some scales and not with those that these lead to is on the way of the rounds."""
+    rng = np.random.default_rng(2)
+    right = np.pi / 2
+    twists = [right, 0, right, -right, right, 0]
+    arm = aj.Arm(alpha=twists, a=[0, 300, 50, 0, 0, 0], d=[200, 0, 0, 250, 0, 80], probe=(0, 0, 30))
+    bending = aj.kinematics.with_corrections(arm, "gravity")
+    q = rng.uniform(-1, 1, (60, 6))
+    true = bending.replace(coefficients=rng.normal(size=len(bending.coefficients)) * 2e-3)
+    seen = np.asarray(true.position(q)) + rng.normal(size=(60, 3)) * 0.3
+    capture = aj.Capture({}, observations=[kinds.MeasuredPoints("tracker", q, seen)])
+    prior = aj.kinematics.default_prior(bending)
+    free = calibrate(bending, capture, None, prior=prior)
+    space, i = free.space, free.space.index(name)
+    start, end = (float(vector[i]) for vector in (space.vector(), free.parameters))
+    lower, upper = np.array(free.bounds.lower), np.array(free.bounds.upper)
+    (lower if end < start else upper)[i] = start + 0.99 * (end - start)
+    assert calibrate(space.base, capture, aj.Bounds(space, lower, upper), prior=prior).converged
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

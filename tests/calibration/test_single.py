@@ -1,5 +1,6 @@
 """Stage 1, stage 2, both and the joint solve: what they recover, what they report, and their derivatives."""
 
+import re
 from functools import partial
 
 import equinox as eqx
@@ -334,6 +335,16 @@ def test_what_data_cannot_tell_apart_is_marked(paper_arm, noisy_capture):
             ).determined
         )
     )
+
+
+def test_what_does_not_converge_names_what_trades_off(paper_arm, noisy_capture, bounds, space):
+    found = aj.calibrate(paper_arm, noisy_capture, bounds, max_steps=1)
+    record = aj.calibration.record_of(found, aj.Recording(noisy_capture, aj.kinematics.ArmSpecification(paper_arm)))
+    assert not record.converged
+    sentence = r"Not converged: the step limit was reached; (.*) trade off: hold one of them, or give it a prior\."
+    names = re.fullmatch(sentence, record.reason)[1].split(", ")
+    assert 2 <= len(names) <= 4
+    assert set(names) <= set(space.names)
 
 
 def test_the_true_arm_may_have_other_corrections(observed_record, paper_arm):

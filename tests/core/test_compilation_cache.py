@@ -4,10 +4,12 @@ import os
 import stat
 import subprocess
 import sys
+import zlib
+from types import SimpleNamespace
 
 import pytest
 
-from aacmm_jax.core.compilation_cache import _unsafe
+from aacmm_jax.core.compilation_cache import _remove_damaged, _unsafe
 
 JAX = "print(jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64)"
 IMPORTS = {
@@ -147,3 +149,57 @@ def test_a_truncated_program_is_replaced(tmp_path):
     assert (second.stdout, second.stderr) == (first.stdout, "")
     for path, content in entries.items():
         assert len(path.read_bytes()) > len(content) // 2
+
+
+def test_entries_are_read_once(tmp_path):
+    """What was written since the last check is read: whole entries stay, cut ones go, and what is no entry stays."""
+    whole = zlib.compress(bytes(range(256)) * 40)
+    contents = {"a-cache": whole, "b-cache": whole[:-1], "c-cache": b"", "d-cache": b"another form", "e-other": b""}
+
+    def left():
+        _remove_damaged(tmp_path)
+        return sorted(path.name for path in tmp_path.iterdir())
+
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    assert left() == ["a-cache", "checked", "d-cache", "e-other"]
+    before = (tmp_path / "checked").stat().st_mtime_ns
+    (tmp_path / "a-cache").write_bytes(b"")
+    for time, expected in ((before, ["a-cache", "checked"]), (before + 1, ["checked"])):
+        os.utime(tmp_path / "a-cache", ns=(time, time))
+        assert left()[: len(expected)] == expected
+    assert left() == ["checked", "d-cache", "e-other"]
+
+
+def test_a_process_with_zstandard_tells_its_entries(tmp_path, monkeypatch):
+    class ZstdError(Exception):
+        pass
+
+    def decompress(content):
+        if content != b"whole":
+            raise ZstdError
+
+    monkeypatch.setitem(sys.modules, "zstandard", SimpleNamespace(decompress=decompress, ZstdError=ZstdError))
+    for name, content in {"a-cache": b"whole", "b-cache": b"who"}.items():
+        (tmp_path / name).write_bytes(content)
+    _remove_damaged(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a-cache", "checked"]
+
+
+@pytest.mark.slow
+def test_no_function_of_jax_is_replaced():
+    """Whatever of the package is imported, JAX's own modules keep their own functions."""
+    program = """
+import importlib, pkgutil, sys, types
+import aacmm_jax
+for module in pkgutil.walk_packages(aacmm_jax.__path__, "aacmm_jax."):
+    if "__main__" not in module.name:
+        importlib.import_module(module.name)
+for name, module in list(sys.modules.items()):
+    if name.split(".")[0] in {"jax", "equinox", "optimistix", "lineax"}:
+        for key, value in vars(module).items():
+            if isinstance(value, types.FunctionType) and value.__module__.startswith("aacmm_jax"):
+                print(name, key)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == ""

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -159,6 +160,23 @@ def test_batches_broadcast(arm_batch, pose_batch):
     for index in np.ndindex(*shape):
         single = aj.Arm(**{kind: value[index] for kind, value in full.items()})
         np.testing.assert_allclose(position[index], by_matrices(single, angles[index])[:3, 3], atol=1e-11)
+
+
+def test_a_method_passed_to_jit_traces_the_arm():
+    """As of any module of Equinox: another arm's method is no new program, and has that arm's values."""
+    traced = []
+
+    @eqx.filter_jit
+    def at(function, q):
+        traced.append(function)
+        return function(q)
+
+    q = jnp.zeros(2)
+    for a in (300.0, 310.0):
+        arm = aj.Arm(alpha=[0.0, 0.0], a=[a, 200.0], d=[0.0, 0.0])
+        for tips in (at(arm.position, q), jax.jit(lambda function, q: function(q))(arm.position, q)):
+            np.testing.assert_allclose(tips, [a + 200, 0, 0], atol=1e-12)
+    assert len(traced) == 1
 
 
 def test_unknown_parameter_suggests_the_nearest():

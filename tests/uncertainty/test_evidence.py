@@ -97,12 +97,24 @@ def test_a_given_scale_stays():
     assert found[1] == pytest.approx(best.x[0], abs=1e-4)
 
 
-def test_a_parameter_on_a_bound_counts_in_full():
-    """Its deviation is known: with the other at sqrt(3), the variance is the mean of 9 and of what that one has."""
-    pinned = model_of(np.diag([0.0, 1e12]), [0.0, np.sqrt(3) * 1e12], [3.0, 0.0], [True, False])
-    assert effective_parameters(pinned, np.ones(2))[0] == 1.0
+def test_a_parameter_on_a_bound_keeps_its_deviation():
+    """With the other at sqrt(3), the variance is the mean of 9 and of what that one has."""
+    pinned = model_of(1e12 * np.eye(2), [0.0, np.sqrt(3) * 1e12], [3.0, 0.0], [True, False])
+    assert effective_parameters(pinned, np.ones(2)) == pytest.approx([1.0, 1.0])
     found = learned(pinned, np.ones((1, 2)))
     assert np.exp(found) == pytest.approx([(9 + 3) / 2])
+
+
+@pytest.mark.parametrize("chosen", range(6))
+def test_nothing_jumps_where_a_parameter_reaches_its_bound(chosen):
+    """With a bound where the parameter would be without one, the learned variances are the same."""
+    model, members = random_model(0), np.repeat(np.eye(2), 3, axis=1)
+    free = learned(model, members)
+    most_probable = np.linalg.solve(model.information + np.diag(np.exp(-free @ members)), model.right)
+    on_bound = np.arange(6) == chosen
+    right = np.where(on_bound, 0.0, model.right - model.information[:, chosen] * most_probable[chosen])
+    pinned = model_of(model.information, right, most_probable, on_bound)
+    np.testing.assert_allclose(learned(pinned, members), free, atol=1e-10)
 
 
 def test_elimination_is_the_marginal():

@@ -19,7 +19,6 @@ from jaxtyping import Float, Int
 from ...core.arguments import real_number, shown, truth_value, whole_number
 from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
-from ...core.module import Module
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from .columns import joined_poses, taken
 
@@ -74,7 +73,7 @@ READINGS = Entry("q", "joint reading", "rad", ("pose", "joint"), required=True)
 TARGET = Entry("target", "tip that was held or seen; empty: the arm's own probe", content="text")
 
 
-class AbstractObservation(Module):
+class AbstractObservation(eqx.Module):
     """Poses in which the tip owes something to an unknown geometry.
 
     ``target`` names the tip that the poses held: "" is the arm's own probe, any other name a tip at an unknown place in
@@ -361,7 +360,7 @@ def numbers(what: str, *shape: int) -> Callable[[Any], np.ndarray]:
     return converted
 
 
-class AbstractSimulated(Module):
+class AbstractSimulated(eqx.Module):
     """An observation to simulate: the true geometry, where the tip goes, and what is then recorded.
 
     Every kind has a field ``poses``: the number of poses, of each place where there are several (points of an artefact,

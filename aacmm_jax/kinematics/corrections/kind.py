@@ -11,12 +11,11 @@ class in this folder: whatever else the package does with kinds, it asks them.
 
 import abc
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 from jaxtyping import Float
 
-from ...core.module import Module
 from ...core.numpy_or_jax import AnyArray
 from ..chain import ForwardPass
 
@@ -53,13 +52,14 @@ class Sought(NamedTuple):
     relative: bool = False
 
 
-class AbstractCorrection(Module):
-    """A kind of joint correction, without data of its own: hashable, so that it is static in every program."""
+@dataclass(frozen=True)
+class AbstractCorrection(abc.ABC):
+    """A kind of joint correction, without data of its own: every two of a class are equal, and static in a program."""
 
-    model: eqx.AbstractClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
-    words: eqx.AbstractClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
-    description: eqx.AbstractClassVar[str]  # what its coefficients are, in the plural: "errors of gear ratios"
-    rows: eqx.AbstractClassVar[int]  # of `values`: 3 for a function of gravity, one for each component of its direction
+    model: ClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
+    words: ClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
+    description: ClassVar[str]  # what its coefficients are, in the plural: "errors of gear ratios"
+    rows: ClassVar[int]  # of `values`: 3 for a function of gravity, one for each component of its direction
     of_arm: ClassVar[bool] = False  # whether it scales all lengths of the arm: its terms are of joint 0
     of_own_reading: ClassVar[bool] = False  # whether each function is of its joint's reading alone, and can be drawn
     sought: ClassVar[tuple[Sought, ...]] = ()  # what residuals of a calibration without it are searched for

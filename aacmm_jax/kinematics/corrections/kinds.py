@@ -53,7 +53,7 @@ def unregister(kind: AbstractCorrection) -> None:
 
 
 def _forget() -> None:
-    for kept in (coefficient_of, term_of, terms_of):
+    for kept in (coefficient_of, unit_of_coefficient, term_of, terms_of):
         kept.cache_clear()
 
 
@@ -84,6 +84,13 @@ def coefficient_of(name: str) -> Coefficient | None:
     if found is None or kind is None:
         return None
     return Coefficient(kind, found[1], int(found[2] or 0), int(found[3] or 0))
+
+
+@lru_cache(_KEPT)
+def unit_of_coefficient(name: str) -> str:
+    """Unit of a joint correction's coefficient, of a joint that rotates; empty for other parameters."""
+    found = coefficient_of(name)
+    return "" if found is None else found.kind.unit_of(Term(*found))
 
 
 def all_sought() -> dict[str, tuple[AbstractCorrection, Sought]]:
