@@ -5,6 +5,7 @@ The unknowns z are the p free parameters of the arm, then the numbers of the unk
 reference length is a relation between the positions of two sockets, a certified value one of a geometry with itself.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -72,7 +73,7 @@ class Observed(eqx.Module):
     ) -> "Observed":
         """The same at other readings, and with observations that have changed along."""
         changed = self if observations is None else self._with_observations(observations)
-        return eqx.tree_at(lambda o: (o.q, o.motion), changed, (q, joint_motion(arm.geometry, q)))
+        return dataclasses.replace(changed, q=q, motion=joint_motion(arm.geometry, q))
 
     def measured_without_errors(
         self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]
@@ -89,8 +90,7 @@ class Observed(eqx.Module):
         )
 
     def _with_observations(self, observations: tuple[AbstractObservation, ...]) -> "Observed":
-        new = observations, _stacks(observations, self.layout)
-        return eqx.tree_at(lambda o: (o.observations, o.stacks), self, new)
+        return dataclasses.replace(self, observations=observations, stacks=_stacks(observations, self.layout))
 
     @property
     def blocks(self) -> dict[str, tuple[str, ...]]:
@@ -115,7 +115,7 @@ class Observed(eqx.Module):
     @property
     def slices(self) -> list[slice]:
         """The poses of each observation."""
-        ends = np.cumsum([observation.q.shape[0] for observation in self.observations])
+        ends = np.cumsum([observation.q.shape[0] for observation in self.observations]).tolist()
         return [
             slice(end - observation.q.shape[0], end) for observation, end in zip(self.observations, ends, strict=True)
         ]
@@ -168,7 +168,8 @@ class Observed(eqx.Module):
         tips = [tips_of(forward, rows) for rows in self.slices]
         found: dict[str, Any] = {}
         for observation, own in zip(self.observations, tips, strict=True):
-            new = observation.start(own, arm.probe)
+            # Through the class: a bound method of Equinox is a module made anew.
+            new = type(observation).start(observation, own, arm.probe)
             if observation.target:
                 new = {offset_of(observation.target): arm.probe} | new
             found = new | found  # what another observation has found stays

@@ -147,6 +147,8 @@ class Agreeing(NamedTuple):
     def named(self, texts: tuple[str, ...], null: Float[np.ndarray, "p nullity"]) -> tuple[str, ...]:
         """Names of undetermined directions with the parts of the geometry that follow them, but for sockets, which
         follow every arm."""
+        if not texts:
+            return ()
         follow = self.eliminated().geometry @ null
         sockets = {position_of(one.name) for one in self.observed.observations if one.kind == "socket"}
         positions, found = self.observed.positions, []
