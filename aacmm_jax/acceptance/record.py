@@ -186,8 +186,7 @@ def evaluation_of(
     """
     known = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
     recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, known))
-    if recording.capture.observations:
-        check_geometry(record.calibrated.arm, recording.capture)
+    check_geometry(record.calibrated.arm, recording.capture)
     readings = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
     readings |= {observation.name: np.asarray(observation.q) for observation in recording.capture.observations}
     shared = {name: sum(row.tobytes() in known for row in q) for name, q in readings.items()}

@@ -18,6 +18,7 @@ from ..core.units import DEG, INCH, UM, M, length_unit
 from ..data.capture import Capture
 from ..data.observations.measured_transforms import MeasuredTransforms
 from ..data.observations.observation import AbstractObservation
+from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import total_link_length
@@ -83,18 +84,20 @@ class _Misfit(NamedTuple):
     """How far an arm is from what was observed: sockets and other observations, a part of them where there are many."""
 
     arm: Arm
-    observed: Observed  # without reference lengths
+    observed: Observed
 
     @classmethod
     def by(cls, arm: Arm, capture: Capture) -> "_Misfit | None":
         """None where no two poses can disagree."""
-        observed = Observed.of(capture, arm, lengths=False)
-        scattering = [one for one in observed.observations if one.kind != "socket" or one.q.shape[0] > 1]
+        sockets = [Socket(name, q) for name, q in capture.sockets.items() if len(q) > 1]
+        scattering = [*sockets, *capture.observations]
         if not scattering:
             return None
         chosen = [scattering[i] for i in _evenly(len(scattering), _OBSERVATIONS)]
         part = [one.select(_evenly(one.q.shape[0], _POSES)) for one in chosen]
-        return cls(arm, Observed.of(Capture({}, (), part), arm))
+        # Without the arm: its readings may be in any unit.
+        observed = Observed.of(Capture({}, (), part), None)
+        return cls(arm, observed.moved(arm, np.asarray(observed.q)))
 
     @property
     def given(self) -> _Tried:
