@@ -12,7 +12,8 @@ from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import PriorRows, Whitening, observed_model, observed_rows
 from ..model.robust import Loss
 from ..uncertainty import observed_covariance as propagation
-from ..uncertainty.covariance import ParameterCovariance, inverse_information
+from ..uncertainty.covariance import STATED, ParameterCovariance, inverse_information
+from ..uncertainty.degrees_of_freedom import Components
 from .bounded_fit import RULES, fit
 from .observed_state import ObservedTask, State, scatter_at_start, state_at, whitening_at
 from .prior_fit import ByScales, PriorProblem, fit_with_prior
@@ -175,20 +176,22 @@ def _covariance(
         noise = propagation.noise_from(propagation.Moments(xp.zeros(()), state.sigma**2))
     if task.noise_model == "robust":
         each = propagation.alone(state.linear, rows, whitening, inverse)
-        total = relations
+        total = stated = relations
         for part, one in zip(rows, each, strict=True):
             total = total + _flat(xp.einsum("zam,mab->zbm", part, one)) @ _flat(part).T
         matrix = inverse @ total @ inverse
     else:
+        stated = relations + propagation.of_measurements(state.linear, rows, whitening)
         matrix = propagation.propagated(
-            state.linear, state.errors, rows, whitening, inverse, relations, noise, np.array(task.pose)
+            state.linear, state.errors, rows, whitening, inverse, stated, noise, np.array(task.pose)
         )
     matrix = matrix if by_scales is None else matrix + by_scales.added(inverse)
-    matrix = matrix * steps[:, None] * steps[None, :]
+    both = steps[:, None] * steps[None, :]
+    matrix, parts = matrix * both, Components.of({STATED: ((inverse @ stated @ inverse * both)[:p, :p], np.inf)})
     # What the data leave open of the geometry (the turn of a ball bar about itself) has no uncertainty.
     known = determined[p:]
     of_geometry = xp.where(known[:, None] & known[None, :], matrix[p:, p:], np.nan)
-    return ParameterCovariance(matrix[:p, :p], determined[:p], lost[:p, :p], noise), of_geometry
+    return ParameterCovariance(matrix[:p, :p], determined[:p], lost[:p, :p], noise, parts), of_geometry
 
 
 def _weighted_rows(loss: Loss, state: State, whitening: Whitening, rows: list[Any]) -> list[Any]:
@@ -219,6 +222,12 @@ def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> P
         set_at(xp.ones(size, dtype=bool), free, covariance.determined),
         set_at(xp.zeros((size, size)), grid, covariance.open),
         covariance.noise,
+        Components.of(
+            {
+                name: (set_at(xp.zeros((size, size)), grid, part), np.inf)
+                for name, part in zip(covariance.components.names, covariance.components.matrices, strict=True)
+            }
+        ),
     )
 
 

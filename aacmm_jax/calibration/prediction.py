@@ -193,7 +193,7 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
             covariance = covariance + np.where(same, 1.0 if one == other else -1.0, 0.0) * (pulled @ direction.T)
     error = measured - np.array([float(length.value) for length in lengths])
     shared = np.asarray(uncertainty.covariance)
-    return UnseenErrors(parts, shared, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
+    return UnseenErrors(parts, shared, error, np.asarray(covariance), uncertainty.scatter_degrees_of_freedom)
 
 
 def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple[float, Float[np.ndarray, " s"]]:
@@ -271,4 +271,4 @@ def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors
     geometry = observed.split(fitted.geometry)
     measured = np.array([float(np.linalg.norm(geometry[end] - geometry[start])) for start, end in observed.ends])
     error = measured - np.asarray(observed.nominal)
-    return UnseenErrors(parts, common, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
+    return UnseenErrors(parts, common, error, np.asarray(covariance), uncertainty.scatter_degrees_of_freedom)

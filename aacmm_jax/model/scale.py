@@ -37,6 +37,7 @@ class Scale(Module):
     u: Float[AnyArray, ""]  # conditional on active bounds: takes parameters on a bound as exact
     measured: Float[AnyArray, " l"]
     nominal: Float[AnyArray, " l"]
+    surplus: Float[AnyArray, ""]  # what the lengths' disagreement, beyond what is predicted, adds to u^2
 
 
 class ScaleFix(Module):
@@ -155,7 +156,8 @@ def scale_and_weights(
     relative = weight_of / measurement.nominal
     predicted = relative @ length_covariance(centroids, measurement, sigma, value) @ relative
     observed = xp.sum(weight_of * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
-    return Scale(value, xp.sqrt(xp.maximum(predicted, observed)), measured, measurement.nominal), relative
+    u = xp.sqrt(xp.maximum(predicted, observed))
+    return Scale(value, u, measured, measurement.nominal, xp.maximum(observed - predicted, 0.0)), relative
 
 
 @checked_arguments
@@ -198,4 +200,4 @@ def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> S
     count = ratio.shape[0]
     value = jnp.mean(ratio)
     repeated = jnp.sum((ratio - value) ** 2) / (max(count - 1, 1) * count)
-    return Scale(value, jnp.sqrt(repeated + (value * u / jnp.mean(nominal)) ** 2), measured, nominal)
+    return Scale(value, jnp.sqrt(repeated + (value * u / jnp.mean(nominal)) ** 2), measured, nominal, repeated)

@@ -21,6 +21,7 @@ from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement, between_ends, length_directions
 from ..model.residuals import measured_lengths
 from ..model.socket_sums import counts, means_over_sockets, sums_over_sockets, to_poses
+from .degrees_of_freedom import Components
 
 # Models of the tips' errors. "given": encoders and seat as stated. "estimated": encoders and seat, both standard
 # deviations estimated from the residuals. "common": one variance for every coordinate of every tip. "robust": each
@@ -29,6 +30,8 @@ from ..model.socket_sums import counts, means_over_sockets, sums_over_sockets, t
 NoiseModel = Literal["given", "estimated", "common", "robust"]
 NOISE_MODELS = ("given", "estimated", "common", "robust")
 
+# Parts of a covariance: what certificates and instruments state, and the disagreement of the lengths beyond that.
+STATED, DISAGREEMENT = "stated", "disagreement of lengths"
 # A direction whose standard uncertainty exceeds 10 mm or 10 mrad is not determined, whatever its eigenvalue.
 _LEAST_INFORMATION = 1e-2
 _NULL = 1e-12  # eigenvalues of the information below this, of the largest, are zero
@@ -51,6 +54,15 @@ class ParameterCovariance(NamedTuple):
     determined: Bool[AnyArray, " p"]  # one by one, and not only in combination with others
     open: Float[AnyArray, "p p"]  # projector onto the directions that are not determined, in natural steps
     noise: Noise  # given, or as estimated: one encoder for all
+    # Its parts that do not rest on the scatter of single poses; None: there is none.
+    components: Components | None = None
+
+    def without(self, name: str) -> "ParameterCovariance":
+        """Less one of its parts."""
+        if self.components is None or name not in self.components.names:
+            return self
+        part = self.components.matrices[self.components.names.index(name)]
+        return self._replace(matrix=self.matrix - part, components=self.components.without(name))
 
 
 class Linearisation(NamedTuple):
@@ -156,9 +168,14 @@ def covariance_of(
     """Covariance of the parameters, natural steps, from the covariance of every tip's error and the lengths' u."""
     xp = namespace(sensitivity, linear, measurement, errors)
     moved = xp.einsum("paN,abN->pbN", sensitivity.tips, errors)
-    by_lengths = sensitivity.lengths * measurement.u[None, :]
     moved, straight = moved.reshape(len(moved), -1), sensitivity.tips.reshape(len(moved), -1)
-    return moved @ straight.T + by_lengths @ by_lengths.T
+    return moved @ straight.T + by_lengths(sensitivity, measurement)
+
+
+def by_lengths(sensitivity: Sensitivity, measurement: Measurement) -> Float[AnyArray, "p p"]:
+    """The part of it by the lengths' u."""
+    moved = sensitivity.lengths * measurement.u[None, :]
+    return moved @ moved.T
 
 
 def residual_degrees_of_freedom(noise_model: NoiseModel, sizes: tuple[int, ...], fitted: int) -> float:

@@ -319,27 +319,38 @@ def _outer(one: Float[AnyArray, "z r m"], other: Float[AnyArray, "z r m"]) -> Fl
     return one.reshape(one.shape[0], -1) @ other.reshape(other.shape[0], -1).T
 
 
+def of_measurements(
+    linear: list[Linear], rows: list[Float[AnyArray, "_ _ _"]], whitening: Whitening
+) -> Float[AnyArray, "z z"]:
+    """What errors of measured values contribute to the middle of the covariance."""
+    total = 0.0
+    for part, root, j in zip(linear, whitening.roots, rows, strict=True):
+        moved = namespace(j).einsum("zam,mab->zbm", j, root)
+        total = total + _outer(namespace(j).einsum("zam,mab->zbm", moved, part.rows.measured), moved)
+    return total
+
+
 def propagated(
     linear: list[Linear],
     errors: list[ArmErrors],
     rows: list[Float[AnyArray, "_ _ _"]],
     whitening: Whitening,
     inverse: Float[AnyArray, "z z"],
-    relations: Float[AnyArray, "z z"],
+    stated: Float[AnyArray, "z z"],
     noise: Noise,
     pose: np.ndarray,
 ) -> Float[AnyArray, "z z"]:
-    """Covariance of the unknowns by the noise; ``relations`` is the information of lengths and certified values.
+    """Covariance of the unknowns by the noise; ``stated`` is what lengths, certified and measured values contribute to
+    its middle.
 
     Rows with one number in ``pose`` were read at once, so they share the errors of their readings.
     """
-    xp = namespace(inverse, relations, noise, rows)
-    total, by_readings = relations, []
-    for part, error, root, j in zip(linear, errors, whitening.roots, rows, strict=True):
+    xp = namespace(inverse, stated, noise, rows)
+    total, by_readings = stated, []
+    for error, root, j in zip(errors, whitening.roots, rows, strict=True):
         moved = xp.einsum("zam,mab->zbm", j, root)  # by the unwhitened rows
-        measured = xp.einsum("zam,mab->zbm", moved, part.rows.measured)
         seat = xp.einsum("zam,acm->zcm", moved, error.by_seat)
-        total = total + _outer(measured, moved) + noise.seating**2 * _outer(seat, seat)
+        total = total + noise.seating**2 * _outer(seat, seat)
         by_readings.append(xp.einsum("zam,anm->znm", moved, error.by_readings))
     readings = xp.concatenate(by_readings, axis=2)
     if len(np.unique(pose)) < len(pose):

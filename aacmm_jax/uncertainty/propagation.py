@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.numpy_or_jax import AnyArray, namespace
@@ -11,10 +12,12 @@ from ..kinematics.parameters import Parameters
 from ..model.measurement import LEAST_SIGMA, Measurement
 from ..model.residuals import JointWeights
 from .covariance import (
+    STATED,
     Linearisation,
     NoiseModel,
     ParameterCovariance,
     Sensitivity,
+    by_lengths,
     covariance_of,
     information_of,
     inverse_information,
@@ -22,6 +25,7 @@ from .covariance import (
     sensitivity_of,
     tip_errors,
 )
+from .degrees_of_freedom import Components
 
 
 class Propagated(NamedTuple):
@@ -57,7 +61,8 @@ def propagate_solve(
         noise_model, arm, measurement, linear, sensitivity, inverse, _typical(linear, measurement, sigma), noise
     )
     matrix = in_units(covariance_of(sensitivity, linear, measurement, errors), space)
-    return Propagated(linear, sensitivity, errors, ParameterCovariance(matrix, determined, lost, behind))
+    parts = Components.of({STATED: (in_units(by_lengths(sensitivity, measurement), space), np.inf)})
+    return Propagated(linear, sensitivity, errors, ParameterCovariance(matrix, determined, lost, behind, parts))
 
 
 def _typical(linear: Linearisation, measurement: Measurement, sigma: Float[AnyArray, ""]) -> Float[AnyArray, ""]:

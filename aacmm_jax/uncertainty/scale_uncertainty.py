@@ -7,6 +7,7 @@ all sockets once more through the parameters that stage 1 identified from them: 
 from typing import NamedTuple
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
@@ -14,7 +15,8 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..model.measurement import Measurement, length_covariance
 from ..model.scale import Partners, Scale, divisible, replaced_lengths, scale_and_weights
-from .covariance import Sensitivity, covariance_of
+from .covariance import DISAGREEMENT, STATED, Sensitivity, by_lengths, covariance_of
+from .degrees_of_freedom import Components
 from .propagation import Propagated, in_units
 
 
@@ -74,7 +76,7 @@ def propagated_scale(
     scale = _scale_sensitivity(tips, measurement, propagated, sigma)
     by_tips = xp.einsum("aN,abN,bN->", scale.by_tips, propagated.errors, scale.by_tips)
     variance = by_tips + xp.sum((scale.by_lengths * measurement.u) ** 2) + scale.surplus
-    return eqx.tree_at(lambda s: s.u, scale.k, xp.sqrt(variance))
+    return eqx.tree_at(lambda s: (s.u, s.surplus), scale.k, (xp.sqrt(variance), scale.surplus))
 
 
 class _ScaleSensitivity(NamedTuple):
@@ -113,7 +115,10 @@ def _with_scale(
         change[:, None, None] * before.sensitivity.tips - by_k[:, None, None] * scale.by_tips[None],
         -by_k[:, None] * scale.by_lengths[None],
     )
-    matrix = covariance_of(sensitivity, before.linear, measurement, before.errors)
-    matrix = in_units(matrix + scale.surplus * by_k[:, None] * by_k[None, :], space)
-    parameter_covariance = before.parameter_covariance._replace(matrix=matrix)
+    surplus = scale.surplus * by_k[:, None] * by_k[None, :]
+    matrix = covariance_of(sensitivity, before.linear, measurement, before.errors) + surplus
+    stated, lengths = by_lengths(sensitivity, measurement), len(measurement.ends)
+    parts = {STATED: (stated, np.inf), DISAGREEMENT: (surplus, max(lengths - 1, 1))}
+    parts = Components.of({name: (in_units(part, space), nu) for name, (part, nu) in parts.items()})
+    parameter_covariance = before.parameter_covariance._replace(matrix=in_units(matrix, space), components=parts)
     return before._replace(sensitivity=sensitivity, parameter_covariance=parameter_covariance)
