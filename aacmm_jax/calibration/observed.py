@@ -222,12 +222,7 @@ def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> P
         set_at(xp.ones(size, dtype=bool), free, covariance.determined),
         set_at(xp.zeros((size, size)), grid, covariance.open),
         covariance.noise,
-        Components.of(
-            {
-                name: (set_at(xp.zeros((size, size)), grid, part), np.inf)
-                for name, part in zip(covariance.components.names, covariance.components.matrices, strict=True)
-            }
-        ),
+        covariance.components and covariance.components.wider(free, size),
     )
 
 

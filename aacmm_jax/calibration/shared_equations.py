@@ -132,4 +132,3 @@ def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarra
     """With the scale anchor, which the lengths determine, as one more unknown."""
     parts = np.split(np.concatenate([of_rows, of_lengths]), np.cumsum([len(b.residual) for b in blocks])[:-1])
     return [b._replace(shared=np.column_stack([b.shared, part])) for b, part in zip(blocks, parts, strict=True)]
-

@@ -32,9 +32,6 @@ from ..uncertainty.degrees_of_freedom import Law
 from ..uncertainty.residual_tests import block_diagonal, form_of_poses, form_test, score_tests
 from ..uncertainty.shared_errors import (
     NULL,
-    PLACES,
-    SUCCESSIVE,
-    VISITS,
     Effects,
     Moments,
     OneVariance,
@@ -43,6 +40,7 @@ from ..uncertainty.shared_errors import (
     one_variance,
     second_moments,
 )
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .drawn_errors import functions_of, places_of
 from .group_equations import EXACT, PRIOR, Rows, equations_in_chunks, residual_rms
 from .record import CalibrationRecord, record_of
@@ -63,6 +61,9 @@ _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are a
 # Shared errors of a few standard deviations cost weight, too, and are what is looked for.
 _TRUSTED = 0.1
 _FEWEST = 6  # degrees of freedom
+# Median of the standard deviation of errors of the tip that poses share, of that of the residuals, as it is expected
+# beforehand; three lengths say so little that it decides how wide intervals are (`benchmarks/NOTES.md`).
+_USUAL = 1.25
 # Differences between lengths from which errors of places are always allowed for. So few do not show that there are
 # none: with three lengths, a gate closes in a third of the captures in which places err by as much as single poses.
 _FEW = 2
@@ -163,7 +164,9 @@ def _summed(
     for whole, effect, law in zip(added, found, laws, strict=True):
         by_effect = problem.by_patterns(effect.patterns[0])
         whole += law.variance * by_effect @ by_effect.T
-    law = Law(np.full(len(laws), np.inf), np.array([law.ratios for law in laws]), np.array([law.weights for law in laws]))
+    law = Law(
+        np.full(len(laws), np.inf), np.array([law.ratios for law in laws]), np.array([law.weights for law in laws])
+    )
     follow, moments, names = np.zeros((p, 0)), Moments(np.zeros((0, 0)), np.zeros((0, 0, 0))), ()
     if len(functions.sd):
         names, follow, steps = functions.names, functions.follow, functions.steps
@@ -202,9 +205,9 @@ class _Tips(NamedTuple):
     def of(self, problem: SharedProblem, effects: Effects) -> "_Tips":
         """With the variance of the most likely patterns.
 
-        Errors that poses share are usually as large as those of single poses.
+        Errors that poses share are about as large as those of single poses.
         """
-        usual = residual_rms(problem.rows)
+        usual = _USUAL * residual_rms(problem.rows)
         every = [one_variance(effects, problem.moved(patterns), usual) for patterns in self.patterns]
         best = int(np.argmax([one.log_likelihood for one in every]))
         return self._replace(patterns=[self.patterns[best]], learned=every[best], length=self.lengths[best])

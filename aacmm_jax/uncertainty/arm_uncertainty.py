@@ -124,10 +124,14 @@ class Uncertainty(Module):
         return sorted(found, key=lambda entry: -abs(entry[2]))
 
     @property
+    def scatter(self) -> Law:
+        """How well the variance by the scatter of single poses is known."""
+        return Law.of(np.array([self.scatter_degrees_of_freedom]))
+
+    @property
     def law(self) -> Law:
         """How well the variances of `parts` are known."""
-        scatter = Law.of(np.array([self.scatter_degrees_of_freedom]))
-        return scatter if self.components is None else scatter.joined(self.components.law)
+        return self.scatter if self.components is None else self.scatter.joined(self.components.law)
 
     def parts(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
         """Variances of quantities with these derivatives by the parameters: by the scatter, then by `components`."""
@@ -147,6 +151,13 @@ class Uncertainty(Module):
         """Expanded uncertainty of each parameter, mm and rad; infinite where only a combination is determined."""
         return self.factor(level) * np.asarray(self.u)
 
+    def expanded_of(self, derivatives: Float[np.ndarray, "... p"], level: float = LEVEL) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of functions of the free parameters with these derivatives."""
+        whole = self.complete
+        wider = np.pad(derivatives, [*((0, 0),) * (derivatives.ndim - 1), (0, len(whole.names) - len(self.names))])
+        parts = np.asarray(whole.parts(wider))
+        return coverage_factor(level, parts, whole.law) * np.sqrt(np.maximum(np.sum(parts, axis=-1), 0.0))
+
     @property
     def degrees_of_freedom(self) -> Float[np.ndarray, " p"]:
         """Effective degrees of freedom of the uncertainty of each parameter."""
@@ -155,6 +166,14 @@ class Uncertainty(Module):
     def _of_parameters(self) -> tuple[Float[AnyArray, "p c"], Law]:
         whole = self.complete
         return whole.parts(np.eye(len(whole.names))[: len(self.names)]), whole.law
+
+    def expanded_by_scatter(
+        self, u: Float[np.ndarray, "..."], stated: Float[np.ndarray, "..."], level: float = LEVEL
+    ) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of what the scatter of single poses and a stated u make uncertain, ``u`` together, such
+        as the error of a reference length by the arm as it is."""
+        variances = np.stack([np.maximum(u**2 - stated**2, 0.0), stated**2], axis=-1)
+        return coverage_factor(level, variances, self.scatter.joined(Law.of(np.array([np.inf])))) * u
 
     def expanded_k(self, level: float = LEVEL) -> float:
         """Expanded uncertainty of k; NaN without one."""
@@ -173,7 +192,7 @@ class Uncertainty(Module):
         return covariance + self._reading(q) if reading else covariance
 
     def expanded_tip(self, q: Numbers, *, level: float = LEVEL, reading: bool = False) -> Float[np.ndarray, "..."]:
-        """Expanded uncertainty of the tip at joint angles ``(..., n)`` along the direction in which it is largest, mm."""
+        """Expanded uncertainty of the tip at joint angles ``(..., n)``, along its most uncertain direction, mm."""
         parts = np.asarray(self.tip_parts(q, reading=reading))
         return coverage_factor(level, parts, self.complete.law) * np.sqrt(np.sum(parts, axis=-1))
 
@@ -232,12 +251,12 @@ class Uncertainty(Module):
             )
         direction, whole = between / xp.linalg.norm(between, axis=-1, keepdims=True), self.complete
         along = xp.einsum("...c,...cp->...p", direction, whole.derivatives(end) - whole.derivatives(start))
-        parts = whole.parts(along)
+        parts = whole.parts_of_functions(along)
         if reading:
             both = self._noise(start) + self._noise(end)
             of_noise = xp.einsum("...c,...cd,...d->...", direction, both, direction)
             parts = whole.with_reading(parts, of_noise, 2)
-        return xp.where(whole._is_open(along[..., None, :]), np.inf, parts)
+        return parts
 
     def derivatives(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 p"]:
         """Derivatives of the tip by the free parameters."""
@@ -248,6 +267,11 @@ class Uncertainty(Module):
         xp = namespace(self, derivatives)
         covariance = derivatives @ self.covariance @ xp.swapaxes(derivatives, -1, -2)
         return xp.where(self._is_open(derivatives)[..., None], np.inf, covariance)
+
+    def parts_of_functions(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
+        """`parts` of functions of the parameters with these derivatives; infinite where they follow what is open."""
+        is_open = self._is_open(derivatives[..., None, :])
+        return namespace(self, derivatives).where(is_open, np.inf, self.parts(derivatives))
 
     def _checked(self, q: Numbers) -> Float[AnyArray, "... n"]:
         q = self.arm._checked(q)

@@ -2,8 +2,8 @@
 
 A covariance is a sum of parts: the scatter of single poses, certified lengths and what instruments state, the
 disagreement of the lengths, effects that poses share. A quantity with derivatives g has the variances v_i = g' C_i g of
-these parts, and where each was estimated from nu_i degrees of freedom, those of their sum are (Welch 1947, Satterthwaite
-1946; JCGM 100, G.4.1)
+these parts, and where each was estimated from nu_i degrees of freedom, those of their sum are (Welch 1947,
+Satterthwaite 1946; JCGM 100, G.4.1)
 
     nu = (sum v_i)^2 / sum (v_i^2 / nu_i).
 
@@ -11,8 +11,8 @@ This takes the variance for nearly normal, or for a chi-square variable's multip
 placements show is neither: it may well be 0, or four times what is most probable. Such a part is described by its
 posterior distribution (`Law.ratios`), and an error of the quantity is then distributed as a mixture of Student's t with
 the variances that are possible, as the propagation of distributions has it (JCGM 101, 6.4.9; Bodnar, Link and Elster
-2016, Bayesian Analysis 11, 25-45). The coverage factor is that of the mixture, the degrees of freedom those of Student's
-t with the same factor at 95 %.
+2016, Bayesian Analysis 11, 25-45). The coverage factor is that of the mixture, the degrees of freedom those of
+Student's t with the same factor at 95 %.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from jaxtyping import Float
 from ..core.distributions import student_quantile, student_tail
 from ..core.errors import InputError
 from ..core.module import Module
-from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
 
 LEVEL = 0.95  # coverage at which degrees of freedom are those of Student's t
 _DRAWS = 128  # combinations of the variances of several parts that have distributions
@@ -48,6 +48,11 @@ class Law(NamedTuple):
         """Of variances that were estimated from so many degrees of freedom."""
         one = np.ones((len(degrees_of_freedom), 1))
         return cls(degrees_of_freedom, one, one)
+
+    @property
+    def in_numpy(self) -> "Law":
+        """With NumPy's arrays."""
+        return Law(*(np.asarray(each, dtype=float) for each in self))
 
     def joined(self, *others: "Law") -> "Law":
         """With further parts."""
@@ -92,6 +97,12 @@ class Components(Module):
             return None
         return Components(tuple(self.names[i] for i in kept), self.matrices[kept], Law(*(of[kept] for of in self.law)))
 
+    def wider(self, free: np.ndarray, size: int) -> "Components":
+        """Of ``size`` parameters, of which these are the ``free`` ones; the others are exact."""
+        xp = namespace(self)
+        matrices = set_at(xp.zeros((len(self.names), size, size)), (slice(None), *np.ix_(free, free)), self.matrices)
+        return Components(self.names, matrices, self.law)
+
     def variances(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
         """Of quantities with these derivatives by the parameters."""
         return namespace(self, derivatives).einsum("...p,cpq,...q->...c", derivatives, self.matrices, derivatives)
@@ -109,9 +120,7 @@ def effective_degrees_of_freedom(
     return np.where(below > 0, np.sum(relative, axis=-1) ** 2 / np.where(below > 0, below, 1.0), np.inf)
 
 
-def coverage_factor(
-    level: float, variances: Float[AnyArray, "... c"], law: Law
-) -> Float[np.ndarray, "..."]:
+def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
     """The factor of U over u for quantities with these variances of their parts.
 
     Args:
@@ -121,13 +130,15 @@ def coverage_factor(
     """
     if not 0 < level < 1:
         raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
-    law, variances = Law(*map(np.asarray, law)), np.asarray(variances, dtype=float)
+    law, variances = law.in_numpy, np.asarray(variances, dtype=float)
     known = np.all(np.isfinite(variances), axis=-1)
     variances = np.where(known[..., None], variances, 0.0)
     # A part that rounding, or its own definition (a difference), makes negative does not know more for that.
-    plain = student_quantile(0.5 + level / 2, effective_degrees_of_freedom(variances, law.degrees_of_freedom))
+    plain = student_quantile(
+        0.5 + level / 2, effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
+    )
     total = np.sum(variances, axis=-1)
-    spread = np.flatnonzero(np.sum(law.weights > 0, axis=1) > 1)
+    spread = np.flatnonzero(np.sum(np.asarray(law.weights) > 0, axis=1) > 1)
     mixed = np.any(variances[..., spread] > 1e-9 * total[..., None], axis=-1) & (total > 0)
     if mixed.any():
         plain = np.array(plain)
@@ -153,11 +164,11 @@ def _of_mixtures(
     level: float, variances: Float[np.ndarray, "m c"], law: Law, spread: np.ndarray
 ) -> Float[np.ndarray, " m"]:
     """Coverage factors of quantities of whose variance some parts have distributions."""
-    ratios, weights = _combinations(law, spread)
+    ratios, weights = _combinations(np.asarray(law.ratios), np.asarray(law.weights), spread)
     total = np.sum(variances, axis=1)
     each = variances[:, None, :] * ratios  # (m, draws, c)
     possible = np.maximum(np.sum(each, axis=2), 1e-12 * total[:, None])
-    freedom = effective_degrees_of_freedom(each, law.degrees_of_freedom)
+    freedom = effective_degrees_of_freedom(each, np.asarray(law.degrees_of_freedom))
     root = np.sqrt(possible / total[:, None])
     both = student_quantile(0.5 + level / 2, freedom) * root
     low, high = np.log(both.min(axis=1)), np.log(both.max(axis=1))
@@ -168,19 +179,20 @@ def _of_mixtures(
     return np.exp(0.5 * (low + high))
 
 
-def _combinations(law: Law, spread: np.ndarray) -> tuple[Float[np.ndarray, "d c"], Float[np.ndarray, " d"]]:
+def _combinations(
+    ratios: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"], spread: np.ndarray
+) -> tuple[Float[np.ndarray, "d c"], Float[np.ndarray, " d"]]:
     """Variances of all parts over the stated ones, and their probabilities: all of one part that has a distribution,
     and of several a lattice (Kronecker's sequence), which has as many of each."""
     if len(spread) == 1:
-        kept = law.weights[spread[0]] > 0
-        found = np.ones((int(kept.sum()), len(law.ratios)))
-        found[:, spread[0]] = law.ratios[spread[0], kept]
-        return found, law.weights[spread[0], kept]
-    found, number = np.ones((_DRAWS, len(law.ratios))), np.arange(_DRAWS)
+        kept = weights[spread[0]] > 0
+        found = np.ones((int(kept.sum()), len(ratios)))
+        found[:, spread[0]] = ratios[spread[0], kept]
+        return found, weights[spread[0], kept]
+    found, number = np.ones((_DRAWS, len(ratios))), np.arange(_DRAWS)
     for i, part in enumerate(spread):
         at = (number + 0.5) / _DRAWS if i == 0 else (0.5 + number * _STEPS[(i - 1) % len(_STEPS)]) % 1.0
-        kept = np.flatnonzero(law.weights[part] > 0)
-        kept = kept[np.argsort(law.ratios[part, kept])]
-        found[:, part] = np.interp(at, np.cumsum(law.weights[part, kept]) - 0.5 * law.weights[part, kept],
-                                   law.ratios[part, kept])
+        order = np.argsort(ratios[part])
+        of_order = weights[part, order]
+        found[:, part] = np.interp(at, np.cumsum(of_order) - 0.5 * of_order, ratios[part, order])
     return found, np.full(_DRAWS, 1 / _DRAWS)

@@ -323,10 +323,11 @@ def of_measurements(
     linear: list[Linear], rows: list[Float[AnyArray, "_ _ _"]], whitening: Whitening
 ) -> Float[AnyArray, "z z"]:
     """What errors of measured values contribute to the middle of the covariance."""
-    total = 0.0
+    xp = namespace(rows)
+    total = xp.zeros((len(rows[0]), len(rows[0])))
     for part, root, j in zip(linear, whitening.roots, rows, strict=True):
-        moved = namespace(j).einsum("zam,mab->zbm", j, root)
-        total = total + _outer(namespace(j).einsum("zam,mab->zbm", moved, part.rows.measured), moved)
+        moved = xp.einsum("zam,mab->zbm", j, root)
+        total = total + _outer(xp.einsum("zam,mab->zbm", moved, part.rows.measured), moved)
     return total
 
 

@@ -19,7 +19,6 @@ from ..core.numpy_or_jax import AnyArray, namespace
 from .degrees_of_freedom import Components, Law
 from .evidence import Groups, PriorModel, covariance_of_log_variances, learned_log_variances
 from .residual_tests import Residuals
-from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 _ROUNDS = 40  # of the variance of independent errors; usually 5
 _TOLERANCE = 1e-6
@@ -165,10 +164,8 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: flo
     explained = np.sum(ratio[:, None] * squares / (1 + ratio[:, None] * values), axis=1)
     cost = total - explained
     log_sum = np.sum(np.log1p(ratio[:, None] * values), axis=1)
-    if effects.given:
-        likelihood = -0.5 * (cost - total + log_sum)
-    else:
-        likelihood = -0.5 * (freedom * np.log(cost / total) + log_sum)
+    of_cost = cost - total if effects.given else freedom * np.log(cost / total)
+    likelihood = -0.5 * (of_cost + log_sum)
     weight = likelihood + np.log(sd) - np.log1p((sd / usual) ** 2)
     weight = np.exp(weight - weight.max())
     weight = weight / weight.sum()
