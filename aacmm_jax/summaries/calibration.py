@@ -273,7 +273,7 @@ def uncertainty_summary(
         "noisy_encoders": noisy_encoder_rows(record.noisy_encoders, record.calibrated.arm.prismatic),
         "misfit": record.reduced_chi,
         # Of the unknown geometry, whose uncertainty follows from the scatter of single poses.
-        "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(()), np.zeros(()))),
+        "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(1), np.zeros(1))[0]),
         "volume": volume.summary,
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
         "rank": observability.rank,

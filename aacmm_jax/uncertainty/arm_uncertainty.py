@@ -156,7 +156,7 @@ class Uncertainty(Module):
         whole = self.complete
         wider = np.pad(derivatives, [*((0, 0),) * (derivatives.ndim - 1), (0, len(whole.names) - len(self.names))])
         parts = np.asarray(whole.parts(wider))
-        return coverage_factor(level, parts, whole.law) * np.sqrt(np.maximum(np.sum(parts, axis=-1), 0.0))
+        return np.asarray(coverage_factor(level, parts, whole.law) * np.sqrt(np.maximum(np.sum(parts, axis=-1), 0.0)))
 
     @property
     def degrees_of_freedom(self) -> Float[np.ndarray, " p"]:
@@ -194,7 +194,7 @@ class Uncertainty(Module):
     def expanded_tip(self, q: Numbers, *, level: float = LEVEL, reading: bool = False) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the tip at joint angles ``(..., n)``, along its most uncertain direction, mm."""
         parts = np.asarray(self.tip_parts(q, reading=reading))
-        return coverage_factor(level, parts, self.complete.law) * np.sqrt(np.sum(parts, axis=-1))
+        return np.asarray(coverage_factor(level, parts, self.complete.law) * np.sqrt(np.sum(parts, axis=-1)))
 
     @numpy_if_known
     def tip_parts(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
@@ -231,7 +231,7 @@ class Uncertainty(Module):
     ) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
         parts = np.asarray(self.length_parts(start, end, reading=reading))
-        return coverage_factor(level, parts, self.complete.law) * np.sqrt(np.sum(parts, axis=-1))
+        return np.asarray(coverage_factor(level, parts, self.complete.law) * np.sqrt(np.sum(parts, axis=-1)))
 
     @numpy_if_known
     def length_parts(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:

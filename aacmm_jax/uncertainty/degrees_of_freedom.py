@@ -117,7 +117,7 @@ def effective_degrees_of_freedom(
     largest = np.max(np.abs(variances), axis=-1, initial=0.0, keepdims=True)
     relative = variances / np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
     below = np.sum(relative**2 / degrees_of_freedom, axis=-1)
-    return np.where(below > 0, np.sum(relative, axis=-1) ** 2 / np.where(below > 0, below, 1.0), np.inf)
+    return np.asarray(np.where(below > 0, np.sum(relative, axis=-1) ** 2 / np.where(below > 0, below, 1.0), np.inf))
 
 
 def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
@@ -133,17 +133,14 @@ def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law)
     law, variances = law.in_numpy, np.asarray(variances, dtype=float)
     known = np.all(np.isfinite(variances), axis=-1)
     variances = np.where(known[..., None], variances, 0.0)
-    # A part that rounding, or its own definition (a difference), makes negative does not know more for that.
-    plain = student_quantile(
-        0.5 + level / 2, effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
-    )
+    freedom = effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
+    found = np.array(student_quantile(0.5 + level / 2, freedom))
     total = np.sum(variances, axis=-1)
     spread = np.flatnonzero(np.sum(np.asarray(law.weights) > 0, axis=1) > 1)
     mixed = np.any(variances[..., spread] > 1e-9 * total[..., None], axis=-1) & (total > 0)
     if mixed.any():
-        plain = np.array(plain)
-        plain[mixed] = _of_mixtures(level, variances[mixed], law, spread)
-    return plain
+        found[mixed] = _of_mixtures(level, variances[mixed], law, spread)
+    return found
 
 
 def degrees_of_freedom(variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
