@@ -25,7 +25,7 @@ from ..kinematics.chain import joint_motion
 from ..model.observed import Observed, certified_and_lengths, linear_rows
 from ..model.socket_sums import means_over_sockets, sums_over_sockets
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.degrees_of_freedom import LEVEL, Law, coverage_factor
+from ..uncertainty.degrees_of_freedom import LEVEL, Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.observed_identifiability import dense_rows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
@@ -43,7 +43,7 @@ class Agreement(NamedTuple):
     rms: float  # root mean square, found
     predicted: float  # infinite where the calibration leaves a direction open that matters
     degrees_of_freedom: float  # effective, of the predicted sum of squares
-    noise_degrees_of_freedom: float  # of the noise that the prediction rests on; infinite where it was given
+    noise_degrees_of_freedom: float  # of what the prediction rests on; infinite where the noise was given
     reduced_chi: float = math.nan  # root mean square of a residual in standard deviations of the noise alone
     rms_angle: float = math.nan  # rad, where orientations were measured
 
@@ -122,12 +122,13 @@ class UnseenErrors(NamedTuple):
         u = np.maximum(u[known], _LEAST_LENGTH_U)
         correlation = self.length_covariance[np.ix_(known, known)] / np.outer(u, u)
         predicted = math.sqrt(np.mean(u**2))
+        parts = np.mean(self.length_parts[known] / u[:, None] ** 2, axis=0)
         return Agreement(
             count=len(known),
             rms=predicted * math.sqrt(np.mean((self.length_error[known] / u) ** 2)),
             predicted=predicted,
             degrees_of_freedom=len(known) ** 2 / float(np.sum(correlation**2)),
-            noise_degrees_of_freedom=self.noise_degrees_of_freedom,
+            noise_degrees_of_freedom=float(degrees_of_freedom(parts, self.law)),
         )
 
 

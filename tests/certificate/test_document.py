@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.record import Removed
