@@ -392,7 +392,9 @@ class _RepeatedTask(NamedTuple):
         """The trials' distribution, with the linear result to compare it with."""
         linear = uncertainty_of(result)
         u_length = np.asarray(linear.length(self.start, self.end))
-        factor_length = linear.expanded_length(self.start, self.end, level=level) / u_length
+        factor_length = linear.expanded_length(self.start, self.end, level=level) / np.where(
+            u_length > 0, u_length, 1.0
+        )
         u = values.std(axis=0, ddof=1)
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
         start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))

@@ -8,7 +8,7 @@ from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
 from ..core.linear_algebra import semidefinite_eigen
 from ..core.module import Module
-from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known
+from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm
 from ..kinematics.chain import joint_motion
@@ -153,19 +153,24 @@ class Uncertainty(Module):
 
     def expanded_of(self, derivatives: Float[np.ndarray, "... p"], level: float = LEVEL) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of functions of the free parameters with these derivatives."""
-        whole = self.complete
+        whole = to_numpy(self).complete
         wider = np.pad(derivatives, [*((0, 0),) * (derivatives.ndim - 1), (0, len(whole.names) - len(self.names))])
         parts = np.asarray(whole.parts(wider))
-        return np.asarray(coverage_factor(level, parts, whole.law) * np.sqrt(np.maximum(np.sum(parts, axis=-1), 0.0)))
+        return whole.expanded_by_parts(parts, level)
 
     @property
     def degrees_of_freedom(self) -> Float[np.ndarray, " p"]:
         """Effective degrees of freedom of the uncertainty of each parameter."""
         return degrees_of_freedom(*self._of_parameters())
 
-    def _of_parameters(self) -> tuple[Float[AnyArray, "p c"], Law]:
-        whole = self.complete
-        return whole.parts(np.eye(len(whole.names))[: len(self.names)]), whole.law
+    def expanded_by_parts(self, parts: Float[np.ndarray, "... c"], level: float = LEVEL) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of quantities of the `complete` uncertainty with these variances of their parts."""
+        u = np.sqrt(np.maximum(np.sum(parts, axis=-1), 0.0))
+        return np.asarray(coverage_factor(level, parts, to_numpy(self).complete.law) * u)
+
+    def _of_parameters(self) -> tuple[Float[np.ndarray, "p c"], Law]:
+        whole = to_numpy(self).complete
+        return np.asarray(whole.parts(np.eye(len(whole.names))[: len(self.names)])), whole.law
 
     def expanded_by_scatter(
         self, u: Float[np.ndarray, "..."], stated: Float[np.ndarray, "..."], level: float = LEVEL
@@ -194,7 +199,7 @@ class Uncertainty(Module):
     def expanded_tip(self, q: Numbers, *, level: float = LEVEL, reading: bool = False) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the tip at joint angles ``(..., n)``, along its most uncertain direction, mm."""
         parts = np.asarray(self.tip_parts(q, reading=reading))
-        return np.asarray(coverage_factor(level, parts, self.complete.law) * np.sqrt(np.sum(parts, axis=-1)))
+        return self.expanded_by_parts(parts, level)
 
     @numpy_if_known
     def tip_parts(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
@@ -231,7 +236,7 @@ class Uncertainty(Module):
     ) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
         parts = np.asarray(self.length_parts(start, end, reading=reading))
-        return np.asarray(coverage_factor(level, parts, self.complete.law) * np.sqrt(np.sum(parts, axis=-1)))
+        return self.expanded_by_parts(parts, level)
 
     @numpy_if_known
     def length_parts(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:

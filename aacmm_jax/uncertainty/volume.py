@@ -14,7 +14,6 @@ from ..kinematics.arm import Arm, joint_limits
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import total_link_length
 from .arm_uncertainty import Uncertainty
-from .degrees_of_freedom import LEVEL, coverage_factor
 
 _LENGTH_MM = 300.0  # lengths of the map, where none is given: those of the paper's checks
 
@@ -47,9 +46,10 @@ class VolumetricUncertainty(NamedTuple):
         """Median, 95th percentile and largest uncertainty, standard and expanded to 95 %, mm; the smallest and the
         largest coverage factor."""
         found = {"length_mm": self.length}
-        factors = np.concatenate(
-            [(expanded / u)[np.isfinite(u) & (u > 0)] for u, expanded in zip(self[5:8], self[8:], strict=True)]
-        )
+        pairs = [np.stack([u, expanded]) for u, expanded in zip(self[5:8], self[8:], strict=True)]
+        u, expanded = np.concatenate(pairs, axis=1)
+        known = np.isfinite(u) & (u > 0)
+        factors = expanded[known] / u[known]
         found |= {"coverage_factor_least": float(factors.min(initial=np.inf))}
         found |= {"coverage_factor_largest": float(factors.max(initial=-np.inf))}
         for name in self._fields[5:]:
@@ -91,9 +91,9 @@ def volumetric_uncertainty(
     length = default_length(uncertainty.arm) if length is None else length
     start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
     tips, *parts = _volume(to_numpy(uncertainty), start, end)
-    u = [np.sqrt(np.sum(np.asarray(part), axis=-1)) for part in parts]
-    law = uncertainty.complete.law
-    expanded = [coverage_factor(LEVEL, part, law) * one for part, one in zip(parts, u, strict=True)]
+    parts = [np.asarray(part) for part in parts]
+    u = [np.sqrt(np.sum(part, axis=-1)) for part in parts]
+    expanded = [uncertainty.expanded_by_parts(part) for part in parts]
     return VolumetricUncertainty(length, start, end, tips[0], tips[1], *u, *expanded)
 
 
