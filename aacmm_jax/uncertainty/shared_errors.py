@@ -159,19 +159,21 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: flo
     values, r = values[known], effects.left.values[:, None]
     squares = (vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2
     total, freedom = float(effects.product(r, r)[0, 0]), effects.left.degrees_of_freedom
-    sd = usual * np.geomspace(*_RANGE, _GRID)
-    ratio = sd**2 / effects.variance
+    ratio = (usual * np.geomspace(*_RANGE, _GRID)) ** 2 / effects.variance
     explained = np.sum(ratio[:, None] * squares / (1 + ratio[:, None] * values), axis=1)
     cost = total - explained
     log_sum = np.sum(np.log1p(ratio[:, None] * values), axis=1)
+    # Of the effect, and of what independent errors add to the mean of a coefficient's tips.
+    variance = ratio if effects.given else ratio * cost / freedom
+    of_errors = variance / ratio / np.mean(values)
     of_cost = cost - total if effects.given else freedom * np.log(cost / total)
     likelihood = -0.5 * (of_cost + log_sum)
-    weight = likelihood + np.log(sd) - np.log1p((sd / usual) ** 2)
+    weight = likelihood + 0.5 * np.log(variance) - np.log1p(variance / usual**2)
     weight = np.exp(weight - weight.max())
     weight = weight / weight.sum()
-    of_errors = effects.variance / float(np.mean(values))
-    stated = float(np.exp(weight @ np.log(sd**2 + of_errors))) - of_errors
-    return OneVariance(stated, sd**2 / stated, weight, float(np.max(likelihood)))
+    stated = float(np.exp(weight @ np.log(variance + of_errors)) - weight @ of_errors)
+    stated = max(stated, float(variance[0]))
+    return OneVariance(stated, variance / stated, weight, float(np.max(likelihood)))
 
 
 def group_deviations(
