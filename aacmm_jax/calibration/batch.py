@@ -140,7 +140,7 @@ def calibrate_many(
         [0.99924 0.99922] [ True  True]
     """
     given = BatchOptions(**options)
-    bounds, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
+    _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
     by_slides = scale_from_slides(arm, capture, space, given.noise)
     general = bool(capture.observations) or any((given.robust, given.prior, given.covariance, by_slides))
     method = default_method(arm, general) if method is None else method

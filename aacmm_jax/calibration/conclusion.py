@@ -12,7 +12,8 @@ from ..kinematics.parameters import Bounds
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
 from ..model.rows import PriorRows
-from ..uncertainty.covariance import ParameterCovariance
+from ..uncertainty.covariance import STATED, ParameterCovariance
+from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.linear_propagation import (
     Influence,
     UnknownsCovariance,
@@ -20,6 +21,7 @@ from ..uncertainty.linear_propagation import (
     covariance_of_rows,
     geometry_covariance,
     of_shared_readings,
+    of_stated,
     propagated,
     row_covariances,
 )
@@ -77,7 +79,9 @@ def concluded(
     added = None if by_scales is None else by_scales.added(influence.inverse)
     unknowns = propagated(influence, covariances, shared, whitening.prior, added)
     matrix = unknowns.head[:p, :p] * steps[:p, None] * steps[:p]
-    covariance = ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise)
+    stated = of_stated(influence, state.point.rows, whitening, whitening.prior)[:p, :p]
+    parts = Components.of({STATED: (stated * steps[:p, None] * steps[:p], np.inf)})
+    covariance = ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise, parts)
     parameters = set_at(task.start, free, z[:p])
     spent = p + count if of_prior is None else of_prior.effective
     metrics = observed_metrics(task, begun.before, state, linear, of_geometry(linear, influence, unknowns), spent)
@@ -173,6 +177,7 @@ def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> P
         set_at(xp.ones(size, dtype=bool), free, covariance.determined),
         set_at(xp.zeros((size, size)), grid, covariance.open),
         covariance.noise,
+        covariance.components and covariance.components.wider(free, size),
     )
 
 

@@ -25,6 +25,7 @@ from ..kinematics.chain import joint_motion
 from ..model.observed import Observed, certified_and_lengths, linear_rows
 from ..model.socket_sums import means_over_sockets, sums_over_sockets
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.degrees_of_freedom import LEVEL, Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.observed_identifiability import dense_rows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
@@ -42,7 +43,7 @@ class Agreement(NamedTuple):
     rms: float  # root mean square, found
     predicted: float  # infinite where the calibration leaves a direction open that matters
     degrees_of_freedom: float  # effective, of the predicted sum of squares
-    noise_degrees_of_freedom: float  # of the noise that the prediction rests on; infinite where it was given
+    noise_degrees_of_freedom: float  # of what the prediction rests on; infinite where the noise was given
     reduced_chi: float = math.nan  # root mean square of a residual in standard deviations of the noise alone
     rms_angle: float = math.nan  # rad, where orientations were measured
 
@@ -75,12 +76,18 @@ class UnseenErrors(NamedTuple):
     common: Float[np.ndarray, "w w"]  # covariance of what they share
     length_error: Float[np.ndarray, " l"]  # of the reference lengths, mm
     length_covariance: Float[np.ndarray, "l l"]  # predicted, mm^2
+    length_parts: Float[np.ndarray, "l c"]  # variances of them by what they rest on, mm^2
+    law: Law  # how well each part is known
     noise_degrees_of_freedom: float
 
     @property
     def length_u(self) -> Float[np.ndarray, " l"]:
         """Standard uncertainty of the error of every reference length, mm."""
         return np.sqrt(np.diagonal(self.length_covariance))
+
+    def expanded(self, level: float = LEVEL) -> Float[np.ndarray, " l"]:
+        """Expanded uncertainty of the error of every reference length, mm."""
+        return coverage_factor(level, self.length_parts, self.law) * self.length_u
 
     def of(self, names: Iterable[str]) -> Agreement:
         """Some sockets and observations together."""
@@ -115,12 +122,13 @@ class UnseenErrors(NamedTuple):
         u = np.maximum(u[known], _LEAST_LENGTH_U)
         correlation = self.length_covariance[np.ix_(known, known)] / np.outer(u, u)
         predicted = math.sqrt(np.mean(u**2))
+        parts = np.mean(self.length_parts[known] / u[:, None] ** 2, axis=0)
         return Agreement(
             count=len(known),
             rms=predicted * math.sqrt(np.mean((self.length_error[known] / u) ** 2)),
             predicted=predicted,
             degrees_of_freedom=len(known) ** 2 / float(np.sum(correlation**2)),
-            noise_degrees_of_freedom=self.noise_degrees_of_freedom,
+            noise_degrees_of_freedom=float(degrees_of_freedom(parts, self.law)),
         )
 
 
@@ -192,8 +200,27 @@ def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
             same = ends[:, one][:, None] == ends[:, other][None, :]
             covariance = covariance + np.where(same, 1.0 if one == other else -1.0, 0.0) * (pulled @ direction.T)
     error = measured - np.array([float(length.value) for length in lengths])
-    shared = np.asarray(uncertainty.covariance)
-    return UnseenErrors(parts, shared, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
+    shared, covariance = np.asarray(uncertainty.covariance), np.asarray(covariance)
+    stated = np.array([float(length.u) ** 2 for length in lengths])
+    by_part = _parts_of_lengths(uncertainty, along, covariance, stated, of_mean[ends].sum(axis=1))
+    return UnseenErrors(parts, shared, error, covariance, *by_part, uncertainty.scatter_degrees_of_freedom)
+
+
+def _parts_of_lengths(
+    uncertainty: Uncertainty,
+    slopes: Float[np.ndarray, "l p"],
+    covariance: Float[np.ndarray, "l l"],
+    stated: Float[np.ndarray, " l"],
+    in_places: Float[np.ndarray, " l"],
+) -> tuple[Float[np.ndarray, "l c"], Law]:
+    """Variances of errors of lengths by what they rest on, mm^2: the parts of the calibration's uncertainty, of which
+    the first contains the scatter of the poses at the ends, errors of places there, and what is stated of lengths."""
+    law = uncertainty.law.joined(Law.of(np.array([np.inf])))
+    others = np.column_stack([uncertainty.parts(slopes)[:, 1:], stated])
+    if PLACES in (names := () if uncertainty.components is None else uncertainty.components.names):
+        others[:, names.index(PLACES)] += in_places
+    whole = np.diagonal(covariance)
+    return np.column_stack([whole - others.sum(axis=1), others]), law
 
 
 def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple[float, Float[np.ndarray, " s"]]:
@@ -271,4 +298,6 @@ def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors
     geometry = observed.split(fitted.geometry)
     measured = np.array([float(np.linalg.norm(geometry[end] - geometry[start])) for start, end in observed.ends])
     error = measured - np.asarray(observed.nominal)
-    return UnseenErrors(parts, common, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
+    covariance, in_places = np.asarray(covariance), ends**2 * np.sum(relations[:count, p:] ** 2, axis=1)
+    by_part = _parts_of_lengths(uncertainty, pull @ along, covariance, u[:count] ** 2, in_places)
+    return UnseenErrors(parts, common, error, covariance, *by_part, uncertainty.scatter_degrees_of_freedom)

@@ -46,7 +46,7 @@ class Sampled(NamedTuple):
     low: Float[np.ndarray, " q"]  # as probable to be below it as above the other end
     high: Float[np.ndarray, " q"]
     linear_u: Float[np.ndarray, " q"]  # what the law of propagation says
-    factor: float  # of the linear interval
+    factor: Float[np.ndarray, " q"]  # of the linear interval
     tolerance: Float[np.ndarray, " q"]  # delta of JCGM 101, 7.9.2
     stable: bool  # the adaptive procedure ended before ``most`` trials
     trials: int
@@ -392,12 +392,16 @@ class _RepeatedTask(NamedTuple):
         """The trials' distribution, with the linear result to compare it with."""
         linear = uncertainty_of(result)
         u_length = np.asarray(linear.length(self.start, self.end))
+        factor_length = linear.expanded_length(self.start, self.end, level=level) / np.where(
+            u_length > 0, u_length, 1.0
+        )
         u = values.std(axis=0, ddof=1)
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
         start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
         lengths = np.linalg.norm(start - end, axis=1)
         scale = result.scale  # None where observations fix it, and not reference lengths alone
         k, u_k = ([], []) if scale is None else ([float(scale.value)], [float(scale.u)])
+        factor_k = [linear.expanded_k(level) / own for own in u_k]
         estimate = np.concatenate([result.parameters, k, lengths])
         return Sampled(
             quantities=(*result.space.names, *("k" for _ in k), *(f"length {i + 1}" for i in range(len(self.start)))),
@@ -406,7 +410,7 @@ class _RepeatedTask(NamedTuple):
             low=low,
             high=high,
             linear_u=np.concatenate([linear.u, u_k, u_length]),
-            factor=linear.factor(level),
+            factor=np.concatenate([linear.factor(level), factor_k, factor_length]),
             tolerance=numerical_tolerance(u, digits),
             stable=stable,
             trials=len(values) + failed,

@@ -15,15 +15,12 @@ class Sensitivities(NamedTuple):
     tips: Float[np.ndarray, "p 3 M"]  # by displacements of the tip, mm
     joints: Float[np.ndarray, "p n M"]  # by errors of the joints, rad (mm of prismatic ones)
     lengths: Float[np.ndarray, "l 3 M"]  # of measured lengths by the tips, where positions of sockets are means
-    # What lengths that contradict each other have added to the covariance of the parameters: errors of places instead.
-    surplus: Float[np.ndarray, "p p"]
 
 
 def sensitivities_of_rows(
     linear: Linearisation,
     rows: list[Float[np.ndarray, "p r m"]],
     lengths: Float[np.ndarray, "l 3 M"],
-    surplus: Float[np.ndarray, "p p"],
 ) -> Sensitivities:
     """Of parameters that follow the whitened rows of every group so."""
     joints = [
@@ -31,7 +28,7 @@ def sensitivities_of_rows(
         for one, error in zip(_of_residuals(linear, rows), linear.errors, strict=False)
     ]
     by_joints = np.concatenate(linear.observed.by_observation(joints), axis=2)
-    return Sensitivities(tips_of_rows(linear, rows), by_joints, lengths, surplus)
+    return Sensitivities(tips_of_rows(linear, rows), by_joints, lengths)
 
 
 def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) -> Float[np.ndarray, "q 3 M"]:

@@ -11,7 +11,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.measured_points import AbstractMeasured

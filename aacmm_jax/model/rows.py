@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.observations.observation import Rows
 from ..kinematics.chain import ForwardPass, forward_pass

@@ -225,12 +225,7 @@ def propagated(
     xp, inverse = namespace(influence.inverse, covariances), influence.inverse
     total = xp.zeros_like(inverse) if shared_readings is None else shared_readings
     if prior is not None:
-        # The errors of the prior have variance 1 in its own rows.
-        total = (
-            total
-            + influence.information
-            - sum((_information(influence, number) for number in range(len(influence.blocks))), xp.zeros_like(inverse))
-        )
+        total = total + _of_prior(influence)
     own_total = [xp.zeros_like(matrix) for matrix in influence.own]
     crossed = [xp.zeros_like(matrix) for matrix in influence.follow]
     for number, block in enumerate(influence.blocks):
@@ -251,6 +246,27 @@ def propagated(
         mixed = own @ both @ inverse @ turned
         components.append(own @ middle @ own - mixed - xp.swapaxes(mixed, -1, -2) + follow @ head @ turned)
     return UnknownsCovariance(head, components)
+
+
+def of_stated(
+    influence: Influence, rows: list[Rows], whitening: Whitening, prior: PriorRows | None
+) -> Float[AnyArray, "h h"]:
+    """The part of the head's covariance that rests on what is stated: of relations, a prior, and measured values."""
+    xp, inverse = namespace(influence.inverse), influence.inverse
+    total = xp.zeros_like(inverse) if prior is None else _of_prior(influence)
+    for number in range(len(influence.blocks)):
+        by = a = influence.weighted_rows(number)
+        if number < len(rows):
+            each = xp.moveaxis(whitening.roots[number], 0, -1)
+            by = products(a, products(products(each, xp.moveaxis(rows[number].measured, 0, -1)), each))
+        total = total + _flat(by) @ _flat(a).T
+    return inverse @ total @ inverse
+
+
+def _of_prior(influence: Influence) -> Float[AnyArray, "h h"]:
+    """The information of the prior, whose errors have variance 1 in its own rows."""
+    of_rows = (_information(influence, number) for number in range(len(influence.blocks)))
+    return influence.information - sum(of_rows, namespace(influence.inverse).zeros_like(influence.inverse))
 
 
 def _information(influence: Influence, number: int) -> Float[AnyArray, "h h"]:
