@@ -107,7 +107,7 @@ def followed(
 
 
 def _flat(rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k _"]:
-    return rows.reshape(rows.shape[0], -1)
+    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
 def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:

@@ -167,7 +167,7 @@ def _left_open(matrix: Float[AnyArray, "K k k"], inverse: Float[AnyArray, "K k k
 
 
 def _flat(rows: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h _"]:
-    return rows.reshape(rows.shape[0], -1)
+    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
 def row_covariances(
