@@ -1,7 +1,7 @@
 """Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,10 +19,10 @@ from ..kinematics.priors import Prior
 from ..model.robust import LossName
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.volume import default_length, sample_lengths
-from .batch import BatchOptions, BatchTask, identify_many
+from .batch import calibrate_many
 from .record import uncertainty_of
 from .redrawn import batch_of_captures, trials_of, truth_of
-from .results import Calibration, ManyCalibrations, ManyIdentifications
+from .results import Calibration, ManyCalibrations
 
 _LENGTHS = 24  # lengths over the working volume whose distribution is found with those of the parameters and k
 _REFINED = 5  # the standard's own tolerance is divided by this where a linear result is validated (JCGM 101, 8.2)
@@ -227,7 +227,7 @@ def bootstrap(
     _check_level(level)
     random = random_generator(seed)
     task = _RepeatedTask.of(result, capture, None, robust)
-    if result.observed is not None:
+    if result.method == "joint":
         captures = truth_of(result, capture).resampled(trials, random)
         means = None if result.prior is None else _of_prior(result, np.asarray(result.prior.mean))
         found, failed = task.solved(captures, task.prior_means(trials, random, means))
@@ -250,7 +250,7 @@ def _check_level(level: float) -> None:
 
 def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:
     """Refuse trials that would be solved with another loss than the calibration, or of another capture."""
-    if result.observed is None:
+    if result.method == "two-stage":
         if capture.observations or robust is not None:
             raise InputError(
                 "the calibration is of sockets and lengths without a robust loss; give its own capture and loss."
@@ -337,24 +337,20 @@ class _RepeatedTask(NamedTuple):
         sd = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
         return centre + sd * random.normal(size=(count, len(sd)))
 
-    def _many(
-        self, captures: Capture, means: Float[np.ndarray, "t p"] | None
-    ) -> ManyCalibrations | ManyIdentifications:
+    def _many(self, captures: Capture, means: Float[np.ndarray, "t p"] | None) -> ManyCalibrations:
         result = self.result
         stage1, bounds = result.stage1, result.bounds
         # What sets the scale, and the noise that weights the poses, are the calibration's own.
-        if result.observed is not None:
-            options = {"noise": result.weighting_noise, "hold": result.hold, "robust": self.robust}
-            if means is None:
-                return identify_many(result.arm, captures, bounds, start=result.parameters, **options)
-            assert result.prior is not None
-            arms = Parameters(result.arm, result.space.names).arm(means)
-            weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
-            prior = Prior({name: 1 / weight for name, weight in weights if weight > 0})
-            return identify_many(arms, captures, bounds, start=result.parameters, prior=prior, **options)
-        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.weighting_noise)
-        task = BatchTask.of(stage1.arm, captures, box, stage1.parameters, result.space, options, stage1.anchor)
-        return task.calibrate(result.method)
+        options: dict[str, Any] = {"noise": result.weighting_noise, "robust": self.robust, "method": result.method}
+        if result.method == "two-stage":
+            return calibrate_many(stage1.arm, captures, bounds, start=stage1.parameters, hold=result.hold, **options)
+        if means is None:
+            return calibrate_many(result.arm, captures, bounds, start=result.parameters, **options)
+        assert result.prior is not None
+        arms = Parameters(result.arm, result.space.names).arm(means)
+        weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
+        prior = Prior({name: 1 / weight for name, weight in weights if weight > 0})
+        return calibrate_many(arms, captures, bounds, start=result.parameters, prior=prior, **options)
 
     def solved(
         self,
