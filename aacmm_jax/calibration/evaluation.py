@@ -1,7 +1,7 @@
 """Repeatability of an arm's sockets, errors of its reference lengths and residuals of its observations on a capture."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -17,10 +17,10 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.socket import position_of
 from ..kinematics.arm import Arm, check_columns
-from ..model.measurement import Measurement, length_covariance
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
-from .observed_evaluation import ObservedEvaluation, checked_geometry, evaluate_observations
+from ..model.socket_sums import to_poses
+from .observed_evaluation import ObservedEvaluation, checked_geometry, described, fit_geometry
 
 
 class Evaluation(eqx.Module):
@@ -39,8 +39,10 @@ class Evaluation(eqx.Module):
     error: Float[AnyArray, "*batch l"]  # measured - calibrated value
     # u of error: the length's own u, and the scatter of the poses at its ends; NaN where unknown
     u: Float[AnyArray, "*batch l"]
-    distances: Float[AnyArray, "*batch N"]  # of every pose's tip from its socket's centroid
-    observed: ObservedEvaluation | None = None  # where the capture has observations besides sockets
+    distances: Float[AnyArray, "*batch N"]  # of every pose's tip from its socket's position
+    # Residuals of all observations; None of a capture of sockets alone, which `repeatability` describes, unless
+    # geometry or noise is given.
+    observed: ObservedEvaluation | None = None
 
 
 @checked_arguments
@@ -56,7 +58,7 @@ def evaluate(
             station and the place of a target by a calibration: ``result.observed.geometry``. Parts that this capture
             does not have are ignored.
         noise: standard deviations of readings and seat, which residuals are compared with; by default the scatter of
-            these residuals. Like ``geometry``, of captures with observations besides sockets.
+            these residuals.
 
     Returns:
         Metrics in mm; every array has the batch axes of the arm first.
@@ -75,54 +77,63 @@ def evaluate(
     check_columns(arm, capture.columns)
     if capture.q.ndim > 2:
         raise InputError("the capture is a batch; evaluate its captures one by one, or map over them with jax.vmap.")
-    subject: tuple[Any, ...]
-    work: Callable
-    if capture.observations:
-        check_finite(noise=noise)
-        observed = Observed.of(capture, arm)
-        kept = checked_geometry(observed, geometry)
-        subject, work = (observed, len(capture.names), *to_numpy((kept, noise))), _evaluate_observed
-    elif geometry is not None or noise is not None:
-        raise InputError(
-            "geometry and noise are for captures with observations besides sockets; leave them out, since a socket's "
-            "position is the mean of its poses."
-        )
-    else:
-        subject, work = (Measurement.of(capture, arm),), evaluate_measurement
+    check_finite(noise=noise)
+    observed, lengths = Observed.of(capture, arm, lengths=False), _Lengths.of(capture)
+    kept = checked_geometry(observed, geometry)
+    whole = bool(capture.observations) or bool(kept) or noise is not None
+    subject = observed, lengths, *to_numpy((kept, noise))
     shape = np.broadcast_shapes(*(leaf.shape[:-1] for leaf in jax.tree.leaves(arm)))
     if not shape:
-        return to_jax(work(*to_numpy((arm, *subject))))
+        return to_jax(_evaluated(*to_numpy((arm, *subject)), capture.sizes, whole))
+    work = partial(_evaluated, sizes=capture.sizes, whole=whole)
     for _ in shape:
         work = eqx.filter_vmap(work, in_axes=(0, *(None for _ in subject)))
     arm = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*shape, leaf.shape[-1])), arm)
     return work(arm, *subject)
 
 
-def _evaluate_observed(
-    arm: Arm, observed: Observed, sockets: int, kept: Mapping[str, AnyArray], noise: Noise | None
-) -> Evaluation:
-    """`evaluate` for a capture of which the first observations are its sockets."""
-    evaluation, measured, u = evaluate_observations(arm, observed, kept, noise)
-    xp = namespace(evaluation)
-    metrics, distances = no_repeatability(evaluation.sigma), xp.zeros(0)
-    if sockets:
-        values = evaluation.residuals[:sockets]
-        positions = [evaluation.geometry[position_of(name)] for name in evaluation.names[:sockets]]
-        tips = [residuals + position[:, None] for residuals, position in zip(values, positions, strict=True)]
-        metrics = repeatability(xp.concatenate(tips, axis=1).T, tuple(tip.shape[1] for tip in tips))
-        distances = xp.sqrt(xp.sum(xp.concatenate(values, axis=1) ** 2, axis=0))
-    return Evaluation(metrics, measured, measured - observed.nominal, u, distances, evaluation)
+class _Lengths(eqx.Module):
+    """The reference lengths of a capture, which are measured and not fitted."""
+
+    nominal: Float[AnyArray, " l"]  # mm
+    u: Float[AnyArray, " l"]
+    ends: tuple[tuple[str, str], ...] = eqx.field(static=True)  # names of the positions
+
+    @classmethod
+    def of(cls, capture: Capture) -> "_Lengths":
+        lengths = to_numpy(capture.lengths)
+        ends = tuple((position_of(length.start), position_of(length.end)) for length in lengths)
+        if not lengths:
+            return cls(np.zeros(0), np.zeros(0), ends)
+        xp = namespace(lengths)
+        return cls(xp.stack([length.value for length in lengths]), xp.stack([length.u for length in lengths]), ends)
 
 
 @compiled(jit=eqx.filter_jit)
-def evaluate_measurement(arm: Arm, measurement: Measurement) -> Evaluation:
-    """`evaluate` for a capture that is a `Measurement` already; nothing is checked."""
-    xp = namespace(arm, measurement)
-    tips = arm.position(measurement.q)
-    metrics = repeatability(tips, measurement.sizes)
-    measured = u = xp.zeros(0)
-    if measurement.ends:
-        measured = measurement.distances(tips)
-        u = xp.sqrt(xp.diagonal(length_covariance(metrics.centroids, measurement, metrics.sigma)))
-    distances = xp.linalg.norm(measurement.centred(tips), axis=-1)
-    return Evaluation(metrics, measured, measured - measurement.nominal, u, distances)
+def _evaluated(
+    arm: Arm,
+    observed: Observed,
+    lengths: _Lengths,
+    kept: Mapping[str, AnyArray],
+    noise: Noise | None,
+    sizes: tuple[int, ...],
+    whole: bool,
+) -> Evaluation:
+    """`evaluate` with the observations of a capture, of which the first are its sockets of so many poses; and with the
+    residuals of all of them, where these are wanted (``whole``)."""
+    found = fit_geometry(arm, observed, kept, noise)
+    xp, positions = namespace(found.linear.z), observed.positions
+    unknown = not found.redundant and noise is None
+    metrics, distances, measured, u = no_repeatability(found.sigma), xp.zeros(0), xp.zeros(0), xp.zeros(0)
+    if sizes:
+        tips = found.linear.point.forward.tip[:, : sum(sizes)]
+        metrics = repeatability(tips.T, sizes)
+        index = np.array([positions[position_of(one.name)] for one in observed.observations[: len(sizes)]])
+        distances = xp.sqrt(xp.sum((tips - to_poses(found.geometry[index.T], sizes)) ** 2, axis=0))
+    if lengths.ends:
+        start, end = (np.array([positions[pair[side]] for pair in lengths.ends]) for side in (0, 1))
+        between = found.geometry[end] - found.geometry[start]
+        measured = xp.sqrt(xp.sum(between**2, axis=1))
+        scatter = found.variances_between(lengths.ends, between / measured[:, None])
+        u = xp.sqrt((np.nan if unknown else scatter) + lengths.u**2)
+    return Evaluation(metrics, measured, measured - lengths.nominal, u, distances, described(found) if whole else None)

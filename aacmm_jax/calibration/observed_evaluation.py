@@ -1,4 +1,8 @@
-"""How far the observations of a capture are from their geometry by one arm: the geometry is fitted, the arm is not."""
+"""How far the observations of a capture are from their geometry by one arm: the geometry is fitted, the arm is not.
+
+Sockets are observations like any other. Where nothing but sockets was observed and every coordinate of a tip weighs the
+same, their positions are the means of their tips, and nothing is iterated.
+"""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,20 +13,22 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError, nearest
-from ..core.numpy_or_jax import AnyArray, compiled, namespace
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
-from ..model.elimination import Args, observed_model, observed_rows
+from ..model.elimination import Args, observed_model, observed_rows, with_linear_geometry
 from ..model.observed import Observed
 from ..model.rows import PointRows, Whitening, rows_at, whitening_of
-from ..uncertainty.linear_propagation import geometry_covariance
+from ..solver.arrow import split
+from ..uncertainty.linear_propagation import variances_of_functions
 from ..uncertainty.linearisation import Linearisation
 from ..uncertainty.tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma, scatter_of
 from .bounded_fit import fit
 
 _MAX_STEPS = 300
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
+_SMALLEST = 1e-300  # mm^2: the derivative of the root of 0 is infinite
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 
 
@@ -45,12 +51,27 @@ class GeometryFit(NamedTuple):
 
     linear: Linearisation  # of one parameter, which does not change; lengths do not take part
     free: np.ndarray  # which numbers of the geometry are fitted
-    sigma: Float[AnyArray, ""]
+    sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
+    redundant: bool  # whether there are more equations than numbers are fitted; otherwise nothing shows the scatter
 
     @property
     def geometry(self) -> Float[AnyArray, " g"]:
         """The numbers of the geometry."""
         return self.linear.z[1:]
+
+    def variances_between(
+        self, ends: tuple[tuple[str, str], ...], directions: Float[AnyArray, "l 3"]
+    ) -> Float[AnyArray, " l"]:
+        """Variances of the distances between positions, along unit vectors, by an arm without errors but the noise of
+        its readings."""
+        xp, observed = namespace(self.linear.z, directions), self.linear.observed
+        influence = self.linear.influence(np.concatenate([[True], ~self.free]))
+        positions, pull = observed.positions, xp.zeros((len(ends), len(self.free)))
+        for side, along in enumerate((-directions, directions)):
+            index = np.array([positions[pair[side]] for pair in ends])
+            pull = set_at(pull, (np.arange(len(ends))[:, None], index), along)
+        head, components = split(pull * observed.steps, observed.layout.shared, observed.layout.classes)
+        return variances_of_functions(influence, xp.concatenate([xp.zeros((len(ends), 1)), head], axis=1), components)
 
 
 def checked_geometry(observed: Observed, geometry: Mapping[str, Numbers] | None) -> dict[str, AnyArray]:
@@ -81,24 +102,25 @@ def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noi
     """
     space = Parameters(arm, ("d_1",))
     xp = namespace(arm, observed, kept, noise)
+    free = np.concatenate([np.full(len(units), name not in kept) for name, units in observed.blocks.items()])
+    spare = observed.equations - len(observed.ends) - int(free.sum())
+    layout = observed.layout
+    alike = noise is None and not kept and not layout.shared and layout.linear == len(layout.classes)
     vector = xp.asarray(space.vector())
-    start = observed.split(observed.start(space, vector)) | dict(kept)
-    z = xp.concatenate([vector, *(start[name] for name in observed.blocks)])
-    free = np.concatenate(
-        [[False], *(np.full(len(units), name not in kept) for name, units in observed.blocks.items())]
-    )
-    sides = xp.where(free, -np.inf, z), xp.where(free, np.inf, z)
-    steps = xp.asarray(np.concatenate([[1.0], observed.steps]))
-    spare = max(observed.equations - len(observed.ends) - int(free.sum()), 1)
+    if alike:
+        z = xp.concatenate([vector, xp.zeros(len(free))])
+    else:
+        start = observed.split(observed.start(space, vector)) | dict(kept)
+        z = xp.concatenate([vector, *(start[name] for name in observed.blocks)])
 
     def weighted(z: Any, first: bool) -> tuple[PointRows, list[ArmErrors], Any, Whitening]:
         point = rows_at(space, observed, z)
         errors = arm_errors(point, observed)
-        if first:
+        if first or alike:
             values = xp.concatenate([xp.reshape(part.values[:_POSITION_ROWS], (-1,)) for part in point.rows])
-            sigma = xp.sqrt(xp.mean(values**2)) + 1e-9
+            sigma = xp.sqrt(xp.sum(values**2) / (max(spare, 1) if alike else len(values)) + _SMALLEST)
         else:
-            sigma = scatter_of(point.rows, errors, spare)
+            sigma = scatter_of(point.rows, errors, max(spare, 1))
         of_arm = [
             covariance_of_sigma(error, sigma) if noise is None else covariance_of_noise(error, noise)
             for error in errors
@@ -106,31 +128,40 @@ def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noi
         whitening = whitening_of(point.rows, observed, of_arm, xp.maximum(_LEAST * sigma, 1e-12))
         return point, errors, sigma, whitening._replace(lengths=xp.zeros(len(observed.ends)))
 
-    whitening = weighted(z, first=True)[-1]
-    for _ in range(2):  # with the weights of the start, and with those of that geometry
-        args = Args(space, observed, whitening)
-        z = fit(observed_rows, observed_model, z, args, sides, steps, _MAX_STEPS).parameters
+    # With the weights of the start, and with those of that geometry.
+    equal = Whitening((None,) * len(layout.groups), np.zeros(0), {})
+    whitening = equal if alike else weighted(z, first=True)[-1]
+    for _ in range(1 if alike else 2):
+        z = _fitted(Args(space, observed, whitening), z, np.concatenate([[False], free]))
         point, errors, sigma, whitening = weighted(z, first=False)
-    return GeometryFit(Linearisation.of(observed, space, z, point, errors, whitening, None), free[1:], sigma)
+    return GeometryFit(Linearisation.of(observed, space, z, point, errors, whitening, None), free, sigma, spare > 0)
 
 
-@compiled(jit=eqx.filter_jit)
-def evaluate_observations(
-    arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noise: Noise | None
-) -> tuple[ObservedEvaluation, Float[AnyArray, " l"], Float[AnyArray, " l"]]:
-    """Residuals of all observations by an arm, the reference lengths as it measures them, and u of their errors."""
-    found = fit_geometry(arm, observed, kept, noise)
-    linear = found.linear
+def _fitted(args: Args, z: Float[AnyArray, " z"], free: np.ndarray) -> Float[AnyArray, " z"]:
+    """One least squares of the free numbers; positions in which the rows are linear are no unknowns of it."""
+    xp, observed = namespace(z, args), args.observed
+    layout = observed.layout
+    count = len(free) - sum(number * size for number, size in layout.classes[len(layout.classes) - layout.linear :])
+    if not free[count:].all():  # a position that is kept
+        count = len(free)
+    if count < len(free):
+        args = args._replace(linear=stop_gradient(z[count:]))
+    z, free = z[:count], free[:count]
+    if free.any():
+        sides = xp.where(free, -np.inf, z), xp.where(free, np.inf, z)
+        steps = xp.asarray(np.concatenate([[1.0], observed.steps])[:count])
+        z = fit(observed_rows, observed_model, z, args, sides, steps, _MAX_STEPS).parameters
+    return z if args.linear is None else with_linear_geometry(z, args)
+
+
+def described(found: GeometryFit) -> ObservedEvaluation:
+    """Residuals of all observations by an arm whose geometry is fitted."""
+    linear, observed = found.linear, found.linear.observed
     xp = namespace(linear.z)
     parts = observed.split(found.geometry)
     residuals = observed.by_observation([part.values for part in linear.point.rows])
     normalised = linear.white()
-    measured = u = xp.zeros(0)
-    if observed.ends:
-        between = xp.stack([parts[end] - parts[start] for start, end in observed.ends])
-        measured = xp.sqrt(xp.sum(between**2, axis=1))
-        u = xp.sqrt(_of_lengths(found, between / measured[:, None]) + observed.u**2)
-    evaluation = ObservedEvaluation(
+    return ObservedEvaluation(
         names=tuple(observation.name for observation in observed.observations),
         kinds=tuple(observation.kind for observation in observed.observations),
         residuals=tuple(residuals),
@@ -141,21 +172,6 @@ def evaluate_observations(
         sigma=found.sigma,
         geometry={name: parts[name] for name in observed.names},
     )
-    return evaluation, measured, u
-
-
-def _of_lengths(found: GeometryFit, directions: Float[AnyArray, "l 3"]) -> Float[AnyArray, " l"]:
-    """Variances of the distances between positions that the geometry has, by an arm without errors but the noise of
-    its readings."""
-    xp, observed, variances = namespace(directions), found.linear.observed, []
-    influence = found.linear.influence(np.concatenate([[True], ~found.free]))
-    covariance, positions = influence.covariance(), observed.positions
-    for (start, end), along in zip(observed.ends, directions, strict=True):
-        index = np.concatenate([positions[start], positions[end]])
-        both = geometry_covariance(observed.layout, covariance, 1, index) * np.outer(*(observed.steps[index],) * 2)
-        pull = xp.concatenate([-along, along])
-        variances.append(pull @ both @ pull)
-    return xp.stack(variances)
 
 
 def _rms(xp: Any, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, ""]:

@@ -37,7 +37,9 @@ class Args(NamedTuple):
     # Where it is given, the components whose rows are linear in them (`Layout.linear`) are no unknowns of the solve:
     # for each head they are where they fit best. These are numbers, at the end of all, that residuals are counted from.
     linear: Float[AnyArray, " l"] | None = None
-    batch: bool = False  # whether it is evaluated in the way that is fastest in a batch, and not differentiated
+    # True where it is evaluated in the way that is fastest in a batch, and not differentiated. None otherwise: a traced
+    # program would trace False as well.
+    batch: bool | None = None
 
     @property
     def eliminated(self) -> int:
@@ -142,7 +144,7 @@ def cost_and_weights(
 
 def arrow_of(
     blocks: list[RowBlock], classes: tuple[tuple[int, int], ...], height: int, prior: PriorRows | None
-) -> tuple[Arrow, list[tuple[AnyArray, AnyArray]]]:
+) -> tuple[Arrow, list[AnyArray]]:
     """The information of rows with their weights; and of each class of components, its part of the gradient.
 
     ``height`` is the number of unknowns of the head.
@@ -215,7 +217,7 @@ def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
     """The rows at a point; those of components without unknowns are where these fit best."""
     space, observed, whitening, _, linear, batch = args
     whole = z if linear is None else namespace(z, linear).concatenate([z, linear])
-    blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole, batch), whitening)
+    blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole, batch is not None), whitening)
     first = len(observed.layout.classes) - args.eliminated
     return [_fitted(block) if block.of is not None and block.of >= first else block for block in blocks]
 
@@ -322,5 +324,5 @@ def pseudo_inverse(matrices: Float[AnyArray, "K k k"]) -> Float[AnyArray, "K k k
     known = values > _NULL * values[:, :1]
     seen = xp.where(known[:, None, :], vectors, 0.0)
     transposed = xp.swapaxes(seen, -1, -2)
-    inner = transposed @ matrices @ seen + xp.where(known, 0.0, 1.0)[..., None] * np.eye(size)
+    inner = transposed @ matrices @ seen + xp.where(known, 0.0, 1.0)[..., None] * np.eye(size)[None]
     return seen @ inverse_positive_definite(inner) @ transposed

@@ -5,6 +5,7 @@ The unknowns z are the p free parameters of the arm, then the numbers of the unk
 reference length is a relation between the positions of two sockets, a certified value one of a geometry with itself.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -38,8 +39,9 @@ class Observed(eqx.Module):
     layout: Layout = eqx.field(static=True)
 
     @classmethod
-    def of(cls, capture: Capture, arm: Arm | None) -> "Observed":
-        """What a capture observed, by an arm with such joints; None where only what is unknown matters.
+    def of(cls, capture: Capture, arm: Arm | None, *, lengths: bool = True) -> "Observed":
+        """What a capture observed, by an arm with such joints; None where only what is unknown matters. Without its
+        reference ``lengths`` sockets are independent of each other.
 
         Raises `InputError` for a batch of captures.
         """
@@ -51,16 +53,16 @@ class Observed(eqx.Module):
         sockets = tuple(Socket(name, readings) for name, readings in capture.sockets.items())
         observations = to_numpy((*sockets, *capture.observations))
         q = xp.concatenate([observation.q for observation in observations])
-        lengths = capture.lengths
-        ends = tuple((position_of(length.start), position_of(length.end)) for length in lengths)
+        known = capture.lengths if lengths else ()
+        ends = tuple((position_of(length.start), position_of(length.end)) for length in known)
         layout = layout_of(observations, ends)
         return cls(
             observations=observations,
             stacks=_stacks(observations, layout),
             q=q,
             motion=None if arm is None else joint_motion(to_numpy(arm.geometry), q),
-            nominal=xp.stack([length.value for length in lengths]) if lengths else np.zeros(0),
-            u=xp.stack([length.u for length in lengths]) if lengths else np.zeros(0),
+            nominal=xp.stack([length.value for length in known]) if known else np.zeros(0),
+            u=xp.stack([length.u for length in known]) if known else np.zeros(0),
             ends=ends,
             layout=layout,
         )
@@ -70,12 +72,14 @@ class Observed(eqx.Module):
     ) -> "Observed":
         """The same at other readings, and with observations that have changed along."""
         changed = self if observations is None else self._with_observations(observations)
-        return eqx.tree_at(lambda o: (o.q, o.motion), changed, (q, joint_motion(arm.geometry, q)))
+        return dataclasses.replace(changed, q=q, motion=joint_motion(arm.geometry, q))
 
     def measured_without_errors(
         self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]
     ) -> "Observed":
         """The same, had every instrument measured exactly the tips of this arm in this geometry."""
+        if not any(isinstance(one, AbstractMeasured) for one in self.observations):
+            return self
         forward, parts = self.forward(space, vector, geometry), self.split(geometry)
         return self._with_observations(
             tuple(
@@ -85,8 +89,7 @@ class Observed(eqx.Module):
         )
 
     def _with_observations(self, observations: tuple[AbstractObservation, ...]) -> "Observed":
-        new = observations, _stacks(observations, self.layout)
-        return eqx.tree_at(lambda o: (o.observations, o.stacks), self, new)
+        return dataclasses.replace(self, observations=observations, stacks=_stacks(observations, self.layout))
 
     @property
     def blocks(self) -> dict[str, tuple[str, ...]]:
@@ -111,7 +114,7 @@ class Observed(eqx.Module):
     @property
     def slices(self) -> list[slice]:
         """The poses of each observation."""
-        ends = np.cumsum([observation.q.shape[0] for observation in self.observations])
+        ends = np.cumsum([observation.q.shape[0] for observation in self.observations]).tolist()
         return [
             slice(end - observation.q.shape[0], end) for observation, end in zip(self.observations, ends, strict=True)
         ]
@@ -164,7 +167,8 @@ class Observed(eqx.Module):
         tips = [tips_of(forward, rows) for rows in self.slices]
         found: dict[str, Any] = {}
         for observation, own in zip(self.observations, tips, strict=True):
-            new = observation.start(own, arm.probe)
+            # Through the class: a bound method of Equinox is a module made anew.
+            new = type(observation).start(observation, own, arm.probe)
             if observation.target:
                 new = {offset_of(observation.target): arm.probe} | new
             found = new | found  # what another observation has found stays

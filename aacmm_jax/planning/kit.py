@@ -1,6 +1,6 @@
 """Plans with artefacts and instruments: where to put what is at hand, and which poses to take with it.
 
-The information of a pose is that of the model's own rows (`model.observed`), so every kind of observation that can be
+The information of a pose is that of the model's own rows (`uncertainty.linearisation`), so every kind of observation that can be
 simulated can be planned, and nothing here depends on a kind.
 """
 
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from ..calibration.observed_evaluation import fit_geometry
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.arm_classes import small_arm_noise
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -24,9 +24,9 @@ from ..kinematics.collisions import Cell
 from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import reached, search_region
-from ..model.observed import Observed, certified_and_lengths, linear_rows, whitening_of
+from ..model.observed import Observed
 from ..uncertainty.identifiability import observability
-from ..uncertainty.tip_errors import arm_errors, covariance_of_noise
+from ..uncertainty.linearisation import Linearisation
 from ..uncertainty.volume import default_length
 from .design import Criterion, Progress, check_plannable, design_problem
 from .fedorov_exchange import Candidates, covariance_of, exchange
@@ -266,26 +266,25 @@ def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObs
     """The information that each pose of the observations would add, and that of certified values alone."""
     observed, space = Observed.of(Capture({}, (), observations), problem.arm), problem.space
     vector, p = np.asarray(space.vector()), len(space.names)
-    z = np.concatenate([vector, np.asarray(observed.start(space, vector))])
-    linear = linear_rows(space, observed, z)
-    if max(np.abs(part.rows.values).max() for part in linear) > _START_AGREES:
-        z[p:] = np.asarray(fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
-        linear = linear_rows(space, observed, z)
-    errors = arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed)
-    of_arm = [covariance_of_noise(error, problem.noise) for error in errors]
-    whitening = whitening_of(linear, observed, of_arm, np.asarray(_LEAST_U))
-    steps = np.concatenate([np.asarray(space.scale), observed.steps])
-    parts = stacked(linear, observed, whitening, len(z))
-    rows = np.zeros((len(observed.q), max(3, *(part.shape[1] for part in parts)), len(z)))
+
+    def linear_at(geometry: Float[AnyArray, " g"]) -> Linearisation:
+        z = np.concatenate([vector, np.asarray(geometry)])
+        return Linearisation.at(observed, space, z, noise=problem.noise, least=_LEAST_U)
+
+    linear = linear_at(observed.start(space, vector))
+    if max(np.abs(rows.values).max() for rows in linear.point.rows) > _START_AGREES:
+        linear = linear_at(fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
+    parts = linear.dense()
+    rows = np.zeros((len(observed.q), max(3, *(part.shape[1] for part in parts)), len(linear.z)))
     owner = np.empty(len(observed.q), dtype=int)
     places = 0
     for observation, part, poses in zip(observed.observations, parts, observed.slices, strict=True):
-        rows[poses, : part.shape[1]] = np.moveaxis(np.asarray(part) * steps[:, None, None], (0, 1, 2), (2, 1, 0))
+        rows[poses, : part.shape[1]] = np.moveaxis(np.asarray(part) * linear.steps[:, None, None], 0, 2).swapaxes(0, 1)
         owner[poses] = places + observation.places
         places = owner[poses].max() + 1
-    relations, u = certified_and_lengths(observed, z, p)
-    scaled = relations * steps / np.maximum(u, _LEAST_U)[:, None]
-    return Candidates(rows, owner, PRIOR * np.eye(len(z)) + scaled.T @ scaled, p)
+    relations, _, u = linear.relations()
+    scaled = relations * linear.steps / np.maximum(u, _LEAST_U)[:, None]
+    return Candidates(rows, owner, PRIOR * np.eye(len(linear.z)) + scaled.T @ scaled, p)
 
 
 def _chosen(

@@ -104,7 +104,7 @@ def split(
     return vector[..., :head], parts
 
 
-def joined(head: Float[AnyArray, "*batch h"], *parts: Float[AnyArray, "*batch K k"]) -> Float[AnyArray, "*batch z"]:
+def joined(head: Float[AnyArray, "*batch h"], *parts: Float[AnyArray, "*batch _ _"]) -> Float[AnyArray, "*batch z"]:
     """The vector with this head and these blocks."""
     if not parts:
         return head
@@ -123,4 +123,5 @@ def _damped(
     xp, inside = namespace(matrix, fixed), ~fixed
     matrix = xp.where(inside[..., :, None] & inside[..., None, :], matrix, 0.0)
     added = xp.where(fixed, 1.0, damping[..., None])
-    return matrix + added[..., :, None] * np.eye(matrix.shape[-1])
+    unit = np.eye(matrix.shape[-1])
+    return matrix + added[..., :, None] * unit.reshape((1,) * (added.ndim - 1) + unit.shape)

@@ -3,26 +3,20 @@
 from collections.abc import Iterable
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..core.arguments import check_finite, checked_arguments, items_of
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm, correction_names, joint_limits, neighbouring_arm, with_arrays
+from ..kinematics.arm import Arm, check_columns, correction_names, joint_limits, neighbouring_arm, with_arrays
 from ..kinematics.chain import joint_motion
-from ..kinematics.independence import equations, generic_poses, nearly_parallel, tip_movements
-from ..kinematics.inverse_kinematics import project_to_centroids, project_to_targets
+from ..kinematics.independence import generic_poses, nearly_parallel, tip_movements
+from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.near_degeneracy import TradeOff, trade_offs
 from ..kinematics.parameters import Bounds, Parameters
-from ..model.measurement import Measurement, check_joints
-from ..model.observed import Observed
-from ..model.residuals import JointWeights
 from .correction_limits import by_more_sockets, why_undetermined
-
-linearised = None
 from .null_space import complement, named_directions, structural
 from .observed_identifiability import Agreeing
 
@@ -160,7 +154,7 @@ def observability(
         space = Parameters.free_of(arm) if bounds is None else bounds.space
     check_one_capture(capture)
     check_finite(arm=arm, capture=capture, noise=noise)
-    check_joints(capture, space)
+    check_columns(space.base, capture.columns)
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
     if noise is not None:
         noise.check(arm.joints)
@@ -182,9 +176,8 @@ def observability(
     open_directions, of_prior = _without_known(complement(spectrum.vectors[:rank], p), space, known)
     null, undetermined = named_directions(open_directions, base, space)
     always = tuple(bool(x) for x in structural(null, base, space))
-    if spectrum.agreeing is not None:
-        undetermined = spectrum.agreeing.named(undetermined, null)
-    weak = _trade_offs(spectrum, capture, space, sigma, bounds)
+    undetermined = spectrum.agreeing.named(undetermined, null)
+    weak = _trade_offs(spectrum, space, sigma, bounds)
     q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
     sockets = 0 if capture.observations else len(capture.names)
     unknown = [(_chief(one, space, 0.5), _chief(one, space, _FOLLOWS)) for one in np.abs(null.T)]
@@ -227,48 +220,36 @@ def _without_known(
 
 
 class _Spectrum(NamedTuple):
-    poses: Float[np.ndarray, "N r p"]  # `equations` in natural steps, or those of all observations
-    lengths: Float[np.ndarray, "l p"]
+    rows: Float[np.ndarray, "w p"]  # of everything, natural steps; whitened where the noise is known
+    movements: Float[np.ndarray, "m p"]  # rows whose sum of squares is the mean square movement of the tips, mm
     singular: Float[np.ndarray, " p"]
     vectors: Float[np.ndarray, "r p"]
     rank: int
     condition: float
-    agreeing: Agreeing | None = None  # where the capture has observations besides sockets
+    agreeing: Agreeing
 
 
 def _spectrum(arm: Arm, targets_of: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> _Spectrum:
-    if capture.observations:
-        observed = Observed.of(capture, arm)
-        agreeing = Agreeing.of(observed, Parameters(arm, space.names))
-        plain = agreeing.eliminated()
-        rows = plain if noise is None else agreeing.eliminated(noise)
-        # Each pose has as many rows on average: only their number of poses counts.
-        poses = plain.poses * np.sqrt(len(plain.poses) / len(observed.q))
-        found = _decomposed(np.concatenate([rows.poses, rows.relations]), poses[:, None], plain.relations)
-        return found._replace(agreeing=agreeing)
-    q = project_to_centroids(arm, capture, targets_of)
-    poses, lengths = (part * np.asarray(space.scale) for part in equations(arm, capture, space.names, q))
-    rows = np.concatenate([poses.reshape(-1, len(space.names)), lengths])
-    if noise is not None:
-        moved = Capture({name: q[capture.owner == i] for i, name in enumerate(capture.names)}, capture.lengths)
-        rows = np.asarray(
-            whitened_equations(
-                arm, Parameters(arm, space.names), Measurement.of(moved, arm).weighted(arm.geometry, noise)
-            )
-        )
-    return _decomposed(rows, poses, lengths)
+    agreeing = Agreeing.of(capture, Parameters(arm, space.names), targets_of)
+    plain = agreeing.eliminated()
+    rows = plain if noise is None else agreeing.eliminated(noise)
+    # Each pose has as many rows on average: only their number of poses counts.
+    poses = plain.poses * np.sqrt(len(plain.poses) / len(agreeing.observed.q))
+    return _decomposed(
+        np.concatenate([rows.poses, rows.relations]), tip_movements(poses[:, None], plain.relations), agreeing
+    )
 
 
-def _decomposed(
-    rows: Float[np.ndarray, "w p"], poses: Float[np.ndarray, "N r p"], lengths: Float[np.ndarray, "l p"]
-) -> _Spectrum:
+def _decomposed(rows: Float[np.ndarray, "w p"], movements: Float[np.ndarray, "m p"], agreeing: Agreeing) -> _Spectrum:
     p = rows.shape[1]
     _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
     singular = np.concatenate([singular, np.zeros(p - len(singular))])
     rank = _rank(singular)
     norms = np.linalg.norm(rows, axis=0)
-    equal = np.linalg.svd(rows / np.where(norms > 0, norms, 1), compute_uv=False)[:rank]
-    return _Spectrum(poses, lengths, singular, vectors, rank, float(equal[0] / equal[-1]) if rank else np.inf)
+    scale = np.where(norms > _RANK * norms.max(), norms, 1.0)  # others are rounding
+    equal = np.linalg.svd(rows / scale, compute_uv=False)[:rank]
+    condition = float(equal[0] / equal[-1]) if rank else np.inf
+    return _Spectrum(rows, movements, singular, vectors, rank, condition, agreeing)
 
 
 def _rank(singular: Float[np.ndarray, " p"]) -> int:
@@ -276,48 +257,23 @@ def _rank(singular: Float[np.ndarray, " p"]) -> int:
 
 
 def _trade_offs(
-    spectrum: _Spectrum, capture: Capture, space: Parameters, sigma: float | None, bounds: Bounds | None
+    spectrum: _Spectrum, space: Parameters, sigma: float | None, bounds: Bounds | None
 ) -> tuple[TradeOff, ...]:
-    movements = tip_movements(spectrum.poses, spectrum.lengths)
     if sigma is None or not sigma > 0:
-        return trade_offs(movements, space.names)
-    if spectrum.agreeing is not None:
-        rows = spectrum.agreeing.eliminated(sigma=sigma)
-        whitened = np.concatenate([rows.poses, rows.relations])
-    else:
-        whitened = _whitened_by_sigma(spectrum, capture, sigma)
+        return trade_offs(spectrum.movements, space.names)
+    rows = spectrum.agreeing.eliminated(sigma=sigma)
+    whitened = np.concatenate([rows.poses, rows.relations])
     default = np.where(space.lengths, 10.0, 17.5)
     half = default
     if bounds is not None:
         half = np.asarray(bounds.upper - bounds.lower) / 2 / np.asarray(space.scale)
         half = np.where(np.isfinite(half), half, default)
-    return trade_offs(movements, space.names, whitened=whitened, half_widths=half)
-
-
-def _whitened_by_sigma(spectrum: _Spectrum, capture: Capture, sigma: float) -> Float[np.ndarray, "w p"]:
-    # A measured length follows the means of the poses at its ends.
-    sizes = np.asarray(capture.sizes, dtype=float)
-    u = np.array([float(length.u) for length in capture.lengths])
-    u_lengths = np.sqrt(u**2 + sigma**2 * np.sum(1 / sizes[capture.ends()], axis=1)) if len(u) else u
-    poses = spectrum.poses.reshape(-1, spectrum.poses.shape[-1])
-    return np.concatenate([poses / sigma, spectrum.lengths / u_lengths[:, None]])
+    return trade_offs(spectrum.movements, space.names, whitened=whitened, half_widths=half)
 
 
 def _lacks_beta(space: Parameters, i: int) -> bool:
     """Whether the angle between the nearly parallel axes i and i + 1 is identified without Hayati's beta."""
     return f"beta_{i}" not in space.names and f"alpha_{i}" in space.names
-
-
-@compiled(jit=eqx.filter_jit)
-def whitened_equations(arm: Arm, space: Parameters, measurement: Measurement) -> Float[AnyArray, "rows p"]:
-    """Derivatives of everything measured by the free parameters, in natural steps and standard deviations.
-
-    The measurement has weights.
-    """
-    xp = namespace(arm, space, measurement)
-    linear = linearised(arm, space, measurement, xp.zeros(len(space.names), dtype=bool))
-    lengths = JointWeights.of(arm.position(measurement.q), measurement, xp.zeros(())).whitening @ linear.lengths
-    return xp.concatenate([linear.counted.reshape(linear.counted.shape[0], -1).T, lengths])
 
 
 def _chief(direction: Float[np.ndarray, " p"], space: Parameters, share: float) -> tuple[str, ...]:
@@ -337,7 +293,7 @@ def _by_more_sockets(arm: Arm, capture: Capture, space: Parameters, names: tuple
     spectrum = _spectrum(arm, arm, more, space, None)
     lost = complement(spectrum.vectors[: spectrum.rank], len(space.names))
     left = {space.names[i] for i in np.flatnonzero(np.any(np.abs(lost) > _FOLLOWS, axis=1))}
-    left |= {one.names[0] for one in _trade_offs(spectrum, more, space, None, None)}
+    left |= {one.names[0] for one in _trade_offs(spectrum, space, None, None)}
     found = [name for name in names if name not in left]
     return (by_more_sockets(found),) if found else ()
 

@@ -130,6 +130,19 @@ def rows_of_functions(
     return found
 
 
+def variances_of_functions(
+    influence: Influence, head: Float[AnyArray, "q h"], components: list[Float[AnyArray, "q K k"]]
+) -> Float[AnyArray, " q"]:
+    """Of linear functions of the unknowns, where every row has the variance 1 that its weight says; ``head`` and
+    ``components`` are their derivatives, natural steps."""
+    xp = namespace(influence.inverse, head)
+    alone = xp.zeros(head.shape[0])
+    for part, own, follow in zip(components, influence.own, influence.follow, strict=True):
+        head = head - xp.einsum("qKk,Kkh->qh", part, follow)
+        alone = alone + xp.einsum("qKk,Kkl,qKl->q", part, own, part)
+    return alone + xp.einsum("qh,hg,qg->q", head, influence.inverse, head)
+
+
 def covariance_of_rows(
     rows: list[Float[AnyArray, "q r m"]], covariances: list[Float[AnyArray, "r r m"]]
 ) -> Float[AnyArray, "q q"]:

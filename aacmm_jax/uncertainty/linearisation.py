@@ -111,14 +111,22 @@ class Linearisation(NamedTuple):
 
     def with_fitted_geometry(self) -> Float[AnyArray, " z"]:
         """The unknowns with the private geometry as its rows have it by this head; exact where they are linear."""
-        xp, influence = namespace(self.z), self.influence()
-        steps = [xp.zeros(own.shape[:2]) for own in influence.own]
+        return self.fitted(np.arange(self.z.shape[0]) < self.height)
+
+    def fitted(self, fixed: Bool[AnyArray, " z"]) -> Float[AnyArray, " z"]:
+        """The unknowns one step of Gauss and Newton further, but for the fixed ones; of steps that change no row, the
+        shortest. A prior takes no part."""
+        xp, influence = namespace(self.z, fixed), self.influence(fixed)
+        slope, slopes = xp.zeros(self.height), [xp.zeros(own.shape[:2]) for own in influence.own]
         for number, block in enumerate(self.blocks):
+            slope = slope + influence.weighted_rows(number).reshape(self.height, -1) @ block.white.reshape(-1)
             own = influence.own_rows(number)
             if own is not None:
                 sums = sums_by_component(influence.weighted(number, own), block.white[None], block.sizes)
-                steps[block.of] = steps[block.of] - (influence.own[block.of] @ sums)[..., 0]
-        return self.z + self.steps * joined(xp.zeros(self.height), *steps)
+                slopes[block.of] = slopes[block.of] + sums[..., 0]
+        head, each = -influence.inverse @ slope, zip(influence.own, influence.follow, slopes, strict=True)
+        parts = [-(own @ part[..., None])[..., 0] - follow @ head for own, follow, part in each]
+        return self.z + self.steps * joined(head, *parts)
 
     def parts(self) -> list[ObservationRows]:
         """The rows, observation by observation."""

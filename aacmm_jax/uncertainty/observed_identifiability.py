@@ -1,29 +1,37 @@
-"""What observations of all kinds determine: their derivatives by the parameters, with the unknown geometry eliminated.
+"""What observations determine: their derivatives by the parameters, with the unknown geometry eliminated.
 
 A rank must not follow from errors of an arm that is not yet calibrated, so what an instrument measured is first
-replaced by what it would measure of this arm, in the geometry that fits best; the configurations of other observations
-are moved, a few milliradians at most, to where the tips agree with that geometry. (An arm of few joints cannot be moved
-to agree with a measured transform.)
+replaced by what it would measure of this arm, in the geometry that fits best; the configurations of other observations,
+such as sockets, are moved, a few milliradians at most, to where the tips agree with that geometry. (An arm of few
+joints cannot be moved to agree with a measured transform.)
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray
+from ..core.linear_algebra import inverse_cholesky
+from ..data.capture import Capture
 from ..data.noise import Noise
+from ..data.observations.socket import position_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
-from ..model.observed import Observed, certified_and_lengths, linear_rows, whitened, whitening_of
+from ..model.elimination import followed, pseudo_inverse, sums_by_component
+from ..model.observed import Observed
+from ..model.rows import PointRows, Whitening, rows_at, whitening_of
+from ..solver.arrow import joined, split
+from .linear_propagation import Influence
+from .linearisation import Linearisation
 from .tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
 
 _ROUNDS = 15
+_FITTED = 1e-8  # mm or rad, a step of the geometry
 _LONGEST_STEP = 0.1  # rad, of a configuration
 _AGREES = 1e-9  # mm or rad
-_NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero
+_LEAST_U = 1e-6  # mm: an exact certified value would be a row of infinite weight
+_NULL = 1e-10  # singular values of the shared geometry below this, of the largest, are zero
 _MOVED = 1e-4  # of the largest change: parts of the geometry that change less do not follow
 _NAMED = 2
 
@@ -32,42 +40,52 @@ class Eliminated(NamedTuple):
     """Derivatives by the parameters in natural steps, after the geometry has followed as well as it can."""
 
     poses: Float[np.ndarray, "r p"]  # of the rows of all poses
-    relations: Float[np.ndarray, "l p"]  # of reference lengths and certified values
+    relations: Float[np.ndarray, "l p"]  # of certified values and reference lengths
     geometry: Float[np.ndarray, "g p"]  # how the geometry follows, natural steps
 
 
 class Agreeing(NamedTuple):
     """Observations whose configurations agree exactly with one arm and one geometry."""
 
-    observed: Observed
+    observed: Observed  # without reference lengths
     space: Parameters
-    linear: list
+    z: Float[np.ndarray, " z"]
+    point: PointRows
     errors: list[ArmErrors]
-    relations: Float[np.ndarray, "l z"]  # derivatives of lengths and certified values
-    u: Float[np.ndarray, " l"]  # their standard uncertainties, mm
+    ends: tuple[tuple[str, str], ...]  # positions at the ends of the lengths
+    u: Float[np.ndarray, " l"]  # standard uncertainties of the lengths, mm
 
     @classmethod
-    def of(cls, observed: Observed, space: Parameters) -> "Agreeing":
-        """Fit the geometry, and make measured values and configurations agree with it."""
-        p = len(space.names)
-        z = np.concatenate([np.asarray(space.vector()), np.zeros(len(observed.steps))])
-        z[p:] = np.asarray(observed.start(space, z[:p]))
+    def of(cls, capture: Capture, space: Parameters, targets_of: Arm | None = None) -> "Agreeing":
+        """Fit the geometry, and make measured values and configurations agree with it.
+
+        The geometry is that of ``targets_of``, by default of the arm itself.
+        """
+        arm, p = space.base, len(space.names)
+        observed = Observed.of(capture, arm, lengths=False)
+        fixed = np.arange(p + len(observed.steps)) < p
+        source = space if targets_of is None else Parameters(targets_of, space.names)
+        z = np.asarray(source.vector())
+        z = np.concatenate([z, np.asarray(observed.start(source, z))])
         for _ in range(_ROUNDS):
-            linear, errors = _linear(observed, space, z)
-            unit = _whitening(observed, linear, [covariance_of_sigma(error, np.asarray(1.0)) for error in errors])
-            dense, values = dense_rows(linear, unit.roots, len(z))
-            step = np.linalg.lstsq(dense[:, p:] * observed.steps, -values, rcond=_NULL)[0] * observed.steps
-            z[p:] += step
-            if np.max(np.abs(step), initial=0.0) < 1e-8:
+            point, errors = _at(source, observed, z)
+            whitening = _whitening(observed, point, [covariance_of_sigma(error, np.ones(())) for error in errors])
+            # What is certified does not count: the fit in mm.
+            alone = whitening._replace(certified={name: 0 * weight for name, weight in whitening.certified.items()})
+            new = Linearisation.of(observed, source, z, point, errors, alone, None).fitted(fixed)
+            step, z = np.max(np.abs(new - z), initial=0.0), new
+            if step < _FITTED:
                 break
+        z = np.concatenate([np.asarray(space.vector()), z[p:]])
         observed = observed.measured_without_errors(space, z[:p], z[p:])
         for _ in range(_ROUNDS):
-            linear, errors = _linear(observed, space, z)
-            if max(np.abs(part.rows.values).max() for part in linear) < _AGREES:
+            point, errors = _at(space, observed, z)
+            if max(np.abs(rows.values).max() for rows in point.rows) < _AGREES:
                 break
-            observed = _moved(observed, space.base, linear, errors)
-        relations, u = certified_and_lengths(observed, z, p)
-        return cls(observed, space, linear, errors, relations, u)
+            observed = _moved(observed, arm, point, errors)
+        ends = tuple((position_of(length.start), position_of(length.end)) for length in capture.lengths)
+        u = np.array([float(length.u) for length in capture.lengths])
+        return cls(observed, space, z, point, errors, ends, u)
 
     def eliminated(self, noise: Noise | None = None, sigma: float | None = None) -> Eliminated:
         """In standard deviations by the noise, or by that of a tip coordinate; else in mm."""
@@ -76,29 +94,68 @@ class Agreeing(NamedTuple):
             of_arm = [covariance_of_noise(error, noise) for error in self.errors]
         else:
             of_arm = [covariance_of_sigma(error, np.asarray(1.0 if sigma is None else sigma)) for error in self.errors]
-        whitening = _whitening(self.observed, self.linear, of_arm, measured)
-        p, steps = len(self.space.names), self.observed.steps
+        whitening = _whitening(self.observed, self.point, of_arm, measured)
         # Poses that this arm cannot take, next to a singularity, would look like information.
-        agree = [np.abs(part.rows.values).max(axis=0) < _AGREES for part in self.linear]
+        agree = [np.abs(rows.values).max(axis=0) < _AGREES for rows in self.point.rows]
         roots = tuple(root * kept[:, None, None] for root, kept in zip(whitening.roots, agree, strict=True))
-        poses, _ = dense_rows(self.linear, roots, p + len(steps))
-        u = np.maximum(self.u, 1e-6) if measured else np.ones_like(self.u)
-        rows = np.concatenate([poses, self.relations / u[:, None]])
-        parameters, geometry = rows[:, :p] * np.asarray(self.space.scale), rows[:, p:] * steps
-        basis, singular, vectors = np.linalg.svd(geometry, full_matrices=False)
-        known = singular > _NULL * max(singular[0], 1e-300)
-        basis, along = basis[:, known], basis[:, known].T @ parameters
-        rest = parameters - basis @ along
-        follow = -vectors[known].T @ (along / singular[known, None])
-        return Eliminated(rest[: len(poses)], rest[len(poses) :], follow)
+        linear = Linearisation.of(
+            self.observed, self.space, self.z, self.point, self.errors, whitening._replace(roots=roots), None
+        )
+        influence, p = linear.influence(), len(self.space.names)
+        rows = [part.reshape(linear.height, -1).T for part in _without_components(influence)]
+        count = sum(len(part) for part in rows[: len(roots)])
+        rows = np.concatenate(rows)
+        # What remains is to eliminate the shared geometry.
+        basis, singular, vectors = np.linalg.svd(rows[:, p:], full_matrices=False)
+        known = singular > _NULL * max(singular.max(initial=0.0), 1e-300)
+        basis, inverse = basis[:, known], vectors[known].T / singular[known]
+        along = basis.T @ rows[:, :p]
+        rest, shared = rows[:, :p] - basis @ along, -inverse @ along
+        whole = np.concatenate([np.eye(p), shared])
+        geometry = joined(shared.T, *(-np.moveaxis(one @ whole, -1, 0) for one in influence.follow)).T
+        lengths = self._lengths(influence, inverse, geometry, measured)
+        return Eliminated(rest[:count], np.concatenate([rest[count:], lengths]), geometry)
+
+    def _lengths(
+        self,
+        influence: Influence,
+        inverse: Float[np.ndarray, "s k"],
+        geometry: Float[np.ndarray, "g p"],
+        measured: bool,
+    ) -> Float[np.ndarray, "l p"]:
+        """How the lengths between the positions follow; where it is ``measured``, in standard deviations of what they
+        are by their own uncertainty and by the poses at their ends."""
+        observed, p = self.observed, len(self.space.names)
+        positions, pull = observed.positions, np.zeros((len(self.ends), len(geometry)))
+        for row, (start, end) in zip(pull, self.ends, strict=True):
+            between = self.z[p + positions[end]] - self.z[p + positions[start]]
+            row[positions[end]] = between / np.linalg.norm(between)
+            row[positions[start]] = -row[positions[end]]
+        pull = pull * observed.steps
+        if not measured or not self.ends:
+            return pull @ geometry
+        head, components = split(pull, observed.layout.shared, observed.layout.classes)
+        covariance = np.diag(np.maximum(self.u, _LEAST_U) ** 2)
+        for part, own, follow in zip(components, influence.own, influence.follow, strict=True):
+            head = head - np.einsum("lKk,Kkh->lh", part, follow[..., p:])
+            turned = np.einsum("lKk,Kkm->lKm", part, own)
+            covariance += turned.reshape(len(pull), -1) @ part.reshape(len(pull), -1).T
+        by_shared = head @ inverse
+        covariance += by_shared @ by_shared.T
+        return np.asarray(inverse_cholesky(covariance)) @ (pull @ geometry)
 
     def named(self, texts: tuple[str, ...], null: Float[np.ndarray, "p nullity"]) -> tuple[str, ...]:
-        """Names of undetermined directions with the parts of the geometry that follow them."""
+        """Names of undetermined directions with the parts of the geometry that follow them, but for sockets, which
+        follow every arm."""
+        if not texts:
+            return ()
         follow = self.eliminated().geometry @ null
-        found = []
+        sockets = {position_of(one.name) for one in self.observed.observations if one.kind == "socket"}
+        positions, found = self.observed.positions, []
         for text, change, direction in zip(texts, follow.T, null.T, strict=True):
             least = _MOVED * np.abs(direction).max()
-            parts = [name for name, rows in self.observed.positions.items() if np.abs(change[rows]).max() > least]
+            parts = [name for name in self.observed.names if np.abs(change[positions[name]]).max() > least]
+            parts = [name for name in parts if name not in sockets]
             found.append(text if not parts or "the scale" in text else _with_parts(text, parts))
         return tuple(found)
 
@@ -111,45 +168,53 @@ def _with_parts(text: str, parts: list[str]) -> str:
     return f"{', '.join(first)} and {last} trade off"
 
 
-def _linear(observed: Observed, space: Parameters, z: Float[np.ndarray, " z"]) -> tuple[list, list[ArmErrors]]:
-    p = len(space.names)
-    linear = linear_rows(space, observed, z)
-    return linear, arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed)
+def _at(space: Parameters, observed: Observed, z: Float[np.ndarray, " z"]) -> tuple[PointRows, list[ArmErrors]]:
+    point = rows_at(space, observed, z)
+    return point, arm_errors(point, observed)
 
 
-def _whitening(observed: Observed, linear: list, of_arm: list[Float[AnyArray, "_ _ _"]], measured: bool = False) -> Any:
-    if not measured:  # rows in mm, whatever the uncertainty of what was measured
-        rows = [part.rows._replace(measured=np.zeros_like(part.rows.measured)) for part in linear]
-        linear = [part._replace(rows=row) for part, row in zip(linear, rows, strict=True)]
-    return whitening_of(linear, observed, of_arm, np.asarray(1e-6))
+def _whitening(
+    observed: Observed, point: PointRows, of_arm: list[Float[np.ndarray, "_ _ _"]], measured: bool = False
+) -> Whitening:
+    """Rows in mm, whatever the uncertainty of what was measured, unless it is to count."""
+    if measured:
+        return whitening_of(point.rows, observed, of_arm, np.asarray(_LEAST_U))
+    rows = [part._replace(measured=np.zeros_like(part.measured)) for part in point.rows]
+    whitening = whitening_of(rows, observed, of_arm, np.asarray(_LEAST_U))
+    return whitening._replace(certified={name: np.ones_like(each) for name, each in whitening.certified.items()})
 
 
-def dense_rows(
-    linear: list, roots: tuple[Float[AnyArray, "_ _ _"], ...], size: int
-) -> tuple[Float[np.ndarray, "r z"], Float[np.ndarray, " r"]]:
-    """All derivatives as one matrix, and the residuals."""
-    blocks, values = [], []
-    for part, root in zip(linear, roots, strict=True):
-        white, jacobian = whitened(part, root)
-        block = np.zeros((white.size, size))
-        block[:, part.indices] = np.asarray(jacobian).reshape(len(part.indices), -1).T
-        blocks.append(block)
-        values.append(np.asarray(white).ravel())
-    return np.concatenate(blocks), np.concatenate(values)
+def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]]:
+    """The rows of every block without what private geometry imitates.
+
+    Eliminated a second time: what rounding leaves of a poorly determined component would look like information.
+    """
+    left = [np.zeros((*own.shape[:2], influence.inverse.shape[0])) for own in influence.own]
+    for number, (block, rows) in enumerate(zip(influence.blocks, influence.rows, strict=True)):
+        own = influence.own_rows(number)
+        if own is not None:
+            left[block.of] += sums_by_component(own, rows, block.sizes)
+    found = []
+    for number, (block, rows) in enumerate(zip(influence.blocks, influence.rows, strict=True)):
+        own = influence.own_rows(number)
+        found.append(
+            rows if own is None else rows - followed(own, influence.own[block.of] @ left[block.of], block.sizes)
+        )
+    return found
 
 
-def _moved(observed: Observed, arm: Arm, linear: list, errors: list[ArmErrors]) -> Observed:
+def _moved(observed: Observed, arm: Arm, point: PointRows, errors: list[ArmErrors]) -> Observed:
     """With configurations one step of Gauss and Newton closer to the geometry, of all such steps the shortest."""
-    new, units = [], reading_units(arm.geometry)
-    for observation, part, error in zip(observed.observations, linear, errors, strict=True):
+    units, q = reading_units(arm.geometry), np.array(observed.q)
+    for group, rows, error in zip(observed.layout.groups, point.rows, errors, strict=True):
         by_units = np.moveaxis(np.asarray(error.by_readings) * units[:, None], -1, 0)
-        step = np.einsum("mnr,rm->mn", np.linalg.pinv(by_units, rcond=1e-6), np.asarray(part.rows.values))
+        turned = by_units.swapaxes(-1, -2)
+        step = turned @ pseudo_inverse(by_units @ turned) @ np.asarray(rows.values).T[..., None]
         size = np.linalg.norm(step, axis=1, keepdims=True)
-        step = step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300))
-        q = np.asarray(observation.q).copy()
-        q[:, : len(units)] -= units * step
-        new.append(q)
-    observations = tuple(
-        eqx.tree_at(lambda o: o.q, observation, q) for observation, q in zip(observed.observations, new, strict=True)
-    )
-    return observed.moved(arm, np.concatenate(new), observations)
+        step = (step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300)))[..., 0]
+        poses = np.arange(len(q))[group.index]
+        q[poses, : len(units)] -= units * step
+    return observed.moved(arm, q)
+
+
+dense_rows = None  # TEMPORARY: a name that calibration/prediction.py still imports
