@@ -172,9 +172,9 @@ class _Unseen(NamedTuple):
     linear: Linearisation
     influence: Influence
     parts: list[ObservationRows]
-    white: list[Float[np.ndarray, "r m"]]
-    own: list[Float[np.ndarray, "k r m"]]  # U of each observation's own geometry
-    joined: list[Float[np.ndarray, "w r m"]]  # W but for these: of the shared geometry, and K A
+    white: list[Float[np.ndarray, "_ _"]]
+    own: list[Float[np.ndarray, "_ _ _"]]  # U of each observation's own geometry
+    joined: list[Float[np.ndarray, "w _ _"]]  # W but for these: of the shared geometry, and K A
     common: Float[np.ndarray, "w w"]  # S for these
     basis: Float[np.ndarray, "s b"]  # of the shared geometry's numbers, with which its columns are orthonormal
     along: Float[np.ndarray, "b p"]  # components of A along them

@@ -36,7 +36,7 @@ class ScaleFound(NamedTuple):
     """k of stage 1, and how it follows the data."""
 
     scale: Scale
-    rows: list[Float[AnyArray, "1 r m"]]  # its derivatives by the whitened rows of every block
+    rows: list[Float[AnyArray, "1 _ _"]]  # its derivatives by the whitened rows of every block
     by_lengths: Float[AnyArray, " l"]  # by the certified lengths, 1/mm
     variance_of_lengths: Float[AnyArray, ""]  # by these; `Scale.surplus` is what their disagreement adds
 
@@ -77,7 +77,7 @@ def positions_at_ends(capture: Capture) -> list[str]:
 
 
 def ends_between(
-    observed: Observed, geometry: Float[AnyArray, " g"], own: list[Float[AnyArray, "K k k"]], capture: Capture
+    observed: Observed, geometry: Float[AnyArray, " g"], own: list[Float[AnyArray, "_ _ _"]], capture: Capture
 ) -> MeasuredEnds:
     """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
     xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
@@ -138,7 +138,7 @@ class DividedUncertainty(NamedTuple):
 
     covariance: Float[AnyArray, "p p"]
     components: Components
-    rows: list[Float[AnyArray, "p r m"]]  # how they follow the whitened rows of every block
+    rows: list[Float[AnyArray, "p _ _"]]  # how they follow the whitened rows of every block
 
 
 def divided_uncertainty(solution: Solution, found: ScaleFound, anchor: ScaleAnchor, divided: Any) -> DividedUncertainty:

@@ -19,7 +19,7 @@ class Sensitivities(NamedTuple):
 
 def sensitivities_of_rows(
     linear: Linearisation,
-    rows: list[Float[np.ndarray, "p r m"]],
+    rows: list[Float[np.ndarray, "p _ _"]],
     lengths: Float[np.ndarray, "l 3 M"],
 ) -> Sensitivities:
     """Of parameters that follow the whitened rows of every group so."""
@@ -31,7 +31,7 @@ def sensitivities_of_rows(
     return Sensitivities(tips_of_rows(linear, rows), by_joints, lengths)
 
 
-def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) -> Float[np.ndarray, "q 3 M"]:
+def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q _ _"]]) -> Float[np.ndarray, "q 3 M"]:
     """Derivatives by the tips, of what follows the whitened rows so."""
     tips = [
         np.einsum("qbm,bcm->qcm", one, part.by_tip)
@@ -40,6 +40,6 @@ def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) 
     return np.concatenate(linear.observed.by_observation(tips), axis=2)
 
 
-def _of_residuals(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) -> list[Float[np.ndarray, "q r m"]]:
+def _of_residuals(linear: Linearisation, rows: list[Float[np.ndarray, "q _ _"]]) -> list[Float[np.ndarray, "q _ _"]]:
     """Derivatives by the residuals before they are whitened."""
     return [np.einsum("qam,mab->qbm", one, root) for one, root in zip(rows, linear.whitening.roots, strict=False)]
