@@ -20,8 +20,8 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
 from ..model.measurement import check_joints
-from ..model.robust import LossName
 from ..solver.reason import reasons
 from .batch_kernel import Problems, Shape, solve_chunk
 from .checks import check_enough, check_method

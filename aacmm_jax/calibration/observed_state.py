@@ -15,9 +15,10 @@ from ..kinematics.arm import Arm
 from ..kinematics.chain import forward_pass
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
 from ..model.measurement import check_joints
 from ..model.observed import Linear, Observed, PriorRows, Whitening, linear_rows, residual_rows, whitening_of
-from ..model.robust import Loss, LossName, check_loss
+from ..model.robust import Loss, check_loss
 from ..uncertainty import observed_covariance as propagation
 from ..uncertainty.covariance import NoiseModel
 from .checks import check_noise_model, check_start

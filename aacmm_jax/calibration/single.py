@@ -19,10 +19,10 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, based_on
 from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
 from ..model.measurement import Measurement, check_joints
 from ..model.metrics import repeatability
 from ..model.residuals import JointWeights, joint_normal_equations, joint_residual
-from ..model.robust import LossName
 from ..uncertainty import propagation, scale_uncertainty
 from ..uncertainty.active_bounds import with_active_bounds
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance, residual_degrees_of_freedom
