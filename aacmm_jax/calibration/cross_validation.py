@@ -13,8 +13,8 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
 from ..model.observed import Observed
-from ..model.robust import LossName
 from .left_out import CrossValidation, LeftOut
 from .prediction import unseen_errors
 from .record import uncertainty_of

@@ -16,7 +16,7 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
-from ..model.robust import LossName
+from ..model.loss_names import LossName
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
