@@ -22,8 +22,8 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, check_columns
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
-from ..model.observed import Observed
 from ..model.loss_names import LossName
+from ..model.observed import Observed
 from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
 from .batch_kernel import Form, Problems, pick, solve_chunk, without_lengths

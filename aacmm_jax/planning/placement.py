@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
+from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at

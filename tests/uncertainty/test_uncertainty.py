@@ -10,15 +10,15 @@ import pytest
 from scipy import stats
 
 import aacmm_jax as aj
-from aacmm_jax.core.numpy_or_jax import to_numpy
-from aacmm_jax.core.units import ARCSEC
-from aacmm_jax.data.noise import tip_covariances
-from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
 from aacmm_jax.calibration.batch_kernel import without_lengths
 from aacmm_jax.calibration.stages import identified, in_two_stages, jointly
 from aacmm_jax.calibration.task import task_of
 from aacmm_jax.core.linear_algebra import inverse_cholesky
+from aacmm_jax.core.numpy_or_jax import to_numpy
+from aacmm_jax.core.units import ARCSEC
+from aacmm_jax.data.noise import tip_covariances
 from aacmm_jax.kinematics.chain import joint_motion
+from aacmm_jax.kinematics.inverse_kinematics import project_to_centroids
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 UNEVEN = aj.Noise(encoder_arcsec=[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], seating=0.003)
@@ -112,12 +112,9 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
             paper_arm, moved, bounds, method=method, noise=noise, check_identifiability=False
         ).parameters
 
-    slopes = np.stack(
-        [
-            parameters(q + step * turn, values) - parameters(q - step * turn, values)
-            for turn in turns
-        ]
-    ) / (2 * step)
+    slopes = np.stack([parameters(q + step * turn, values) - parameters(q - step * turn, values) for turn in turns]) / (
+        2 * step
+    )
     found = aj.calibrate(paper_arm, capture, bounds, method=method, noise=noise)
     # With arrays of NumPy, which compiles nothing; tests/core/test_numpy_or_jax.py has both libraries.
     found, arm, space, capture, noise = to_numpy((found, paper_arm, space, capture, noise))
