@@ -1,7 +1,7 @@
 """Plans with artefacts and instruments: where to put what is at hand, and which poses to take with it.
 
-The information of a pose is that of the rows themselves (`uncertainty.linearisation`), so every kind that can be
-simulated can be planned, and nothing here depends on a kind.
+The information of a pose is that of the model's own rows (`uncertainty.linearisation`), so every kind of observation
+that can be simulated can be planned, and nothing here depends on a kind.
 """
 
 import math

@@ -21,8 +21,9 @@ from ..data.observations.observation import AbstractObservation
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import total_link_length
-from ..model.observed import Observed, linear_rows
-from ..uncertainty.observed_identifiability import dense_rows
+from ..model.observed import Observed
+from ..model.rows import Whitening, rows_at
+from ..uncertainty.linearisation import Linearisation
 
 _BETTER = 4.0  # the factor by which a correction must reduce the residual to be named
 _SMALL = 0.05  # of the arm's size: a larger residual is left by an arm that the data do not belong to
@@ -59,7 +60,9 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
     """
     arm, capture = to_numpy((arm, capture))
     with np.errstate(all="ignore"):
-        misfit = _OfObservations.by(arm, capture) if capture.observations else _OfSockets(arm, capture)
+        misfit = _Misfit.by(arm, capture)
+        if misfit is None:
+            return ""
         given, size = misfit.rms(misfit.given), total_link_length(arm)
         if given < _NOMINAL * size:
             return ""
@@ -76,38 +79,22 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
     )
 
 
-class _OfSockets(NamedTuple):
-    """Sockets, of which there may be thousands."""
+class _Misfit(NamedTuple):
+    """How far an arm is from what was observed: sockets and other observations, a part of them where there are many."""
 
     arm: Arm
-    capture: Capture
-
-    @property
-    def given(self) -> _Tried:
-        return _Tried("", np.asarray(self.capture.q))
-
-    def corrections(self) -> Iterator[_Tried]:
-        return _readings(np.asarray(self.capture.q), self.arm)
-
-    def rms(self, tried: _Tried) -> float:
-        """RMS distance of the tips from the centroid of their socket, mm."""
-        tips = np.split(np.asarray(self.arm.position(tried.q)), np.cumsum(self.capture.sizes)[:-1])
-        centred = np.concatenate([tip - tip.mean(axis=0) for tip in tips if len(tip) > 1] or [np.zeros((1, 3))])
-        return float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
-
-
-class _OfObservations(NamedTuple):
-    """Observations of all kinds, a part of them where there are many."""
-
-    arm: Arm
-    observed: Observed
+    observed: Observed  # without reference lengths
 
     @classmethod
-    def by(cls, arm: Arm, capture: Capture) -> "_OfObservations":
-        observed = Observed.of(capture, arm)
-        chosen = [observed.observations[i] for i in _evenly(len(observed.observations), _OBSERVATIONS)]
-        part = tuple(one.select(_evenly(one.q.shape[0], _POSES)) for one in chosen)
-        return cls(arm, observed.moved(arm, _stacked_readings(part), part))
+    def by(cls, arm: Arm, capture: Capture) -> "_Misfit | None":
+        """None where no two poses can disagree."""
+        observed = Observed.of(capture, arm, lengths=False)
+        scattering = [one for one in observed.observations if one.kind != "socket" or one.q.shape[0] > 1]
+        if not scattering:
+            return None
+        chosen = [scattering[i] for i in _evenly(len(scattering), _OBSERVATIONS)]
+        part = [one.select(_evenly(one.q.shape[0], _POSES)) for one in chosen]
+        return cls(arm, Observed.of(Capture({}, (), part), arm))
 
     @property
     def given(self) -> _Tried:
@@ -138,29 +125,24 @@ class _OfObservations(NamedTuple):
 
         What is certified stays as it is stated.
         """
-        observations = tried.observations
-        if observations is None:
-            parts = zip(self.observed.observations, self.observed.slices, strict=True)
-            observations = tuple(eqx.tree_at(lambda o: o.q, one, tried.q[rows]) for one, rows in parts)
-        observed = self.observed.moved(self.arm, _stacked_readings(observations), observations)
+        observed = self.observed.moved(self.arm, tried.q, tried.observations)
         space, lever = Parameters(self.arm, ("d_1",)), total_link_length(self.arm) / 4
-        fixed = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
-        free = np.concatenate([np.full(len(units), name not in fixed) for name, units in observed.blocks.items()])
+        certified = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
+        known = [np.full(len(units), name in certified) for name, units in observed.blocks.items()]
+        vector, best = np.asarray(space.vector()), np.inf
         try:
-            start = observed.split(np.asarray(observed.start(space, np.asarray(space.vector())))) | fixed
-            z = np.concatenate([np.asarray(space.vector()), *(start[name] for name in observed.blocks)])
-            best = np.inf
+            start = observed.split(np.asarray(observed.start(space, vector))) | certified
+            z = np.concatenate([vector, *(start[name] for name in observed.blocks)])
             for _ in range(_ROUNDS):
-                linear = linear_rows(space, observed, z)
-                roots = tuple(_roots(part.rows.values.shape, lever) for part in linear)
-                dense, values = dense_rows(linear, roots, len(z))
-                poses = sum(part.rows.values.shape[1] for part in linear)
-                found = float(np.sqrt(np.sum(values**2) / poses))
+                point = rows_at(space, observed, z)
+                roots = tuple(_roots(rows.values.shape, lever) for rows in point.rows)
+                whitening = Whitening(roots, np.zeros(0), {name: np.zeros_like(certified[name]) for name in certified})
+                linear = Linearisation.of(observed, space, z, point, [], whitening, None)
+                squares = sum(float(np.sum(white**2)) for white in linear.white())
+                found = float(np.sqrt(squares / len(observed.q)))
                 if not found < 0.95 * best:
                     break
-                best = found
-                by = (dense[:, 1:] * observed.steps)[:, free]
-                z[1:][free] -= np.linalg.lstsq(by, values, rcond=1e-10)[0] * observed.steps[free]
+                best, z = found, linear.fitted(np.concatenate([[True], *known]))
         except np.linalg.LinAlgError:
             return np.inf
         return best if np.isfinite(best) else np.inf
@@ -168,10 +150,6 @@ class _OfObservations(NamedTuple):
 
 def _evenly(number: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, number - 1, min(number, most)).astype(int))
-
-
-def _stacked_readings(observations: tuple[AbstractObservation, ...]) -> Float[np.ndarray, "M n"]:
-    return np.concatenate([np.asarray(one.q) for one in observations])
 
 
 def _roots(shape: tuple[int, ...], lever: float) -> Float[np.ndarray, "m r r"]:
