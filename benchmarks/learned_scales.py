@@ -51,7 +51,7 @@ def coverage(poses: int, trials: int, given: bool) -> dict[str, Any]:
         z = (np.asarray(found.parameters) - vector) / np.sqrt(np.diag(np.asarray(found.covariance)))
         inside.append(np.mean(np.abs(z) <= factor))
         squares.append(np.mean(z**2))
-        factors.append(factor)
+        factors.append(np.median(factor))
     return {
         "inside": round(float(np.mean(inside)), 4),
         "standard_error": round(float(np.std(inside) / np.sqrt(trials)), 4),

@@ -89,7 +89,7 @@ def simulated(scenario: Mapping[str, Any], number: int) -> dict[str, Any]:
                 u = np.asarray(uncertainty.length(start, end))
                 between = np.subtract(*(np.asarray(result.arm.position(q)) for q in (start, end)))
                 error = np.linalg.norm(between, axis=1) - lengths
-                inside = np.abs(error) <= uncertainty.factor(0.95) * u
+                inside = np.abs(error) <= uncertainty.expanded_length(start, end)
                 rows[name].append((np.mean(inside), np.mean(error**2), np.mean(u**2)))
                 for kind in () if result.shared is None else result.shared.kinds:
                     kinds[kind] = kinds.get(kind, 0) + 1 / number

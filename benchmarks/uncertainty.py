@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import aacmm_jax as aj
+from aacmm_jax.uncertainty.degrees_of_freedom import Law, coverage_factor
 
 ARCSEC = aj.units.ARCSEC
 CAPTURES = Path(__file__).resolve().parents[1] / "examples/mukca"
@@ -63,11 +64,10 @@ def lengths_over_volume(arm: aj.Arm) -> tuple[np.ndarray, np.ndarray]:
 
 
 def calibrated(study, drawn, lengths, method, noise, noise_model, hold="d_3"):
-    """Every trial by `aj.calibrate`: errors of parameters, k and lengths, their u, coverage factor, active bounds."""
+    """Every trial by `aj.calibrate`: errors of parameters, k and lengths, their u, coverage factors, active bounds."""
     arm, space = study.nominal.arm, study.space
     bounds = aj.Bounds(space, drawn.lower[0], drawn.upper[0])
     start, end = (jnp.asarray(q) for q in lengths)
-    factor = []
 
     def one(row):
         q, value, true = row
@@ -75,7 +75,6 @@ def calibrated(study, drawn, lengths, method, noise, noise_model, hold="d_3"):
             arm, capture_of(q, value), bounds, method=method, noise=noise, noise_model=noise_model, hold=hold
         )
         uncertainty = aj.uncertainty_of(result)
-        factor.append(uncertainty.factor(0.95))
 
         def measured(vector):
             body = space.arm(vector)
@@ -88,12 +87,20 @@ def calibrated(study, drawn, lengths, method, noise, noise_model, hold="d_3"):
         u = jnp.concatenate([
             jnp.sqrt(jnp.diagonal(result.covariance)), jnp.stack([result.scale.u]), uncertainty.length(start, end)
         ])  # fmt: skip
-        return errors, u, result.active, result.converged
+        parts = jnp.concatenate([
+            uncertainty.parts(jnp.eye(len(space.names))), uncertainty.length_parts(start, end)
+        ])  # fmt: skip
+        of_k = jnp.stack([result.scale.u**2 - result.scale.surplus, result.scale.surplus])
+        freedom = jnp.asarray([uncertainty.scatter_degrees_of_freedom, max(value.shape[0] - 1, 1)])
+        return errors, u, result.active, result.converged, parts, uncertainty.law, of_k, freedom
 
     rows = (jnp.asarray(drawn.q), jnp.asarray(drawn.value[:, 0]), jnp.asarray(drawn.true))
     found = jax.jit(lambda r: jax.lax.map(one, r, batch_size=16))(rows)
-    errors, u, active, good = (np.asarray(x) for x in found)
-    return errors, u, factor[0], active, good
+    errors, u, active, good, parts = (np.asarray(x) for x in found[:5])
+    law, freedom = (jax.tree.map(lambda x: np.asarray(x)[0], each) for each in (found[5], found[7]))
+    factor, p = coverage_factor(0.95, parts, law), len(space.names)
+    factor = np.insert(factor, p, coverage_factor(0.95, np.asarray(found[6]), Law.of(freedom)), axis=1)
+    return errors, u, factor, active, good
 
 
 def coverage_row(inside: np.ndarray, names: tuple[str, ...]) -> dict:
@@ -120,7 +127,7 @@ def coverage(trials: int = 10_000) -> dict:
             errors, u, factor, active, good = calibrated(study, drawn, lengths, method, noise, noise_model)
             row = coverage_row(np.abs(errors) <= factor * u, study.space.names)
             row |= {
-                "factor": round(factor, 3),
+                "factor": round(float(np.median(factor)), 3),
                 "converged": float(good.mean()),
                 "active": int(np.any(active, axis=1).sum()),
             }

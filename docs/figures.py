@@ -127,7 +127,7 @@ def uncertainty() -> None:
         capture = _capture(arm, 3, {"A": poses // 2, "B": poses - poses // 2})
         result = aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE, shared_errors=False)
         found = aj.uncertainty_of(result)
-        U = 1000 * found.factor(0.95) * np.sort(np.asarray(aj.volumetric_uncertainty(found, points=400).u_length))
+        U = 1000 * np.sort(aj.volumetric_uncertainty(found, points=400).expanded_length)
         axes.plot(U, np.linspace(0, 100, len(U)), color=BLUE, linestyle=style, linewidth=2, label=f"{poses} poses")
     axes.set(xlabel="U (95 %) of a length of 300 mm [um]", ylabel="lengths below it [%]", xlim=(0, 80))
     axes.legend(loc="lower right")

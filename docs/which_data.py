@@ -188,8 +188,7 @@ def predicted(case: Case, data: str, poses: int, seed: int) -> dict[str, float |
             raise
         return found  # too few poses for so many parameters
     uncertainty = aj.uncertainty_of(result)
-    u = np.asarray(aj.volumetric_uncertainty(uncertainty, points=VOLUME, seed=0).u_length)
-    expanded = uncertainty.factor(0.95) * u
+    expanded = aj.volumetric_uncertainty(uncertainty, points=VOLUME, seed=0).expanded_length
     return found | {"median": float(np.median(expanded)), "largest": float(np.max(expanded))}
 
 

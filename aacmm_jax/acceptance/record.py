@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from ..calibration.evaluation import evaluate
-from ..calibration.task import check_observed
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.scale_fix import LARGEST_LOG_K
+from ..calibration.task import check_observed
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, names_in

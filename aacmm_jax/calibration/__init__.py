@@ -1,6 +1,6 @@
 """Identification and calibration: one (`single`), many (`batch`), repeated, cross-validated; and their results.
 
-Elsewhere: the residual that is minimised (`model.residuals`), the active set (`solver.active_set`), covariance
+Elsewhere: the rows that are minimised (`model.rows`), the active set (`solver.active_set`), covariance
 (`uncertainty`), the file of a calibration (`files.calibrations`), the wording of its warnings (`summaries.warnings`).
 """
 

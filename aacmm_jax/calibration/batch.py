@@ -22,8 +22,9 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, check_columns
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
 from ..model.observed import Observed
-from ..model.robust import Loss, LossName, check_loss
+from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
 from .batch_kernel import Form, Problems, pick, solve_chunk, without_lengths
 from .checks import check_method, check_noise_model
@@ -140,7 +141,7 @@ def calibrate_many(
         [0.99924 0.99922] [ True  True]
     """
     given = BatchOptions(**options)
-    bounds, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
+    _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
     by_slides = scale_from_slides(arm, capture, space, given.noise)
     general = bool(capture.observations) or any((given.robust, given.prior, given.covariance, by_slides))
     method = default_method(arm, general) if method is None else method

@@ -12,7 +12,8 @@ from ..kinematics.parameters import Bounds
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
 from ..model.rows import PriorRows
-from ..uncertainty.covariance import ParameterCovariance
+from ..uncertainty.covariance import STATED, ParameterCovariance
+from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.linear_propagation import (
     Influence,
     UnknownsCovariance,
@@ -20,6 +21,7 @@ from ..uncertainty.linear_propagation import (
     covariance_of_rows,
     geometry_covariance,
     of_shared_readings,
+    of_stated,
     propagated,
     row_covariances,
 )
@@ -47,11 +49,11 @@ class Solution(NamedTuple):
     identification: Identification
     linear: Linearisation
     influence: Influence
-    covariances: list[Float[AnyArray, "r r m"]]  # of the whitened rows of every group
+    covariances: list[Float[AnyArray, "_ _ _"]]  # of the whitened rows of every group
     reading: list[np.ndarray]  # number of the reading of each pose of each group; equal ones were read at once
     state: State
 
-    def covariance_of(self, rows: list[Float[AnyArray, "q r m"]]) -> Float[AnyArray, "q q"]:
+    def covariance_of(self, rows: list[Float[AnyArray, "q _ _"]]) -> Float[AnyArray, "q q"]:
         """Of functions that follow the rows of every block so."""
         identification = self.identification
         total = covariance_of_rows(rows, self.covariances)
@@ -76,8 +78,11 @@ def concluded(
     by_scales = None if of_prior is None else of_prior.by_scales
     added = None if by_scales is None else by_scales.added(influence.inverse)
     unknowns = propagated(influence, covariances, shared, whitening.prior, added)
-    matrix = unknowns.head[:p, :p] * steps[:p, None] * steps[:p]
-    covariance = ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise)
+    both = steps[:p, None] * steps[None, :p]
+    matrix = unknowns.head[:p, :p] * both
+    stated = of_stated(influence, state.point.rows, whitening, whitening.prior)[:p, :p]
+    parts = Components.of({STATED: (stated * both, np.inf)})
+    covariance = ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise, parts)
     parameters = set_at(task.start, free, z[:p])
     spent = p + count if of_prior is None else of_prior.effective
     metrics = observed_metrics(task, begun.before, state, linear, of_geometry(linear, influence, unknowns), spent)
@@ -134,7 +139,7 @@ def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: St
 
 def _of_rows(
     task: Task, linear: Linearisation, influence: Influence, noise: Noise
-) -> tuple[list[Float[AnyArray, "r r m"]], Float[AnyArray, "h h"] | None, list[np.ndarray]]:
+) -> tuple[list[Float[AnyArray, "_ _ _"]], Float[AnyArray, "h h"] | None, list[np.ndarray]]:
     """Covariances of the whitened rows of every pose, what shared readings add to the information that these make, and
     the number of the reading of each pose."""
     number = np.array(task.pose)
@@ -173,6 +178,7 @@ def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> P
         set_at(xp.ones(size, dtype=bool), free, covariance.determined),
         set_at(xp.zeros((size, size)), grid, covariance.open),
         covariance.noise,
+        covariance.components and covariance.components.wider(free, size),
     )
 
 

@@ -13,8 +13,8 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
 from ..model.observed import Observed
-from ..model.robust import LossName
 from .left_out import CrossValidation, LeftOut
 from .prediction import unseen_errors
 from .record import uncertainty_of
@@ -146,7 +146,7 @@ def cross_validate(
         >>> print(left_out.labels)
         ['A, B', 'C, D']
         >>> print(f"error {left_out.rms:.3f} mm, predicted {left_out.rms_predicted:.3f} mm")
-        error 0.016 mm, predicted 0.016 mm
+        error 0.016 mm, predicted 0.017 mm
     """
     if groups is not None:
         parts = _chosen(capture, groups, len(bounds.space.names))

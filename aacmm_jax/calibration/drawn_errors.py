@@ -30,8 +30,11 @@ def draw_shared(
         return None
     q = np.asarray(capture.readings)
     tips = np.zeros((count, len(q), 3))
-    for root in _roots(shared, capture):
-        tips += np.einsum("Mc,tcd->tMd", root, random.normal(size=(count, root.shape[1], 3)))
+    law = shared.law.in_numpy
+    for i, root in enumerate(_roots(shared, capture)):
+        # A variance that few places show is itself uncertain, so it is drawn too (JCGM 101, 6.4.9).
+        sd = np.sqrt(random.choice(law.ratios[i], size=(count, 1, 1), p=law.weights[i] / law.weights[i].sum()))
+        tips += np.einsum("Mc,tcd->tMd", root, sd * random.normal(size=(count, root.shape[1], 3)))
     values, joints = functions_of(shared.names, arm, q)
     factor = _root(np.asarray(shared.moments))
     coefficients = random.normal(size=(count, len(shared.names))) @ factor.T
@@ -104,7 +107,7 @@ def _owner(capture: Capture) -> np.ndarray:
 
 
 def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M c"]]:
-    """Square roots of the covariances of a tip coordinate over the poses."""
+    """Square roots of the covariances of a tip coordinate over the poses, of each kind that moves tips."""
     found, owner = [], _owner(capture)
     total = len(owner)
     for kind, sd in zip(shared.kinds, np.asarray(shared.sd), strict=True):

@@ -62,8 +62,7 @@ def function_of_joint(
     functions = function_values(arm.corrections.nominal, terms, rows, gravity) - mean
     names = [one.name for one in terms]
     free = [i for i, name in enumerate(names) if name in record.names]
-    index = [record.names.index(names[i]) for i in free]
-    covariance = record.covariance[np.ix_(index, index)]
-    u = np.sqrt(np.maximum(np.einsum("kp,kl,lp->p", functions[free], covariance, functions[free]), 0.0))
-    expanded = uncertainty_of(record).factor() * u
+    slopes = np.zeros((points, len(record.names)))
+    slopes[:, [record.names.index(names[i]) for i in free]] = functions[free].T
+    expanded = uncertainty_of(record).expanded_of(slopes)
     return JointFunction(at, coefficients @ functions, expanded, coefficients @ (at_poses - mean))

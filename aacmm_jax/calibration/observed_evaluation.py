@@ -70,7 +70,7 @@ class GeometryFit(NamedTuple):
         for side, along in enumerate((-directions, directions)):
             index = np.array([positions[pair[side]] for pair in ends])
             pull = set_at(pull, (np.arange(len(ends))[:, None], index), along)
-        head, components = split(pull * observed.steps, observed.layout.shared, observed.layout.classes)
+        head, components = split(pull * observed.steps[None, :], observed.layout.shared, observed.layout.classes)
         return variances_of_functions(influence, xp.concatenate([xp.zeros((len(ends), 1)), head], axis=1), components)
 
 

@@ -9,29 +9,31 @@ with n degrees of freedom, the ratio of found to predicted has the F distributio
 
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..core.distributions import chance
-from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
-from ..data.noise import tip_covariances
+from ..data.observations.socket import position_of
 from ..data.visits import visits_of
-from ..kinematics.chain import joint_motion
-from ..model.observed import Observed, certified_and_lengths, linear_rows
-from ..model.socket_sums import means_over_sockets, sums_over_sockets
+from ..model.elimination import followed
+from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.observed_identifiability import dense_rows
+from ..uncertainty.degrees_of_freedom import LEVEL, Law, coverage_factor, degrees_of_freedom
+from ..uncertainty.linear_propagation import Influence
+from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
+from .batch_kernel import without_lengths
 from .observed_evaluation import fit_geometry
 
 _NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
+_LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
 _LEAST_LENGTH_U = 1e-6  # mm: an error of a millionth of a millimetre is rounding
 
 
@@ -42,7 +44,7 @@ class Agreement(NamedTuple):
     rms: float  # root mean square, found
     predicted: float  # infinite where the calibration leaves a direction open that matters
     degrees_of_freedom: float  # effective, of the predicted sum of squares
-    noise_degrees_of_freedom: float  # of the noise that the prediction rests on; infinite where it was given
+    noise_degrees_of_freedom: float  # of what the prediction rests on; infinite where the noise was given
     reduced_chi: float = math.nan  # root mean square of a residual in standard deviations of the noise alone
     rms_angle: float = math.nan  # rad, where orientations were measured
 
@@ -75,12 +77,18 @@ class UnseenErrors(NamedTuple):
     common: Float[np.ndarray, "w w"]  # covariance of what they share
     length_error: Float[np.ndarray, " l"]  # of the reference lengths, mm
     length_covariance: Float[np.ndarray, "l l"]  # predicted, mm^2
+    length_parts: Float[np.ndarray, "l c"]  # variances of them by what they rest on, mm^2
+    law: Law  # how well each part is known
     noise_degrees_of_freedom: float
 
     @property
     def length_u(self) -> Float[np.ndarray, " l"]:
         """Standard uncertainty of the error of every reference length, mm."""
         return np.sqrt(np.diagonal(self.length_covariance))
+
+    def expanded(self, level: float = LEVEL) -> Float[np.ndarray, " l"]:
+        """Expanded uncertainty of the error of every reference length, mm."""
+        return coverage_factor(level, self.length_parts, self.law) * self.length_u
 
     def of(self, names: Iterable[str]) -> Agreement:
         """Some sockets and observations together."""
@@ -115,12 +123,13 @@ class UnseenErrors(NamedTuple):
         u = np.maximum(u[known], _LEAST_LENGTH_U)
         correlation = self.length_covariance[np.ix_(known, known)] / np.outer(u, u)
         predicted = math.sqrt(np.mean(u**2))
+        parts = np.mean(self.length_parts[known] / u[:, None] ** 2, axis=0)
         return Agreement(
             count=len(known),
             rms=predicted * math.sqrt(np.mean((self.length_error[known] / u) ** 2)),
             predicted=predicted,
             degrees_of_freedom=len(known) ** 2 / float(np.sum(correlation**2)),
-            noise_degrees_of_freedom=self.noise_degrees_of_freedom,
+            noise_degrees_of_freedom=float(degrees_of_freedom(parts, self.law)),
         )
 
 
@@ -143,57 +152,163 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
         [-0.003 -0.001] [0.005 0.008]
     """
     uncertainty, capture = to_numpy((uncertainty.complete, capture))
-    return _of_observations(uncertainty, capture) if capture.observations else _of_sockets(uncertainty, capture)
+    problem = _Unseen.of(uncertainty, capture)
+    parts = {part.observation.name: _part_of(problem, number, part) for number, part in enumerate(problem.parts)}
+    error, covariance, *by_part = _of_lengths(problem, capture)
+    scatter = uncertainty.scatter_degrees_of_freedom
+    return UnseenErrors(parts, problem.common, error, covariance, *by_part, scatter)
 
 
-def _of_sockets(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
-    """Of sockets and reference lengths: every position is a mean, so nothing is as large as all poses together."""
-    arm, owner, sizes = uncertainty.arm, capture.owner, np.asarray(capture.sizes, dtype=float)
-    tips, slopes = np.asarray(arm.position(capture.q)), np.asarray(uncertainty.derivatives(capture.q))
-    motion = joint_motion(arm.geometry, capture.q)
-    noise = np.moveaxis(np.asarray(tip_covariances(arm.geometry, motion, uncertainty.noise)), -1, 0)
-    of_one, of_mean = _variances_in_places(uncertainty.shared, capture)
-    noise = noise + of_one * np.eye(3)
+class _Unseen(NamedTuple):
+    """A capture by a calibrated arm, with the geometry that fits it.
 
-    def over(sums: Any, values: np.ndarray) -> np.ndarray:
-        return np.moveaxis(np.asarray(sums(np.moveaxis(values, 0, -1), capture.sizes)), -1, 0)
+    With whitened derivatives A by the parameters and G by the geometry, and U an orthonormal basis of G, errors dp of
+    the parameters and w of the rows leave K (A dp + w) with K = I - U U^T. In mm, with D the inverse of the whitening,
+    V = D (K + K A C A^T K) D^T = D (I + W S W^T) D^T, where W = [U, K A] and S = diag(-I, C). The part of U for one
+    observation's own geometry concerns that observation alone.
+    """
 
-    centroids, means = over(means_over_sockets, tips), over(means_over_sockets, slopes)
-    residuals, slopes = tips - centroids[owner], slopes - means[owner]
-    by_parameters = uncertainty.covariance_of_functions(slopes)
-    # tr V and tr V^2 of the errors R of single tips, from which their mean is taken (P), and of the parameters C:
-    # V = P R P + S C S^T with S = P S, so tr V^2 = tr (P R)^2 + 2 tr (R S C S^T) + tr (S^T S C)^2.
-    own, kept = np.einsum("mcd,mcd->m", noise, noise), 1 - 1 / sizes
-    trace = np.trace(by_parameters, axis1=1, axis2=2) + np.trace(noise, axis1=1, axis2=2) * kept[owner]
-    square = own * (1 - 2 / sizes[owner]) + 2 * np.einsum("mcd,mcd->m", noise, by_parameters)
-    total = over(sums_over_sockets, noise)
-    squares = over(sums_over_sockets, square) + np.einsum("scd,scd->s", total, total) / sizes**2
-    white = np.einsum("mcd,md->mc", inverse_cholesky(noise), residuals)
-    sums = [over(sums_over_sockets, each) for each in (np.sum(residuals**2, axis=1), np.sum(white**2, axis=1), trace)]
-    ends_of_sockets = np.cumsum(capture.sizes)
-    parts = {}
-    for i, (name, size) in enumerate(zip(capture.names, capture.sizes, strict=True)):
-        rows = slopes[ends_of_sockets[i] - size : ends_of_sockets[i]].reshape(3 * size, -1)
-        found, normalised, expected = (float(values[i]) for values in sums)
-        parts[name] = _Part(
-            size if size > 1 else 0, found, math.nan, normalised, 3 * size, expected, float(squares[i]), rows.T @ rows
+    uncertainty: Uncertainty
+    linear: Linearisation
+    influence: Influence
+    parts: list[ObservationRows]
+    white: list[Float[np.ndarray, "_ _"]]
+    own: list[Float[np.ndarray, "_ _ _"]]  # U of each observation's own geometry
+    joined: list[Float[np.ndarray, "w _ _"]]  # W but for these: of the shared geometry, and K A
+    common: Float[np.ndarray, "w w"]  # S for these
+    basis: Float[np.ndarray, "s b"]  # of the shared geometry's numbers, with which its columns are orthonormal
+    along: Float[np.ndarray, "b p"]  # components of A along them
+
+    @classmethod
+    def of(cls, uncertainty: Uncertainty, capture: Capture) -> "_Unseen":
+        """Reference lengths take no part: they are to be measured."""
+        noise, shared = uncertainty.noise, uncertainty.shared
+        if shared is not None:
+            seating = np.hypot(noise.seating, shared.sd_of(VISITS, SUCCESSIVE))
+            noise = eqx.tree_at(lambda n: n.seating, noise, seating)
+        observed = to_numpy(Observed.of(without_lengths(capture), uncertainty.arm))
+        fitted = fit_geometry(uncertainty.arm, observed, {}, noise)
+        space, p = uncertainty.space, len(uncertainty.space.names)
+        z = np.concatenate([np.asarray(space.vector()), np.asarray(fitted.geometry)])
+        least = max(_LEAST * float(fitted.sigma), 1e-12)
+        linear = Linearisation.at(observed, space, z, noise=noise, least=least)
+        influence, groups = linear.influence(), len(observed.layout.groups)
+        scale = np.asarray(space.scale)[:, None, None]
+        of_shared, of_parameters = (
+            [np.asarray(r)[part] for r in influence.rows] for part in (slice(p, None), slice(p))
         )
-    ends = capture.ends()
-    between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
-    measured = np.linalg.norm(between, axis=1)
-    direction = between / measured[:, None]
-    along = np.einsum("lc,lcp->lp", direction, means[ends[:, 1]] - means[ends[:, 0]])
-    lengths = capture.lengths
-    covariance = uncertainty.covariance_of_functions(along) + np.diag([float(length.u) ** 2 for length in lengths])
-    of_means = total / sizes[:, None, None] ** 2 + of_mean[:, None, None] * np.eye(3)
-    for one in (0, 1):
-        pulled = np.einsum("lcd,ld->lc", of_means[ends[:, one]], direction)
-        for other in (0, 1):
-            same = ends[:, one][:, None] == ends[:, other][None, :]
-            covariance = covariance + np.where(same, 1.0 if one == other else -1.0, 0.0) * (pulled @ direction.T)
-    error = measured - np.array([float(length.value) for length in lengths])
-    shared = np.asarray(uncertainty.covariance)
-    return UnseenErrors(parts, shared, error, np.asarray(covariance), uncertainty.degrees_of_freedom)
+        values, vectors = np.linalg.eigh(sum(_flat(rows) @ _flat(rows).T for rows in of_shared))
+        known = values > _NULL * values.max(initial=0.0)
+        basis = vectors[:, known] / np.sqrt(values[known])
+        of_shared = [np.einsum("sb,srm->brm", basis, rows) for rows in of_shared]
+        of_parameters = [rows / scale for rows in of_parameters]
+        along = sum(_flat(b) @ _flat(a).T for b, a in zip(of_shared, of_parameters, strict=True))
+        joined = [
+            np.concatenate([b, a - np.einsum("bp,brm->prm", along, b)])
+            for b, a in zip(of_shared[:groups], of_parameters[:groups], strict=True)
+        ]
+        common = np.zeros((len(basis.T) + p,) * 2)
+        common[: len(basis.T), : len(basis.T)] = -np.eye(len(basis.T))
+        common[len(basis.T) :, len(basis.T) :] = uncertainty.covariance
+        own = [_own_basis(influence, number) for number in range(groups)]
+        by_observation = observed.by_observation
+        return cls(
+            uncertainty, linear, influence, linear.parts(), linear.white(), by_observation(own), by_observation(joined),
+            common, basis, along,
+        )  # fmt: skip
+
+
+def _own_basis(influence: Influence, number: int) -> Float[np.ndarray, "k r m"]:
+    """Orthonormal columns of the private geometry of a group's components."""
+    rows, block = influence.own_rows(number), influence.blocks[number]
+    if rows is None:
+        return np.zeros((0, *block.white.shape))
+    values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
+    roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
+    return followed(np.asarray(rows), np.swapaxes(roots, 1, 2), block.sizes)
+
+
+def _flat(rows: Float[np.ndarray, "k r m"]) -> Float[np.ndarray, "k _"]:
+    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
+
+
+def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
+    values, observation = np.asarray(part.values), part.observation
+    r, m = values.shape
+    own, joined = (np.moveaxis(rows[number], -1, 0) for rows in (problem.own, problem.joined))  # (m, w, r)
+    to_mm = np.linalg.inv(np.asarray(part.root))[:, :_POSITION_ROWS]
+    weights = np.einsum("mca,mcb->mab", to_mm, to_mm)
+    common, p = problem.common, len(problem.uncertainty.space.names)
+    by_common = np.einsum("mwa,wv->mva", joined, common)
+    errors = np.einsum("mva,mvb->mab", by_common, joined) - np.einsum("mka,mkb->mab", own, own)
+    along = np.swapaxes(joined[:, joined.shape[1] - p :], 1, 2)
+    is_open = not np.all(np.isfinite(problem.uncertainty.covariance_of_functions(to_mm @ along)))
+    weighted, of_own = joined @ weights, own @ weights
+    alone, crossed = np.einsum("mka,mla->kl", of_own, own), np.einsum("mka,mwa->kw", of_own, joined)
+    square = np.sum(weights**2) + 2 * np.einsum("mab,mbc,mca->", weights, weights, errors)
+    square = square + np.sum(alone * alone.T) - 2 * np.sum((crossed @ common) * crossed)
+    return _Part(
+        poses=0 if observation.kind == "socket" and m == 1 else m,
+        found=float(np.sum(values[:_POSITION_ROWS] ** 2)),
+        angles=float(np.sum(values[_POSITION_ROWS:] ** 2)) if r > _POSITION_ROWS else math.nan,
+        normalised=float(np.sum(np.asarray(problem.white[number]) ** 2)),
+        rows=r * m,
+        trace=math.inf if is_open else float(np.einsum("maa->", weights) + np.sum(weights * errors)),
+        square=float(square),
+        shared=np.einsum("mwa,mva->wv", weighted, joined),
+    )
+
+
+def _of_lengths(
+    problem: _Unseen, capture: Capture
+) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, "l l"], Float[np.ndarray, "l c"], Law]:
+    """Errors of the reference lengths, their covariance, and its parts."""
+    linear, influence, uncertainty = problem.linear, problem.influence, problem.uncertainty
+    observed, p, count = linear.observed, len(linear.space.names), len(capture.lengths)
+    u = np.array([float(length.u) for length in capture.lengths])
+    if not count:
+        none = np.zeros((0, 0))
+        return np.zeros(0), none, *_parts_of_lengths(uncertainty, np.zeros((0, p)), none, u, u)
+    _, of_mean = _variances_in_places(uncertainty.shared, capture)
+    in_place = dict(zip(capture.names, of_mean, strict=True))
+    components = [np.zeros((count, *own.shape[:2])) for own in influence.own]
+    error, places = np.zeros(count), np.zeros((count, count))
+    pulls: dict[str, np.ndarray] = {}
+    for number, length in enumerate(capture.lengths):
+        rows = [observed.positions[position_of(name)] for name in (length.start, length.end)]
+        between = np.asarray(linear.z)[p + rows[1]] - np.asarray(linear.z)[p + rows[0]]
+        size = float(np.linalg.norm(between))
+        error[number] = size - float(length.value)
+        for name, index, sign in zip((length.start, length.end), rows, (-1.0, 1.0), strict=True):
+            of, component, first = observed.layout.component_of(int(index[0]))
+            assert of is not None  # the position of a socket, which no other observation shares
+            components[of][number, component, first : first + 3] += sign * between / size
+            pulls.setdefault(name, np.zeros((count, 3)))[number] += sign * between / size
+    for name, pull in pulls.items():
+        places += in_place[name] * pull @ pull.T
+    by_head = -sum(np.einsum("lKk,Kkh->lh", c, f) for c, f in zip(components, influence.follow, strict=True))
+    pull = by_head[:, p:] @ problem.basis
+    along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
+    scatter = sum(np.einsum("lKk,Kkj,gKj->lg", c, d, c) for c, d in zip(components, influence.own, strict=True))
+    covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
+    return error, covariance, *_parts_of_lengths(uncertainty, along, covariance, u**2, np.diagonal(places))
+
+
+def _parts_of_lengths(
+    uncertainty: Uncertainty,
+    slopes: Float[np.ndarray, "l p"],
+    covariance: Float[np.ndarray, "l l"],
+    stated: Float[np.ndarray, " l"],
+    in_places: Float[np.ndarray, " l"],
+) -> tuple[Float[np.ndarray, "l c"], Law]:
+    """Variances of errors of lengths by what they rest on, mm^2: the parts of the calibration's uncertainty, of which
+    the first contains the scatter of the poses at the ends, errors of places there, and what is stated of lengths."""
+    law = uncertainty.law.joined(Law.of(np.array([np.inf])))
+    others = np.column_stack([uncertainty.parts(slopes)[:, 1:], stated])
+    if PLACES in (names := () if uncertainty.components is None else uncertainty.components.names):
+        others[:, names.index(PLACES)] += in_places
+    whole = np.diagonal(covariance)
+    return np.column_stack([whole - others.sum(axis=1), others]), law
 
 
 def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple[float, Float[np.ndarray, " s"]]:
@@ -213,62 +328,3 @@ def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple
 
     parts = np.array([part_of_mean(name, size) for name, size in zip(capture.names, capture.sizes, strict=True)])
     return within, between + within * (parts - 1 / sizes)
-
-
-def _of_observations(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
-    """Of observations whose geometry is fitted to the arm.
-
-    With whitened derivatives A by the parameters and G by the geometry, and U an orthonormal basis of G, errors dp of
-    the parameters and w of the rows leave K (A dp + w) with K = I - U U^T. In mm, with D the inverse of the whitening,
-    V = D (K + K A C A^T K) D^T = D (I + W S W^T) D^T, where W = [U, K A] and S = diag(-I, C).
-    """
-    observed, noise, shared = Observed.of(capture, uncertainty.arm), uncertainty.noise, uncertainty.shared
-    if shared is not None:
-        noise = eqx.tree_at(lambda n: n.seating, noise, np.hypot(noise.seating, shared.sd_of(VISITS, SUCCESSIVE)))
-    fitted = fit_geometry(uncertainty.arm, observed, {}, noise)
-    space = uncertainty.space
-    p = len(space.names)
-    z = np.concatenate([np.asarray(space.vector()), fitted.geometry])
-    linear = linear_rows(space, observed, z)
-    rows, white = dense_rows(linear, fitted.whitening.roots, len(z))
-    relations, u = certified_and_lengths(observed, z, p)
-    count = len(observed.ends)
-    rows = np.concatenate([rows, relations[count:] / np.maximum(u[count:], 1e-9)[:, None]])
-    basis, singular, vectors = np.linalg.svd(rows[:, p:] * observed.steps, full_matrices=False)
-    known = singular > _NULL * singular[0]
-    basis, follow = basis[:, known], vectors[known].T / singular[known]
-    along = basis.T @ rows[:, :p]
-    joined = np.concatenate([basis, rows[:, :p] - basis @ along], axis=1)
-    g = basis.shape[1]
-    common = np.zeros((g + p, g + p))
-    common[:g, :g], common[g:, g:] = -np.eye(g), uncertainty.covariance
-    parts, first = {}, 0
-    for observation, part, root in zip(observed.observations, linear, fitted.whitening.roots, strict=True):
-        values = np.asarray(part.rows.values)
-        r, m = values.shape
-        mine, whitened = joined[first : first + r * m], white[first : first + r * m]
-        first += r * m
-        by_pose = mine.reshape(r, m, -1).transpose(1, 0, 2)
-        to_mm = np.linalg.inv(np.asarray(root))[:, :_POSITION_ROWS]
-        weights = np.einsum("mca,mcb->mab", to_mm, to_mm)
-        errors = np.einsum("mav,mbv->mab", by_pose @ common, by_pose)  # W S W^T within a pose
-        is_open = not np.all(np.isfinite(uncertainty.covariance_of_functions(to_mm @ by_pose[:, :, g:])))
-        weighted = np.einsum("mab,mbw->maw", weights, by_pose)
-        parts[observation.name] = _Part(
-            poses=0 if observation.kind == "socket" and m == 1 else m,
-            found=float(np.sum(values[:_POSITION_ROWS] ** 2)),
-            angles=float(np.sum(values[_POSITION_ROWS:] ** 2)) if r > _POSITION_ROWS else math.nan,
-            normalised=float(np.sum(whitened**2)),
-            rows=r * m,
-            trace=math.inf if is_open else float(np.einsum("maa->", weights) + np.sum(weights * errors)),
-            square=float(np.sum(weights**2) + 2 * np.einsum("mab,mbc,mca->", weights, weights, errors)),
-            shared=np.einsum("maw,mav->wv", by_pose, weighted),
-        )
-    pull = (relations[:count, p:] * observed.steps) @ follow
-    covariance = uncertainty.covariance_of_functions(pull @ along) + pull @ pull.T + np.diag(u[:count] ** 2)
-    ends = 0.0 if shared is None else float(shared.sd_of(PLACES))
-    covariance = covariance + ends**2 * relations[:count, p:] @ relations[:count, p:].T
-    geometry = observed.split(fitted.geometry)
-    measured = np.array([float(np.linalg.norm(geometry[end] - geometry[start])) for start, end in observed.ends])
-    error = measured - np.asarray(observed.nominal)
-    return UnseenErrors(parts, common, error, np.asarray(covariance), uncertainty.degrees_of_freedom)

@@ -17,6 +17,7 @@ from ..kinematics.arm import Arm, parameter_names, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import MAX_STEPS, SCALE, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.shared_errors import SharedErrors
 from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
@@ -85,7 +86,7 @@ class CalibrationRecord(NamedTuple):
     open: np.ndarray  # projector onto the directions that are not determined, in steps of 1 mm and 1 mrad
     noise: Noise  # given, or estimated from the residuals
     noise_model: str  # model of the tips' errors: `uncertainty.covariance.NOISE_MODELS`
-    degrees_of_freedom: float  # of the covariance
+    degrees_of_freedom: float  # of the scatter of single poses
     reduced_chi: float | None  # residuals in units of the given noise
     k: float
     u_k: float
@@ -104,6 +105,8 @@ class CalibrationRecord(NamedTuple):
     prior: PriorMetrics | None = None  # with arrays of NumPy
     noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected
     shared: SharedErrors | None = None  # errors that poses share, likewise
+    components: Components | None = None  # parts of the covariance that do not rest on the scatter of single poses
+    surplus_k: float = 0.0  # of u_k^2, by lengths that disagree
 
     @property
     def given_noise(self) -> Noise | None:
@@ -202,6 +205,7 @@ def record_of(
     single = isinstance(calibration, Identification)
     shared = None if single else calibration.shared
     stage1 = calibration if single else calibration.stage1
+    components = calibration.parameter_covariance.components
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -232,6 +236,8 @@ def record_of(
         prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
         noisy_encoders=calibration.noisy_encoders,
         shared=None if shared is None else jax.tree.map(np.asarray, shared),
+        components=None if components is None else jax.tree.map(np.asarray, components),
+        surplus_k=0.0 if calibration.scale is None else float(calibration.scale.surplus),
         others=None if others is None else _other_poses(calibration.arm, others, stage1.observed),
     )
 
@@ -298,17 +304,29 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
             noise=result.noise,
             u_k=None if np.isnan(result.u_k) else to_jax(np.asarray(result.u_k)),
             shared=result.shared,
+            components=_parts(result.components, result.shared),
+            surplus_k=to_jax(np.asarray(result.surplus_k)),
             names=result.names,
-            degrees_of_freedom=result.degrees_of_freedom,
+            scatter_degrees_of_freedom=result.degrees_of_freedom,
+            lengths=len(result.recording.capture.lengths),
         )
-    scale = result.scale
+    scale, shared = result.scale, None if isinstance(result, Identification) else result.shared
     return Uncertainty(
         arm=result.arm,
         covariance=result.covariance,
         open=result.parameter_covariance.open,
         noise=result.noise,
         u_k=None if scale is None else scale.u,
-        shared=None if isinstance(result, Identification) else result.shared,
+        shared=shared,
+        components=_parts(result.parameter_covariance.components, shared),
+        surplus_k=None if scale is None else scale.surplus,
         names=result.space.names,
-        degrees_of_freedom=float(result.degrees_of_freedom),
+        scatter_degrees_of_freedom=float(result.degrees_of_freedom),
+        lengths=0 if scale is None else len(scale.nominal),
     )
+
+
+def _parts(components: Components | None, shared: SharedErrors | None) -> Components | None:
+    """Parts of the covariance of the parameters, with errors of the tip that poses share."""
+    of_tips = None if shared is None else shared.of_tips
+    return of_tips if components is None else components.joined(of_tips)

@@ -21,11 +21,11 @@ from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.shifted import ShiftedObservation
 from ..kinematics.arm import Arm
-from ..kinematics.chain import reading_units
+from ..kinematics.chain import JointKinds, reading_units
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
-from ..model.observed import Observed, linear_rows
-from ..uncertainty.tip_errors import ArmErrors, arm_errors
+from ..model.observed import Observed
+from ..uncertainty.linearisation import Linearisation, ObservationRows
 from .drawn_errors import DrawnErrors, draw_shared
 from .results import Calibration
 from .task import configurations
@@ -46,7 +46,7 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
     def coefficients(found: DrawnErrors | None, count: int) -> Float[np.ndarray, "t k"]:
         return np.zeros((count, 0)) if found is None else found.coefficients
 
-    if result.observed is not None:
+    if result.method == "joint":
         truth = truth_of(result, capture)
 
         def drawn_observations(count: int, random: np.random.Generator, level: Any) -> Any:
@@ -94,8 +94,8 @@ class ObservedTruth(NamedTuple):
     """An arm and a geometry about which data are drawn, in NumPy: by them every residual is 0 but for its errors."""
 
     observed: Observed
-    linear: list[Any]
-    errors: list[ArmErrors]
+    parts: list[ObservationRows]
+    kinds: JointKinds | None
     roots: list[Float[np.ndarray, "m r r"]]  # of the covariance of what was measured
     geometry: dict[str, Float[np.ndarray, " k"]]
     reading: Int[np.ndarray, " M"]  # number of the reading of each pose; equal ones were read at once
@@ -106,22 +106,21 @@ class ObservedTruth(NamedTuple):
         observed, space = to_numpy((Observed.of(capture, space.base), space))
         numbers = [np.asarray(geometry[name]) for name in observed.blocks]
         z = np.concatenate([np.asarray(vector), *numbers])
-        p = len(space.names)
-        linear = linear_rows(space, observed, z)
-        errors = arm_errors(observed.forward(space, z[:p], z[p:]), linear, observed)
+        linear = Linearisation.at(observed, space, z, least=1.0)
+        parts = linear.parts()
         return cls(
             observed,
-            linear,
-            errors,
-            [_square_roots(np.asarray(part.rows.measured)) for part in linear],
-            {name: np.asarray(values) for name, values in observed.split(z[p:]).items()},
+            parts,
+            linear.errors[0].kinds,
+            [_square_roots(np.asarray(part.measured)) for part in parts],
+            {name: np.asarray(values) for name, values in observed.split(z[len(space.names) :]).items()},
             np.array(configurations(observed.q)),
         )
 
     @property
     def size(self) -> int:
         """Numbers in the data of one trial."""
-        return sum(one.q.size + part.rows.values.size for one, part in self._parts())
+        return sum(part.observation.q.size + part.values.size for part in self.parts)
 
     def drawn(
         self,
@@ -134,27 +133,28 @@ class ObservedTruth(NamedTuple):
         """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat, ``alike``
         are errors that poses share."""
         q = np.asarray(self.observed.q)
-        encoder = noise.of_columns(self.errors[0].kinds, self.errors[0].by_readings.shape[1], q.shape[1])
+        encoder = noise.of_columns(self.kinds, self.parts[0].by_readings.shape[1], q.shape[1])
         read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
         values = self.values(count, random)
         errors = self.errors_of_rows(count, level * float(noise.seating), random)
         found = []
-        for (observation, part), rows, error in zip(self._parts(), self.observed.slices, errors, strict=True):
-            shift, readings = error - np.asarray(part.rows.values), q[rows] + read[:, self.reading[rows]]
+        for part, error in zip(self.parts, errors, strict=True):
+            rows = part.poses
+            shift, readings = error - np.asarray(part.values), q[rows] + read[:, self.reading[rows]]
             if alike is not None:
-                shift = shift + np.einsum("rcm,tmc->trm", np.asarray(part.rows.by_tip), alike.tips[:, rows])
+                shift = shift + np.einsum("rcm,tmc->trm", np.asarray(part.by_tip), alike.tips[:, rows])
                 readings = readings + alike.joints[:, rows]
-            found.append(shifted(observation, readings, shift, values))
+            found.append(shifted(part.observation, readings, shift, values))
         return batch_of_observations(found, self.ends, self.lengths(count, random))
 
     def errors_of_rows(self, count: int, seating: Any, random: np.random.Generator) -> list[Float[np.ndarray, "t r m"]]:
         """Errors of the seat (of this standard deviation, mm) and of what was measured, in each observation's rows."""
         found = []
-        for part, error, root in zip(self.linear, self.errors, self.roots, strict=True):
-            r, m = part.rows.values.shape
-            seat = seating * random.normal(size=(count, error.by_seat.shape[1], m))
+        for part, root in zip(self.parts, self.roots, strict=True):
+            r, m = part.values.shape
+            seat = seating * random.normal(size=(count, part.by_seat.shape[1], m))
             measured = np.einsum("mab,tbm->tam", root, random.normal(size=(count, r, m)))
-            found.append(measured + np.einsum("rcm,tcm->trm", error.by_seat, seat))
+            found.append(measured + np.einsum("rcm,tcm->trm", part.by_seat, seat))
         return found
 
     def values(self, count: int, random: np.random.Generator) -> dict[str, Float[np.ndarray, "t k"]]:
@@ -188,18 +188,16 @@ class ObservedTruth(NamedTuple):
             for name, (value, u) in self.observed.certified().items()
         }
         found = []
-        for observation, part in self._parts():
+        for part in self.parts:
+            observation = part.observation
             rows = _rows_with_replacement(observation, count, random)
             batch = _selected(observation, rows)
             own = {name: values[name] for name in observation.certified}
-            none = np.zeros((count, *part.rows.values.shape))
+            none = np.zeros((count, *part.values.shape))
             found.append(ShiftedObservation(batch, batch.q, none, own))
         nominal, u = np.asarray(self.observed.nominal), np.asarray(self.observed.u)
         drawn = nominal + u * random.normal(size=(count, len(u)))
         return batch_of_observations(found, self.ends, DrawnLengths(drawn, np.broadcast_to(u, drawn.shape)))
-
-    def _parts(self) -> Any:
-        return list(zip(self.observed.observations, self.linear, strict=True))
 
     @property
     def ends(self) -> list[tuple[str, str]]:
@@ -209,7 +207,6 @@ class ObservedTruth(NamedTuple):
 
 def truth_of(result: Calibration, capture: Capture) -> ObservedTruth:
     """The arm and the geometry of a calibration. Raises `InputError` where it is of another capture."""
-    assert result.observed is not None
     geometry = result.observed.geometry
     missing = [name for name in Observed.of(capture, None).blocks if name not in geometry]
     if missing:

@@ -1,7 +1,7 @@
 """Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,13 +16,13 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
-from ..model.robust import LossName
+from ..model.loss_names import LossName
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.volume import default_length, sample_lengths
-from .batch import BatchOptions, BatchTask, identify_many
+from .batch import calibrate_many
 from .record import uncertainty_of
 from .redrawn import batch_of_captures, trials_of, truth_of
-from .results import Calibration, ManyCalibrations, ManyIdentifications
+from .results import Calibration, ManyCalibrations
 
 _LENGTHS = 24  # lengths over the working volume whose distribution is found with those of the parameters and k
 _REFINED = 5  # the standard's own tolerance is divided by this where a linear result is validated (JCGM 101, 8.2)
@@ -46,7 +46,7 @@ class Sampled(NamedTuple):
     low: Float[np.ndarray, " q"]  # as probable to be below it as above the other end
     high: Float[np.ndarray, " q"]
     linear_u: Float[np.ndarray, " q"]  # what the law of propagation says
-    factor: float  # of the linear interval
+    factor: Float[np.ndarray, " q"]  # of the linear interval
     tolerance: Float[np.ndarray, " q"]  # delta of JCGM 101, 7.9.2
     stable: bool  # the adaptive procedure ended before ``most`` trials
     trials: int
@@ -227,7 +227,7 @@ def bootstrap(
     _check_level(level)
     random = random_generator(seed)
     task = _RepeatedTask.of(result, capture, None, robust)
-    if result.observed is not None:
+    if result.method == "joint":
         captures = truth_of(result, capture).resampled(trials, random)
         means = None if result.prior is None else _of_prior(result, np.asarray(result.prior.mean))
         found, failed = task.solved(captures, task.prior_means(trials, random, means))
@@ -250,7 +250,7 @@ def _check_level(level: float) -> None:
 
 def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:
     """Refuse trials that would be solved with another loss than the calibration, or of another capture."""
-    if result.observed is None:
+    if result.method == "two-stage":
         if capture.observations or robust is not None:
             raise InputError(
                 "the calibration is of sockets and lengths without a robust loss; give its own capture and loss."
@@ -337,24 +337,20 @@ class _RepeatedTask(NamedTuple):
         sd = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
         return centre + sd * random.normal(size=(count, len(sd)))
 
-    def _many(
-        self, captures: Capture, means: Float[np.ndarray, "t p"] | None
-    ) -> ManyCalibrations | ManyIdentifications:
+    def _many(self, captures: Capture, means: Float[np.ndarray, "t p"] | None) -> ManyCalibrations:
         result = self.result
         stage1, bounds = result.stage1, result.bounds
         # What sets the scale, and the noise that weights the poses, are the calibration's own.
-        if result.observed is not None:
-            options = {"noise": result.weighting_noise, "hold": result.hold, "robust": self.robust}
-            if means is None:
-                return identify_many(result.arm, captures, bounds, start=result.parameters, **options)
-            assert result.prior is not None
-            arms = Parameters(result.arm, result.space.names).arm(means)
-            weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
-            prior = Prior({name: 1 / weight for name, weight in weights if weight > 0})
-            return identify_many(arms, captures, bounds, start=result.parameters, prior=prior, **options)
-        box, options = (bounds.lower, bounds.upper), BatchOptions(noise=result.weighting_noise)
-        task = BatchTask.of(stage1.arm, captures, box, stage1.parameters, result.space, options, stage1.anchor)
-        return task.calibrate(result.method)
+        options: dict[str, Any] = {"noise": result.weighting_noise, "robust": self.robust, "method": result.method}
+        if result.method == "two-stage":
+            return calibrate_many(stage1.arm, captures, bounds, start=stage1.parameters, hold=result.hold, **options)
+        if means is None:
+            return calibrate_many(result.arm, captures, bounds, start=result.parameters, **options)
+        assert result.prior is not None
+        arms = Parameters(result.arm, result.space.names).arm(means)
+        weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
+        prior = Prior({name: 1 / weight for name, weight in weights if weight > 0})
+        return calibrate_many(arms, captures, bounds, start=result.parameters, prior=prior, **options)
 
     def solved(
         self,
@@ -392,12 +388,16 @@ class _RepeatedTask(NamedTuple):
         """The trials' distribution, with the linear result to compare it with."""
         linear = uncertainty_of(result)
         u_length = np.asarray(linear.length(self.start, self.end))
+        factor_length = linear.expanded_length(self.start, self.end, level=level) / np.where(
+            u_length > 0, u_length, 1.0
+        )
         u = values.std(axis=0, ddof=1)
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
         start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
         lengths = np.linalg.norm(start - end, axis=1)
         scale = result.scale  # None where observations fix it, and not reference lengths alone
         k, u_k = ([], []) if scale is None else ([float(scale.value)], [float(scale.u)])
+        factor_k = [linear.expanded_k(level) / own for own in u_k]
         estimate = np.concatenate([result.parameters, k, lengths])
         return Sampled(
             quantities=(*result.space.names, *("k" for _ in k), *(f"length {i + 1}" for i in range(len(self.start)))),
@@ -406,7 +406,7 @@ class _RepeatedTask(NamedTuple):
             low=low,
             high=high,
             linear_u=np.concatenate([linear.u, u_k, u_length]),
-            factor=linear.factor(level),
+            factor=np.concatenate([linear.factor(level), factor_k, factor_length]),
             tolerance=numerical_tolerance(u, digits),
             stable=stable,
             trials=len(values) + failed,

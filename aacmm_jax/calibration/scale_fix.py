@@ -22,6 +22,8 @@ from ..data.observations.socket import position_of
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.observed import Observed
 from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
+from ..uncertainty.covariance import DISAGREEMENT, STATED
+from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.linear_propagation import rows_of_functions
 from .conclusion import Solution
 from .scale_anchor import ScaleAnchor
@@ -34,9 +36,14 @@ class ScaleFound(NamedTuple):
     """k of stage 1, and how it follows the data."""
 
     scale: Scale
-    rows: list[Float[AnyArray, "1 r m"]]  # its derivatives by the whitened rows of every block
+    rows: list[Float[AnyArray, "1 _ _"]]  # its derivatives by the whitened rows of every block
     by_lengths: Float[AnyArray, " l"]  # by the certified lengths, 1/mm
-    variance_of_lengths: Float[AnyArray, ""]  # of these, and what their disagreement adds
+    variance_of_lengths: Float[AnyArray, ""]  # by these; `Scale.surplus` is what their disagreement adds
+
+    @property
+    def added(self) -> Float[AnyArray, ""]:
+        """What is added to the variance that follows from the poses."""
+        return self.variance_of_lengths + self.scale.surplus
 
 
 def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
@@ -59,10 +66,9 @@ def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
             components[of] = set_at(components[of], (0, component, slice(first, first + 3)), derivative)
     rows = rows_of_functions(influence, head, components)
     by_lengths = -relative * scale.measured / scale.nominal
-    predicted = relative @ ends.covariance(scale.value) @ relative
-    added = xp.sum((by_lengths * ends.u) ** 2) + xp.maximum(scale.u**2 - predicted, 0.0)
-    u = xp.sqrt(solution.covariance_of(rows)[0, 0] + added)
-    return ScaleFound(eqx.tree_at(lambda s: s.u, scale, u), rows, by_lengths, added)
+    of_lengths = xp.sum((by_lengths * ends.u) ** 2)
+    u = xp.sqrt(solution.covariance_of(rows)[0, 0] + of_lengths + scale.surplus)
+    return ScaleFound(eqx.tree_at(lambda s: s.u, scale, u), rows, by_lengths, of_lengths)
 
 
 def positions_at_ends(capture: Capture) -> list[str]:
@@ -71,7 +77,7 @@ def positions_at_ends(capture: Capture) -> list[str]:
 
 
 def ends_between(
-    observed: Observed, geometry: Float[AnyArray, " g"], own: list[Float[AnyArray, "K k k"]], capture: Capture
+    observed: Observed, geometry: Float[AnyArray, " g"], own: list[Float[AnyArray, "_ _ _"]], capture: Capture
 ) -> MeasuredEnds:
     """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
     xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
@@ -131,7 +137,8 @@ class DividedUncertainty(NamedTuple):
     """Of the divided parameters, mm and rad."""
 
     covariance: Float[AnyArray, "p p"]
-    rows: list[Float[AnyArray, "p r m"]]  # how they follow the whitened rows of every block
+    components: Components
+    rows: list[Float[AnyArray, "p _ _"]]  # how they follow the whitened rows of every block
 
 
 def divided_uncertainty(solution: Solution, found: ScaleFound, anchor: ScaleAnchor, divided: Any) -> DividedUncertainty:
@@ -155,5 +162,9 @@ def divided_uncertainty(solution: Solution, found: ScaleFound, anchor: ScaleAnch
     for one, of_k in zip(of_free, found.rows, strict=True):
         whole = set_at(xp.zeros((p, *one.shape[1:])), index, one)
         rows.append(change[:, None, None] * whole - by_k[:, None, None] * of_k)
-    matrix = solution.covariance_of(rows) + found.variance_of_lengths * by_k[:, None] * by_k[None, :]
-    return DividedUncertainty(matrix, rows)
+    of_k = by_k[:, None] * by_k[None, :]
+    parts = {
+        STATED: (found.variance_of_lengths * of_k, np.inf),
+        DISAGREEMENT: (found.scale.surplus * of_k, max(len(found.by_lengths) - 1, 1)),
+    }
+    return DividedUncertainty(solution.covariance_of(rows) + found.added * of_k, Components.of(parts), rows)

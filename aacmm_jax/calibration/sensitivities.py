@@ -15,15 +15,12 @@ class Sensitivities(NamedTuple):
     tips: Float[np.ndarray, "p 3 M"]  # by displacements of the tip, mm
     joints: Float[np.ndarray, "p n M"]  # by errors of the joints, rad (mm of prismatic ones)
     lengths: Float[np.ndarray, "l 3 M"]  # of measured lengths by the tips, where positions of sockets are means
-    # What lengths that contradict each other have added to the covariance of the parameters: errors of places instead.
-    surplus: Float[np.ndarray, "p p"]
 
 
 def sensitivities_of_rows(
     linear: Linearisation,
-    rows: list[Float[np.ndarray, "p r m"]],
+    rows: list[Float[np.ndarray, "p _ _"]],
     lengths: Float[np.ndarray, "l 3 M"],
-    surplus: Float[np.ndarray, "p p"],
 ) -> Sensitivities:
     """Of parameters that follow the whitened rows of every group so."""
     joints = [
@@ -31,10 +28,10 @@ def sensitivities_of_rows(
         for one, error in zip(_of_residuals(linear, rows), linear.errors, strict=False)
     ]
     by_joints = np.concatenate(linear.observed.by_observation(joints), axis=2)
-    return Sensitivities(tips_of_rows(linear, rows), by_joints, lengths, surplus)
+    return Sensitivities(tips_of_rows(linear, rows), by_joints, lengths)
 
 
-def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) -> Float[np.ndarray, "q 3 M"]:
+def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q _ _"]]) -> Float[np.ndarray, "q 3 M"]:
     """Derivatives by the tips, of what follows the whitened rows so."""
     tips = [
         np.einsum("qbm,bcm->qcm", one, part.by_tip)
@@ -43,6 +40,6 @@ def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) 
     return np.concatenate(linear.observed.by_observation(tips), axis=2)
 
 
-def _of_residuals(linear: Linearisation, rows: list[Float[np.ndarray, "q r m"]]) -> list[Float[np.ndarray, "q r m"]]:
+def _of_residuals(linear: Linearisation, rows: list[Float[np.ndarray, "q _ _"]]) -> list[Float[np.ndarray, "q _ _"]]:
     """Derivatives by the residuals before they are whitened."""
     return [np.einsum("qam,mab->qbm", one, root) for one, root in zip(rows, linear.whitening.roots, strict=False)]

@@ -8,15 +8,12 @@ from jaxtyping import Float
 
 from ..uncertainty.group_test import Block
 from ..uncertainty.residual_tests import Residuals
-from .group_equations import LEAST_U, PRIOR, Rows, lengths_in_solve, residual_rms
+from .group_equations import LEAST_U, PRIOR, Rows, lengths_in_solve
 from .length_consistency import lengths_of_sockets
 from .record import CalibrationRecord
 from .sensitivities import Sensitivities
 
 _EXPLAINED = 1e-3  # part of a column that the model leaves, below which it counts as the model's own
-# Standard deviation of an effect of the tip above which it is improbable, of that of the residuals. Two to four lengths
-# say so little that this decides how wide intervals are: at 3 they covered 89 to 91 % (`benchmarks/NOTES.md`).
-_USUAL = 9.0
 
 
 class SharedProblem(NamedTuple):
@@ -135,9 +132,3 @@ def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarra
     """With the scale anchor, which the lengths determine, as one more unknown."""
     parts = np.split(np.concatenate([of_rows, of_lengths]), np.cumsum([len(b.residual) for b in blocks])[:-1])
     return [b._replace(shared=np.column_stack([b.shared, part])) for b, part in zip(blocks, parts, strict=True)]
-
-
-def usual_deviations(problem: SharedProblem) -> tuple[float, float]:
-    """Standard deviations of an effect of the tip: below which it is nothing, and above which it is improbable."""
-    scatter = residual_rms(problem.rows)
-    return scatter / np.sqrt(np.mean([len(each.poses) for each in problem.rows])), _USUAL * scatter

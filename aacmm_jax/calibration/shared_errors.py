@@ -1,10 +1,11 @@
 """Errors that poses share, found in the residuals of a calibration and added to its uncertainty.
 
 Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
-all poses of a visit share (marked in the capture, or successive poses where none are), functions of the readings that
-the model lacks (`uncertainty.shared_errors`), and errors that all poses of a socket share, which only reference lengths
-show. The gate keeps the intervals of a calibration in which nothing is wrong as they are. After a robust loss,
-poses count with the weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
+all poses of a visit share (marked in the capture, or successive poses where none are), and functions of the readings
+that the model lacks (`uncertainty.shared_errors`). The gate keeps the intervals of a calibration in which nothing is
+wrong as they are. Errors that all poses of a socket share, which only reference lengths show, are always allowed for
+where three lengths or more compare them, as far as these leave them possible. After a robust loss, poses count with the
+weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,24 +27,26 @@ from ..kinematics.corrected_arm import with_corrections, with_further_correction
 from ..kinematics.corrections.kinds import coefficient_of, shared_model
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.prior_scales import default_prior
+from ..uncertainty.covariance import DISAGREEMENT
+from ..uncertainty.degrees_of_freedom import Law
 from ..uncertainty.residual_tests import block_diagonal, form_of_poses, form_test, score_tests
 from ..uncertainty.shared_errors import (
     NULL,
-    PLACES,
-    SUCCESSIVE,
-    VISITS,
     Effects,
+    Moments,
+    OneVariance,
     SharedErrors,
     group_deviations,
     one_variance,
     second_moments,
 )
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .drawn_errors import functions_of, places_of
 from .group_equations import EXACT, PRIOR, Rows, equations_in_chunks, lengths_in_solve, residual_rms
 from .record import CalibrationRecord, record_of
 from .results import Calibration
 from .sensitivities import Sensitivities
-from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, usual_deviations, with_lengths
+from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
 # Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as
@@ -58,6 +61,12 @@ _NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are a
 # Shared errors of a few standard deviations cost weight, too, and are what is looked for.
 _TRUSTED = 0.1
 _FEWEST = 6  # degrees of freedom
+# Median of the standard deviation of errors of the tip that poses share, of that of the residuals, as it is expected
+# beforehand; three lengths say so little that it decides how wide intervals are (`benchmarks/NOTES.md`).
+_USUAL = 1.25
+# Differences between lengths from which errors of places are always allowed for. So few do not show that there are
+# none: with three lengths, a gate closes in a third of the captures in which places err by as much as single poses.
+_FEW = 2
 
 
 def with_shared_errors(
@@ -75,6 +84,8 @@ def with_shared_errors(
     if found is None:
         return result
     before = result.parameter_covariance
+    if PLACES in found.shared.kinds:
+        before = before.without(DISAGREEMENT)
     covariance = before._replace(
         matrix=before.matrix + found.added,
         noise=jax.tree.map(lambda leaf: np.sqrt(found.variance) * leaf, before.noise),
@@ -116,15 +127,16 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
         if probability >= _GATE:
             continue
         if effect == tips.kind:
-            tips = tips.learned(of_poses, effects)
+            tips = tips.of(of_poses, effects)
             effects = tips.joined(of_poses, effects)
         else:
-            functions = functions._replace(sd=group_deviations(effects, functions.columns, functions.members))
+            found = group_deviations(effects, functions.columns, functions.members)
+            functions = functions._replace(sd=found[0], degrees_of_freedom=found[1])
             effects = effects.joined(functions.columns, functions.sd**2 @ functions.members)
     with_tips = tips.joined(problem, Effects.none(problem.left, effects.given))
     every = functions.joined(problem, with_tips)
     places = _places(problem, every)
-    if not (tips.variance or places.variance or len(functions.sd)):
+    if tips.learned is None and places.learned is None and not len(functions.sd):
         return None
     return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
 
@@ -143,33 +155,40 @@ def _summed(
     problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
 ) -> _Found:
     """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
-    found = [effect for effect in tips if effect.variance]
+    found = [effect for effect in tips if effect.learned is not None]
     kinds, units = [effect.kind for effect in found], ["mm" for _ in found]
-    sds = [np.sqrt(effect.variance) for effect in found]
-    p = len(problem.record.names)
-    added = -problem.sensitivities.surplus if PLACES in kinds else np.zeros((p, p))
-    follow, moments, names = np.zeros((p, 0)), np.zeros((0, 0)), ()
-    for effect in found:
+    laws = [effect.learned for effect in found if effect.learned is not None]
+    sds, p = [np.sqrt(law.variance) for law in laws], len(problem.record.names)
+    added = np.zeros((len(found), p, p))
+    for whole, effect, law in zip(added, found, laws, strict=True):
         by_effect = problem.by_patterns(effect.patterns[0])
-        added = added + effect.variance * by_effect @ by_effect.T
+        whole += law.variance * by_effect @ by_effect.T
+    law = Law(
+        np.full(len(laws), np.inf), np.array([law.ratios for law in laws]), np.array([law.weights for law in laws])
+    )
+    follow, moments, names = np.zeros((p, 0)), Moments(np.zeros((0, 0)), np.zeros((0, 0, 0))), ()
     if len(functions.sd):
         names, follow, steps = functions.names, functions.follow, functions.steps
-        moments = second_moments(without, problem.turned(*functions.turned), functions.sd @ functions.members)
-        moments = moments * steps[:, None] * steps
-        added = added + follow @ moments @ follow.T
+        moments = second_moments(without, problem.turned(*functions.turned), functions.sd, functions.members)
+        moments = moments.in_units(steps)
         kinds, units = [*kinds, *functions.kinds], [*units, *functions.units]
         sds += [sd * steps[np.argmax(own)] for sd, own in zip(functions.sd, functions.members, strict=True)]
+        of_functions = Law.of(functions.degrees_of_freedom)
+        law = law.joined(of_functions) if laws else of_functions
     lengths = [effect.length for effect in found if np.isfinite(effect.length)]
     shared = SharedErrors(
         kinds=tuple(kinds),
         units=tuple(units),
         names=names,
         sd=np.array(sds),
-        moments=moments,
+        moments=moments.matrix,
         follow=follow,
         correlation_length=np.asarray(lengths[0] if lengths else np.nan),
+        added=added,
+        by_group=moments.by_group,
+        law=law,
     )
-    return _Found(shared, added, every.variance)
+    return _Found(shared, added.sum(axis=0) + follow @ moments.matrix @ follow.T, every.variance)
 
 
 class _Tips(NamedTuple):
@@ -179,23 +198,25 @@ class _Tips(NamedTuple):
     probability: float
     patterns: list[Float[np.ndarray, "M c"]]
     lengths: tuple[float, ...] = (np.nan,)  # of correlation, for each of the patterns
-    variance: float = 0.0  # mm^2
+    learned: OneVariance | None = None
     length: float = np.nan
 
-    def learned(self, problem: SharedProblem, effects: Effects) -> "_Tips":
-        """With the variance of the most likely patterns."""
-        every = [
-            one_variance(effects, problem.moved(patterns), *usual_deviations(problem)) for patterns in self.patterns
-        ]
+    def of(self, problem: SharedProblem, effects: Effects) -> "_Tips":
+        """With the variance of the most likely patterns.
+
+        Errors that poses share are about as large as those of single poses.
+        """
+        usual = _USUAL * residual_rms(problem.rows)
+        every = [one_variance(effects, problem.moved(patterns), usual) for patterns in self.patterns]
         best = int(np.argmax([one.log_likelihood for one in every]))
-        return self._replace(patterns=[self.patterns[best]], variance=every[best].variance, length=self.lengths[best])
+        return self._replace(patterns=[self.patterns[best]], learned=every[best], length=self.lengths[best])
 
     def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
         """Effects with this one."""
-        if not self.variance:
+        if self.learned is None:
             return effects
         columns = problem.moved(self.patterns[0])
-        return effects.joined(columns, np.full(columns.shape[1], self.variance))
+        return effects.joined(columns, np.full(columns.shape[1], self.learned.variance))
 
 
 def _visits(problem: SharedProblem) -> _Tips:
@@ -252,6 +273,7 @@ class _Functions(NamedTuple):
     columns: Float[np.ndarray, "R k"]
     follow: Float[np.ndarray, "p k"]
     sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
+    degrees_of_freedom: Float[np.ndarray, " g"] = np.zeros(0)
 
     def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
         """Effects with these."""
@@ -335,8 +357,11 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips:
     explained = np.sum((vectors[:, known].T @ effects.product(columns, by_poses)[:, 0]) ** 2 / values[known])
     if explained > _MOST_OF_POSES * float(effects.product(by_poses, by_poses)[0, 0]):
         return nothing
-    square = float(np.sum((vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2 / values[known]))
     number, spare = int(known.sum()), effects.left.degrees_of_freedom - int(known.sum())
+    found = nothing._replace(patterns=[patterns])
+    if number >= _FEW:
+        return found.of(problem, effects)
+    square = float(np.sum((vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2 / values[known]))
     if effects.given:
         probability = chi_square_tail(square, number)
     else:
@@ -344,9 +369,7 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips:
         probability = f_tail(square / number / (rest / spare), number, spare)
     if not len(effects.variances):
         probability = min(probability, _neighbours(problem))
-    if not probability < _GATE:
-        return nothing
-    return nothing._replace(probability=probability, patterns=[patterns]).learned(problem, effects)
+    return found.of(problem, effects) if probability < _GATE else nothing
 
 
 def _neighbours(problem: SharedProblem) -> float:

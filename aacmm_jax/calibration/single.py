@@ -18,7 +18,7 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..kinematics.priors import Prior
-from ..model.robust import LossName
+from ..model.loss_names import LossName
 from ..uncertainty.covariance import NoiseModel
 from .checks import check_identifiable, check_method, check_single
 from .encoder_noise import with_noise_by_joint

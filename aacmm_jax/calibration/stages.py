@@ -93,7 +93,9 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     xp = namespace(identification)
     division = divided(anchor, bounds, identification.active, identification.parameters, k)
     uncertainty = divided_uncertainty(solution, found, anchor, division.parameters)
-    covariance = identification.parameter_covariance._replace(matrix=uncertainty.covariance + of_bounds)
+    covariance = identification.parameter_covariance._replace(
+        matrix=uncertainty.covariance + of_bounds, components=uncertainty.components
+    )
     arm, active = bounds.space.arm(division.parameters), bounds.active(division.parameters)
     linear = _divided_linearisation(task, solution, division)
     state = state_at(task, linear.space, linear.z)
@@ -121,9 +123,7 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     )
 
     def sensitivities() -> Sensitivities:
-        without = solution.covariance_of(uncertainty.rows)
-        surplus = np.asarray(uncertainty.covariance - without)
-        return sensitivities_of_rows(linear, uncertainty.rows, _of_lengths(solution, capture), surplus)
+        return sensitivities_of_rows(linear, uncertainty.rows, _of_lengths(solution, capture))
 
     return Stages(calibration, sensitivities, division.stands_against)
 
@@ -150,7 +150,7 @@ def _divided_metrics(
     # What is divided is counted from the foot of the second axis, where d_1 ends.
     can_scale = solution.identification.anchor.can_scale
     foot = xp.stack([xp.zeros(()), xp.zeros(()), linear.space.base.d[0]]) if can_scale else None
-    variance = solution.covariance_of(found.rows)[0, 0] + found.variance_of_lengths
+    variance = solution.covariance_of(found.rows)[0, 0] + found.added
     _, with_k = covariance_with(solution.influence, found.rows, solution.covariances)
     covariances, geometry = {}, {}
     for name in observed.names:
@@ -244,6 +244,6 @@ def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str
         of_free = rows_of_functions(influence, head, components)
         rows = [set_at(np.zeros((p, *one.shape[1:])), task.free, one) for one in of_free]
         none = np.zeros((0, 3, task.observed.q.shape[0]))
-        return sensitivities_of_rows(linear, rows, none, np.zeros((p, p)))
+        return sensitivities_of_rows(linear, rows, none)
 
     return Stages(calibration, sensitivities)

@@ -15,8 +15,9 @@ from ..kinematics.arm import Arm, check_columns
 from ..kinematics.chain import forward_pass
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
 from ..model.observed import Observed
-from ..model.robust import Loss, LossName, check_loss
+from ..model.robust import Loss, check_loss
 from ..uncertainty.covariance import NoiseModel
 from .checks import check_noise_model, check_start
 from .scale_anchor import ScaleAnchor, scale_anchor

@@ -16,6 +16,7 @@ from ..kinematics.arm import Arm, parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
 from ..summaries.calibration import prior_rows, prior_sentence
 from ..summaries.observations import less_weight
+from ..uncertainty.arm_uncertainty import Uncertainty
 from .observation_results import add_observation_equipment, add_observations
 from .xml_elements import (
     CELSIUS,
@@ -74,7 +75,6 @@ def add_results(
 def uncertainty_statement(record: CalibrationRecord) -> str:
     """How the uncertainties were evaluated, and what they do not include."""
     noise = "as it was given" if record.noise_model == "given" else "as estimated from the residuals"
-    count = "infinitely many" if math.isinf(record.degrees_of_freedom) else f"{record.degrees_of_freedom:.4g}"
     sources = "uncertainty of the reference lengths"
     if record.recording.capture.observations:
         sources = "uncertainties of what was measured and certified"
@@ -88,8 +88,9 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
     if record.calibrated.arm.corrections is not None:
         model += " with the joint corrections below"
     return (
-        f"Expanded uncertainties are standard uncertainties times {uncertainty_of(record).factor(LEVEL):.4g}, the "
-        f"coverage factor of Student's t for {count} degrees of freedom and a coverage probability of {LEVEL:.0%}. "
+        "Expanded uncertainties are standard uncertainties times the coverage factor that is stated with each: of "
+        f"Student's t for a coverage probability of {LEVEL:.0%} and the effective degrees of freedom of that quantity, "
+        "which follow from what each part of its variance rests on. "
         f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
         f"{sources}. They apply to each parameter alone; the parameters are correlated, as the covariance matrix says. "
         "Expanded uncertainties have two digits, and values are rounded to them. "
@@ -118,19 +119,19 @@ def _add_measurement(
     add_observation_equipment(equipments, residuals, any_artefact_stated=bool(given.reference))
     _add_conditions(add(measurement, "influenceConditions"), given, stage)
     results = add(measurement, "results")
-    factor = uncertainty_of(record).factor(LEVEL)
+    uncertainty = uncertainty_of(record)
     _add_repeatability(results, stage)
     left = stage.name == "As left"
     if lengths:
-        _add_lengths(results, lengths, stage, factor, fixed_scale=left and record.fixed_by_one_length)
+        _add_lengths(results, lengths, stage, uncertainty, fixed_scale=left and record.fixed_by_one_length)
     if residuals:
         data = _add_result(results, "Observations", "Distances of the tip from the geometry of each observation.")
         add_observations(data, residuals, distances_of(capture, stage.evaluation), left)
-    _add_parameters(results, record, stage, factor)
+    _add_parameters(results, record, stage, uncertainty)
     if left:
         _add_covariance(results, record)
     if left and not math.isnan(record.k):
-        _add_scale(results, record, factor)
+        _add_scale(results, record, uncertainty)
 
 
 def _add_methods(parent: Element, record: CalibrationRecord, residuals: tuple[ObservationResiduals, ...]) -> None:
@@ -232,7 +233,7 @@ def _length_name(number: int, length: ReferenceLength) -> str:
 
 
 def _add_lengths(
-    results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, factor: float, fixed_scale: bool
+    results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, uncertainty: Uncertainty, fixed_scale: bool
 ) -> None:
     data = _add_result(
         results,
@@ -240,11 +241,14 @@ def _add_lengths(
         "An error is the measured value minus the calibrated one; its uncertainty is that of the calibrated value and "
         "of the scatter of the poses at both ends.",
     )
-    columns = (np.asarray(column) for column in (stage.evaluation.measured, stage.evaluation.error, stage.evaluation.u))
-    for number, (length, measured, error, error_u) in enumerate(zip(lengths, *columns, strict=True), start=1):
+    columns = [np.asarray(column) for column in (stage.evaluation.measured, stage.evaluation.error, stage.evaluation.u)]
+    stated = np.array([float(length.u) for length in lengths])
+    columns.append(uncertainty.expanded_by_scatter(columns[2], stated, LEVEL))
+    for number, (length, measured, error, error_u, expanded) in enumerate(zip(lengths, *columns, strict=True), start=1):
+        factor = float(expanded / error_u) if _is_known(float(error_u)) else None
         row = add(data, "list")
         add_text(row, "name", _length_name(number, length))
-        decimals = decimals_of(factor * float(error_u)) if _is_known(float(error_u)) else _DECIMALS
+        decimals = decimals_of(float(expanded)) if factor is not None else _DECIMALS
         # The reference has the uncertainty of its own certificate, not that of this calibration's coverage factor.
         values = [
             ("calibrated value", "basic_referenceValue", length.value, float(length.u), None),
@@ -268,7 +272,7 @@ def _add_lengths(
             add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, scale, digits)
 
 
-def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, factor: float) -> None:
+def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, uncertainty: Uncertainty) -> None:
     data = _add_result(
         results,
         "Denavit-Hartenberg parameters",
@@ -281,8 +285,10 @@ def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, 
             "coefficient times a known function of the readings; gravity is its direction in the base frame."
         ),
     )
+    factors = dict(zip(record.names, map(float, uncertainty.factor(LEVEL)), strict=True))
     for name, value in _values(stage.arm).items():
         note, u = "", None
+        factor = factors.get(name)
         if stage.name == "As left":
             note, u = _note_and_uncertainty(record, name)
         quantity = add(data, "quantity")
@@ -339,11 +345,12 @@ def _note_and_uncertainty(record: CalibrationRecord, name: str) -> tuple[str, fl
     return "", u
 
 
-def _add_scale(results: Element, record: CalibrationRecord, factor: float) -> None:
+def _add_scale(results: Element, record: CalibrationRecord, uncertainty: Uncertainty) -> None:
     description = "Reference lengths as the arm measured them before its scale was set, over their calibrated values."
     quantity = add(_add_result(results, "Scale", description), "quantity")
     add_english(quantity, "name", "k")
-    add_real(quantity, record.k, ONE, record.u_k if _is_known(record.u_k) else None, factor)
+    u = record.u_k if _is_known(record.u_k) else None
+    add_real(quantity, record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
 
 
 def _is_known(u: float) -> bool:

@@ -110,9 +110,7 @@ def _observations(console: Console, part: dict[str, Any], predicted: bool) -> No
 
 def _predicted_lengths(console: Console, rows: list[dict[str, Any]], predicted: dict[str, Any], fitted: bool) -> None:
     """Held-out reference lengths: U contains the uncertainty of the calibration and of the length, and the noise."""
-    factor = predicted["coverage_factor"]
-    title = f"\nReference lengths [mm]; U: 95 %, coverage factor {factor:.2f}"
-    table = new_table(title, "between", "value", "measured", "error", "U", "error / U")
+    table = new_table("\nReference lengths [mm]; U: 95 %", "between", "value", "measured", "error", "U", "error / U")
     for row in rows:
         ratio = row["error_over_expanded"]
         decimals = decimals_for(row["expanded_mm"])

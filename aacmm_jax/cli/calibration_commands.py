@@ -12,6 +12,7 @@ from ..core.text import number
 from ..core.units import DEG
 from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import reading, together
+from ..model.loss_names import LossName
 from .app import (
     KEPT,
     Json,
@@ -58,7 +59,7 @@ def calibrate(
         ),
     ] = None,
     robust: Annotated[
-        Literal["huber", "cauchy", "tukey"] | None,
+        LossName | None,
         typer.Option(
             help="Robust loss, which takes weight from bad poses and lists them; encoders that are noisier than others "
             "are not looked for then."

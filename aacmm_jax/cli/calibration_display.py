@@ -13,6 +13,7 @@ from ..summaries.tables import (
     decimals_for,
     encoders_in_words,
     expanded_words,
+    factor_words,
     lengths_sentence,
     observed_words,
     quantity_words,
@@ -184,7 +185,7 @@ def _observed(console: Console, summary: dict[str, Any]) -> None:
             table.add_row(escape(row["observation"]), row["kind"], str(row["poses"]), *numbers)
         print_table(console, table)
         table = new_table("\nUnknown geometry", "part", "quantity", "found", "U (95 %)")
-        factor = summary["uncertainty"]["coverage_factor_95"]
+        factor = summary["uncertainty"]["coverage_factor_geometry_95"]
         parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")]
         for row in parts[:_MOST_PARTS]:
             for one in row["quantities"]:
@@ -224,7 +225,7 @@ def _base(console: Console, summary: dict[str, Any]) -> None:
     rows = summary.get("base")
     if not rows:
         return
-    factor = summary["uncertainty"]["coverage_factor_95"]
+    factor = summary["uncertainty"]["coverage_factor_geometry_95"]
     table = new_table("\nBase frame as seen from frames with known coordinates, U (95 %)", "in", "", "x", "y", "z")
     table.columns[1].justify = "left"
     for row in rows[:_MOST_PARTS]:
@@ -289,10 +290,11 @@ def _left_out(console: Console, rows: list[dict[str, Any]]) -> None:
 def _uncertainty(console: Console, summary: dict[str, Any]) -> None:
     """The expanded uncertainty (95 %) over the volume, the noise that it follows from, and what the data determine."""
     found = summary["uncertainty"]
-    volume, factor = found["volume"], found["coverage_factor_95"]
-    title = f"\nExpanded uncertainty U over the working volume (95 %, coverage factor {factor:.2f}) [mm]"
+    volume = found["volume"]
+    factors = ", ".join(filter(None, ("95 %", factor_words(volume))))
+    title = f"\nExpanded uncertainty U over the working volume ({factors}) [mm]"
     table = new_table(title, "", "median", "95th percentile", "largest")
-    for text, values in volume_rows(volume, factor):
+    for text, values in volume_rows(volume):
         table.add_row(text, *("not determined" if value is None else two_digits(value) for value in values))
     print_table(console, table)
     console.print(

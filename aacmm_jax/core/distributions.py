@@ -5,6 +5,8 @@ This takes 0.2 s still, so it is imported where it is used.
 
 import numpy as np
 
+_NORMAL = 1e6  # degrees of freedom from which Student's t is normal to all digits that matter
+
 
 def student_quantile(probability: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray:
     """Quantile of Student's t; of the normal distribution where the degrees of freedom are infinite."""
@@ -13,6 +15,15 @@ def student_quantile(probability: float, degrees_of_freedom: float | np.ndarray)
     infinite = np.isinf(degrees_of_freedom)
     finite = special.stdtrit(np.where(infinite, 1.0, degrees_of_freedom), probability)
     return np.where(infinite, special.ndtri(probability), finite)
+
+
+def student_tail(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
+    """Probability that a variable of Student's t is farther from 0 than a value; normal for infinite degrees."""
+    from scipy import special
+
+    many = np.asarray(degrees_of_freedom) > _NORMAL
+    finite = special.stdtr(np.where(many, 1.0, degrees_of_freedom), -np.abs(value)) if not np.all(many) else 0.0
+    return 2 * np.where(many, special.ndtr(-np.abs(value)), finite)
 
 
 def chi_square_quantile(probability: float, degrees_of_freedom: float) -> float:

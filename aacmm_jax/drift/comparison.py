@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.record import CalibrationRecord
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, correction_names, parameter_names, parameter_unit, value_of
+from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
-from .statistics import FIXED, ON_BOUND, coverage_factor, effective_degrees_of_freedom, joint_test, length_change
+from .statistics import FIXED, ON_BOUND, joint_test, length_change
 
 _PAIR = ("the old calibration", "the new calibration")
 
@@ -128,17 +130,19 @@ def _compared(
     before, after = (_values(arm, names) for arm in arms)
     reasons = _reasons(old, new, names)
     known = np.array([not reason for reason in reasons])
-    u_old, u_new = (np.where(known, _standard_uncertainties(record, names), 0.0) for record in (old, new))
-    degrees_of_freedom = effective_degrees_of_freedom(u_old, old.degrees_of_freedom, u_new, new.degrees_of_freedom)
-    u = np.where(known, np.hypot(u_old, u_new), np.nan)
+    both = [uncertainty_of(record) for record in (old, new)]
+    law = both[0].law.joined(both[1].law)
+    parts = np.concatenate([_parts(uncertainty, names) for uncertainty in both], axis=1)
+    parts = np.where(known[:, None], parts, 0.0)
+    u = np.where(known, np.sqrt(parts.sum(axis=1)), np.nan)
     return Drift(
         names=names,
         units=tuple(_unit(arms, name) for name in names),
         old=before,
         new=after,
         u=u,
-        degrees_of_freedom=degrees_of_freedom,
-        expanded=coverage_factor(level, degrees_of_freedom) * u,
+        degrees_of_freedom=degrees_of_freedom(parts, law),
+        expanded=coverage_factor(level, parts, law) * u,
         reasons=reasons,
         level=level,
         joint_test=joint_test(old, new, names, reasons, after - before, level),
@@ -191,10 +195,14 @@ def _reason(record: CalibrationRecord, name: str) -> str:
     return "" if known else "left open by the data"
 
 
-def _standard_uncertainties(record: CalibrationRecord, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
-    """Standard uncertainties in the order of ``names``; 0 for fixed parameters."""
-    known = dict(zip(record.names, np.sqrt(np.diag(record.covariance)), strict=True))
-    return np.array([known.get(name, 0.0) for name in names])
+def _parts(uncertainty: Uncertainty, names: tuple[str, ...]) -> Float[np.ndarray, "p c"]:
+    """Variances of parameters in the order of ``names``, part by part; 0 for fixed ones."""
+    index = {name: i for i, name in enumerate(uncertainty.names)}
+    slopes = np.zeros((len(names), len(uncertainty.names)))
+    for row, name in zip(slopes, names, strict=True):
+        if name in index:
+            row[index[name]] = 1.0
+    return np.asarray(uncertainty.parts(slopes))
 
 
 def _check(records: Sequence[Any], level: float, labels: Sequence[str]) -> None:

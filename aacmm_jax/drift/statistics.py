@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..core.distributions import chi_square_tail, f_tail, student_quantile
+from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..kinematics.arm import is_length
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 
 PROBE = ("probe_x", "probe_y", "probe_z")
 _REMOUNTED_LEVEL, _REMOUNTED_SHARE = 1e-3, 0.67  # probability by chance; least share of the change that it explains
@@ -87,23 +88,6 @@ class LengthChange(NamedTuple):
         return float(np.quantile(np.abs(self.change), 0.95))
 
 
-def effective_degrees_of_freedom(
-    u_old: Float[np.ndarray, " m"], nu_old: float, u_new: Float[np.ndarray, " m"], nu_new: float
-) -> Float[np.ndarray, " m"]:
-    """Degrees of freedom of differences of two independent estimates (Welch and Satterthwaite; JCGM 100, G.4.1)."""
-    # Relative variances, so that angles of a microradian do not underflow.
-    largest = np.maximum(u_old, u_new)
-    safe = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
-    one, two = (np.where(np.isfinite(u), u / safe, 1.0) ** 2 for u in (u_old, u_new))
-    below = one**2 / nu_old + two**2 / nu_new
-    return np.where(below > 0, (one + two) ** 2 / np.where(below > 0, below, 1.0), np.inf)
-
-
-def coverage_factor(level: float, degrees_of_freedom: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Student's t for a coverage of ``level``; the normal quantile for infinite degrees of freedom."""
-    return student_quantile(0.5 + level / 2, degrees_of_freedom)
-
-
 def joint_test(
     old: CalibrationRecord,
     new: CalibrationRecord,
@@ -141,13 +125,17 @@ def joint_test(
     rank = int(regular.sum())
     whitened = root.T @ moved
     statistic = float(np.sum(whitened**2))
-    weights = [float(np.sum((root.T @ matrix @ root) ** 2)) for matrix in covariances]
-    denominator = weights[0] / old.degrees_of_freedom + weights[1] / new.degrees_of_freedom
-    degrees_of_freedom = rank / denominator if denominator > 0 else math.inf
+    combined = determined @ root / steps[:, None]
+    denominator = sum(
+        float(np.sum((combined.T @ matrix[np.ix_(own, own)] @ combined) ** 2)) / freedom
+        for record, own in zip(records, rows, strict=True)
+        for matrix, freedom in _parts_of(record)
+    )
+    spare = rank / denominator if denominator > 0 else math.inf
     robust = "robust" in (old.noise_model, new.noise_model)
 
     def probability(remaining: float, fitted: int) -> float:
-        return _probability(remaining, rank - fitted, degrees_of_freedom, robust)
+        return _probability(remaining, rank - fitted, spare, robust)
 
     columns = root.T @ determined.T  # whitened change for a change of each parameter by one step
     causes = _causes(whitened, columns, lambda remaining, fitted: probability(remaining, fitted) >= 1 - level)
@@ -157,7 +145,15 @@ def joint_test(
     if p < 1 - level:
         of_probe = columns @ (_changes_of_probe(new, tested) / steps[:, None])
         probe = _probe_test(whitened, of_probe, columns, probability)
-    return JointTest(statistic, rank, degrees_of_freedom, p, tested, named, probe)
+    return JointTest(statistic, rank, spare, p, tested, named, probe)
+
+
+def _parts_of(record: CalibrationRecord) -> list[tuple[Float[np.ndarray, "p p"], float]]:
+    """Parts of the covariance of a calibration's parameters, each with its degrees of freedom."""
+    uncertainty = to_numpy(uncertainty_of(record))
+    others = [] if uncertainty.components is None else list(np.asarray(uncertainty.components.matrices))
+    each = degrees_of_freedom(np.eye(1 + len(others)), uncertainty.law)
+    return list(zip([record.covariance - sum(others, np.zeros_like(record.covariance)), *others], each, strict=True))
 
 
 def _changes_of_probe(record: CalibrationRecord, names: tuple[str, ...]) -> Float[np.ndarray, "p 3"]:
@@ -255,36 +251,32 @@ def length_change(
 ) -> LengthChange:
     """Change of ``lengths``: their length, mm, and the configurations at both ends (``(v, n)`` each)."""
     length, start, end = lengths
-    both = [_measured(to_numpy(uncertainty_of(record)), start, end) for record in (old, new)]
-    (before, u_old, mean_old), (after, u_new, mean_new) = ([np.asarray(part) for part in found] for found in both)
-    nu_old, nu_new = old.degrees_of_freedom, new.degrees_of_freedom
-    factors = coverage_factor(level, effective_degrees_of_freedom(u_old, nu_old, u_new, nu_new))
-    mean_nu = effective_degrees_of_freedom(mean_old[None], nu_old, mean_new[None], nu_new)
-    u = np.hypot(u_old, u_new)
-    u_scale_change = float(np.hypot(mean_old, mean_new) / np.mean(before))
+    both = [to_numpy(uncertainty_of(record)) for record in (old, new)]
+    (before, *of_old), (after, *of_new) = ([np.asarray(part) for part in _measured(one, start, end)] for one in both)
+    law = both[0].law.joined(both[1].law)
+    each, mean = (np.concatenate(pair, axis=-1) for pair in zip(of_old, of_new, strict=True))
+    u, u_scale_change = np.sqrt(each.sum(axis=-1)), float(np.sqrt(mean.sum()) / np.mean(before))
     return LengthChange(
         length=length,
         q=start,
         q_end=end,
         change=after - before,
         u=u,
-        expanded=factors * u,
+        expanded=coverage_factor(level, each, law) * u,
         scale_change=float(np.mean(after - before) / np.mean(before)),
         u_scale_change=u_scale_change,
-        expanded_scale_change=float(coverage_factor(level, mean_nu)[0]) * u_scale_change,
+        expanded_scale_change=float(coverage_factor(level, mean, law)) * u_scale_change,
     )
 
 
 @compiled(jit=eqx.filter_jit)
 def _measured(
     uncertainty: Uncertainty, start: Float[AnyArray, "v n"], end: Float[AnyArray, "v n"]
-) -> tuple[Float[AnyArray, " v"], Float[AnyArray, " v"], Float[AnyArray, ""]]:
-    """Lengths by an arm, their standard uncertainties, and that of their mean; mm."""
+) -> tuple[Float[AnyArray, " v"], Float[AnyArray, "v c"], Float[AnyArray, " c"]]:
+    """Lengths by an arm, mm; their variances and that of their mean, part by part, mm^2."""
     xp = namespace(uncertainty, start, end)
     between = uncertainty.arm.position(end) - uncertainty.arm.position(start)
     measured = xp.linalg.norm(between, axis=-1)
     slopes = uncertainty.derivatives(end) - uncertainty.derivatives(start)
     along = xp.einsum("vc,vcw->vw", between / measured[:, None], slopes)
-    each = uncertainty.covariance_of_functions(along[:, None, :])[:, 0, 0]
-    mean = uncertainty.covariance_of_functions(xp.mean(along, axis=0)[None, :])[0, 0]
-    return measured, xp.sqrt(each), xp.sqrt(mean)
+    return measured, uncertainty.parts_of_functions(along), uncertainty.parts_of_functions(xp.mean(along, axis=0))

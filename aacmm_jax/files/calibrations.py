@@ -18,7 +18,7 @@ from ..kinematics.parameters import Parameters
 from ..uncertainty.covariance import NOISE_MODELS
 from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
 from .calibration_prior import prior_metrics_of, prior_tables
-from .calibration_shared import shared_errors_of, shared_tables
+from .calibration_shared import component_tables, components_of, shared_errors_of, shared_tables
 from .captures import (
     arm_table,
     linear_encoder_attribute,
@@ -87,6 +87,7 @@ def save_calibration(
     if record.noisy_encoders:
         tables["noisy_encoders"] = _noisy_table(record)
     tables |= observed_tables(record) | prior_tables(record) | shared_tables(record.shared)
+    tables |= component_tables(record.components)
     attributes = recording_attributes(record.recording) | {
         "robust": record.robust,
         "sampled_says": record.sampled_says,
@@ -96,6 +97,7 @@ def save_calibration(
         "scale_set_by": list(record.scale_set_by) or "",
         "scale_k": record.k,
         "scale_u": record.u_k,
+        "scale_surplus": record.surplus_k,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec),
         "linear_encoder_mm": linear_encoder_attribute(record.noise),
         "seating_mm": float(record.noise.seating),
@@ -198,6 +200,8 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         prior=prior_metrics_of(stored),
         noisy_encoders=_noisy_of(stored),
         shared=shared_errors_of(stored),
+        components=components_of(stored),
+        surplus_k=float(attributes.get("scale_surplus", 0.0)),
     )
 
 

@@ -16,7 +16,7 @@ from ..acceptance.standards import STANDARDS
 from ..kinematics.arm import Arm, parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .calibration_shared import shared_errors_of, shared_tables
+from .calibration_shared import component_tables, components_of, shared_errors_of, shared_tables
 from .captures import (
     arm_table,
     lengths_of,
@@ -73,7 +73,7 @@ def save_evaluation(
     tables["figures"] = _metric_table(record)
     if record.uncertainty is not None:
         tables["uncertainty"] = _uncertainty_table(record.uncertainty)
-        tables |= shared_tables(record.uncertainty.shared)
+        tables |= shared_tables(record.uncertainty.shared) | component_tables(record.uncertainty.components)
     attributes = recording_attributes(record.recording) | {
         "warnings": list(record.warnings) or None,
         "calibration_warnings": list(record.calibration_warnings) or None,
@@ -100,7 +100,7 @@ def _uncertainty_table(uncertainty: Uncertainty) -> Table:
             "encoder_arcsec": np.asarray(uncertainty.noise.encoder_arcsec),
             "linear_encoder_mm": linear_encoder_attribute(uncertainty.noise),
             "seating_mm": float(uncertainty.noise.seating),
-            "degrees_of_freedom": uncertainty.degrees_of_freedom,
+            "degrees_of_freedom": uncertainty.scatter_degrees_of_freedom,
         },
     )
 
@@ -122,7 +122,8 @@ def _uncertainty_of(path: str | os.PathLike, stored: Stored, calibrated: Arm) ->
         u_k=None,
         shared=shared_errors_of(stored),
         names=names,
-        degrees_of_freedom=float(attributes["degrees_of_freedom"]),
+        components=components_of(stored),
+        scatter_degrees_of_freedom=float(attributes["degrees_of_freedom"]),
     )
 
 

@@ -191,9 +191,7 @@ class SharedColumns(NamedTuple):
     own: Int[np.ndarray, " c"]  # the parameters that are none
     order: Int[np.ndarray, " p"] | None  # of these and the coefficients among all; None where they are in order
 
-    def multiplied(
-        self, columns: Float[AnyArray, "b r m"], forward: Any, rows: Any
-    ) -> Float[AnyArray, "p r m"]:
+    def multiplied(self, columns: Float[AnyArray, "b r m"], forward: Any, rows: Any) -> Float[AnyArray, "p r m"]:
         """Columns of all parameters at some of the configurations, from the few."""
         if not len(self.functions):
             return columns

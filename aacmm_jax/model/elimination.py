@@ -109,7 +109,7 @@ def followed(
 
 
 def _flat(rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k _"]:
-    return rows.reshape(rows.shape[0], -1)
+    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
 def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
@@ -118,9 +118,9 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
         return block
     root = namespace(weight).sqrt(weight)
     return RowBlock(
-        block.white * root,
-        None if block.by_head is None else block.by_head * root,
-        None if block.by_own is None else block.by_own * root,
+        block.white * root[None],
+        None if block.by_head is None else block.by_head * root[None, None],
+        None if block.by_own is None else block.by_own * root[None, None],
         block.of,
         block.sizes,
     )
@@ -128,7 +128,7 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
 
 def cost_and_weights(
     blocks: list[RowBlock], loss: Loss | None, groups: int
-) -> tuple[AnyArray, list[Float[AnyArray, " m"] | None]]:
+) -> tuple[AnyArray, list[Float[AnyArray, " _"] | None]]:
     """Half the weighted sum of squares, and the weight of every pose; the first ``groups`` blocks are of poses."""
     total: Any = 0.0
     weights: list[Any] = []
@@ -289,7 +289,7 @@ def _of_rows(
     return information, (inverse_positive_definite(information) @ right[..., None])[..., 0]
 
 
-def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) -> list[Float[AnyArray, "K 3 3"]]:
+def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) -> list[Float[AnyArray, "_ 3 3"]]:
     """Covariances of the positions of sockets by a given arm, as entries of a list of all classes."""
     layout = observed.layout
     found: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)

@@ -194,14 +194,7 @@ def _stacks(observations: tuple[AbstractObservation, ...], layout: Layout) -> tu
     return tuple(stack(group) for group in layout.groups)
 
 
-def tips_of(forward: ForwardPass, rows: Any) -> Tips:
+def tips_of(forward: Any, rows: Any) -> Tips:
     """The tips of some poses, and the axes of their last frames."""
     x, y, z = (axis[:, rows] for axis in forward.frame)
     return Tips(forward.tip[:, rows], (x, y, z))
-
-
-# TEMPORARY: names that consumers still import; each goes with its consumer's move to `uncertainty.linearisation`.
-Linear = linear_rows = observed_model = observed_rows = residual_rows = certified_and_lengths = whitened = (
-    whitening_of
-) = None
-PriorRows = Whitening = None

@@ -6,7 +6,6 @@ Sources: Huber 1964; Holland and Welsch 1977 (Cauchy); Beaton and Tukey 1974; Tr
 """
 
 from functools import cache
-from typing import Literal, get_args
 
 import equinox as eqx
 import numpy as np
@@ -16,9 +15,7 @@ from ..core.arguments import shown
 from ..core.distributions import chi_square_quantile, chi_square_tail
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
-
-LossName = Literal["huber", "cauchy", "tukey"]
-LOSSES = get_args(LossName)
+from .loss_names import LOSSES, LossName
 
 _EFFICIENCY = 0.95  # for normal residuals
 

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.observations.observation import Rows
 from ..kinematics.chain import ForwardPass, forward_pass
@@ -143,7 +142,7 @@ def row_blocks(
 
 
 def _by_head(
-    by_parameters: Float[AnyArray, "p r m"], by_roles: list[Float[AnyArray, "_ r m"]], group: Group, shared: int
+    by_parameters: Float[AnyArray, "p r m"], by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, shared: int
 ) -> Float[AnyArray, "h r m"]:
     """Derivatives by the parameters and by all shared numbers, of which the group uses some."""
     if not shared:
@@ -167,7 +166,7 @@ def _by_head(
     return xp.concatenate(parts)
 
 
-def _by_own(by_roles: list[Float[AnyArray, "_ r m"]], group: Group, size: int) -> Float[AnyArray, "k r m"] | None:
+def _by_own(by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, size: int) -> Float[AnyArray, "k r m"] | None:
     """Derivatives by the numbers of the component of each pose, in their order."""
     if group.of is None:
         return None

@@ -38,6 +38,7 @@ class Scale(eqx.Module):
     u: Float[AnyArray, ""]  # conditional on active bounds: takes parameters on a bound as exact
     measured: Float[AnyArray, " l"]
     nominal: Float[AnyArray, " l"]
+    surplus: Float[AnyArray, ""]  # what the lengths' disagreement, beyond what is predicted, adds to u^2
 
 
 class ScaleFix(eqx.Module):
@@ -198,7 +199,8 @@ def scale_and_weights(measured: MeasuredEnds) -> tuple[Scale, Float[AnyArray, " 
     relative = weight_of / measured.nominal
     predicted = relative @ measured.covariance(value) @ relative
     observed = xp.sum(weight_of * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
-    return Scale(value, xp.sqrt(xp.maximum(predicted, observed)), length, measured.nominal), relative
+    u = xp.sqrt(xp.maximum(predicted, observed))
+    return Scale(value, u, length, measured.nominal, xp.maximum(observed - predicted, 0.0)), relative
 
 
 @checked_arguments
@@ -241,4 +243,4 @@ def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> S
     count = ratio.shape[0]
     value = jnp.mean(ratio)
     repeated = jnp.sum((ratio - value) ** 2) / (max(count - 1, 1) * count)
-    return Scale(value, jnp.sqrt(repeated + (value * u / jnp.mean(nominal)) ** 2), measured, nominal)
+    return Scale(value, jnp.sqrt(repeated + (value * u / jnp.mean(nominal)) ** 2), measured, nominal, repeated)

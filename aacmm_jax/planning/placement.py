@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from ..core.arrays import in_chunks
 from ..core.errors import InputError
+from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at
 from ..kinematics.chain import Geometry, joint_motion
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import SearchRegion, arm_reach, configurations_at, reached, total_link_length
-from ..model.weights import inverse_root
 from .fedorov_exchange import Candidates, Objective, relaxed_value
 
 LEAST_POSES = 2  # in a socket: one shows no scatter
@@ -118,7 +118,8 @@ def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Poo
 
 
 def _whitening(geometry: Geometry, q: Float[np.ndarray, "c n"], noise: Noise) -> Float[np.ndarray, "c 3 3"]:
-    return np.moveaxis(np.asarray(inverse_root(tip_covariances(geometry, joint_motion(geometry, q), noise))), -1, 0)
+    covariances = tip_covariances(geometry, joint_motion(geometry, q), noise)
+    return inverse_cholesky(np.moveaxis(np.asarray(covariances), -1, 0))
 
 
 def random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:

@@ -223,7 +223,7 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
     chosen = [i for i, name in enumerate(record.names) if name in listed]
     scale = 1.0 if kind == "length" else 1 / DEG
     change = scale * (vectors["calibrated"] - vectors["nominal"])[chosen]
-    expanded = scale * uncertainty.factor() * np.asarray(uncertainty.u)[chosen]
+    expanded = scale * uncertainty.expanded()[chosen]
     known = np.isfinite(expanded)
     axes.axhline(0, color="0.4", linewidth=0.8)
     style = {"fmt": "o", "color": DARK, "capsize": 3, "markersize": 4, "label": "with U (95 %)"}
@@ -270,7 +270,9 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     if two:
         axes.plot(x - 0.1, np.asarray(stage1.error), linestyle="none", **_STAGES["stage1"])
     u = np.asarray(calibrated.u)
-    bars = np.where(np.isfinite(u), uncertainty_of(record).factor() * u, 0.0)
+    stated = np.array([float(length.u) for length in lengths])
+    expanded = uncertainty_of(record).expanded_by_scatter(u, stated)
+    bars = np.where(np.isfinite(u), expanded, 0.0)
     style = {"fmt": "s", "color": DARK, "capsize": 3, "markersize": 4, "label": "calibrated, with U (95 %)"}
     axes.errorbar(x + 0.1 * two, np.asarray(calibrated.error), yerr=bars, **style)
     axes.axhline(0, color="0.4", linewidth=0.8)

@@ -15,14 +15,13 @@ _MANY = 25  # parameters of which correlations are drawn larger
 _WITHIN = 0.98  # of the lengths are within the colour scale; the others have its last colour
 
 
-def volumetric_uncertainty_map(volume: VolumetricUncertainty, factor: float = 2.0, axes: Any = None) -> Any:
-    """Plot the expanded uncertainty of lengths over the working volume: larger and darker marks are more uncertain.
+def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) -> Any:
+    """Plot U (95 %) of lengths over the working volume: larger and darker marks are more uncertain.
 
     Each length is marked at the height and the distance from the first axis where it starts.
 
     Args:
         volume: The result of `volumetric_uncertainty`.
-        factor: Coverage factor.
         axes: Axes to plot into; new ones if None.
 
     Returns:
@@ -38,7 +37,7 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, factor: float = 2.
         distance from the first axis [mm]
     """
     axes = axes_or_new(axes)
-    expanded = factor * volume.u_length
+    expanded = volume.expanded_length
     known = np.isfinite(expanded)
     if not np.any(known):
         raise InputError("no length over the volume is determined, so there is no uncertainty to draw.")

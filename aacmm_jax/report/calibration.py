@@ -63,18 +63,17 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
     volume = volumetric_uncertainty(uncertainty)
     summary = calibration_summary(record, observability, volume)
     evaluations = record.evaluations()
-    factor = uncertainty.factor(0.95)
     capture = record.recording.capture
     sections = [
         _data(record, summary),
         _nominal_and_calibrated(record, summary, evaluations),
-        _scale(record, summary, evaluations, factor),
-        parameters_section(record, summary, factor),
+        _scale(record, summary, evaluations),
+        parameters_section(record, summary),
         *_residuals(record, summary, evaluations["calibrated"]),
         *patterns_sections(record),
         Section("arm", "The arm in its poses", [_view(record, evaluations["calibrated"])]),
-        volume_section(volume, summary, factor),
-        *tried_sections(record, volume, factor),
+        volume_section(volume, summary),
+        *tried_sections(record, volume),
         *([] if record.sampled is None else [monte_carlo_section(record)]),
         correlations_section(record, uncertainty),
         observability_section(observability),
@@ -89,7 +88,7 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         verdict=verdict["says"],
         verdict_mark=verdict["mark"],
         warnings=summary["warnings"],
-        facts=_facts(summary, factor),
+        facts=_facts(summary),
         sections=sections,
     )
     return report, summary
@@ -103,7 +102,7 @@ def _view(record: CalibrationRecord, evaluation: Evaluation) -> ArmView:
     return view_of_arm(arm, capture, distances, record.observed.geometry)
 
 
-def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
+def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     nominal, calibrated, facts = summary["nominal"], summary["calibrated"], []
     validated = summary["cross_validation"]
     if validated is not None and validated["rms_mm"] is not None:
@@ -119,16 +118,16 @@ def _facts(summary: dict[str, Any], factor: float) -> list[tuple[str, str]]:
         facts.append((f"RMS residual, {row['kind']}, nominal → calibrated", change))
     volume = summary["uncertainty"]["volume"]
     length = f"U of a {volume['length_mm']:g} mm length with the noise of its readings"
-    largest, median = volume["u_length_reading_largest_mm"], volume["u_length_reading_median_mm"]
+    largest, median = (volume[f"expanded_length_reading_{which}_mm"] for which in ("largest", "median"))
     if median is not None and largest is not None:
-        typical, worst = (f"{two_digits(factor * u)}\u00a0mm" for u in (median, largest))
+        typical, worst = (f"{two_digits(u)}\u00a0mm" for u in (median, largest))
         facts.append((f"{length} (95 %)", f"median {typical}, largest {worst}"))
     else:
         facts.append((length, "not determined everywhere"))
     if summary.get("lengths_tested"):
         facts.append(("Lengths tested", lengths_sentence(summary["lengths_tested"]).partition(": ")[2]))
     if summary["scale_k"] is not None:
-        expanded = factor * (summary["scale_u"] or 0.0)
+        expanded = summary["scale_expanded"] or 0.0
         decimals = decimals_for(expanded, 7)
         k = f"{summary['scale_k']:.{decimals}f}\u00a0±\u00a0{expanded:.{decimals}f} (95\u00a0%)"
         facts.append(("Scale k of stage 1", k))
@@ -239,9 +238,7 @@ def _prior_table(prior: list[dict[str, Any]]) -> ReportTable:
     return ReportTable("Priors of the parameters, and effective parameters", columns, rows)
 
 
-def _scale(
-    record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation], factor: float
-) -> Section:
+def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> Section:
     k, u, single = record.k, record.u_k, record.fixed_by_one_length
     k_shown = f"{k:.{decimals_for(u, 8)}f}"
     u_of_k = f"u(k)\u00a0=\u00a0{two_digits(u)}"
@@ -257,7 +254,7 @@ def _scale(
             f"k = {k_shown} times their calibrated value, with {u_of_k}."
         )
     else:
-        expanded = 1000 * factor * u
+        expanded = 1000 * (summary["scale_expanded"] or math.nan)
         decimals = decimals_for(expanded)
         introduction = (
             "Repeatability does not determine the size of an arm; the reference lengths do. The arm of stage 1 "
@@ -278,11 +275,11 @@ def _scale(
     stage1 = ["error, stage 1"] if two else []
     columns = ("between", "value", "error, nominal", *stage1, "error, calibrated", "U of error")
     table = ReportTable(
-        "Reference lengths [mm]", columns, length_rows(summary["lengths"], factor, before, 0 if single else None)
+        "Reference lengths [mm]", columns, length_rows(summary["lengths"], before, 0 if single else None)
     )
     drawn = {"stage 1": errors["stage1"]} if two else {}
     drawn["calibrated"] = errors["calibrated"]
-    block = table if single else length_chart(summary["lengths"], drawn, factor, table)
+    block = table if single else length_chart(summary["lengths"], drawn, table)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 

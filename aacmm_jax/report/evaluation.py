@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..acceptance.decision import COVERAGE_FACTOR
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric
 from ..calibration.evaluation import Evaluation, evaluate
@@ -307,13 +308,13 @@ def _lengths(
             "to": length.end,
             "value_mm": float(length.value),
             "error_mm": float(calibrated.error[i]),
-            "error_u_mm": float(calibrated.u[i]) if np.isfinite(calibrated.u[i]) else None,
+            "expanded_mm": COVERAGE_FACTOR * float(calibrated.u[i]) if np.isfinite(calibrated.u[i]) else None,
         }
         for i, length in enumerate(capture.lengths)
     ]
     columns = ("between", "value", "error, nominal", "error, calibrated", "U of error")
     before = [np.asarray(evaluations["nominal"].error)]
-    cells = length_rows(rows, 2.0, before, record.length_that_fixed_scale())
+    cells = length_rows(rows, before, record.length_that_fixed_scale())
     table = ReportTable("Lengths between the mean points of their sockets [mm]", columns, cells)
     note = (
         "Means of all poses, for comparison; no acceptance test uses them. Their U (factor 2) also contains the "

@@ -49,16 +49,14 @@ def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, charts
 def length_chart(
     lengths: Sequence[Mapping[str, Any]],
     errors: Mapping[str, np.ndarray],
-    factor: float,
     table: ReportTable,
     id: str = "lengths",
 ) -> Chart:
     """Errors of reference lengths by one arm or two, the last with its expanded uncertainty.
 
     Args:
-        lengths: Rows of a summary: "from", "to" and "error_u_mm".
+        lengths: Rows of a summary: "from", "to" and "expanded_mm".
         errors: Name of an arm -> measured minus calibrated value, mm.
-        factor: Coverage factor.
         table: The numbers.
         id: Identifier of the chart.
 
@@ -67,7 +65,7 @@ def length_chart(
     """
     between = [(row["from"], row["to"]) for row in lengths]
     x, axis, borders = by_placement(between)
-    expanded = np.array([factor * (row["error_u_mm"] or np.nan) for row in lengths])
+    expanded = np.array([row["expanded_mm"] or np.nan for row in lengths])
     *earlier, (last, error) = errors.items()
     hover = [
         f"{start} – {end}: {format_number(value, signed=True)} mm"

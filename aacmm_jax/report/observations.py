@@ -201,7 +201,7 @@ def _weights_table(summary: dict[str, Any]) -> ReportTable:
 
 def geometry_section(summary: dict[str, Any]) -> Section:
     """Every part of the unknown geometry as found, beside what is certified of it."""
-    rows, factor = [], summary["uncertainty"]["coverage_factor_95"]
+    rows, factor = [], summary["uncertainty"]["coverage_factor_geometry_95"]
     for part in summary["geometry"]:
         # What is certified has its numbers in the order of the quantities.
         errors = None if part["certified"] is None else np.abs(np.subtract(part["values"], part["certified"]))

@@ -18,33 +18,34 @@ _POINTS = 301  # of a curve
 _COLUMNS = ("parameter", "unit", "calibrated", "U (95 %)", "change", "nominal", "")
 
 
-def parameters_section(record: CalibrationRecord, summary: Mapping[str, Any], factor: float) -> Section:
+def parameters_section(record: CalibrationRecord, summary: Mapping[str, Any]) -> Section:
     """Every parameter with its expanded uncertainty; hundreds of coefficients joint by joint, and on demand."""
     listed, harmonics = listed_apart(summary["parameters"])
     introduction = (
-        f"U is the expanded uncertainty, coverage factor {factor:.2f}. A parameter on a bound, or one that the data "
+        "U is the expanded uncertainty (95 %), with the coverage factor of each parameter's own degrees of freedom. A "
+        "parameter on a bound, or one that the data "
         "determine only together with others, has none of its own."
     )
     by_unit = {unit: [row for row in listed if row["unit"] == unit] for unit in ("mm", "rad")}
-    changes = [_change_chart(unit, chosen, factor) for unit, chosen in by_unit.items() if chosen]
-    table = ReportTable("Parameters", _COLUMNS, _rows(listed, factor))
+    changes = [_change_chart(unit, chosen) for unit, chosen in by_unit.items() if chosen]
+    table = ReportTable("Parameters", _COLUMNS, _rows(listed))
     functions = [chart] if (chart := _functions_chart(record)) is not None else []
     blocks = [introduction, *changes, table, *functions]
     if harmonics:
         blocks += [
             f"The {len(harmonics)} coefficients of harmonics are not printed: they are in the table below on screen, "
             "and in the calibration's file (aacmm export --format csv).",
-            _by_joint(harmonics, factor),
-            ReportTable("Coefficients of harmonics", _COLUMNS, _rows(harmonics, factor), folded=True),
+            _by_joint(harmonics),
+            ReportTable("Coefficients of harmonics", _COLUMNS, _rows(harmonics), folded=True),
         ]
     return Section("parameters", "Parameters", blocks)
 
 
-def _rows(parameters: Sequence[Mapping[str, Any]], factor: float) -> list[list]:
+def _rows(parameters: Sequence[Mapping[str, Any]]) -> list[list]:
     rows = []
     for row in parameters:
         scale, unit = people_read(row["unit"])
-        expanded = None if row["u"] is None else factor * scale * row["u"]
+        expanded = None if row["expanded"] is None else scale * row["expanded"]
         decimals = decimals_for(expanded)
         rounded = expanded is not None
         state = "" if expanded else "only with others"
@@ -62,12 +63,12 @@ def _rows(parameters: Sequence[Mapping[str, Any]], factor: float) -> list[list]:
     return rows
 
 
-def _by_joint(harmonics: Sequence[Mapping[str, Any]], factor: float) -> ReportTable:
+def _by_joint(harmonics: Sequence[Mapping[str, Any]]) -> ReportTable:
     rows = []
     for row in harmonics_by_joint(harmonics):
         scale, unit = people_read(row["unit"])
         largest = row["largest"]
-        expanded = None if largest["u"] is None else factor * scale * largest["u"]
+        expanded = None if largest["expanded"] is None else scale * largest["expanded"]
         decimals = decimals_for(expanded)
         rows.append([
             text_cell(row["joint"]),
@@ -120,12 +121,12 @@ def _functions_chart(record: CalibrationRecord) -> Chart | None:
     return Chart("functions", "What the joints do besides their readings", description, tuple(plots))
 
 
-def _change_chart(unit: str, parameters: Sequence[Mapping[str, Any]], factor: float) -> Chart:
+def _change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
     scale, label = people_read(unit)
     kind = "length" if unit == "mm" else "angle"
     names = [row["parameter"] for row in parameters]
     x, change = np.arange(len(names)), scale * np.array([row["calibrated"] - row["nominal"] for row in parameters])
-    expanded = np.array([np.nan if row["u"] is None else factor * scale * row["u"] for row in parameters])
+    expanded = np.array([np.nan if row["expanded"] is None else scale * row["expanded"] for row in parameters])
     known = np.isfinite(expanded)
     decimals = [decimals_for(bar) if there else 4 for bar, there in zip(expanded.tolist(), known, strict=True)]
     hover = np.array([

@@ -238,7 +238,7 @@ def _held_out(row: Mapping[str, Any]) -> list[Cell]:
 
 
 def length_rows(
-    rows: Sequence[Mapping[str, Any]], factor: float, before: Sequence[np.ndarray], fixed_scale: int | None = None
+    rows: Sequence[Mapping[str, Any]], before: Sequence[np.ndarray], fixed_scale: int | None = None
 ) -> list[list[Cell]]:
     """Rows of a table of lengths: value, errors by earlier arms, error of the calibrated arm, and its U.
 
@@ -246,7 +246,7 @@ def length_rows(
     """
     found = []
     for i, row in enumerate(rows):
-        expanded = None if row["error_u_mm"] is None else factor * row["error_u_mm"]
+        expanded = row["expanded_mm"]
         decimals = decimals_for(expanded)
         error = number_cell(row["error_mm"], decimals, signed=True)
         found.append([

@@ -18,19 +18,19 @@ _TIPS = 400  # most tips of the calibration that are drawn
 _FULL_TURN = 360.0
 
 
-def tried_sections(record: CalibrationRecord, volume: VolumetricUncertainty, factor: float) -> list[Section]:
-    """Where the calibration was never tried; ``factor`` is the coverage factor."""
+def tried_sections(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[Section]:
+    """Where the calibration was never tried."""
     readings = np.asarray(record.recording.capture.readings)
     if len(readings) < 2:
         return []
     found = tried_poses(record.calibrated.arm, readings, volume.q)
     summary = {"poses": len(found.distance), "tried": int(found.tried.sum()), "spacing_rad": found.spacing}
-    blocks = [tried_sentence(summary) + _u_within(volume, found, factor), _section_view(record, volume, found)]
+    blocks = [tried_sentence(summary) + _u_within(volume, found), _section_view(record, volume, found)]
     return [Section("tried", "Where the calibration was never tried", [*blocks, _joints(record, readings)])]
 
 
-def _u_within(volume: VolumetricUncertainty, found: TriedPoses, factor: float) -> str:
-    medians = [factor * float(np.median(volume.u_tip[part])) for part in (found.tried, ~found.tried) if np.any(part)]
+def _u_within(volume: VolumetricUncertainty, found: TriedPoses) -> str:
+    medians = [float(np.median(volume.expanded_tip[part])) for part in (found.tried, ~found.tried) if np.any(part)]
     if len(medians) < 2 or not all(map(math.isfinite, medians)):
         return ""
     near, far = map(two_digits, medians)

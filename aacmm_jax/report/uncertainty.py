@@ -9,7 +9,7 @@ from ..calibration.record import CalibrationRecord
 from ..core.units import people_read
 from ..kinematics.arm import parameter_unit
 from ..summaries.harmonics import listed_apart
-from ..summaries.tables import decimals_for, encoders_in_words, seat_in_words, volume_rows
+from ..summaries.tables import decimals_for, encoders_in_words, factor_words, seat_in_words, volume_rows
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
@@ -25,21 +25,21 @@ _INDICES = {
 }
 
 
-def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any], factor: float) -> Section:
+def volume_section(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     """Expanded uncertainty of tips and lengths over the working volume."""
     found = summary["uncertainty"]["volume"]
     length = f"{volume.length:g} mm length"
-    rows = [[text_cell(title), *map(_expanded, values)] for title, values in volume_rows(found, factor)]
+    rows = [[text_cell(title), *map(_expanded, values)] for title, values in volume_rows(found)]
     low, high = volume.start.min(axis=0), volume.start.max(axis=0)
     box = ", ".join(f"{axis} from {_whole(a)} to {_whole(b)}" for axis, a, b in zip("xyz", low, high, strict=True))
     introduction = (
         f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
-        f"expanded to 95 % with the factor {factor:.2f}."
+        f"expanded to 95 % ({factor_words(found)})."
     )
     table = ReportTable(
         "Expanded uncertainty over the working volume [mm]", ("", "median", "95th percentile", "largest"), rows
     )
-    chart = _volume_chart(volume, factor, length)
+    chart = _volume_chart(volume, length)
     return Section(
         "volume",
         "Uncertainty over the working volume",
@@ -56,8 +56,8 @@ def _whole(value: float) -> str:
     return f"{value:.0f}".replace("-", "−")
 
 
-def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> Chart:
-    expanded = factor * volume.u_length
+def _volume_chart(volume: VolumetricUncertainty, length: str) -> Chart:
+    expanded = volume.expanded_length
     known = np.isfinite(expanded)
     radius = np.hypot(volume.start[:, 0], volume.start[:, 1])
     hover = [
@@ -76,8 +76,8 @@ def _volume_chart(volume: VolumetricUncertainty, factor: float, length: str) -> 
     plot = charts.Plot(*axes, (marks,), height=380)
     columns = ("x [mm]", "y [mm]", "z [mm]", "U of the tip [mm]", f"U of a {length} [mm]", "with readings [mm]")
     data = [
-        [*(number_cell(float(x), 0) for x in point), *(_expanded(factor * float(value)) for value in u)]
-        for point, *u in zip(volume.start, volume.u_tip, volume.u_length, volume.u_length_reading, strict=True)
+        [*(number_cell(float(x), 0) for x in point), *(_expanded(float(value)) for value in u)]
+        for point, *u in zip(volume.start, *volume[8:], strict=True)
     ]
     return Chart(
         "volume",

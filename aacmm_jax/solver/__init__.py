@@ -1,6 +1,6 @@
 """Box-bounded nonlinear least squares: Levenberg-Marquardt with an active set, and its adjoint.
 
-The residuals of a calibration are in `model.residuals`.
+The rows of a calibration are in `model.rows`.
 """
 
 import lazy_loader as _lazy_loader

@@ -110,7 +110,9 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
     forced = (progress.damping > 1e-3 * largest) & (optimality > 1e-6)
     reason = xp.where(tiny, xp.where(small_step, STEP, ROUNDING), RUNNING)
     reason = xp.where(tiny & forced, STALLED, reason)
-    reason = xp.where(optimality <= rules.gtol, GRADIENT, reason)
+    # A gradient may also be zero because the residual, or its derivative, depends on no unknown at all.
+    ended = xp.where((largest > 0) | (model.cost == 0), GRADIENT, STALLED)
+    reason = xp.where(optimality <= rules.gtol, ended, reason)
     reason = xp.where(first & ~finite, NONFINITE, reason).astype(np.int32)
     return Progress(
         y=y,

@@ -23,7 +23,10 @@ class Reason(eqx.Enumeration):
     step = "Converged: the last step is below the tolerance."
     rounding = "Converged: no step can lower the cost by more than rounding error."
     max_steps = "Not converged: the step limit was reached; allow more steps or start closer."
-    stalled = "Not converged: no step lowers the cost although the gradient is not zero; is the residual smooth?"
+    stalled = (
+        "Not converged: no step lowers the cost, and this is not a minimum; is the residual smooth, and is its "
+        "derivative right?"
+    )
     nonfinite = (
         "Not converged: the residual or its derivative is not finite at the start; check the data and the start."
     )

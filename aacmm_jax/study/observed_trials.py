@@ -18,7 +18,8 @@ from ..data.capture import Capture
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
-from ..model.observed import Observed, residual_rows
+from ..model.observed import Observed
+from ..model.rows import rows_at
 from .definition import Study
 from .drawn_trials import DrawnTrials
 from .settings import CellValues, Setting
@@ -44,7 +45,7 @@ def _recorded(study: Study) -> _Recorded:
     geometry = np.asarray(fit_geometry(arm, observed, {}, None).geometry)
     truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
     units = reading_units(space.base.geometry)
-    by_units = [np.moveaxis(np.asarray(error.by_readings) * units[:, None], -1, 0) for error in truth.errors]
+    by_units = [np.moveaxis(np.asarray(part.by_readings) * units[:, None], -1, 0) for part in truth.parts]
     return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_units], geometry)
 
 
@@ -102,7 +103,7 @@ def _taken(
     q, units = np.asarray(observed.q).copy(), reading_units(recorded.space.base.geometry)
     for number in range(_ROUNDS + 1):
         now = observed.moved(recorded.space.base, q)
-        left = [np.asarray(rows.values) for rows in residual_rows(recorded.space, now, z)]
+        left = [np.asarray(one) for one in now.by_observation([r.values for r in rows_at(recorded.space, now, z).rows])]
         if number == _ROUNDS:
             break
         for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):

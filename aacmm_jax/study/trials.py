@@ -3,7 +3,6 @@
 from functools import lru_cache
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -85,8 +84,6 @@ def _identified(
     # Coefficients that a model frees begin at 0, whatever the nominal arm's are.
     corrects = np.isin(study.space.names, correction_names(space.base)) & (setting.model is not None)
     start = np.where(corrects, fixed, drawn.start)[:, chosen]
-    if setting.method == "stage1" and prior is not None:  # lengths would take part in its one least squares
-        capture = eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
     options = {
         "space": space,
         "prior": prior,

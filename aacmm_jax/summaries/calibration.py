@@ -17,6 +17,7 @@ from ..data.recording import Recording
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.corrections.kinds import coefficient_of
 from ..kinematics.parameters import ArmSpecification, Parameters
+from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.tried_poses import tried_poses
@@ -129,13 +130,18 @@ def length_metrics(error: np.ndarray) -> dict[str, float]:
     }
 
 
-def metrics_by_socket_and_length(capture: Capture, evaluation: Evaluation) -> dict[str, Any]:
-    """Repeatability socket by socket and errors length by length; mm."""
+def metrics_by_socket_and_length(
+    capture: Capture, evaluation: Evaluation, uncertainty: Uncertainty | None = None
+) -> dict[str, Any]:
+    """Repeatability socket by socket and errors length by length; mm. With the uncertainty of a calibration that the
+    lengths belong to, their errors' U."""
     found = evaluation.repeatability
     columns = (np.asarray(column) for column in (found.socket_de, found.socket_deltam, found.socket_rms))
     sockets = zip(capture.names, capture.sizes, *columns, strict=True)
-    columns = (np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u))
-    lengths = zip(capture.lengths, *columns, strict=True)
+    columns = [np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u)]
+    stated = np.array([float(length.u) for length in capture.lengths])
+    expanded = None if uncertainty is None else uncertainty.expanded_by_scatter(columns[2], stated)
+    lengths = list(zip(capture.lengths, *columns, strict=True))
     return {
         "sockets": [
             {"socket": name, "poses": size}
@@ -152,7 +158,8 @@ def metrics_by_socket_and_length(capture: Capture, evaluation: Evaluation) -> di
                 "error_mm": float(error),
                 "error_u_mm": float(u) if np.isfinite(u) else None,
             }
-            for length, measured, error, u in lengths
+            | ({} if expanded is None else {"expanded_mm": float(expanded[i]) if np.isfinite(u) else None})
+            for i, (length, measured, error, u) in enumerate(lengths)
         ],
     }
 
@@ -169,12 +176,14 @@ def calibration_summary(
     observability = observed(record) if observability is None else observability
     tests = None if record.implausible_residual or not record.plausible_scale else model_tests(record)
     evaluations, vectors = record.evaluations(), record.vectors()
-    u = np.sqrt(np.diag(record.covariance))
+    uncertainty, u = uncertainty_of(record), np.sqrt(np.diag(record.covariance))
+    expanded = uncertainty.factor() * u
     parameters = [
         {
             "parameter": name,
             "unit": parameter_unit(record.recording.nominal.arm, name),
             "u": float(u[i]) if record.determined[i] and u[i] > 0 else None,
+            "expanded": float(expanded[i]) if record.determined[i] and u[i] > 0 else None,
             **{stage: float(vector[i]) for stage, vector in vectors.items()},
             "bound": {-1: "lower", 1: "upper"}.get(int(record.active[i])),
         }
@@ -193,13 +202,14 @@ def calibration_summary(
         "sockets_used": list(record.recording.capture.names),
         "scale_k": record.k if np.isfinite(record.k) else None,
         "scale_u": record.u_k if np.isfinite(record.u_k) else None,
+        "scale_expanded": uncertainty.expanded_k() if np.isfinite(record.u_k) else None,
         "fixed_by_one_length": record.fixed_by_one_length,
         "held": list(record.held),
         "hold": record.hold,
         "active_stage1": active_names_of(record, record.active_stage1),
         "active": active_names_of(record, record.active),
         **{stage: metrics(evaluation) for stage, evaluation in evaluations.items()},
-        **metrics_by_socket_and_length(record.recording.capture, evaluations["calibrated"]),
+        **metrics_by_socket_and_length(record.recording.capture, evaluations["calibrated"], uncertainty),
         "parameters": parameters,
         "uncertainty": uncertainty_summary(record, observability, volume),
         "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
@@ -262,7 +272,8 @@ def uncertainty_summary(
         "seating_mm": float(record.noise.seating),
         "noisy_encoders": noisy_encoder_rows(record.noisy_encoders, record.calibrated.arm.prismatic),
         "misfit": record.reduced_chi,
-        "coverage_factor_95": uncertainty.factor(0.95),
+        # Of the unknown geometry, whose uncertainty follows from the scatter of single poses.
+        "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(1), np.zeros(1))[0]),
         "volume": volume.summary,
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
         "rank": observability.rank,

@@ -110,7 +110,7 @@ def _add_prediction(
     group["predicted"], group["kinds"], group["groups"] = None, [], []
     if record.uncertainty is None:
         return []
-    capture, factor = record.recording.capture, record.uncertainty.factor(0.95)
+    capture = record.recording.capture
     compared = None if part is None else unseen_errors(record.uncertainty, part)
     of_lengths = compared if part is capture or not lengths else unseen_errors(record.uncertainty, capture)
     each: dict[str, Agreement] = {}
@@ -133,12 +133,11 @@ def _add_prediction(
         ]
     if of_lengths is not None and lengths:
         lengths_found = of_lengths.of_lengths(lengths)
+        every = of_lengths.expanded()
         for row, i in zip(group["lengths"], lengths, strict=True):
-            expanded = finite(factor * of_lengths.length_u[i])
-            row["expanded_mm"] = expanded
+            row["expanded_mm"] = expanded = finite(every[i])
             row["error_over_expanded"] = finite(row["error_mm"] / expanded) if expanded else None
     group["predicted"] = {
-        "coverage_factor": factor,
         "poses": agreement_row(poses),
         "lengths": {
             "lengths": lengths_found.count,

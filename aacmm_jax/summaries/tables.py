@@ -70,16 +70,24 @@ def decimals_for(u: float | None, default: int = 4) -> int:
     return min(max(1 - math.floor(math.log10(float(f"{u:.1e}"))), 0), 9)
 
 
-def volume_rows(volume: Mapping[str, Any], factor: float) -> list[tuple[str, list[float | None]]]:
+def factor_words(volume: Mapping[str, Any]) -> str:
+    """The coverage factors over the working volume: each length has its own."""
+    low, high = (volume[f"coverage_factor_{end}"] for end in ("least", "largest"))
+    if low is None or high is None:
+        return ""
+    return f"coverage factor {low:.2f}" + (f" to {high:.2f}" if f"{low:.2f}" != f"{high:.2f}" else "")
+
+
+def volume_rows(volume: Mapping[str, Any]) -> list[tuple[str, list[float | None]]]:
     """U over the working volume: what it is of, and its median, 95th percentile and largest value, mm."""
     length = f"{volume['length_mm']:g} mm length"
     titles = {
-        "u_tip": "tip position, along its worst direction: from the calibration",
-        "u_length": f"{length}: from the calibration",
-        "u_length_reading": f"{length}: with the noise of both readings",
+        "expanded_tip": "tip position, along its worst direction: from the calibration",
+        "expanded_length": f"{length}: from the calibration",
+        "expanded_length_reading": f"{length}: with the noise of both readings",
     }
-    u = {key: [volume[f"{key}_{which}_mm"] for which in ("median", "95", "largest")] for key in titles}
-    return [(title, [None if x is None else factor * x for x in u[key]]) for key, title in titles.items()]
+    which = ("median", "95", "largest")
+    return [(title, [volume[f"{key}_{one}_mm"] for one in which]) for key, title in titles.items()]
 
 
 def encoders_in_words(found: Mapping[str, Any]) -> str:

@@ -53,13 +53,13 @@ def _sentence(doubts: list[str], consequence: str = "") -> str:
 def _stated(summary: Mapping[str, Any]) -> str | None:
     """The expanded uncertainty of a length, with the noise of its readings; None where it is not determined."""
     found = summary["uncertainty"]
-    volume, factor = found["volume"], found["coverage_factor_95"]
-    median, largest = volume["u_length_reading_median_mm"], volume["u_length_reading_largest_mm"]
+    volume = found["volume"]
+    median, largest = (volume[f"expanded_length_reading_{which}_mm"] for which in ("median", "largest"))
     if median is None or largest is None:
         return None
     return (
-        f"U (95 %) of a measured length of {volume['length_mm']:g} mm, {two_digits(factor * median)} mm "
-        f"(at worst {two_digits(factor * largest)} mm)"
+        f"U (95 %) of a measured length of {volume['length_mm']:g} mm, {two_digits(median)} mm "
+        f"(at worst {two_digits(largest)} mm)"
     )
 
 

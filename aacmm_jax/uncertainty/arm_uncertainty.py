@@ -5,14 +5,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.arrays import Numbers, is_concrete
-from ..core.distributions import student_quantile
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known
+from ..core.linear_algebra import semidefinite_eigen
+from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, checked_readings
 from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
+from .degrees_of_freedom import LEVEL, Components, Law, coverage_factor, degrees_of_freedom
 from .shared_errors import SharedErrors
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
@@ -42,8 +43,12 @@ class Uncertainty(eqx.Module):
     noise: Noise
     u_k: Float[AnyArray, ""] | None
     shared: SharedErrors | None = eqx.field(default=None, kw_only=True)
+    # Parts of the covariance that do not rest on the scatter of single poses, but for functions of the readings.
+    components: Components | None = eqx.field(default=None, kw_only=True)
+    surplus_k: Float[AnyArray, ""] | None = eqx.field(default=None, kw_only=True)  # of u_k^2, by lengths that disagree
     names: tuple[str, ...] = eqx.field(static=True)
-    degrees_of_freedom: float = eqx.field(static=True)  # degrees of freedom; infinite where the noise was given
+    scatter_degrees_of_freedom: float = eqx.field(static=True)  # of the noise; infinite where it was given
+    lengths: int = eqx.field(static=True, default=0, kw_only=True)  # from which k was found
 
     @property
     def space(self) -> Parameters:
@@ -60,6 +65,10 @@ class Uncertainty(eqx.Module):
         crossed = shared.follow @ shared.moments
         above = xp.concatenate([self.covariance, crossed], axis=1)
         below = xp.concatenate([crossed.T, shared.moments], axis=1)
+        parts = shared.of_functions
+        if self.components is not None:
+            wider = xp.pad(self.components.matrices, ((0, 0), (0, k), (0, k)))
+            parts = Components(self.components.names, wider, self.components.law).joined(parts)
         return Uncertainty(
             arm=with_further_corrections(self.arm, shared.names),
             covariance=xp.concatenate([above, below]),
@@ -67,8 +76,11 @@ class Uncertainty(eqx.Module):
             noise=self.noise,
             u_k=self.u_k,
             shared=shared.without_functions(),
+            components=parts,
+            surplus_k=self.surplus_k,
             names=(*self.names, *shared.names),
-            degrees_of_freedom=self.degrees_of_freedom,
+            scatter_degrees_of_freedom=self.scatter_degrees_of_freedom,
+            lengths=self.lengths,
         )
 
     @property
@@ -110,11 +122,70 @@ class Uncertainty(eqx.Module):
         found = [(self.names[j], self.names[i], float(table[i, j])) for i, j in pairs]
         return sorted(found, key=lambda entry: -abs(entry[2]))
 
-    def factor(self, level: float = 0.95) -> float:
-        """Coverage factor of a level: Student's t for the degrees of freedom (JCGM 100, annex G)."""
-        if not 0 < level < 1:
-            raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
-        return float(student_quantile(0.5 + level / 2, self.degrees_of_freedom))
+    @property
+    def scatter(self) -> Law:
+        """How well the variance by the scatter of single poses is known."""
+        return Law.of(np.array([self.scatter_degrees_of_freedom]))
+
+    @property
+    def law(self) -> Law:
+        """How well the variances of `parts` are known."""
+        return self.scatter if self.components is None else self.scatter.joined(self.components.law)
+
+    def parts(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
+        """Variances of quantities with these derivatives by the parameters: by the scatter, then by `components`."""
+        xp = namespace(self, derivatives)
+        whole = xp.einsum("...p,pq,...q->...", derivatives, self.covariance, derivatives)[..., None]
+        if self.components is None:
+            return whole
+        others = self.components.variances(derivatives)
+        return xp.concatenate([whole - xp.sum(others, axis=-1, keepdims=True), others], axis=-1)
+
+    def factor(self, level: float = LEVEL) -> Float[np.ndarray, " p"]:
+        """Coverage factor of the U of each parameter: Student's t, for as many degrees of freedom as what its
+        uncertainty rests on gives it (`uncertainty.degrees_of_freedom`)."""
+        return coverage_factor(level, *self._of_parameters())
+
+    def expanded(self, level: float = LEVEL) -> Float[np.ndarray, " p"]:
+        """Expanded uncertainty of each parameter, mm and rad; infinite where only a combination is determined."""
+        return self.factor(level) * np.asarray(self.u)
+
+    def expanded_of(self, derivatives: Float[np.ndarray, "... p"], level: float = LEVEL) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of functions of the free parameters with these derivatives."""
+        whole = to_numpy(self).complete
+        wider = np.pad(derivatives, [*((0, 0),) * (derivatives.ndim - 1), (0, len(whole.names) - len(self.names))])
+        parts = np.asarray(whole.parts(wider))
+        return whole.expanded_by_parts(parts, level)
+
+    @property
+    def degrees_of_freedom(self) -> Float[np.ndarray, " p"]:
+        """Effective degrees of freedom of the uncertainty of each parameter."""
+        return degrees_of_freedom(*self._of_parameters())
+
+    def expanded_by_parts(self, parts: Float[np.ndarray, "... c"], level: float = LEVEL) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of quantities of the `complete` uncertainty with these variances of their parts."""
+        u = np.sqrt(np.maximum(np.sum(parts, axis=-1), 0.0))
+        return np.asarray(coverage_factor(level, parts, to_numpy(self).complete.law) * u)
+
+    def _of_parameters(self) -> tuple[Float[np.ndarray, "p c"], Law]:
+        whole = to_numpy(self).complete
+        return np.asarray(whole.parts(np.eye(len(whole.names))[: len(self.names)])), whole.law
+
+    def expanded_by_scatter(
+        self, u: Float[np.ndarray, "..."], stated: Float[np.ndarray, "..."], level: float = LEVEL
+    ) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of what the scatter of single poses and a stated u make uncertain, ``u`` together, such
+        as the error of a reference length by the arm as it is."""
+        variances = np.stack([np.maximum(u**2 - stated**2, 0.0), stated**2], axis=-1)
+        return coverage_factor(level, variances, self.scatter.joined(Law.of(np.array([np.inf])))) * u
+
+    def expanded_k(self, level: float = LEVEL) -> float:
+        """Expanded uncertainty of k; NaN without one."""
+        if self.u_k is None:
+            return float("nan")
+        square, surplus = float(self.u_k) ** 2, 0.0 if self.surplus_k is None else float(self.surplus_k)
+        law = Law.of(np.array([self.scatter_degrees_of_freedom, max(self.lengths - 1, 1)]))
+        return float(coverage_factor(level, np.array([square - surplus, surplus]), law) * np.sqrt(square))
 
     @numpy_if_known
     def tip(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... 3 3"]:
@@ -124,9 +195,51 @@ class Uncertainty(eqx.Module):
         covariance = whole.covariance_of_functions(whole.derivatives(q))
         return covariance + self._reading(q) if reading else covariance
 
+    def expanded_tip(self, q: Numbers, *, level: float = LEVEL, reading: bool = False) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of the tip at joint angles ``(..., n)``, along its most uncertain direction, mm."""
+        parts = np.asarray(self.tip_parts(q, reading=reading))
+        return self.expanded_by_parts(parts, level)
+
+    @numpy_if_known
+    def tip_parts(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
+        """Variances of the tip along the direction in which it is most uncertain, part by part, mm^2."""
+        xp, q, whole = namespace(self, q, reading), self._checked(q), self.complete
+        covariance = self.tip(q, reading=reading)
+        finite = xp.where(xp.isfinite(covariance), covariance, 0.0)
+        direction = semidefinite_eigen(finite)[1][..., 0]
+        along = xp.einsum("...c,...cp->...p", direction, whole.derivatives(q))
+        parts = whole.parts(along)
+        if reading:
+            of_noise = xp.einsum("...c,...cd,...d->...", direction, self._noise(q), direction)
+            parts = whole.with_reading(parts, of_noise, 1)
+        return xp.where(xp.all(xp.isfinite(covariance), axis=(-1, -2))[..., None], parts, np.inf)
+
+    def with_reading(
+        self, parts: Float[AnyArray, "... c"], of_noise: Float[AnyArray, "..."], ends: int
+    ) -> Float[AnyArray, "... c"]:
+        """Variances of `parts` with the noise of readings, and with what poses in each of so many places share."""
+        xp = namespace(self, parts, of_noise)
+        names = () if self.components is None else self.components.names
+        in_places = [0.0 if self.shared is None else ends * self.shared.sd_of(name) ** 2 for name in names]
+        return xp.stack(
+            [part + more for part, more in zip(xp.moveaxis(parts, -1, 0), [of_noise, *in_places], strict=True)], axis=-1
+        )
+
     @numpy_if_known
     def length(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "..."]:
         """Standard uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
+        return namespace(self, start, end).sqrt(self.length_parts(start, end, reading=reading).sum(axis=-1))
+
+    def expanded_length(
+        self, start: Numbers, end: Numbers, *, level: float = LEVEL, reading: bool = False
+    ) -> Float[np.ndarray, "..."]:
+        """Expanded uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
+        parts = np.asarray(self.length_parts(start, end, reading=reading))
+        return self.expanded_by_parts(parts, level)
+
+    @numpy_if_known
+    def length_parts(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
+        """Variances of the distance between the tips at two poses, part by part, mm^2."""
         xp = namespace(self, start, end, reading)
         start, end = self._checked(start), self._checked(end)
         try:
@@ -142,11 +255,12 @@ class Uncertainty(eqx.Module):
             )
         direction, whole = between / xp.linalg.norm(between, axis=-1, keepdims=True), self.complete
         along = xp.einsum("...c,...cp->...p", direction, whole.derivatives(end) - whole.derivatives(start))
-        variance = whole.covariance_of_functions(along[..., None, :])[..., 0, 0]
+        parts = whole.parts_of_functions(along)
         if reading:
-            both = self._reading(start) + self._reading(end)
-            variance = variance + xp.einsum("...c,...cd,...d->...", direction, both, direction)
-        return xp.sqrt(variance)
+            both = self._noise(start) + self._noise(end)
+            of_noise = xp.einsum("...c,...cd,...d->...", direction, both, direction)
+            parts = whole.with_reading(parts, of_noise, 2)
+        return parts
 
     def derivatives(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 p"]:
         """Derivatives of the tip by the free parameters."""
@@ -158,6 +272,11 @@ class Uncertainty(eqx.Module):
         covariance = derivatives @ self.covariance @ xp.swapaxes(derivatives, -1, -2)
         return xp.where(self._is_open(derivatives)[..., None], np.inf, covariance)
 
+    def parts_of_functions(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
+        """`parts` of functions of the parameters with these derivatives; infinite where they follow what is open."""
+        is_open = self._is_open(derivatives[..., None, :])
+        return namespace(self, derivatives).where(is_open, np.inf, self.parts(derivatives))
+
     def _checked(self, q: Numbers) -> Float[AnyArray, "... n"]:
         q = checked_readings(self.arm, q)
         if is_concrete(q) and not np.all(np.isfinite(np.asarray(q))):
@@ -166,10 +285,14 @@ class Uncertainty(eqx.Module):
 
     def _reading(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 3"]:
         xp = namespace(self, q)
+        return self._noise(q) + self.in_one_place**2 * xp.asarray(np.eye(3))
+
+    def _noise(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 3"]:
+        xp = namespace(self, q)
         flat = q.reshape(-1, q.shape[-1])
         geometry = self.arm.geometry
         covariance = xp.moveaxis(tip_covariances(geometry, joint_motion(geometry, flat), self.noise), -1, 0)
-        return covariance.reshape(*q.shape[:-1], 3, 3) + self.in_one_place**2 * xp.asarray(np.eye(3))
+        return covariance.reshape(*q.shape[:-1], 3, 3)
 
     def _is_open(self, derivatives: Float[AnyArray, "... k p"]) -> Bool[AnyArray, "... k"]:
         """Which rows follow an undetermined direction."""

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from ..core.linear_algebra import inverse_positive_definite, semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..data.noise import Noise
+from .degrees_of_freedom import Components
 
 # Models of the tips' errors. "given": encoders and seat as stated. "estimated": encoders and seat, both standard
 # deviations estimated from the residuals. "common": one variance for every coordinate of every tip. "robust": each
@@ -15,6 +16,8 @@ from ..data.noise import Noise
 NoiseModel = Literal["given", "estimated", "common", "robust"]
 NOISE_MODELS = ("given", "estimated", "common", "robust")
 
+# Parts of a covariance: what certificates and instruments state, and the disagreement of the lengths beyond that.
+STATED, DISAGREEMENT = "stated", "disagreement of lengths"
 # A direction whose standard uncertainty exceeds 10 mm or 10 mrad is not determined, whatever its eigenvalue.
 _LEAST_INFORMATION = 1e-2
 _NULL = 1e-12  # eigenvalues of the information below this, of the largest, are zero
@@ -27,6 +30,15 @@ class ParameterCovariance(NamedTuple):
     determined: Bool[AnyArray, " p"]  # one by one, and not only in combination with others
     open: Float[AnyArray, "p p"]  # projector onto the directions that are not determined, in natural steps
     noise: Noise  # given, or as estimated: one encoder for all
+    # Its parts that do not rest on the scatter of single poses; None: there is none.
+    components: Components | None = None
+
+    def without(self, name: str) -> "ParameterCovariance":
+        """Less one of its parts."""
+        if self.components is None or name not in self.components.names:
+            return self
+        part = self.components.matrices[self.components.names.index(name)]
+        return self._replace(matrix=self.matrix - part, components=self.components.without(name))
 
 
 def inverse_information(

@@ -28,30 +28,30 @@ class UnknownsCovariance(NamedTuple):
     """Covariance of the head, and of the numbers of each component, natural steps."""
 
     head: Float[AnyArray, "h h"]
-    components: list[Float[AnyArray, "K k k"]]
+    components: list[Float[AnyArray, "_ _ _"]]
 
 
 class Influence(NamedTuple):
     """How the unknowns follow the rows at one point; natural steps, 0 for what is fixed."""
 
     blocks: list[RowBlock]  # of poses, then of relations; whitened, not weighted
-    weights: list[Float[AnyArray, " m"] | None]  # by a robust loss
+    weights: list[Float[AnyArray, " _"] | None]  # by a robust loss
     fixed: Bool[AnyArray, " h"]  # numbers of the head that follow nothing
-    rows: list[Float[AnyArray, "h r m"]]  # A of every block
-    parts: list[Float[AnyArray, "K k"]]  # steps of the components' numbers, class by class
+    rows: list[Float[AnyArray, "h _ _"]]  # A of every block
+    parts: list[Float[AnyArray, "_ _"]]  # steps of the components' numbers, class by class
     information: Float[AnyArray, "h h"]  # 1/G, with that of a prior
     inverse: Float[AnyArray, "h h"]  # G
     lost: Float[AnyArray, "h h"]  # projector onto what the data leave open
     determined: Bool[AnyArray, " h"]  # numbers of the head that are determined one by one
-    own: list[Float[AnyArray, "K k k"]]  # D^-1, class by class
-    follow: list[Float[AnyArray, "K k h"]]  # D^-1 C
-    open: list[Bool[AnyArray, "K k"]]  # numbers of components that their rows leave open
+    own: list[Float[AnyArray, "_ _ _"]]  # D^-1, class by class
+    follow: list[Float[AnyArray, "_ _ h"]]  # D^-1 C
+    open: list[Bool[AnyArray, "_ _"]]  # numbers of components that their rows leave open
 
     @classmethod
     def of(
         cls,
         blocks: list[RowBlock],
-        weights: list[Float[AnyArray, " m"] | None],
+        weights: list[Float[AnyArray, " _"] | None],
         classes: tuple[tuple[int, int], ...],
         steps: Float[AnyArray, " z"],
         prior: PriorRows | None,
@@ -74,7 +74,7 @@ class Influence(NamedTuple):
             rows.append(mine)
         information: Any = 0.0
         for mine, weight in zip(rows, weights, strict=True):
-            flat = _flat(mine if weight is None else mine * xp.sqrt(weight))
+            flat = _flat(mine if weight is None else mine * xp.sqrt(weight)[None, None])
             information = information + flat @ flat.T
         if prior is not None:
             index = np.arange(prior.weight.shape[0])
@@ -92,7 +92,7 @@ class Influence(NamedTuple):
     def weighted(self, number: int, rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k r m"]:
         """Rows of a block as a robust loss counts them: the influence of its poses."""
         weight = self.weights[number]
-        return rows if weight is None else rows * weight
+        return rows if weight is None else rows * weight[None, None]
 
     def weighted_rows(self, number: int) -> Float[AnyArray, "h r m"]:
         """A W of a block."""
@@ -112,8 +112,8 @@ class Influence(NamedTuple):
 def rows_of_functions(
     influence: Influence,
     head: Float[AnyArray, "q h"],
-    components: list[Float[AnyArray, "q K k"]],
-) -> list[Float[AnyArray, "q r m"]]:
+    components: list[Float[AnyArray, "q _ _"]],
+) -> list[Float[AnyArray, "q _ _"]]:
     """How linear functions of the unknowns follow the whitened rows of every block; ``head`` and ``components`` are
     their derivatives by the unknowns, natural steps."""
     xp = namespace(influence.inverse, head)
@@ -131,7 +131,7 @@ def rows_of_functions(
 
 
 def variances_of_functions(
-    influence: Influence, head: Float[AnyArray, "q h"], components: list[Float[AnyArray, "q K k"]]
+    influence: Influence, head: Float[AnyArray, "q h"], components: list[Float[AnyArray, "q _ _"]]
 ) -> Float[AnyArray, " q"]:
     """Of linear functions of the unknowns, where every row has the variance 1 that its weight says; ``head`` and
     ``components`` are their derivatives, natural steps."""
@@ -144,7 +144,7 @@ def variances_of_functions(
 
 
 def covariance_of_rows(
-    rows: list[Float[AnyArray, "q r m"]], covariances: list[Float[AnyArray, "r r m"]]
+    rows: list[Float[AnyArray, "q _ _"]], covariances: list[Float[AnyArray, "_ _ _"]]
 ) -> Float[AnyArray, "q q"]:
     """Covariance of functions that follow rows so; relations, which come after the poses, have variance 1."""
     total: Any = 0.0
@@ -155,8 +155,8 @@ def covariance_of_rows(
 
 
 def covariance_with(
-    influence: Influence, rows: list[Float[AnyArray, "1 r m"]], covariances: list[Float[AnyArray, "r r m"]]
-) -> tuple[Float[AnyArray, " h"], list[Float[AnyArray, "K k"]]]:
+    influence: Influence, rows: list[Float[AnyArray, "1 _ _"]], covariances: list[Float[AnyArray, "_ _ _"]]
+) -> tuple[Float[AnyArray, " h"], list[Float[AnyArray, "_ _"]]]:
     """Covariance of the unknowns with a function that follows the rows so; natural steps."""
     xp = namespace(influence.inverse, rows)
     of_head, of_own = xp.zeros(influence.inverse.shape[0]), [xp.zeros(one.shape[:2]) for one in influence.own]
@@ -180,12 +180,12 @@ def _left_open(matrix: Float[AnyArray, "K k k"], inverse: Float[AnyArray, "K k k
 
 
 def _flat(rows: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h _"]:
-    return rows.reshape(rows.shape[0], -1)
+    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
 def row_covariances(
     rows: list[Rows], errors: list[ArmErrors], whitening: Whitening, noise: Noise
-) -> list[Float[AnyArray, "r r m"]]:
+) -> list[Float[AnyArray, "_ _ _"]]:
     """Covariance of the whitened rows of every pose, by the noise and by what was measured."""
     found = []
     for part, error, root in zip(rows, errors, whitening.roots, strict=True):
@@ -199,7 +199,7 @@ def row_covariances(
     return found
 
 
-def alone(influence: Influence, groups: int) -> list[Float[AnyArray, "r r m"]]:
+def alone(influence: Influence, groups: int) -> list[Float[AnyArray, "_ _ _"]]:
     """Covariance of every pose's whitened rows from its own residual, as it were without the pose in the fit."""
     found = []
     for number, block in enumerate(influence.blocks[:groups]):
@@ -225,7 +225,7 @@ def alone(influence: Influence, groups: int) -> list[Float[AnyArray, "r r m"]]:
 
 def propagated(
     influence: Influence,
-    covariances: list[Float[AnyArray, "r r m"]],
+    covariances: list[Float[AnyArray, "_ _ _"]],
     shared_readings: Float[AnyArray, "h h"] | None,
     prior: PriorRows | None,
     added: Float[AnyArray, "h h"] | None,
@@ -238,12 +238,7 @@ def propagated(
     xp, inverse = namespace(influence.inverse, covariances), influence.inverse
     total = xp.zeros_like(inverse) if shared_readings is None else shared_readings
     if prior is not None:
-        # The errors of the prior have variance 1 in its own rows.
-        total = (
-            total
-            + influence.information
-            - sum((_information(influence, number) for number in range(len(influence.blocks))), xp.zeros_like(inverse))
-        )
+        total = total + _of_prior(influence)
     own_total = [xp.zeros_like(matrix) for matrix in influence.own]
     crossed = [xp.zeros_like(matrix) for matrix in influence.follow]
     for number, block in enumerate(influence.blocks):
@@ -266,13 +261,34 @@ def propagated(
     return UnknownsCovariance(head, components)
 
 
+def of_stated(
+    influence: Influence, rows: list[Rows], whitening: Whitening, prior: PriorRows | None
+) -> Float[AnyArray, "h h"]:
+    """The part of the head's covariance that rests on what is stated: of relations, a prior, and measured values."""
+    xp, inverse = namespace(influence.inverse), influence.inverse
+    total = xp.zeros_like(inverse) if prior is None else _of_prior(influence)
+    for number in range(len(influence.blocks)):
+        by = a = influence.weighted_rows(number)
+        if number < len(rows):
+            each = xp.moveaxis(whitening.roots[number], 0, -1)
+            by = products(a, products(products(each, xp.moveaxis(rows[number].measured, 0, -1)), each))
+        total = total + _flat(by) @ _flat(a).T
+    return inverse @ total @ inverse
+
+
+def _of_prior(influence: Influence) -> Float[AnyArray, "h h"]:
+    """The information of the prior, whose errors have variance 1 in its own rows."""
+    of_rows = (_information(influence, number) for number in range(len(influence.blocks)))
+    return influence.information - sum(of_rows, namespace(influence.inverse).zeros_like(influence.inverse))
+
+
 def _information(influence: Influence, number: int) -> Float[AnyArray, "h h"]:
     flat = _flat(influence.rows[number])
     return flat @ _flat(influence.weighted_rows(number)).T
 
 
 def of_shared_readings(
-    rows: list[Float[AnyArray, "q r m"]],
+    rows: list[Float[AnyArray, "q _ _"]],
     errors: list[ArmErrors],
     whitening: Whitening,
     noise: Noise,

@@ -46,7 +46,7 @@ class Linearisation(NamedTuple):
     errors: list[ArmErrors]
     whitening: Whitening
     blocks: list[RowBlock]  # whitened rows of groups, then of lengths and certified values
-    weights: list[Float[AnyArray, " m"] | None]
+    weights: list[Float[AnyArray, " _"] | None]
 
     @classmethod
     def at(
@@ -155,17 +155,17 @@ class Linearisation(NamedTuple):
             found.append(ObservationRows(one, poses, *values))
         return found
 
-    def white(self) -> list[Float[AnyArray, "r m"]]:
+    def white(self) -> list[Float[AnyArray, "_ _"]]:
         """Whitened residuals of each observation."""
         groups = len(self.observed.layout.groups)
         return self.observed.by_observation([block.white for block in self.blocks[:groups]])
 
-    def by_head(self) -> list[Float[AnyArray, "h r m"]]:
+    def by_head(self) -> list[Float[AnyArray, "h _ _"]]:
         """Whitened derivatives of each observation by parameters and shared geometry."""
         groups = len(self.observed.layout.groups)
         return self.observed.by_observation([_present(block.by_head) for block in self.blocks[:groups]])
 
-    def by_private(self) -> list[Float[AnyArray, "k r m"]]:
+    def by_private(self) -> list[Float[AnyArray, "_ _ _"]]:
         """Whitened derivatives of each observation by the private geometry that it alone uses."""
         found: list[AnyArray] = [np.zeros((0, 0, 0))] * len(self.observed.observations)
         for group, block in zip(self.observed.layout.groups, self.blocks, strict=False):
@@ -189,7 +189,7 @@ class Linearisation(NamedTuple):
                 found[number] = np.concatenate(parts) if parts else found[number]
         return found
 
-    def dense(self) -> list[Float[AnyArray, "z r m"]]:
+    def dense(self) -> list[Float[AnyArray, "z _ _"]]:
         """Whitened derivatives of each observation by all unknowns; as large as all of them together."""
         found = []
         for head, own, index in zip(self.by_head(), self.by_private(), self.private(), strict=True):

@@ -32,6 +32,7 @@ _LONGEST_STEP = 0.1  # rad, of a configuration
 _AGREES = 1e-9  # mm or rad
 _LEAST_U = 1e-6  # mm: an exact certified value would be a row of infinite weight
 _NULL = 1e-10  # singular values of the shared geometry below this, of the largest, are zero
+_MOST = 0.5  # of the poses: where fewer agree, all count
 _MOVED = 1e-4  # of the largest change: parts of the geometry that change less do not follow
 _NAMED = 2
 
@@ -97,6 +98,8 @@ class Agreeing(NamedTuple):
         whitening = _whitening(self.observed, self.point, of_arm, measured)
         # Poses that this arm cannot take, next to a singularity, would look like information.
         agree = [np.abs(rows.values).max(axis=0) < _AGREES for rows in self.point.rows]
+        if np.mean(np.concatenate(agree)) < _MOST:  # another arm's: what is left of it says as little
+            agree = [np.ones_like(mask) for mask in agree]
         roots = tuple(root * kept[:, None, None] for root, kept in zip(whitening.roots, agree, strict=True))
         linear = Linearisation.of(
             self.observed, self.space, self.z, self.point, self.errors, whitening._replace(roots=roots), None

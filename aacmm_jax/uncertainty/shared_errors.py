@@ -14,16 +14,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray
-from .evidence import Groups, PriorModel, learned_log_variances
+from ..core.numpy_or_jax import AnyArray, namespace
+from .degrees_of_freedom import Components, Law
+from .evidence import Groups, PriorModel, covariance_of_log_variances, learned_log_variances
 from .residual_tests import Residuals
-from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 _ROUNDS = 40  # of the variance of independent errors; usually 5
 _TOLERANCE = 1e-6
 NULL = 1e-6  # eigenvalues of an effect's information below this, of the largest, are zero
-_GRID = 240  # standard deviations at which the likelihood of one effect is computed
-_LARGEST = 30.0  # standard deviation of an effect, of that of a tip coordinate
+# Standard deviations at which the likelihood of one effect is computed: how many, and between which parts of the usual.
+_GRID, _RANGE = 80, (0.01, 100.0)
 _LEAST_LOG = 2 * np.log(1e-4)  # smallest log variance of a learned group, in natural steps
 
 
@@ -41,20 +41,41 @@ class SharedErrors(eqx.Module):
     moments: Float[AnyArray, "k k"]  # second moments of the coefficients about 0, which the calibrated arm has
     follow: Float[AnyArray, "p k"]  # derivatives of the parameters by the coefficients, mm and rad
     correlation_length: Float[AnyArray, ""]  # of successive poses, where visits are not marked; NaN otherwise
+    # What each kind adds to the covariance of the parameters, or, of functions, to the moments of the coefficients when
+    # the logarithm of its variance grows; and how well the variances are known.
+    added: Float[AnyArray, "e p p"]
+    by_group: Float[AnyArray, "f k k"]
+    law: Law  # of all kinds
 
-    def without_functions(self) -> "SharedErrors | None":
+    def without_functions(self) -> "SharedErrors":
         """Those that move the tips of poses alike."""
-        own = [i for i, kind in enumerate(self.kinds) if kind in (PLACES, VISITS, SUCCESSIVE)]
-        kinds, units = tuple(self.kinds[i] for i in own), tuple(self.units[i] for i in own)
+        own = len(self.added)
         return SharedErrors(
-            kinds,
-            units,
-            (),
-            self.sd[np.array(own, dtype=int)],
-            np.zeros((0, 0)),
-            self.follow[:, :0],
-            self.correlation_length,
+            kinds=self.kinds[:own],
+            units=self.units[:own],
+            names=(),
+            sd=self.sd[:own],
+            moments=np.zeros((0, 0)),
+            follow=self.follow[:, :0],
+            correlation_length=self.correlation_length,
+            added=self.added,
+            by_group=np.zeros((0, 0, 0)),
+            law=Law(*(of[:own] for of in self.law)),
         )
+
+    @property
+    def of_tips(self) -> Components | None:
+        """What errors of the tip add to the covariance of the parameters."""
+        own = len(self.added)
+        return Components(self.kinds[:own], self.added, Law(*(of[:own] for of in self.law))) if own else None
+
+    @property
+    def of_functions(self) -> Components:
+        """By how much the covariance of parameters and coefficients grows with the logarithm of each variance."""
+        xp, own = namespace(self), len(self.added)
+        by_coefficients = xp.concatenate([self.follow, xp.asarray(np.eye(len(self.names)))])
+        grown = by_coefficients @ self.by_group @ by_coefficients.T
+        return Components(self.kinds[own:], grown, Law(*(of[own:] for of in self.law)))
 
     def sd_of(self, *kinds: str) -> Float[AnyArray, ""] | float:
         """Standard deviation of a tip coordinate by effects of some kinds, mm; 0 without."""
@@ -109,23 +130,26 @@ class Effects(NamedTuple):
 
 
 class OneVariance(NamedTuple):
-    """An effect of one variance: every coefficient is a displacement of the tip, mm."""
+    """An effect of one variance, every coefficient a displacement of the tip: how large the variance may be."""
 
-    variance: float  # posterior mean, mm^2
+    variance: float  # as stated, mm^2
+    ratios: Float[np.ndarray, " k"]  # of those that are possible to that one
+    weights: Float[np.ndarray, " k"]  # their probabilities
     log_likelihood: float  # its maximum over that without the effect
 
 
-def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], low: float, usual: float) -> OneVariance:
-    """The variance of one more effect: its posterior mean.
+def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: float) -> OneVariance:
+    """The variance of one more effect, with its posterior distribution.
 
-    The mean and not the maximum, because intervals with the mean cover what those of Student's t do: the variance of t
-    is that of the normal distribution times the mean of the variance. Beforehand the logarithm of the standard
-    deviation is uniform between ``low`` and ``usual`` and less and less probable above, as few data say nothing of it.
+    Beforehand the standard deviation has a half-Cauchy distribution: as probable anywhere below what is ``usual``, and
+    less and less above, which few data would not exclude (Gelman 2006, Bayesian Analysis 1, 515-534, section 7, for
+    just such effects of a few groups). What residuals show is the sum of the effect and of the independent errors in
+    its place; stated is the geometric mean of that sum, less the errors. Intervals do not follow from it alone, but
+    from the whole distribution (`degrees_of_freedom`).
 
     Args:
         effects: What is known.
         columns: Of the effect, as far as the model does not explain them.
-        low: Standard deviation below which the effect is nothing, mm.
         usual: Standard deviation above which it is improbable, mm.
     """
     information = effects.product(columns, columns)
@@ -134,25 +158,28 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], low: float
     values, r = values[known], effects.left.values[:, None]
     squares = (vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2
     total, freedom = float(effects.product(r, r)[0, 0]), effects.left.degrees_of_freedom
-    sd = np.exp(np.linspace(np.log(low), np.log(_LARGEST * usual), _GRID))
-    ratio = sd**2 / effects.variance
+    ratio = (usual * np.geomspace(*_RANGE, _GRID)) ** 2 / effects.variance
     explained = np.sum(ratio[:, None] * squares / (1 + ratio[:, None] * values), axis=1)
     cost = total - explained
     log_sum = np.sum(np.log1p(ratio[:, None] * values), axis=1)
-    if effects.given:
-        likelihood, variance = -0.5 * (cost - total + log_sum), np.ones(_GRID)
-    else:
-        likelihood, variance = -0.5 * (freedom * np.log(cost / total) + log_sum), cost / freedom
-    weight = likelihood - np.maximum(np.log(sd / usual), 0.0)
+    # Of the effect, and of what independent errors add to the mean of a coefficient's tips.
+    variance = ratio if effects.given else ratio * cost / freedom
+    of_errors = variance / ratio / np.mean(values)
+    of_cost = cost - total if effects.given else freedom * np.log(cost / total)
+    likelihood = -0.5 * (of_cost + log_sum)
+    weight = likelihood + 0.5 * np.log(variance) - np.log1p(variance / usual**2)
     weight = np.exp(weight - weight.max())
-    mean = float(np.sum(weight * ratio * variance) / np.sum(weight))
-    return OneVariance(mean, float(np.max(likelihood)))
+    weight = weight / weight.sum()
+    stated = float(np.exp(weight @ np.log(variance + of_errors)) - weight @ of_errors)
+    stated = max(stated, float(variance[0]))
+    return OneVariance(stated, variance / stated, weight, float(np.max(likelihood)))
 
 
 def group_deviations(
     effects: Effects, columns: Float[np.ndarray, "R k"], members: Float[np.ndarray, "g k"]
-) -> Float[np.ndarray, " g"]:
-    """Standard deviations of groups of effects at which the residuals are most probable, natural steps.
+) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
+    """Standard deviations of groups of effects at which the residuals are most probable, natural steps, and the degrees
+    of freedom that the residuals and what is expected beforehand give each: 2 over the variance of its log variance.
 
     Each group is expected, to a factor of 4.5, to explain an equal share of the residuals: else groups of which the
     data say little would be as large as anybody fears, or collapse (`benchmarks/NOTES.md`).
@@ -179,18 +206,36 @@ def group_deviations(
         change, variance = abs(np.log(new / variance)), new
         if change < _TOLERANCE:
             break
-    return np.exp(0.5 * logs)
+    curved = covariance_of_log_variances(model, groups, logs, logs > _LEAST_LOG + 1e-9)
+    spread = np.diag(curved)
+    return np.exp(0.5 * logs), 2 / np.where(spread > 0, spread, 1e-9)
+
+
+class Moments(NamedTuple):
+    """Second moments about 0 of the coefficients of an effect, and their derivatives by log variances of groups."""
+
+    matrix: Float[np.ndarray, "k k"]
+    by_group: Float[np.ndarray, "g k k"]
+
+    def in_units(self, steps: Float[np.ndarray, " k"]) -> "Moments":
+        """Of coefficients in units of their own, of those in ``steps``."""
+        both = steps[:, None] * steps
+        return Moments(self.matrix * both, self.by_group * both)
 
 
 def second_moments(
-    effects: Effects, columns: Float[np.ndarray, "R k"], sd: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, "k k"]:
-    """Second moments about 0 of the coefficients of an effect, given the residuals and their own standard deviations.
+    effects: Effects, columns: Float[np.ndarray, "R k"], sd: Float[np.ndarray, " g"], members: Float[np.ndarray, "g k"]
+) -> Moments:
+    """Second moments of the coefficients of groups, given the residuals and the groups' standard deviations.
 
     A calibration without the effect has the error that these coefficients make, whose mean square is this.
     """
     variance, r = effects.variance, effects.left.values[:, None]
-    inner = effects.product(columns, columns) / variance + np.diag(1 / sd**2)
+    weights = members / sd[:, None] ** 2
+    inner = effects.product(columns, columns) / variance + np.diag(weights.sum(axis=0))
     covariance = np.linalg.inv(inner)
     mean = covariance @ effects.product(columns, r) / variance
-    return covariance + mean @ mean.T
+    grown = [covariance @ (weight[:, None] * covariance) for weight in weights]
+    moved = [covariance @ (weight[:, None] * mean) for weight in weights]
+    by_group = [one + step @ mean.T + mean @ step.T for one, step in zip(grown, moved, strict=True)]
+    return Moments(covariance + mean @ mean.T, np.array(by_group))

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
 from ..core.errors import InputError
-from ..core.linear_algebra import semidefinite_eigen
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
 from ..core.random_keys import random_generator
 from ..kinematics.arm import Arm, joint_limits
@@ -20,7 +19,7 @@ _LENGTH_MM = 300.0  # lengths of the map, where none is given: those of the pape
 
 
 class VolumetricUncertainty(NamedTuple):
-    """Standard uncertainties over the working volume, point by point, as NumPy arrays, mm.
+    """Uncertainties over the working volume, standard ones and expanded to 95 %, point by point, as NumPy arrays, mm.
 
     At each point: of a tip, and of a length that starts there, in random poses.
 
@@ -38,12 +37,22 @@ class VolumetricUncertainty(NamedTuple):
     u_tip: Float[np.ndarray, " v"]  # along the direction in which it is largest
     u_length: Float[np.ndarray, " v"]
     u_length_reading: Float[np.ndarray, " v"]  # with the noise of the readings at both ends
+    expanded_tip: Float[np.ndarray, " v"]  # each with a coverage factor of its own
+    expanded_length: Float[np.ndarray, " v"]
+    expanded_length_reading: Float[np.ndarray, " v"]
 
     @property
     def summary(self) -> dict[str, float]:
-        """Median, 95th percentile and largest standard uncertainty, mm."""
+        """Median, 95th percentile and largest uncertainty, standard and expanded to 95 %, mm; the smallest and the
+        largest coverage factor."""
         found = {"length_mm": self.length}
-        for name in ("u_tip", "u_length", "u_length_reading"):
+        pairs = [np.stack([u, expanded]) for u, expanded in zip(self[5:8], self[8:], strict=True)]
+        u, expanded = np.concatenate(pairs, axis=1)
+        known = np.isfinite(u) & (u > 0)
+        factors = expanded[known] / u[known]
+        found |= {"coverage_factor_least": float(factors.min(initial=np.inf))}
+        found |= {"coverage_factor_largest": float(factors.max(initial=-np.inf))}
+        for name in self._fields[5:]:
             values = getattr(self, name)
             found |= {
                 f"{name}_median_mm": float(np.median(values)),
@@ -69,7 +78,7 @@ def volumetric_uncertainty(
         seed: of the random numbers.
 
     Returns:
-        Standard uncertainties at every point, mm.
+        Uncertainties at every point, mm.
 
     Raises:
         InputError: no length of this size can be placed within the joint limits.
@@ -81,8 +90,11 @@ def volumetric_uncertainty(
     """
     length = default_length(uncertainty.arm) if length is None else length
     start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
-    tips, covariance, plain, read = _volume(to_numpy(uncertainty), start, end)
-    return VolumetricUncertainty(length, start, end, tips[0], tips[1], covariance, plain, read)
+    tips, *parts = _volume(to_numpy(uncertainty), start, end)
+    parts = [np.asarray(part) for part in parts]
+    u = [np.sqrt(np.sum(part, axis=-1)) for part in parts]
+    expanded = [uncertainty.expanded_by_parts(part) for part in parts]
+    return VolumetricUncertainty(length, start, end, tips[0], tips[1], *u, *expanded)
 
 
 @compiled(jit=eqx.filter_jit)
@@ -90,12 +102,9 @@ def _volume(
     uncertainty: Uncertainty, start: Float[AnyArray, "v n"], end: Float[AnyArray, "v n"]
 ) -> tuple[Any, Any, Any, Any]:
     xp = namespace(uncertainty, start, end)
-    covariance = uncertainty.tip(start)
-    finite = xp.where(xp.isfinite(covariance), covariance, 0.0)
-    largest = xp.sqrt(semidefinite_eigen(finite)[0][..., 0])
-    largest = xp.where(xp.all(xp.isfinite(covariance), axis=(-1, -2)), largest, np.inf)
     tips = xp.stack([uncertainty.arm.position(q) for q in (start, end)])
-    return tips, largest, uncertainty.length(start, end), uncertainty.length(start, end, reading=True)
+    plain, read = (uncertainty.length_parts(start, end, reading=reading) for reading in (False, True))
+    return tips, uncertainty.tip_parts(start), plain, read
 
 
 def default_length(arm: Arm) -> float:

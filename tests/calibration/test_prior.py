@@ -147,6 +147,7 @@ def test_learned_scales(paper_arm, space, bounds):
     assert np.all(u_of(found) < 1.05 * u_of(calibrate(paper_arm, capture, bounds, method="joint")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a_1", "alpha_2"])
 def test_learned_scales_settle_where_a_bound_is_reached(name):
     """A bound that is met with some scales and not with those that these lead to is on the way of the rounds."""

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from aacmm_jax.uncertainty.observed_covariance import covariance_of_noise
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import truth_of
@@ -12,7 +13,6 @@ from aacmm_jax.calibration.sampling import _RepeatedTask
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.model.observed import Observed, linear_rows, whitening_of
-from aacmm_jax.uncertainty.observed_covariance import covariance_of_noise
 
 from .test_observed import NOISE, SIMULATED
 

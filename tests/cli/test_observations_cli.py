@@ -10,6 +10,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.model.loss_names import LOSSES
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
 BOX = [[200, -300, 100], [600, 300, 500]]
@@ -139,6 +140,57 @@ def test_a_robust_loss_lists_what_lost_weight(aacmm, folder, tmp_path):
     assert 5 * float(robust.observed.sigma) < float(
         aj.evaluate(plain.calibrated.arm, plain.recording.capture).repeatability.rms
     )
+
+
+class SeenFromAbove(kinds.MeasuredPoints):
+    """A kind with two rows a pose: of points, what lies in the base's plane."""
+
+    rows = 2
+
+    def residual(self, tips, unknowns):
+        rows = super().residual(tips, unknowns)
+        by_unknowns = {part: columns[:, :2] for part, columns in rows.by_unknowns.items()}
+        return rows._replace(
+            values=rows.values[:2],
+            by_tip=rows.by_tip[:2],
+            by_unknowns=by_unknowns,
+            measured=rows.measured[:, :2, :2],
+        )
+
+
+@pytest.fixture(scope="module")
+def several_rows(folder):
+    """Observations of 1, 3 and 6 rows a pose."""
+    recording = aj.files.load_capture(folder / "tracker.h5")
+    arm, points = recording.nominal.arm, recording.capture.observations[0]
+    target, frame = (10, 20, 80, 0.1, 0.2, 0.3), (0.3, 0.0, 0.1, -500.0, 900.0, 100.0)
+    turned = kinds.SimulatedTransforms("T6", BOX, 20, target, frame, u=0.01, u_angle=1e-4)
+    more = aj.simulate(arm, {}, observations=[turned], noise=NOISE).observations
+    capture = aj.Capture({}, observations=[*recording.capture.observations, *more])
+    assert [observation.rows for observation in capture.observations] == [3, 1, 6]
+    aj.files.save_capture(folder / "several.h5", recording._replace(capture=capture))
+    above = SeenFromAbove("above", points.q[40:], points.points[40:], u=0.01, station=points.station)
+    with_two = [points.select(range(40)), *capture.observations[1:], above]
+    return arm, capture, aj.Capture({}, observations=with_two)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robust", LOSSES)
+def test_every_loss_is_for_python_and_the_command_line(aacmm, folder, several_rows, tmp_path, robust):
+    arm, capture, with_two = several_rows
+    aacmm("calibrate", folder / "several.h5", "-o", "c.h5", "--robust", robust)
+    found = aj.calibrate(arm, capture, robust=robust)
+    assert found.converged
+    record = aj.files.load_calibration(tmp_path / "c.h5")
+    assert record.robust == robust
+    np.testing.assert_allclose(record.covariance, found.covariance, rtol=1e-5, atol=1e-12)
+    assert aj.calibrate(arm, with_two, robust=robust).converged
+
+
+def test_a_loss_that_is_none_is_refused_with_the_list(aacmm, folder):
+    for loss in LOSSES:
+        assert loss in aacmm("calibrate", folder / "bad.h5", "--robust", "hubert", expect=2).stderr
+        assert loss in aacmm("calibrate", "--help").stdout
 
 
 @pytest.mark.slow

@@ -177,7 +177,7 @@ def test_what_was_observed_in_words(counts, words):
 def test_base_has_its_units_and_the_digits_of_its_uncertainty(capsys):
     row = {"in": "tracker", "position_mm": [507.922315, 1.0, 2.0], "position_u_mm": [0.08, 0.0031, None]}
     row |= {"rotation_rad": [0.1, 0.0, 0.0], "rotation_u_rad": [1e-3, 1e-3, 1e-3]}
-    summary = {"base": [row], "uncertainty": {"coverage_factor_95": 2.0}}
+    summary = {"base": [row], "uncertainty": {"coverage_factor_geometry_95": 2.0}}
     calibration_display._base(new_console(), summary)
     shown = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["tracker", "position", "[mm]", "507.92", "1.0000", "2.0000"] in shown

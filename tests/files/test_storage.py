@@ -510,7 +510,20 @@ DIMENSIONS = {
     "calibrated_arm": JOINTS,
     "parameters": {"parameter": 8, "parameter_2": 8},
     "sockets": {"socket": 2, "axis": 3},
-    "shared_errors": {"shared_kind": 4, "coefficient": 23, "coefficient_2": 23, "shared_parameter": 8},
+    "shared_errors": {
+        "shared_kind": 4,
+        "shared_kind_variance": 1,
+        "coefficient": 23,
+        "coefficient_2": 23,
+        "function_kind": 4,
+        "shared_parameter": 8,
+    },
+    "components": {
+        "component": 2,
+        "component_variance": 1,
+        "component_parameter": 8,
+        "component_parameter_2": 8,
+    },
 }
 
 

@@ -207,14 +207,13 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
     record = written.record
     report = calibration_report(record)[0]
     tables = tables_of(report)
-    evaluations, factor = record.evaluations(), aj.uncertainty_of(record).factor(0.95)
+    evaluations, expanded = record.evaluations(), aj.uncertainty_of(record).expanded(0.95)
     stages = {"nominal": "nominal", "stage 1": "stage1", "calibrated": "calibrated"}
     metrics = tables["Metrics by arm [mm]"]
     for heading, stage in stages.items():
         cell = metrics.rows[0][metrics.columns.index(heading)]
         assert cell.value == pytest.approx(float(evaluations[stage].repeatability.de))
     parameters = tables["Parameters"]
-    u = np.sqrt(np.diag(record.covariance))
     for row in parameters.rows:
         i = record.names.index(row[0].text)
         scale = 1 / aj.units.DEG if row[1].text == "deg" else 1.0
@@ -222,23 +221,23 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
             scale * record.vectors()["calibrated"][i]
         )
         if row[parameters.columns.index("U (95 %)")].value is not None:
-            assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * factor * u[i])
+            assert row[parameters.columns.index("U (95 %)")].value == pytest.approx(scale * expanded[i])
     volume = aj.volumetric_uncertainty(aj.uncertainty_of(record))
     rows = tables["Expanded uncertainty over the working volume [mm]"].rows
-    assert rows[1][3].value == pytest.approx(factor * volume.u_length.max())
+    assert rows[1][3].value == pytest.approx(volume.expanded_length.max())
     positions = tables["All positions"]
-    np.testing.assert_allclose([row[4].value for row in positions.rows], factor * volume.u_length)
+    np.testing.assert_allclose([row[4].value for row in positions.rows], volume.expanded_length)
     charts_by_id = {
         block.id: block for section in report.sections for block in section.blocks if isinstance(block, elements.Chart)
     }
     shade, limits = charts_by_id["volume"].plots[0].marks[0].shade, charts_by_id["volume"].shade_limits
-    assert limits[-1] == pytest.approx(factor * volume.u_length.max())
-    assert sum(np.asarray(shade) == 0) == sum(factor * volume.u_length < limits[1])
+    assert limits[-1] == pytest.approx(volume.expanded_length.max())
+    assert sum(np.asarray(shade) == 0) == sum(volume.expanded_length < limits[1])
     change = charts_by_id["change-mm"].plots[0]
     i = record.names.index(change.x.ticks[0][1])
     vectors, marks = record.vectors(), change.marks[0]
     assert marks.y[0] == pytest.approx(vectors["calibrated"][i] - vectors["nominal"][i], rel=1e-5)
-    assert marks.high[0] - marks.y[0] == pytest.approx(factor * u[i], rel=1e-5)
+    assert marks.high[0] - marks.y[0] == pytest.approx(expanded[i], rel=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -347,12 +346,14 @@ def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
     bounds = aj.Bounds.around(recording.nominal.arm, space, length=10.0, angle=0.0175)
     record = aj.calibration.record_of(aj.calibrate(recording.nominal.arm, recording.capture, bounds), recording)
     table = tables_of(calibration_report(record)[0])["Reference lengths [mm]"]
-    factor, evaluations = aj.uncertainty_of(record).factor(0.95), record.evaluations()
+    evaluations = record.evaluations()
+    u, stated = evaluations["calibrated"].u, np.array([float(length.u) for length in recording.capture.lengths])
+    expanded = aj.uncertainty_of(record).expanded_by_scatter(np.asarray(u), stated)
     for i, row in enumerate(table.rows):
         cells = dict(zip(table.columns, row, strict=True))
         for heading, stage in (("nominal", "nominal"), ("stage 1", "stage1"), ("calibrated", "calibrated")):
             assert cells[f"error, {heading}"].value == pytest.approx(float(evaluations[stage].error[i]))
-        assert cells["U of error"].value == pytest.approx(factor * float(evaluations["calibrated"].u[i]))
+        assert cells["U of error"].value == pytest.approx(expanded[i])
 
 
 def test_a_report_of_very_many_poses_stays_small(written, tmp_path):

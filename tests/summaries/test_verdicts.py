@@ -9,16 +9,16 @@ from aacmm_jax.summaries.verdicts import (
     evaluation_verdict,
 )
 
-VOLUME = {"length_mm": 300.0, "u_length_reading_median_mm": 0.01, "u_length_reading_largest_mm": 0.05}
+VOLUME = {"length_mm": 300.0, "expanded_length_reading_median_mm": 0.02, "expanded_length_reading_largest_mm": 0.1}
 SOUND = {
     "converged": True, "reason": "stopped", "residual_plausible": True, "method": "two-stage", "hold": "d_3",
     "active": {}, "active_stage1": {}, "cross_validation": {"rms_mm": 0.1, "surprising": False}, "model_tests": None,
-    "uncertainty": {"volume": VOLUME, "coverage_factor_95": 2.0},
+    "uncertainty": {"volume": VOLUME},
 }  # fmt: skip
 TESTS = dict.fromkeys(("misfit", "lengths", "noisy_joint", "successive_poses")) | {
     "level": 0.01, "missing_terms": [], "noisy_observations": []
 }  # fmt: skip
-UNKNOWN = {"volume": VOLUME | {"u_length_reading_largest_mm": None}, "coverage_factor_95": 2.0}
+UNKNOWN = {"volume": VOLUME | {"expanded_length_reading_largest_mm": None}}
 
 
 @pytest.mark.parametrize(

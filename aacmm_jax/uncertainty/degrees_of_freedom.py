@@ -1,0 +1,194 @@
+"""Degrees of freedom of a quantity, by what each part of its variance rests on, and the one coverage factor of every U.
+
+A covariance is a sum of parts: the scatter of single poses, certified lengths and what instruments state, the
+disagreement of the lengths, effects that poses share. A quantity with derivatives g has the variances v_i = g' C_i g of
+these parts, and where each was estimated from nu_i degrees of freedom, those of their sum are (Welch 1947,
+Satterthwaite 1946; JCGM 100, G.4.1)
+
+    nu = (sum v_i)^2 / sum (v_i^2 / nu_i).
+
+This takes the variance for nearly normal, or for a chi-square variable's multiple. The variance of an effect that three
+placements show is neither: it may well be 0, or four times what is most probable. Such a part is described by its
+posterior distribution (`Law.ratios`), and an error of the quantity is then distributed as a mixture of Student's t with
+the variances that are possible, as the propagation of distributions has it (JCGM 101, 6.4.9; Bodnar, Link and Elster
+2016, Bayesian Analysis 11, 25-45). The coverage factor is that of the mixture, the degrees of freedom those of
+Student's t with the same factor at 95 %.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..core.distributions import student_quantile, student_tail
+from ..core.errors import InputError
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
+
+LEVEL = 0.95  # coverage at which degrees of freedom are those of Student's t
+_DRAWS = 128  # combinations of the variances of several parts that have distributions
+_ROUNDS = 24  # bisections of the logarithm of a coverage factor
+_STEPS = (0.41421356237309515, 0.7320508075688772, 0.23606797749978969, 0.6457513110645906)  # fractions of square roots
+
+
+class Law(NamedTuple):
+    """How well the variances of c parts are known.
+
+    A part's variance is estimated from ``degrees_of_freedom`` (infinite: exact), or has one of k ``ratios`` to the
+    stated one, with probabilities ``weights``.
+    """
+
+    degrees_of_freedom: Float[AnyArray, " c"]
+    ratios: Float[AnyArray, "c k"]
+    weights: Float[AnyArray, "c k"]
+
+    @classmethod
+    def of(cls, degrees_of_freedom: Float[AnyArray, " c"]) -> "Law":
+        """Of variances that were estimated from so many degrees of freedom."""
+        one = np.ones((len(degrees_of_freedom), 1))
+        return cls(degrees_of_freedom, one, one)
+
+    @property
+    def in_numpy(self) -> "Law":
+        """With NumPy's arrays."""
+        return Law(*(np.asarray(each, dtype=float) for each in self))
+
+    def joined(self, *others: "Law") -> "Law":
+        """With further parts."""
+        every = [self, *others]
+        most = max(law.ratios.shape[1] for law in every)
+        xp = namespace(every)
+        ratios = [xp.pad(law.ratios, ((0, 0), (0, most - law.ratios.shape[1])), constant_values=1.0) for law in every]
+        weights = [xp.pad(law.weights, ((0, 0), (0, most - law.weights.shape[1]))) for law in every]
+        return Law(
+            xp.concatenate([law.degrees_of_freedom for law in every]), xp.concatenate(ratios), xp.concatenate(weights)
+        )
+
+
+class Components(eqx.Module):
+    """Parts of a covariance that rest on something else than its other parts do; names of what they rest on."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    matrices: Float[AnyArray, "c p p"]
+    law: Law
+
+    @classmethod
+    def of(cls, parts: dict[str, tuple[Float[AnyArray, "p p"], float]]) -> "Components | None":
+        """Of matrices, each with its degrees of freedom."""
+        if not parts:
+            return None
+        matrices, degrees_of_freedom = zip(*parts.values(), strict=True)
+        xp = namespace(matrices)
+        return cls(tuple(parts), xp.stack(matrices), Law.of(np.array(degrees_of_freedom)))
+
+    def joined(self, other: "Components | None") -> "Components":
+        """With further ones."""
+        if other is None:
+            return self
+        xp = namespace(self, other)
+        matrices = xp.concatenate([self.matrices, other.matrices])
+        return Components((*self.names, *other.names), matrices, self.law.joined(other.law))
+
+    def without(self, name: str) -> "Components | None":
+        """Without one of them."""
+        kept = np.array([i for i, own in enumerate(self.names) if own != name], dtype=int)
+        if not len(kept):
+            return None
+        return Components(tuple(self.names[i] for i in kept), self.matrices[kept], Law(*(of[kept] for of in self.law)))
+
+    def wider(self, free: np.ndarray, size: int) -> "Components":
+        """Of ``size`` parameters, of which these are the ``free`` ones; the others are exact."""
+        xp = namespace(self)
+        matrices = set_at(xp.zeros((len(self.names), size, size)), (slice(None), *np.ix_(free, free)), self.matrices)
+        return Components(self.names, matrices, self.law)
+
+    def variances(self, derivatives: Float[AnyArray, "... p"]) -> Float[AnyArray, "... c"]:
+        """Of quantities with these derivatives by the parameters."""
+        return namespace(self, derivatives).einsum("...p,cpq,...q->...c", derivatives, self.matrices, derivatives)
+
+
+def effective_degrees_of_freedom(
+    variances: Float[np.ndarray, "... c"], degrees_of_freedom: Float[np.ndarray, " c"]
+) -> Float[np.ndarray, "..."]:
+    """Of sums of independent variances (Welch and Satterthwaite); infinite where no part that counts is estimated."""
+    variances = np.asarray(variances, dtype=float)
+    # Relative to the largest, so that the variance of an angle of a microradian does not underflow.
+    largest = np.max(np.abs(variances), axis=-1, initial=0.0, keepdims=True)
+    relative = variances / np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
+    below = np.sum(relative**2 / degrees_of_freedom, axis=-1)
+    return np.asarray(np.where(below > 0, np.sum(relative, axis=-1) ** 2 / np.where(below > 0, below, 1.0), np.inf))
+
+
+def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
+    """The factor of U over u for quantities with these variances of their parts.
+
+    Args:
+        level: Coverage probability.
+        variances: Of the parts, whose sum is u^2.
+        law: How well each is known.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
+    law, variances = law.in_numpy, np.asarray(variances, dtype=float)
+    known = np.all(np.isfinite(variances), axis=-1)
+    variances = np.where(known[..., None], variances, 0.0)
+    freedom = effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
+    found = np.array(student_quantile(0.5 + level / 2, freedom))
+    total = np.sum(variances, axis=-1)
+    spread = np.flatnonzero(np.sum(np.asarray(law.weights) > 0, axis=1) > 1)
+    mixed = np.any(variances[..., spread] > 1e-9 * total[..., None], axis=-1) & (total > 0)
+    if mixed.any():
+        found[mixed] = _of_mixtures(level, variances[mixed], law, spread)
+    return found
+
+
+def degrees_of_freedom(variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
+    """Those of Student's t with the same coverage factor at 95 %."""
+    from scipy import special
+
+    variances = np.asarray(variances, dtype=float)
+    plain = effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
+    factor = coverage_factor(LEVEL, variances, law)
+    normal = special.ndtri(0.5 + LEVEL / 2)
+    # Very many are infinitely many: the inverse has no more digits there.
+    mixed = special.stdtridf(0.5 + LEVEL / 2, np.maximum(factor, normal * (1 + 1e-6)))
+    same = np.abs(student_quantile(0.5 + LEVEL / 2, plain) - factor) < 1e-9 * factor
+    return np.where(same, plain, np.where(factor > normal * (1 + 1e-6), mixed, np.inf))
+
+
+def _of_mixtures(
+    level: float, variances: Float[np.ndarray, "m c"], law: Law, spread: np.ndarray
+) -> Float[np.ndarray, " m"]:
+    """Coverage factors of quantities of whose variance some parts have distributions."""
+    ratios, weights = _combinations(np.asarray(law.ratios), np.asarray(law.weights), spread)
+    total = np.sum(variances, axis=1)
+    each = variances[:, None, :] * ratios  # (m, draws, c)
+    possible = np.maximum(np.sum(each, axis=2), 1e-12 * total[:, None])
+    freedom = effective_degrees_of_freedom(each, np.asarray(law.degrees_of_freedom))
+    root = np.sqrt(possible / total[:, None])
+    both = student_quantile(0.5 + level / 2, freedom) * root
+    low, high = np.log(both.min(axis=1)), np.log(both.max(axis=1))
+    for _ in range(_ROUNDS):
+        middle = 0.5 * (low + high)
+        outside = np.sum(weights * student_tail(np.exp(middle)[:, None] / root, freedom), axis=1)
+        low, high = np.where(outside > 1 - level, middle, low), np.where(outside > 1 - level, high, middle)
+    return np.exp(0.5 * (low + high))
+
+
+def _combinations(
+    ratios: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"], spread: np.ndarray
+) -> tuple[Float[np.ndarray, "d c"], Float[np.ndarray, " d"]]:
+    """Variances of all parts over the stated ones, and their probabilities: all of one part that has a distribution,
+    and of several a lattice (Kronecker's sequence), which has as many of each."""
+    if len(spread) == 1:
+        kept = weights[spread[0]] > 0
+        found = np.ones((int(kept.sum()), len(ratios)))
+        found[:, spread[0]] = ratios[spread[0], kept]
+        return found, weights[spread[0], kept]
+    found, number = np.ones((_DRAWS, len(ratios))), np.arange(_DRAWS)
+    for i, part in enumerate(spread):
+        at = (number + 0.5) / _DRAWS if i == 0 else (0.5 + number * _STEPS[(i - 1) % len(_STEPS)]) % 1.0
+        order = np.argsort(ratios[part])
+        of_order = weights[part, order]
+        found[:, part] = np.interp(at, np.cumsum(of_order) - 0.5 * of_order, ratios[part, order])
+    return found, np.full(_DRAWS, 1 / _DRAWS)
