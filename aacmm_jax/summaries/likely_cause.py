@@ -130,7 +130,7 @@ class _Misfit(NamedTuple):
         """
         observed = self.observed.moved(self.arm, tried.q, tried.observations)
         space, lever = Parameters(self.arm, ("d_1",)), total_link_length(self.arm) / 4
-        certified = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
+        certified: dict[str, AnyArray] = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
         known = [np.full(len(units), name in certified) for name, units in observed.blocks.items()]
         vector, best = np.asarray(space.vector()), np.inf
         try:
@@ -139,7 +139,7 @@ class _Misfit(NamedTuple):
             for _ in range(_ROUNDS):
                 point = rows_at(space, observed, z)
                 roots = tuple(_roots(rows.values.shape, lever) for rows in point.rows)
-                whitening = Whitening(roots, np.zeros(0), {name: np.zeros_like(certified[name]) for name in certified})
+                whitening = Whitening(roots, np.zeros(0), {name: 0 * value for name, value in certified.items()})
                 linear = Linearisation.of(observed, space, z, point, [], whitening, None)
                 squares = sum(float(np.sum(white**2)) for white in linear.white())
                 found = float(np.sqrt(squares / len(observed.q)))

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
+from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.socket import position_of
@@ -74,7 +75,7 @@ class Agreeing(NamedTuple):
             # What is certified does not count: the fit in mm.
             alone = whitening._replace(certified={name: 0 * weight for name, weight in whitening.certified.items()})
             new = Linearisation.of(observed, source, z, point, errors, alone, None).fitted(fixed)
-            step, z = np.max(np.abs(new - z), initial=0.0), new
+            step, z = np.max(np.abs(new - z), initial=0.0), np.asarray(new)
             if step < _FITTED:
                 break
         z = np.concatenate([np.asarray(space.vector()), z[p:]])
@@ -115,7 +116,8 @@ class Agreeing(NamedTuple):
         along = basis.T @ rows[:, :p]
         rest, shared = rows[:, :p] - basis @ along, -inverse @ along
         whole = np.concatenate([np.eye(p), shared])
-        geometry = joined(shared.T, *(-np.moveaxis(one @ whole, -1, 0) for one in influence.follow)).T
+        followers = (-np.moveaxis(np.asarray(one) @ whole, -1, 0) for one in influence.follow)
+        geometry = np.asarray(joined(shared.T, *followers)).T
         lengths = self._lengths(influence, inverse, geometry, measured)
         return Eliminated(rest[:count], np.concatenate([rest[count:], lengths]), geometry)
 
@@ -171,13 +173,13 @@ def _with_parts(text: str, parts: list[str]) -> str:
     return f"{', '.join(first)} and {last} trade off"
 
 
-def _at(space: Parameters, observed: Observed, z: Float[np.ndarray, " z"]) -> tuple[PointRows, list[ArmErrors]]:
+def _at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> tuple[PointRows, list[ArmErrors]]:
     point = rows_at(space, observed, z)
     return point, arm_errors(point, observed)
 
 
 def _whitening(
-    observed: Observed, point: PointRows, of_arm: list[Float[np.ndarray, "_ _ _"]], measured: bool = False
+    observed: Observed, point: PointRows, of_arm: list[Float[AnyArray, "_ _ _"]], measured: bool = False
 ) -> Whitening:
     """Rows in mm, whatever the uncertainty of what was measured, unless it is to count."""
     if measured:
@@ -195,14 +197,13 @@ def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]
     left = [np.zeros((*own.shape[:2], influence.inverse.shape[0])) for own in influence.own]
     for number, (block, rows) in enumerate(zip(influence.blocks, influence.rows, strict=True)):
         own = influence.own_rows(number)
-        if own is not None:
+        if own is not None and block.of is not None:
             left[block.of] += sums_by_component(own, rows, block.sizes)
-    found = []
-    for number, (block, rows) in enumerate(zip(influence.blocks, influence.rows, strict=True)):
+    found = [np.asarray(rows) for rows in influence.rows]
+    for number, block in enumerate(influence.blocks):
         own = influence.own_rows(number)
-        found.append(
-            rows if own is None else rows - followed(own, influence.own[block.of] @ left[block.of], block.sizes)
-        )
+        if own is not None and block.of is not None:
+            found[number] = found[number] - followed(own, influence.own[block.of] @ left[block.of], block.sizes)
     return found
 
 
@@ -218,6 +219,3 @@ def _moved(observed: Observed, arm: Arm, point: PointRows, errors: list[ArmError
         poses = np.arange(len(q))[group.index]
         q[poses, : len(units)] -= units * step
     return observed.moved(arm, q)
-
-
-dense_rows = None  # TEMPORARY: a name that calibration/prediction.py still imports

@@ -40,6 +40,28 @@ def test_sockets_and_lengths_are_as_without_observations(paper_arm, capture):
     np.testing.assert_allclose(found.distances, alone.distances, atol=0.01)
 
 
+def test_sockets_alone_with_noise_or_known_positions(paper_arm, capture):
+    """Residuals are described where something is known of them besides their scatter."""
+    sockets = aj.Capture(capture.sockets, capture.lengths)
+    alone, weighted = aj.evaluate(paper_arm, sockets), aj.evaluate(paper_arm, sockets, noise=NOISE)
+    assert alone.observed is None
+    np.testing.assert_allclose(weighted.observed.reduced_chi, 1.0, atol=0.3)
+    np.testing.assert_allclose(weighted.measured, alone.measured, atol=0.01)
+    moved = {"position of A": np.asarray(alone.repeatability.centroids[0]) + np.array([1.0, 0.0, 0.0])}
+    kept = aj.evaluate(paper_arm, sockets, geometry=moved)
+    np.testing.assert_array_equal(kept.observed.geometry["position of A"], moved["position of A"])
+    assert float(kept.observed.rms[0]) == pytest.approx(np.hypot(1.0, float(alone.repeatability.socket_rms[0])))
+    assert float(kept.observed.rms[1]) == pytest.approx(float(alone.repeatability.socket_rms[1]))
+
+
+def test_without_redundancy_lengths_have_no_uncertainty(paper_arm, capture):
+    one_each = aj.Capture({name: q[:1] for name, q in capture.sockets.items()}, capture.lengths)
+    found = aj.evaluate(paper_arm, one_each)
+    assert np.isnan(found.u).all()
+    assert np.isfinite(found.measured).all()
+    assert np.isfinite(aj.evaluate(paper_arm, one_each, noise=NOISE).u).all()
+
+
 def test_a_frame_that_is_kept_shows_a_moved_station(paper_arm):
     box = [[200, -300, 100], [600, 300, 500]]
 

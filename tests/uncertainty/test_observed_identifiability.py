@@ -7,6 +7,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.uncertainty.observed_identifiability import Agreeing
 from aacmm_jax.uncertainty.target_parameters import independent_of_targets
 
 NOISE = aj.Noise(encoder_arcsec=2, seating=0.005)
@@ -133,7 +134,7 @@ def test_one_bar_on_a_platform_that_turns_half_a_revolution(paper_arm):
 
 
 def test_indices_agree_with_eliminated_sockets(paper_arm):
-    """A socket as an observation is a socket: the same spectrum by code of its own."""
+    """A socket as an observation is a socket."""
     points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300)}
     sockets = aj.simulate(paper_arm, points, poses=20, lengths=[("A", "B", 0.001)], noise=NOISE)
     q = sockets.sockets
@@ -141,9 +142,22 @@ def test_indices_agree_with_eliminated_sockets(paper_arm):
     space = aj.Parameters.independent(paper_arm)
     for noise in (None, NOISE):
         one, other = (aj.observability(paper_arm, capture, space, noise=noise) for capture in (sockets, written))
-        # A length is one row of the sockets' centroids there, and follows their weighted positions here.
-        np.testing.assert_allclose(other.singular[:-1], one.singular[:-1], rtol=0.02)
+        np.testing.assert_allclose(other.singular, one.singular, rtol=1e-9)
+        assert other.condition == pytest.approx(one.condition, rel=1e-9)
         assert other.rank == one.rank == len(space.names)
+
+
+def test_lengths_of_measured_sockets_weigh_as_their_poses_scatter(paper_arm):
+    """A length that is exact determines the scale as well as the poses at its ends say where these are."""
+    points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300)}
+    capture = aj.simulate(paper_arm, points, poses=20, lengths=[("A", "B", 1e-9)], noise=NOISE)
+    few = aj.Capture({name: q[:5] for name, q in capture.sockets.items()}, capture.lengths)
+    space = aj.Parameters(paper_arm, ("d_1", "a_2", "a_3", "d_4", "probe_z"))
+    many, less = (aj.observability(paper_arm, one, space, sigma=0.01) for one in (capture, few))
+    assert many.rank == less.rank == 4  # d_1 moves the whole arm
+    agreeing = Agreeing.of(*to_numpy((capture, space)))
+    by_sigma = agreeing.eliminated(sigma=0.01).relations
+    np.testing.assert_allclose(by_sigma, agreeing.eliminated().relations / (0.01 * np.sqrt(2 / 20)), rtol=1e-6)
 
 
 def test_calibrate_warns_of_what_observations_leave_open(paper_arm):
