@@ -54,9 +54,8 @@ class Task(NamedTuple):
     @property
     def needs_no_weights(self) -> bool:
         """Whether all rows weigh the same at every arm, and are linear in the unknown geometry."""
-        kinds = (one.linear for one in self.observed.observations)
-        known = self.noise is None and self.loss is None and self.prior is None and not self.observed.ends
-        return known and all(kinds) and not self.observed.certified()
+        layout, known = self.observed.layout, self.noise is None and self.loss is None and self.prior is None
+        return known and not layout.shared and layout.linear == len(layout.classes)
 
 
 def task_of(
