@@ -3,11 +3,9 @@
 Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
 all poses of a visit share (marked in the capture, or successive poses where none are), and functions of the readings
 that the model lacks (`uncertainty.shared_errors`). The gate keeps the intervals of a calibration in which nothing is
-wrong as they are. Errors that all poses of a socket share, which only reference lengths show, are allowed for wherever
-two lengths or more compare them, as far as these leave them possible: so few do not show that there are none, and a
-gate closes in a third of the captures with three lengths in which places err by as much as single poses. After a robust
-loss, poses count with the weights of the solution, as if these were given, and bad ones, which lost most of it, not at
-all.
+wrong as they are. Errors that all poses of a socket share, which only reference lengths show, are always allowed for
+where three lengths or more compare them, as far as these leave them possible. After a robust loss, poses count with the
+weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,6 +18,7 @@ from jaxtyping import Float
 
 from ..core._compat import inside_trace
 from ..core.arrays import is_concrete
+from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.recording import Recording
@@ -57,13 +56,11 @@ _MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, fas
 # Part of the residuals of poses above which the size of the arm explains them, to which residuals of sockets are in
 # proportion: parameters, or errors of places, of which poses say nothing.
 _MOST_OF_POSES = 0.5
+_NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
 # Of the weight of a pose after a robust loss: less remains beyond 13 standard deviations with Huber, 4 with Tukey.
 # Shared errors of a few standard deviations cost weight, too, and are what is looked for.
 _TRUSTED = 0.1
 _FEWEST = 6  # degrees of freedom
-# Median of the standard deviation of errors of the tip that poses share, of that of the residuals, as it is expected
-# beforehand; three lengths say so little that it decides how wide intervals are (`benchmarks/NOTES.md`).
-_USUAL = 1.25
 # Median of the standard deviation of errors of the tip that poses share, of that of the residuals, as it is expected
 # beforehand; three lengths say so little that it decides how wide intervals are (`benchmarks/NOTES.md`).
 _USUAL = 1.25
@@ -361,4 +358,29 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips:
     explained = np.sum((vectors[:, known].T @ effects.product(columns, by_poses)[:, 0]) ** 2 / values[known])
     if explained > _MOST_OF_POSES * float(effects.product(by_poses, by_poses)[0, 0]):
         return nothing
-    return nothing._replace(patterns=[patterns]).of(problem, effects)
+    number, spare = int(known.sum()), effects.left.degrees_of_freedom - int(known.sum())
+    found = nothing._replace(patterns=[patterns])
+    if number >= _FEW:
+        return found.of(problem, effects)
+    square = float(np.sum((vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2 / values[known]))
+    if effects.given:
+        probability = chi_square_tail(square, number)
+    else:
+        rest = max(float(effects.product(r, r)[0, 0]) - square, 1e-300)
+        probability = f_tail(square / number / (rest / spare), number, spare)
+    if not len(effects.variances):
+        probability = min(probability, _neighbours(problem))
+    return found.of(problem, effects) if probability < _GATE else nothing
+
+
+def _neighbours(problem: SharedProblem) -> float:
+    """Probability that poses of one socket at neighbouring configurations err so much alike by chance."""
+    q = np.asarray(problem.record.recording.capture.readings)
+    columns, kernel = [], []
+    for each in problem.rows:
+        own = q[each.poses]
+        distance = np.sqrt(np.sum(4 * np.sin((own[:, None] - own) / 2) ** 2, axis=2))
+        columns.append(block_diagonal(each.by_tip))
+        kernel.append(np.kron(np.exp(-distance / _NEIGHBOURS) - np.eye(len(own)), np.eye(3)))
+    relative = problem.record.given_noise is None
+    return form_test(problem.left, form_of_poses(problem.left, columns, kernel), relative).probability
