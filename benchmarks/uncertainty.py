@@ -91,7 +91,7 @@ def calibrated(study, drawn, lengths, method, noise, noise_model, hold="d_3"):
             uncertainty.parts(jnp.eye(len(space.names))), uncertainty.length_parts(start, end)
         ])  # fmt: skip
         of_k = jnp.stack([result.scale.u**2 - result.scale.surplus, result.scale.surplus])
-        freedom = jnp.asarray([uncertainty.scatter_degrees_of_freedom, max(value.shape[0] - 1, 1)])
+        freedom = jnp.asarray([uncertainty.scatter_degrees_of_freedom, max(uncertainty.lengths - 1, 1)])
         return errors, u, result.active, result.converged, parts, uncertainty.law, of_k, freedom
 
     rows = (jnp.asarray(drawn.q), jnp.asarray(drawn.value[:, 0]), jnp.asarray(drawn.true))

@@ -146,7 +146,7 @@ def cross_validate(
         >>> print(left_out.labels)
         ['A, B', 'C, D']
         >>> print(f"error {left_out.rms:.3f} mm, predicted {left_out.rms_predicted:.3f} mm")
-        error 0.016 mm, predicted 0.017 mm
+        error 0.016 mm, predicted 0.016 mm
     """
     if groups is not None:
         parts = _chosen(capture, groups, len(bounds.space.names))
