@@ -61,7 +61,7 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
     table, reference, attributes = stored.tables["parameters"], stored.tables["reference"], stored.attributes
     names, covariance = table["parameter"].tolist(), table["covariance"]
     vectors = [table[key] for key in ("lower", "upper", "active_stage1", "active", "determined")]
-    square = (covariance, table.get("open", covariance))
+    square = (covariance, table["open"])
     count = len(names)
     check_sense(
         path,
@@ -78,8 +78,8 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
         for stage in ("stage1", "calibrated")
         if len(reference["value"]) and f"measured_{stage}" in reference
     ]
-    # Observations, or a single stage, need no reference length.
-    scaled = "observed" not in stored.tables and attributes["method"] != "repeatability"
+    # Only the division by k needs reference lengths.
+    scaled = attributes["method"] == "two-stage"
     finite = all(np.all(np.isfinite(x)) for x in ((k, u_k, covariance) if scaled else (covariance,)))
     stated = ("encoder_arcsec", "linear_encoder_mm", "seating_mm")
     noise = np.concatenate([np.atleast_1d(attributes.get(what, 0.0)) for what in stated])
@@ -99,7 +99,7 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
             "the covariance is not one": finite and not _is_semidefinite(covariance),
             "the method is unknown": attributes["method"] not in ("two-stage", "joint", "repeatability"),
             "its number of steps is negative": attributes["steps"] < 0,
-            "its degrees of freedom are not positive": not attributes.get("freedom", np.inf) > 0,
+            "its degrees of freedom are not positive": not attributes["freedom"] > 0,
             "a standard deviation of its noise is negative": bool(np.any(noise < 0)),
             "a verdict of its Monte Carlo is neither yes nor no": sampled is not None
             and not np.all(np.isin(sampled["agrees"], (0, 1))),
