@@ -129,11 +129,11 @@ def against_division(calibration: Calibration) -> tuple[str, ...]:
     if calibration.method != "two-stage" or bool(calibration.divided) or calibration.scale is None:
         return ()
     found, bounds = to_numpy((calibration.stage1, calibration.bounds))
-    space, anchor, names = bounds.space, found.anchor, []
+    space, anchor = bounds.space, found.anchor
     scaled = divide_lengths(space, found.parameters, np.asarray(calibration.scale.value), anchor.partners)
     below, above = _on_bounds(anchor, bounds, found.active, scaled)
-    for side, beyond in (("lower bound", below), ("upper bound", above)):
-        names += [f"{space.names[i]} ({side})" for i in np.flatnonzero(beyond & divisible(space))]
+    concerned = np.flatnonzero((below | above) & divisible(space))
+    names = [f"{space.names[i]} ({'upper' if above[i] else 'lower'} bound)" for i in concerned]
     if anchor.partners is None:
         names += [f"{name} (fixed length)" for name in fixed_lengths(space.base, space)]
         names += [f"q_{joint} (slide)" for joint in space.base.prismatic]
