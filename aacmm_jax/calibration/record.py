@@ -140,7 +140,8 @@ class CalibrationRecord(NamedTuple):
 
     @property
     def fixed_by_one_length(self) -> bool:
-        """Whether the arm was divided by the k of a single length, whose own error is then zero by construction."""
+        """Whether the arm was divided by the k of a single length, whose own error is then zero by construction, between
+        the positions that k was measured with."""
         return self.divided and len(self.recording.capture.lengths) == 1
 
     @property
