@@ -140,8 +140,7 @@ class CalibrationRecord(NamedTuple):
 
     @property
     def fixed_by_one_length(self) -> bool:
-        """Whether the arm was divided by the k of a single length, whose own error is then zero by construction, between
-        the positions that k was measured with."""
+        """Whether the arm was divided by the k of a single length, whose own error is then zero by construction."""
         return self.divided and len(self.recording.capture.lengths) == 1
 
     @property
