@@ -1,6 +1,5 @@
 """HDF5 files: damaged and foreign ones, whole-or-nothing writing, round trips, and xarray's view of tables."""
 
-import dataclasses
 import os
 import shutil
 import signal
@@ -25,6 +24,7 @@ from aacmm_jax.files.hdf5 import write_tables
 from aacmm_jax.kinematics.independence import nearly_parallel
 from tests.example_counts import example_count
 from tests.refusals import assert_refused
+from tests.renamed_sockets import renamed_sockets
 
 FULL = OSError(28, "No space left on device")
 LOAD = {"capture": aj.files.load_capture, "calibration": aj.files.load_calibration}
@@ -463,15 +463,10 @@ def test_round_trip_of_a_calibration(tmp_path, good):
 def test_names_with_a_comma(tmp_path, good, held, earlier):
     """Lists of names are lists in the file; those that were one string with commas between are still read."""
     names = ("A", "B") if earlier else ("plate, left", "B")
-    lengths = [aj.ReferenceLength(*names, good.recording.capture.lengths[0].value, 0.01)]
-    capture = aj.Capture(dict(zip(names, good.recording.capture.sockets.values(), strict=True)), lengths)
+    record = renamed_sockets(good.record, *names)
     group = LeftOut(names, 15, 0.1, 0.1, np.array([0.2]), np.array([0.1]), True)
-    recording = good.recording._replace(capture=capture, nominal=good.recording.nominal._replace(held=held))
-    geometry = dict(zip((f"position of {name}" for name in names), good.record.observed.geometry.values(), strict=True))
-    observed = dataclasses.replace(good.record.observed, names=names, geometry=geometry)
-    record = good.record._replace(
-        recording=recording, held=held, validation=CrossValidation((group, group)), observed=observed
-    )
+    recording = record.recording._replace(nominal=good.recording.nominal._replace(held=held))
+    record = record._replace(recording=recording, held=held, validation=CrossValidation((group, group)))
     path = tmp_path / "calibration.h5"
     aj.files.save_calibration(path, record)
     if earlier:
