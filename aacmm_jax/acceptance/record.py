@@ -9,7 +9,6 @@ import numpy as np
 
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..calibration.scale_fix import LARGEST_LOG_K
 from ..calibration.task import check_observed
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
@@ -34,6 +33,7 @@ from .influences import Influences
 from .standards import OF_SPHERES, STANDARDS, Standard, checked_standards
 
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
+_ROUNDING = 1e-7  # relative error up to which a length has the error zero by construction
 SIMULATED = "The readings are simulated: no real arm was measured."
 
 
@@ -79,7 +79,7 @@ class EvaluationRecord(NamedTuple):
         if len(known) != 1:
             return None
         error = float(np.asarray(evaluate(self.calibrated.arm, self.recording.capture).error)[known[0]])
-        return known[0] if abs(error) <= LARGEST_LOG_K * float(lengths[known[0]].value) else None
+        return known[0] if abs(error) <= _ROUNDING * float(lengths[known[0]].value) else None
 
     def measured(self, arm: Arm) -> Measured:
         """What acceptance tests are run on: held-out data, or everything if there are none."""

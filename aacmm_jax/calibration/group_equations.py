@@ -118,7 +118,6 @@ def linearisation_of(
 ) -> Linearisation:
     """A calibration linear at its solution, by some parameters, weighted by the noise, or where that is None by the
     scatter of its tips; with reference lengths as relations, or without."""
-    assert record.observed is not None
     capture = record.recording.capture if lengths else without_lengths(record.recording.capture)
     arm = record.calibrated.arm
     observed, arm, noise = to_numpy((Observed.of(capture, arm), arm, noise))
@@ -135,7 +134,7 @@ def linearisation_of(
 
 def lengths_in_solve(record: CalibrationRecord) -> bool:
     """Whether reference lengths took part in the least squares, and not only as the scale afterwards."""
-    return record.method == "joint" and bool(record.recording.capture.lengths)
+    return record.final_method == "joint" and bool(record.recording.capture.lengths)
 
 
 def _kept(record: CalibrationRecord) -> str | None:

@@ -149,8 +149,7 @@ def _tests(record: CalibrationRecord, usual: ArmNoise | None) -> ModelTests:
 
 def weighted_by_loss(record: CalibrationRecord) -> bool:
     """Whether a robust loss took weight from poses, so that residuals are smaller than the noise."""
-    observed = record.observed
-    return observed is not None and any(bool(np.any(np.asarray(weights) < 1)) for weights in observed.weights)
+    return any(bool(np.any(np.asarray(weights) < 1)) for weights in record.observed.weights)
 
 
 def _misfit(record: CalibrationRecord, left: Residuals, usual: ArmNoise | None) -> Misfit | None:

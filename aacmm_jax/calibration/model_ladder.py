@@ -215,14 +215,13 @@ def _compared(
         check_identifiability=False,
     )
     record = record_of(result, Recording(capture, ArmSpecification(arm)))
-    assert record.observed is not None
     assert record.prior is not None
-    poses, equations = [len(weights) for weights in record.observed.weights], equations_of(record)
+    equations = equations_of(record)
     return ComparedModel(
         model=model,
         parameters=len(record.names),
         effective_parameters=float(np.sum(record.prior.effective)),
-        rms_inside=float(np.sqrt(np.average(np.asarray(record.observed.rms_after) ** 2, weights=poses))),
+        rms_inside=record.observed.rms,
         regions=unseen_regions(record, regions, equations),
         cpu_seconds=time.process_time() - begun,
         result=result,

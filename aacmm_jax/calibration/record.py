@@ -9,13 +9,12 @@ import numpy as np
 from ..core._compat import member_numbers
 from ..core.arguments import checked_arguments
 from ..core.numpy_or_jax import to_jax
-from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, parameter_names, value_of
 from ..kinematics.parameters import ArmSpecification, Parameters
-from ..solver.reason import MAX_STEPS, SCALE, STALLED, Reason
+from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.shared_errors import SharedErrors
@@ -23,7 +22,7 @@ from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
 from .left_out import CrossValidation
 from .results import Calibration, Identification, NoisyEncoder, ObservedMetrics, PriorMetrics
-from .scale_fix import LARGEST_LOG_K
+from .scale_fix import against_division
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
 _CORRELATED = 0.1  # smallest eigenvalue of correlations, below which parameters slide along each other
@@ -94,11 +93,14 @@ class CalibrationRecord(NamedTuple):
     steps: int
     converged: bool
     reason: str
+    observed: ObservedMetrics  # how sockets and other observations agree, and their geometry; with arrays of NumPy
+    divided: bool  # whether the arm is that of stage 1 divided by k
+    # Bounds, fixed lengths and slides that stood against that in two stages, so that everything was solved at once.
+    against_division: tuple[str, ...] = ()
     validation: CrossValidation | None = None
     # Monte Carlo after JCGM 101: quantity, estimate, u, low, high, linear_u, agrees; and its summary in words.
     sampled: Mapping[str, np.ndarray] | None = None
     sampled_says: str | None = None
-    observed: ObservedMetrics | None = None  # where there are observations besides sockets, or a robust loss
     robust: str | None = None  # the robust loss
     others: OtherPoses | None = None
     removed: tuple[Removed, ...] = ()
@@ -119,15 +121,27 @@ class CalibrationRecord(NamedTuple):
         return bool(np.isnan(self.k)) or plausible(self.k)
 
     @property
-    def fixed_by_one_length(self) -> bool:
-        """Whether a single length fixed the scale, so that its own error as left is zero by construction.
+    def sockets_alone(self) -> bool:
+        """Whether nothing took part but poses in sockets, which all count in full, and reference lengths: no other
+        observation, no slides that set the scale instead of lengths, no robust loss and no prior."""
+        capture = self.recording.capture
+        by_slides = self.method != REPEATABILITY and not capture.lengths
+        return not (capture.observations or by_slides or self.robust is not None or self.prior is not None)
 
-        It is not zero where stage 2 ended with k off 1, on a bound of the adjusted length.
-        """
-        if self.method != "two-stage" or len(self.recording.capture.lengths) != 1 or self.scale_set_by:
-            return False
-        left = np.asarray(evaluate(self.calibrated.arm, self.recording.capture).error)
-        return bool(np.abs(left[0]) <= LARGEST_LOG_K * float(self.recording.capture.lengths[0].value))
+    @property
+    def stage1_apart(self) -> bool:
+        """Whether stage 1 was a solve of its own, with another arm than the calibrated one."""
+        return self.sockets_alone and self.method != REPEATABILITY
+
+    @property
+    def final_method(self) -> str:
+        """How the calibrated arm was solved: jointly too where the division by k of two stages was not possible."""
+        return "joint" if self.against_division else self.method
+
+    @property
+    def fixed_by_one_length(self) -> bool:
+        """Whether the arm was divided by the k of a single length, whose own error is then zero by construction."""
+        return self.divided and len(self.recording.capture.lengths) == 1
 
     @property
     def largest_plausible_residual(self) -> float:
@@ -138,14 +152,8 @@ class CalibrationRecord(NamedTuple):
     @property
     def implausible_residual(self) -> bool:
         """Whether the residual is larger than that of any such arm, so that data and arm do not belong together."""
-        arm, capture = self.calibrated.arm, self.recording.capture
-        if self.robust is not None and self.observed is not None:
-            rms = float(np.sqrt(3) * self.observed.sigma)  # bad poses do not count
-        elif self.observed is not None:
-            poses = [len(weights) for weights in self.observed.weights]
-            rms = float(np.sqrt(np.average(np.asarray(self.observed.rms_after) ** 2, weights=poses)))
-        else:
-            rms = float(evaluate(arm, capture).repeatability.rms)
+        # Bad poses do not count where a robust loss took their weight.
+        rms = self.observed.rms if self.robust is None else float(np.sqrt(3) * self.observed.sigma)
         return rms > self.largest_plausible_residual
 
     def vectors(self) -> dict[str, np.ndarray]:
@@ -231,6 +239,8 @@ def record_of(
         steps=int(calibration.steps),
         converged=bool(calibration.converged),
         reason=_reason(calibration, stage1),
+        divided=not single and bool(calibration.divided) and stage1.anchor.can_scale,
+        against_division=() if single else against_division(calibration),
         observed=jax.tree.map(np.asarray, calibration.observed),
         robust=robust,
         prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
@@ -238,13 +248,13 @@ def record_of(
         shared=None if shared is None else jax.tree.map(np.asarray, shared),
         components=None if components is None else jax.tree.map(np.asarray, components),
         surplus_k=0.0 if calibration.scale is None else float(calibration.scale.surplus),
-        others=None if others is None else _other_poses(calibration.arm, others, stage1.observed),
+        others=None if others is None else _other_poses(calibration.arm, others, calibration.observed),
     )
 
 
-def _other_poses(arm: Arm, capture: Capture, observed: ObservedMetrics | None) -> OtherPoses:
+def _other_poses(arm: Arm, capture: Capture, observed: ObservedMetrics) -> OtherPoses:
     """Of an arm, with the geometry found; what another observation alone determined is fitted."""
-    if observed is None or not capture.observations:
+    if not capture.observations:
         found = evaluate(arm, capture).repeatability
         none = np.full(len(capture.names), np.nan)
         return OtherPoses(capture.names, np.array(capture.sizes), np.asarray(found.socket_rms), none)
@@ -255,12 +265,9 @@ def _other_poses(arm: Arm, capture: Capture, observed: ObservedMetrics | None) -
 
 
 def _reason(calibration: Calibration | Identification, stage1: Identification) -> str:
-    """Why the calibration ended, in words; where bounds set the scale, or parameters trade off, with their names."""
+    """Why the calibration ended, in words; where parameters trade off, with their names."""
     result = calibration.result if bool(stage1.converged) else stage1.result
     sentence, number = Reason[result], int(member_numbers(result))
-    sides = [f"{name} ({side})" for name, side in calibration.active_names().items()]
-    if number == SCALE and sides:
-        return f"{sentence.rstrip('.')}: {shorten(sides)}."
     together = _trading_off(calibration) if number in (MAX_STEPS, STALLED) else []
     if len(together) < 2:
         return sentence

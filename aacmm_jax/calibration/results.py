@@ -188,6 +188,12 @@ class ObservedMetrics(eqx.Module):
     geometry_covariance: dict[str, Float[AnyArray, "_ _"]]  # of the numbers of each part
     weights: tuple[Float[AnyArray, " _"], ...]  # of every pose; less than 1 where a robust loss takes weight from it
 
+    @property
+    def rms(self) -> float:
+        """Root mean square distance of all poses from their geometry, by the arm found, mm."""
+        poses = [len(weights) for weights in self.weights]
+        return float(np.sqrt(np.average(np.asarray(self.rms_after) ** 2, weights=poses)))
+
 
 class Identification(AbstractSingleResult):
     """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array has the batch axis first.
@@ -222,8 +228,7 @@ class Identification(AbstractSingleResult):
     noise_model: NoiseModel = eqx.field(static=True)  # model of the tips' errors
     # Of the covariance, with every parameter as fitted in full; infinite where the noise was given.
     fitted_degrees_of_freedom: float = eqx.field(static=True)
-    # Where the capture has observations besides sockets, a robust loss or a prior.
-    observed: ObservedMetrics | None = None
+    observed: ObservedMetrics  # how the observations agree, sockets first
     prior_metrics: PriorMetrics | None = None
     noisy_encoders: tuple[NoisyEncoder, ...] = eqx.field(static=True, default=())
 

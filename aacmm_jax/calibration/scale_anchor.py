@@ -49,28 +49,26 @@ _LARGEST_OF_SLIDES = 1e-3
 _EQUATIONS = 200
 _SCATTER = 0.02
 _CONFIGURATIONS = 100
-_LEAST_SHARE = 0.05  # of the longest link: a shorter length hardly changes the scale
 _EXACT = 1e-9  # residual, relative to the column, below which free lengths replace a fixed one exactly
 
 
 class ScaleAnchor(NamedTuple):
-    """What sets the scale in stage 1, and how stage 2 changes it; static, so that it may fix a compiled program."""
+    """What sets the scale in stage 1, and whether it may be divided; static, so that it may fix a compiled program."""
 
     hold: str | None  # free length that stage 1 keeps at its start
-    # Length that stage 2 adjusts where it has to identify again; None without a free length, or where neither an anchor
-    # nor the values of the arm are known.
-    adjusted: str | None
-    # Fixed lengths, and readings ``q_i`` of prismatic joints, that determine the scale well, so that stage 2 changes
-    # nothing.
+    # Whether a length is free; False too where neither an anchor nor the values of the arm are known.
+    free: bool
+    # Fixed lengths, and readings ``q_i`` of prismatic joints, that determine the scale well, so that a division by k
+    # changes nothing.
     set_by: tuple[str, ...]
-    # Fixed lengths that free ones replace exactly in stage 2; None where some have no such partner, as slides have not,
-    # or are not known.
+    # Fixed lengths that free ones replace exactly in a division; None where some have no such partner, as slides have
+    # not, or are not known.
     partners: Partners | None
 
     @property
     def can_scale(self) -> bool:
         """Whether stage 2 changes the arm: not where fixed lengths set the scale, or no length is free."""
-        return not self.set_by and self.adjusted is not None
+        return self.free and not self.set_by
 
 
 def scale_anchor(
@@ -124,8 +122,7 @@ def scale_anchor(
     partners = None if fixed or slides else ((), ())
     if one is not None and not slides:
         partners = _partners(arm, _columns_of_both(one, space, fixed), space, fixed)
-    adjusted = hold if hold is not None and _carries_scale(hold, longest, arm if known else None) else longest
-    return ScaleAnchor(hold, None if hold is None and not known else adjusted, set_by, partners)
+    return ScaleAnchor(hold, hold is not None or (known and bool(lengths)), set_by, partners)
 
 
 def default_method(arm: Arm, general: bool) -> Literal["two-stage", "joint"]:
@@ -181,14 +178,6 @@ def _longest_link(lengths: list[str], arm: Arm | None) -> str | None:
 
     # The links of a gantry are slides, and all that scales with the wrist may be the probe.
     return max(links if any(map(size, links)) else lengths, key=size)
-
-
-def _carries_scale(name: str, longest: str | None, arm: Arm | None) -> bool:
-    """Whether changing this length changes the scale: not ``d_1``, and not one that is nearly zero."""
-    if name == "d_1" or longest is None or arm is None:
-        return name != "d_1"
-    size, largest = (float(np.abs(value_of(arm, other)).max()) for other in (name, longest))
-    return size >= _LEAST_SHARE * largest
 
 
 def _first(arm: Arm) -> Arm:

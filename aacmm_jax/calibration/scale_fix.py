@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from ..data.capture import Capture
 from ..data.observations.socket import position_of
 from ..kinematics.parameters import Bounds, Parameters
@@ -26,9 +26,9 @@ from ..uncertainty.covariance import DISAGREEMENT, STATED
 from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.linear_propagation import rows_of_functions
 from .conclusion import Solution
-from .scale_anchor import ScaleAnchor
+from .results import Calibration
+from .scale_anchor import ScaleAnchor, fixed_lengths
 
-LARGEST_LOG_K = 1e-7  # |log k| up to which k = 1 counts as reached
 _ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
 
 
@@ -108,13 +108,36 @@ def divided(anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"],
         return Division(parameters, namespace(parameters).zeros(parameters.shape[:-1], dtype=bool))
     xp, scaled = namespace(parameters, k), divide_lengths(space, parameters, k, anchor.partners)
     lengths = np.broadcast_to(divisible(space), scaled.shape)
-    concerned = (scaled < bounds.lower - _ROUNDING) | (scaled > bounds.upper + _ROUNDING)
-    if anchor.hold is not None:  # without an anchor it is the active bounds that set the scale of stage 1
-        concerned = concerned | (active != 0)
-    if anchor.partners is None:
-        concerned = xp.ones_like(concerned)
+    below, above = _on_bounds(anchor, bounds, active, scaled)
+    concerned = xp.ones_like(below) if anchor.partners is None else below | above
     against = xp.any(concerned & lengths, axis=-1) & xp.all(xp.isfinite(scaled), axis=-1)
     return Division(_clipped(space, bounds.lower, bounds.upper, scaled), against)
+
+
+def _on_bounds(
+    anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], scaled: Float[AnyArray, "... p"]
+) -> tuple[Bool[AnyArray, "... p"], Bool[AnyArray, "... p"]]:
+    """Which divided parameters are below their bounds, or were on the lower one in stage 1; and likewise above."""
+    below, above = scaled < bounds.lower - _ROUNDING, scaled > bounds.upper + _ROUNDING
+    if anchor.hold is None:  # without an anchor it is the active bounds that set the scale of stage 1
+        return below, above
+    return below | (active < 0), above | (active > 0)
+
+
+def against_division(calibration: Calibration) -> tuple[str, ...]:
+    """What stood against the division by k of a calibration in two stages, in words; nothing where it was divided."""
+    if calibration.method != "two-stage" or bool(calibration.divided) or calibration.scale is None:
+        return ()
+    found, bounds = to_numpy((calibration.stage1, calibration.bounds))
+    space, anchor = bounds.space, found.anchor
+    scaled = divide_lengths(space, found.parameters, np.asarray(calibration.scale.value), anchor.partners)
+    below, above = _on_bounds(anchor, bounds, found.active, scaled)
+    concerned = np.flatnonzero((below | above) & divisible(space))
+    names = [f"{space.names[i]} ({'upper' if above[i] else 'lower'} bound)" for i in concerned]
+    if anchor.partners is None:
+        names += [f"{name} (fixed length)" for name in fixed_lengths(space.base, space)]
+        names += [f"q_{joint} (slide)" for joint in space.base.prismatic]
+    return tuple(names)
 
 
 def _clipped(

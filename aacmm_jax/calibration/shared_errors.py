@@ -143,7 +143,6 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
 
 def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
     """Without poses that lost most of their weight to a robust loss: what is left of their errors is no noise."""
-    assert record.observed is not None
     weights, found = np.concatenate([np.asarray(one) for one in record.observed.weights]), []
     for each in rows:
         kept = weights[each.poses] > _TRUSTED

@@ -144,7 +144,6 @@ def _divided_metrics(
 ) -> ObservedMetrics:
     """Of the observations by the divided arm: p' = p / k for a position above the base, which follows k too."""
     metrics, observed, k = solution.identification.observed, linear.observed, found.scale.value
-    assert metrics is not None
     xp, p = namespace(linear.z), len(linear.space.names)
     parts = observed.split(linear.z[p:])
     # What is divided is counted from the foot of the second axis, where d_1 ends.
@@ -210,7 +209,6 @@ def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str
         ).parameters
     solution = solve(task, near)
     found = solution.identification
-    assert found.observed is not None
     matrix = found.parameter_covariance.matrix + _of_bounds(task, solution, capture)
     found = eqx.tree_at(lambda one: one.parameter_covariance.matrix, found, matrix)
     first = found if stage1 is None else stage1.solution.identification

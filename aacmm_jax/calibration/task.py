@@ -22,7 +22,7 @@ from ..uncertainty.covariance import NoiseModel
 from .checks import check_noise_model, check_start
 from .scale_anchor import ScaleAnchor, scale_anchor
 
-NO_ANCHOR = ScaleAnchor(hold=None, adjusted=None, set_by=(), partners=None)
+NO_ANCHOR = ScaleAnchor(hold=None, free=False, set_by=(), partners=None)
 
 
 class Task(NamedTuple):

@@ -124,7 +124,7 @@ def _add_measurement(
     left = stage.name == "As left"
     if lengths:
         _add_lengths(results, lengths, stage, uncertainty, fixed_scale=left and record.fixed_by_one_length)
-    if residuals:
+    if not record.sockets_alone:
         data = _add_result(results, "Observations", "Distances of the tip from the geometry of each observation.")
         add_observations(data, residuals, distances_of(capture, stage.evaluation), left)
     _add_parameters(results, record, stage, uncertainty)
@@ -140,10 +140,10 @@ def _add_methods(parent: Element, record: CalibrationRecord, residuals: tuple[Ob
     lengths = f"reference lengths between sockets: {len(capture.lengths)}"
     squares = "Parameters were identified by bounded least squares"
     words = (
-        f"{poses}{lengths}. {squares}, {_METHODS.get(record.method, record.method)}: those with which the positions of "
+        f"{poses}{lengths}. {squares}, {_METHODS[record.final_method]}: those with which the positions of "
         "the tip in each socket agree best, and the distances between the sockets with the reference lengths."
     )
-    if residuals:
+    if not record.sockets_alone:
         others = len(capture.observations)
         words = (
             f"{poses}{lengths}; of other observations: {others}, of their poses: "

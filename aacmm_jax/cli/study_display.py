@@ -114,7 +114,6 @@ def _identified(console: Console, cells: list[dict[str, Any]], names: list[str])
         "max_steps": "reached the step limit",
         "stalled": "stalled",
         "nonfinite": "had a pose that the true arm cannot take",
-        "scale": "could not reach k = 1 because of active bounds",
     }
     failed = {reason: sum(cell["reasons"][reason] for cell in cells) for reason in words}
     for reason, count in failed.items():

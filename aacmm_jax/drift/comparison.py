@@ -242,9 +242,10 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[s
         elif not record.plausible_scale:
             found.append(f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm.")
     found += [sentence for sentence in (_common_poses(old, new, labels), _other_arm(old, new, labels)) if sentence]
-    if old.method != new.method:
+    if old.final_method != new.final_method:
         found.append(
-            f"Different methods: {labels[0]} is {old.method}, {labels[1]} {new.method}; this is part of the change."
+            f"Different methods: {labels[0]} is {old.final_method}, {labels[1]} {new.final_method}; "
+            "this is part of the change."
         )
     for one, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         alone = [name for name in one.names if name not in other.names]

@@ -14,11 +14,9 @@ from .hdf5 import Stored, Table, Variable, check_sense, columns, need, numbering
 
 
 def observed_tables(record: CalibrationRecord) -> dict[str, Table]:
-    """The tables ``observed``, ``geometry``, ``pose_weights`` and ``other_poses``, as far as there is anything in
-    them."""
-    found = {}
-    if record.observed is not None:
-        found = _tables_of(record.observed, Observed.of(record.recording.capture, None).blocks)
+    """The tables ``observed``, ``geometry`` and ``pose_weights``; and ``other_poses`` and ``removed``, where there is
+    anything in them."""
+    found = _tables_of(record.observed, Observed.of(record.recording.capture, None).blocks)
     others = record.others
     if others is not None:
         found["other_poses"] = Table(
@@ -141,12 +139,9 @@ def _covariances(geometry: Mapping[str, np.ndarray], flat: np.ndarray) -> dict[s
     }
 
 
-def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> ObservedMetrics | None:
-    """How the observations of a file agree with its arm; None where it holds sockets and lengths only."""
-    table = stored.tables.get("observed")
-    if table is None:
-        check_sense(path, {"its observations have no results": bool(capture.observations)})
-        return None
+def observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> ObservedMetrics:
+    """How sockets and other observations of a file agree with its arm."""
+    table = stored.tables["observed"]
     need(path, stored.tables, "geometry", "pose_weights")
     need(path, table, "observation", "kind", "poses", "rms_before", "rms_after", "reduced_chi", of="entry")
     geometry, weights = stored.tables["geometry"], stored.tables["pose_weights"]

@@ -10,11 +10,8 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import NoisyEncoder
-from ..calibration.scale_anchor import scale_anchor
 from ..core.errors import InputError
-from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_length, parameter_names, parameter_unit, value_of
-from ..kinematics.parameters import Parameters
+from ..kinematics.arm import parameter_unit
 from ..uncertainty.covariance import NOISE_MODELS
 from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
 from .calibration_prior import prior_metrics_of, prior_tables
@@ -107,6 +104,8 @@ def save_calibration(
         "steps": record.steps,
         "converged": record.converged,
         "reason": record.reason,
+        "divided": record.divided,
+        "against_division": list(record.against_division) or "",
     }
     write_tables(path, "calibration", tables, attributes, summary=summary)
 
@@ -138,32 +137,16 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
         return record
 
 
-def _divided_fixed_lengths(path: str | os.PathLike, stored: Stored) -> bool:
-    """Whether a file of an earlier version holds an arm whose fixed lengths were divided by k, and not only zeros."""
-    arm, names = specification_of(path, stored, "calibrated_arm").arm, set(stored.tables["parameters"]["parameter"])
-    fixed = [name for name in parameter_names(arm) if is_length(name) and name not in ("d_1", *names)]
-    return any(value_of(arm, name) != 0 for name in fixed)
-
-
-def _scale_set_by(arm: Arm, names: tuple[str, ...], hold: str | None, noise: Noise | None) -> tuple[str, ...]:
-    """Fixed lengths that set the scale, judged as in `scale_anchor`: files of earlier versions do not name them."""
-    return () if hold is not None else scale_anchor(Parameters(arm, names), arm, None, noise).set_by
-
-
 def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
     table, attributes = stored.tables["parameters"], stored.attributes
-    if attributes.get("stretch_variance", 0.0) and _divided_fixed_lengths(path, stored):
+    if "observed" not in stored.tables:
         raise InputError(
-            f"{path} is from an earlier version, which divided fixed lengths by k; calibrate again from its capture."
+            f"{path} is from an earlier version, which did not store residuals and positions of sockets; calibrate "
+            "again from its capture."
         )
-    need(path, table, "parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", of="entry")
+    entries = ("parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", "open")
+    need(path, table, *entries, of="entry")
     recording, names = recording_of(path, stored), tuple(str(name) for name in table["parameter"])
-    noise = noise_of_attributes(attributes)
-    if "scale_set_by" in attributes:
-        scale_set_by = names_in(attributes["scale_set_by"])
-    else:
-        given = None if attributes.get("misfit") is None else noise
-        scale_set_by = _scale_set_by(recording.nominal.arm, names, attributes.get("hold"), given)
     return CalibrationRecord(
         recording=recording,
         stage1=specification_of(path, stored, "stage1_arm"),
@@ -171,18 +154,17 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         names=names,
         held=names_in(attributes.get("held")),
         hold=attributes.get("hold"),
-        scale_set_by=scale_set_by,
+        scale_set_by=names_in(attributes.get("scale_set_by")),
         lower=table["lower"],
         upper=table["upper"],
         active_stage1=table["active_stage1"],
         active=table["active"],
         covariance=table["covariance"],
         determined=table["determined"].astype(bool),
-        # Files of version 0.1 and before have none of the following.
-        open=table.get("open", np.zeros_like(table["covariance"])),
-        noise=noise,
-        noise_model=attributes.get("form", "common"),
-        degrees_of_freedom=float(attributes.get("freedom", np.inf)),
+        open=table["open"],
+        noise=noise_of_attributes(attributes),
+        noise_model=attributes["form"],
+        degrees_of_freedom=float(attributes["freedom"]),
         reduced_chi=attributes.get("misfit"),
         k=attributes["scale_k"],
         u_k=attributes["scale_u"],
@@ -190,10 +172,13 @@ def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
         steps=attributes["steps"],
         converged=bool(attributes["converged"]),
         reason=attributes["reason"],
+        observed=observed_of(path, stored, recording.capture),
+        # Of versions before 5 only joint solves are read.
+        divided=bool(attributes.get("divided", False)),
+        against_division=names_in(attributes.get("against_division")),
         validation=_validation_of(stored),
         sampled=stored.tables.get("monte_carlo"),
         sampled_says=attributes.get("sampled_says"),
-        observed=observed_of(path, stored, recording.capture),
         robust=attributes.get("robust"),
         others=other_poses_of(stored),
         removed=removed_of(stored),

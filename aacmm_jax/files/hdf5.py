@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from .hdf5_content import Content
 
 FORMAT = "aacmm_jax"
-FORMAT_VERSION = 4  # prismatic joints and joint corrections since 3; no SHA-256 of the logical content since 4
+# Prismatic joints and joint corrections since 3; no SHA-256 of the logical content since 4; residuals and positions of
+# sockets in calibrations since 5.
+FORMAT_VERSION = 5
 SEALED_SINCE = 2  # the first format version whose files end with a SHA-256 of their bytes
 _DIGEST = "content_sha256"  # an attribute of files of versions 2 and 3
 BLOCK = "block"  # kind of the files of a study's blocks, which carry no provenance of their own

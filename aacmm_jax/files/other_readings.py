@@ -184,7 +184,4 @@ def _rms(recording: Recording, given: Recording) -> float | None:
                 result = identify(arm, capture, bounds)
     except InputError:
         return None
-    if result.observed is None:
-        return float(result.after.rms)
-    sizes = [len(weights) for weights in result.observed.weights]
-    return float(np.sqrt(np.average(np.square(np.asarray(result.observed.rms_after)), weights=sizes)))
+    return result.observed.rms

@@ -15,6 +15,7 @@ from ..acceptance.standards import STANDARDS
 from .hdf5 import Stored, check_sense, names_in, read_tables, undamaged
 
 _ROUNDING = 1e-6  # of k
+_LARGEST_U = 0.1  # of k: a larger one says nothing about it
 
 
 def check_shown(path: str | os.PathLike, kind: str, summary: Mapping[str, Any]) -> None:
@@ -56,12 +57,13 @@ def check_recording(path: str | os.PathLike, stored: Stored) -> None:
 def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
     """Raise `InputError` where a value is not one that a calibration can have.
 
-    k is a weighted mean of measured over certified lengths, so it lies between the least and the largest of them.
+    k is a weighted mean of measured over certified lengths, so it lies between the least and the largest of them; its
+    lengths are between positions by weighted poses, and those stored between centroids, which differ by less than u.
     """
     table, reference, attributes = stored.tables["parameters"], stored.tables["reference"], stored.attributes
     names, covariance = table["parameter"].tolist(), table["covariance"]
     vectors = [table[key] for key in ("lower", "upper", "active_stage1", "active", "determined")]
-    square = (covariance, table.get("open", covariance))
+    square = (covariance, table["open"])
     count = len(names)
     check_sense(
         path,
@@ -78,9 +80,10 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
         for stage in ("stage1", "calibrated")
         if len(reference["value"]) and f"measured_{stage}" in reference
     ]
-    # Observations, or a single stage, need no reference length.
-    scaled = "observed" not in stored.tables and attributes["method"] != "repeatability"
+    # Only the division by k needs reference lengths.
+    scaled = attributes["method"] == "two-stage"
     finite = all(np.all(np.isfinite(x)) for x in ((k, u_k, covariance) if scaled else (covariance,)))
+    slack = _ROUNDING + (3 * u_k if u_k < _LARGEST_U else 0.0)
     stated = ("encoder_arcsec", "linear_encoder_mm", "seating_mm")
     noise = np.concatenate([np.atleast_1d(attributes.get(what, 0.0)) for what in stated])
     sampled = stored.tables.get("monte_carlo")
@@ -95,11 +98,11 @@ def check_calibration(path: str | os.PathLike, stored: Stored) -> None:
             "the scale k is not that of its lengths": converged
             and (scaled or not np.isnan(k))
             and bool(ratios)
-            and not any(ratio.min() - _ROUNDING <= k <= ratio.max() + _ROUNDING for ratio in ratios),
+            and not any(ratio.min() - slack <= k <= ratio.max() + slack for ratio in ratios),
             "the covariance is not one": finite and not _is_semidefinite(covariance),
             "the method is unknown": attributes["method"] not in ("two-stage", "joint", "repeatability"),
             "its number of steps is negative": attributes["steps"] < 0,
-            "its degrees of freedom are not positive": not attributes.get("freedom", np.inf) > 0,
+            "its degrees of freedom are not positive": not attributes["freedom"] > 0,
             "a standard deviation of its noise is negative": bool(np.any(noise < 0)),
             "a verdict of its Monte Carlo is neither yes nor no": sampled is not None
             and not np.all(np.isin(sampled["agrees"], (0, 1))),

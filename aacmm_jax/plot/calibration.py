@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
-from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
+from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..kinematics.arm import is_length, parameter_unit
@@ -61,9 +61,8 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
     axes = axes_or_new(axes)
     capture, evaluations = record.recording.capture, record.evaluations()
     by_stage = {stage: distances_of(capture, evaluations[stage]) for stage in ("nominal", "calibrated")}
-    found = observation_residuals(record)
-    if found:
-        by_stage["calibrated"] = tuple(one.distance for one in found)  # with the geometry of the calibration
+    if not record.sockets_alone:  # with the geometry of the calibration
+        by_stage["calibrated"] = tuple(one.distance for one in observation_residuals(record))
     for stage, distances in by_stage.items():
         distance = np.concatenate(distances)
         style = {**_STAGES[stage]} | {"label": f"{_STAGES[stage]['label']} (RMS {rms(distance):.3g} mm)"}
@@ -79,7 +78,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
 
 
 def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
-    """Plot the residual of every pose of a calibration from observations, or with a robust loss, by kind (logarithmic).
+    """Plot the residual of every pose of a calibration by kind of observation (logarithmic).
 
     Poses that a robust loss took half of their weight from or more have a ring.
 
@@ -92,7 +91,7 @@ def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = N
         The axes.
 
     Raises:
-        InputError: If the calibration has no such residuals.
+        InputError: If the calibration has no such residuals (orientations, for ``"deg"``).
 
     Example:
         >>> robust = aj.calibrate(arm, capture, bounds, robust="huber")
@@ -104,8 +103,7 @@ def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = N
         raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
     found = [one for one in observation_residuals(record) if unit != "deg" or one.angle is not None]
     if not found:
-        what = "orientations" if unit == "deg" else "observations besides sockets, and no robust loss"
-        raise InputError(f"the calibration has no {what}; draw its residuals with aj.plot.pose_distances.")
+        raise InputError("the calibration has no orientations; draw its residuals in mm or in standard deviations.")
     axes = axes_or_new(axes)
     values = [_in_unit(one, unit) for one in found]
     starts = np.cumsum([0, *(len(one) for one in values)])
@@ -189,8 +187,7 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 
 def _stages(record: CalibrationRecord) -> Mapping[str, Mapping[str, Any]]:
     """The arms of a calibration; without that of stage 1 where there was one solve."""
-    one = record.observed is not None or record.method == REPEATABILITY
-    return {stage: style for stage, style in _STAGES.items() if not (one and stage == "stage1")}
+    return {stage: style for stage, style in _STAGES.items() if stage != "stage1" or record.stage1_apart}
 
 
 def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any = None) -> Any:
@@ -317,7 +314,7 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     """
     found = observation_residuals(record)
     draw: list[Callable[..., Any]] = [pose_distances]
-    if found:
+    if not record.sockets_alone:
         draw.append(lambda record, axes: residuals_by_kind(record, "standard deviations", axes))
     if any(one.angle is not None for one in found):
         draw.append(lambda record, axes: residuals_by_kind(record, "deg", axes))

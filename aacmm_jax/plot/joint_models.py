@@ -74,7 +74,7 @@ def joint_function(
         The axes.
 
     Raises:
-        InputError: If the arm has no such joint, or no residuals of observations are known.
+        InputError: If the arm has no such joint.
 
     Example:
         >>> robust = aj.calibrate(arm, two_bars, bounds, robust="huber")
@@ -87,8 +87,6 @@ def joint_function(
     if not 1 <= joint <= arm.joints:
         raise InputError(f"joint is {joint}; the arm has joints 1 to {arm.joints}.")
     residuals = observation_residuals(record)
-    if not residuals:
-        raise InputError("the residuals of single poses are not known; calibrate with observations or with a prior.")
     axes = axes_or_new(axes)
     q = np.concatenate([np.asarray(one.observation.q) for one in residuals])
     asked = np.concatenate([one.by_joint[joint - 1] for one in residuals])

@@ -8,7 +8,7 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
-from ..core.text import pluralise
+from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read
 from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
@@ -79,7 +79,8 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
         observability_section(observability),
         bounds_section(record, summary),
     ]
-    method = _OBSERVED if record.method == "joint" and capture.observations else _METHODS[record.method]
+    joint = record.final_method == "joint"
+    method = _OBSERVED if joint and capture.observations else _METHODS[record.final_method]
     robust = f", robust loss {record.robust}" if record.robust else ""
     verdict = summary["verdict"]
     report = Report(
@@ -96,7 +97,7 @@ def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any
 
 def _view(record: CalibrationRecord, evaluation: Evaluation) -> ArmView:
     arm, capture = record.calibrated.arm, record.recording.capture
-    if record.observed is None:
+    if record.sockets_alone:
         return view_of_arm(arm, capture, pose_distances(capture, evaluation))
     distances = np.concatenate([one.distance for one in observation_residuals(record)])
     return view_of_arm(arm, capture, distances, record.observed.geometry)
@@ -192,13 +193,13 @@ def _nominal_and_calibrated(
     if summary["cross_validation"] is not None:
         blocks += validation_tables(summary["cross_validation"])
     capture, fixed = record.recording.capture, record.fixed_by_one_length
-    if record.observed is not None or record.method == REPEATABILITY:
+    if not record.stage1_apart:
         del stages["stage1"]  # which is the calibrated arm
     if summary.get("prior"):
         blocks.append(_prior_table(summary["prior"]))
     if summary.get("shared_errors"):
         blocks.append(shared_sentence(summary["shared_errors"]))
-    if record.observed is not None:
+    if not record.sockets_alone:
         blocks += [*agreement_tables(summary), *other_poses_table(summary)]
     if summary["nominal"]:
         caption = "Metrics by arm [mm]"
@@ -206,12 +207,12 @@ def _nominal_and_calibrated(
             counts = pluralise(len(capture.names), "socket"), pluralise(len(capture.lengths), "reference length")
             caption = f"{counts[0]} of the arm's own probe, {counts[1]} [mm]"
         blocks.append(metrics_table(caption, summary, stages, fixed_scale=fixed))
-    if record.observed is not None:
-        blocks.append(stages_chart(record, distances_of(capture, evaluations["nominal"])))
-    else:
+    if record.sockets_alone:
         pair = {stage: evaluations[stage] for stage in ("nominal", "calibrated")}
         title = "Distance of every pose from its socket's centroid"
         blocks.append(residual_chart("stages", title, capture, pair))
+    else:
+        blocks.append(stages_chart(record, distances_of(capture, evaluations["nominal"])))
     if "truth" in summary:
         rows = [
             [text_cell(title), *(number_cell(scale * summary["truth"][stage][key]) for stage in stages)]
@@ -248,10 +249,10 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
         )
     elif math.isnan(k):
         introduction = f"Fitted with all else at once, the scale comes from {', '.join(summary['scale_from'])}."
-    elif record.method == "joint":
+    elif record.final_method == "joint":
         introduction = (
-            "Poses and reference lengths were fitted together. The arm that poses alone give measures the lengths as "
-            f"k = {k_shown} times their calibrated value, with {u_of_k}."
+            f"Poses and reference lengths were fitted together{_why_jointly(record)}. The arm that poses alone give "
+            f"measures the lengths as k = {k_shown} times their calibrated value, with {u_of_k}."
         )
     else:
         expanded = 1000 * (summary["scale_expanded"] or math.nan)
@@ -270,22 +271,27 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
         else " U of a length contains the uncertainty of its certificate and the scatter of the poses at its ends."
     )
     errors = {stage: np.asarray(evaluations[stage].error) for stage in ("nominal", "stage1", "calibrated")}
-    two = record.method != REPEATABILITY and record.observed is None
-    before = [errors["nominal"], *([errors["stage1"]] if two else [])]
-    stage1 = ["error, stage 1"] if two else []
+    apart = record.stage1_apart
+    before = [errors["nominal"], *([errors["stage1"]] if apart else [])]
+    stage1 = ["error, stage 1"] if apart else []
     columns = ("between", "value", "error, nominal", *stage1, "error, calibrated", "U of error")
     table = ReportTable(
         "Reference lengths [mm]", columns, length_rows(summary["lengths"], before, 0 if single else None)
     )
-    drawn = {"stage 1": errors["stage1"]} if two else {}
+    drawn = {"stage 1": errors["stage1"]} if apart else {}
     drawn["calibrated"] = errors["calibrated"]
     block = table if single else length_chart(summary["lengths"], drawn, table)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 
+def _why_jointly(record: CalibrationRecord) -> str:
+    against = shorten(record.against_division)
+    return f", since the division by k was not possible because of {against}" if against else ""
+
+
 def _residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
     capture = record.recording.capture
-    if record.observed is not None:
+    if not record.sockets_alone:
         return [residuals_section(record, summary), geometry_section(summary)]
     chart = residual_chart(
         "residuals", "Residuals of the calibrated arm", capture, {"calibrated": evaluation}, mark=True

@@ -178,7 +178,7 @@ def bounds_section(record: CalibrationRecord, summary: dict[str, Any]) -> Sectio
         values = (number_cell(scale * x) for x in (record.lower[i], vector[i], record.upper[i]))
         rows.append([text_cell(name), text_cell(unit), *values, text_cell(state, "unsure" if side else "")])
     introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
-    if record.method == "two-stage":
+    if record.final_method == "two-stage":
         introduction += " Bounds are those of stage 1; the scale fix comes after it."
     at, on = np.asarray(positions), np.array([name in on_bound for name in shown])
     x = np.arange(len(at))

@@ -30,15 +30,10 @@ class Reason(eqx.Enumeration):
     nonfinite = (
         "Not converged: the residual or its derivative is not finite at the start; check the data and the start."
     )
-    # Of stage 2 of a calibration (`calibration.second_stage`), not of a solve.
-    scale = (
-        "Not converged: no value of the scale anchor within its bounds gives the reference lengths (k = 1), because "
-        "active bounds set the scale; widen these bounds."
-    )
 
 
 # Their numbers, which the steps of a solve compute with.
-RUNNING, GRADIENT, STEP, ROUNDING, MAX_STEPS, STALLED, NONFINITE, SCALE = (
+RUNNING, GRADIENT, STEP, ROUNDING, MAX_STEPS, STALLED, NONFINITE = (
     int(_compat.member_numbers(reason))
     for reason in (
         Reason.running,
@@ -48,7 +43,6 @@ RUNNING, GRADIENT, STEP, ROUNDING, MAX_STEPS, STALLED, NONFINITE, SCALE = (
         Reason.max_steps,
         Reason.stalled,
         Reason.nonfinite,
-        Reason.scale,
     )
 )
 

@@ -166,7 +166,7 @@ def _label(level: Any, labels: list) -> float | str:
 
 
 def _reasons() -> dict[str, int]:
-    names = ("gradient", "step", "rounding", "max_steps", "stalled", "nonfinite", "scale")
+    names = ("gradient", "step", "rounding", "max_steps", "stalled", "nonfinite")
     return {name: int(numbers_of(getattr(Reason, name))) for name in names}
 
 

@@ -101,7 +101,7 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
         ],
     }
     observed, others = record.observed, record.others
-    if observed is not None:
+    if not record.sockets_alone:
         residuals = observation_residuals(record)
         before = distances_of(record.recording.capture, nominal)
         pairs = list(zip(residuals, before, strict=True))

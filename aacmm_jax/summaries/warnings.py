@@ -148,12 +148,12 @@ def of_calibration(
     found += [] if record.validation is None else contradicted_prediction(record.validation)
     if not record.implausible_residual:
         tests = model_tests(record) if tests is None else tests
-        found += sentences_of_tests(tests, record.method, record.shared, record.calibrated.arm)
+        found += sentences_of_tests(tests, record.final_method, record.shared, record.calibrated.arm)
     if record.recording.capture.observations:
         found += [*_on_bounds_observed(record), *_scale(record), *of_capture(record.recording)]
         seen = observed(record) if seen is None else seen
         return found if record.implausible_residual else found + _identifiability(record, seen)
-    found += [*_scale(record), *of_capture(record.recording)]
+    found += [*_scale(record), *_not_divided(record), *of_capture(record.recording)]
     seen = observed(record) if seen is None else seen
     if record.implausible_residual:
         return found + _data(record)  # bounds and uncertainties of such a solve say nothing
@@ -192,7 +192,7 @@ def _implausible(record: CalibrationRecord) -> list[str]:
     if not record.implausible_residual:
         return []
     most = f"more than the {record.largest_plausible_residual:.2g} mm that are plausible for this arm"
-    if record.observed is not None and record.recording.capture.observations:
+    if record.recording.capture.observations:
         worst = int(np.argmax(record.observed.rms_after))
         name, rms = record.observed.names[worst], record.observed.rms_after[worst]
         return [
@@ -263,6 +263,15 @@ def _scale(record: CalibrationRecord) -> list[str]:
             f"k = {k:.5f} is far from 1: is {record.hold} at its nominal value, and is each reference length right?"
         ]
     return []
+
+
+def _not_divided(record: CalibrationRecord) -> list[str]:
+    if not record.against_division:
+        return []
+    return [
+        f"The division by k was not possible because of {shorten(record.against_division)}; poses and reference "
+        "lengths were solved jointly instead."
+    ]
 
 
 def _bounds(record: CalibrationRecord, seen: Observability) -> list[str]:

@@ -49,7 +49,9 @@ def eliminated(
     """The model of the parameters of an index, from the information and the gradient of all data in natural steps."""
     xp, size = namespace(gram, gradient), gram.shape[0]
     others = np.setdiff1d(np.arange(size), index)
-    inverse = inverse_information(gram[np.ix_(others, others)], pinned[others])[0]
+    inverse = xp.zeros((0, 0))
+    if len(others):
+        inverse = inverse_information(gram[np.ix_(others, others)], pinned[others])[0]
     crossed, own = gram[np.ix_(index, others)], pinned[index]
     information = gram[np.ix_(index, index)] - crossed @ inverse @ crossed.T
     slope = gradient[index] - crossed @ (inverse @ gradient[others])

@@ -28,6 +28,7 @@ from aacmm_jax.kinematics.corrections.kind import Loads
 from aacmm_jax.summaries.warnings import of_calibration
 from tests.certificate import dcc_model
 from tests.refusals import assert_refused
+from tests.renamed_sockets import renamed_sockets
 
 CREATED = "2026-03-05T10:11:12+00:00"
 DCC, SI = "{https://ptb.de/dcc}", "{https://ptb.de/si}"
@@ -107,15 +108,6 @@ def record(paper_arm) -> aj.calibration.CalibrationRecord:
     return aj.calibration.record_of(aj.calibrate(paper_arm, capture, bounds), aj.Recording(capture, nominal))
 
 
-def renamed(record: aj.calibration.CalibrationRecord, *names: str) -> aj.calibration.CalibrationRecord:
-    """The same calibration, with other names of sockets A, B and C."""
-    other = dict(zip("ABC", names, strict=True))
-    capture = record.recording.capture
-    lengths = [aj.ReferenceLength(other[x.start], other[x.end], x.value, x.u) for x in capture.lengths]
-    capture = aj.Capture({other[name]: q for name, q in capture.sockets.items()}, lengths)
-    return record._replace(recording=record.recording._replace(capture=capture))
-
-
 @pytest.fixture(scope="module")
 def full(tmp_path_factory) -> AdministrativeData:
     path = tmp_path_factory.mktemp("about") / "about.toml"
@@ -163,7 +155,7 @@ def certificates(record, observed_record, full, evaluation) -> dict[str, str]:
             evaluation=evaluation,
         ),
         "hostile names": dcc_xml(
-            renamed(record, *HOSTILE[:3]), full.model_copy(update={"conformity": None}), created=CREATED
+            renamed_sockets(record, *HOSTILE[:3]), full.model_copy(update={"conformity": None}), created=CREATED
         ),
         "on bounds": dcc_xml(
             record._replace(determined=uncertain, active=active), AdministrativeData(), created=CREATED
@@ -652,7 +644,7 @@ def test_the_same_calibration_has_the_same_certificate(record):
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_names_stay_text(record, name):
-    record = renamed(record, name, "B", "C")
+    record = renamed_sockets(record, name, "B", "C")
     record = record._replace(recording=record.recording._replace(nominal=record.recording.nominal._replace(name=name)))
     text = dcc_xml(record, AdministrativeData(), created=CREATED, command=name)
     assert ("As left", "Reference lengths", f"1: {name} - B", "error") in parse_dcc(text)
@@ -711,7 +703,7 @@ def test_what_cannot_be_certified_is_refused(record, changes, keywords, parts):
 
 def test_names_that_xml_cannot_hold_are_refused(record):
     assert_refused(
-        lambda: dcc_xml(renamed(record, "A\x1b", "B", "C"), AdministrativeData(), created=CREATED),
+        lambda: dcc_xml(renamed_sockets(record, "A\x1b", "B", "C"), AdministrativeData(), created=CREATED),
         r"socket 'A\x1b'",
         "U+001B",
     )

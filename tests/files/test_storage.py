@@ -24,6 +24,7 @@ from aacmm_jax.files.hdf5 import write_tables
 from aacmm_jax.kinematics.independence import nearly_parallel
 from tests.example_counts import example_count
 from tests.refusals import assert_refused
+from tests.renamed_sockets import renamed_sockets
 
 FULL = OSError(28, "No space left on device")
 LOAD = {"capture": aj.files.load_capture, "calibration": aj.files.load_calibration}
@@ -104,7 +105,7 @@ BAD = {
     ),
     "empty": (lambda path, source: path.touch(), ["is not an HDF5 file"]),
     "foreign": (make_foreign, ["was not written by aacmm", "name a "]),
-    "newer": (set_attribute("format_version", 5), ["format version 5, newer", "(4)", "update aacmm_jax"]),
+    "newer": (set_attribute("format_version", 6), ["format version 6, newer", "(5)", "update aacmm_jax"]),
     "no version": (edit(lambda file: file.attrs.pop("format_version")), ["damaged", "make it again"]),
     "other kind": (set_attribute("kind", "study"), ["holds a study", "name a "]),
     "no table": (remove("capture"), ["lacks the table 'capture'", "make it again"]),
@@ -139,6 +140,11 @@ def test_a_capture_is_no_calibration(tmp_path, good):
         assert_refused(
             lambda: aj.files.load_calibration(tmp_path / "bad.h5"), f"lacks the table '{name}'", "make it again"
         )
+    # As versions before 5 wrote those of sockets alone.
+    remove("observed")(tmp_path / "bad.h5", good.files["calibration"])
+    assert_refused(
+        lambda: aj.files.load_calibration(tmp_path / "bad.h5"), "from an earlier version", "again from its capture"
+    )
     path = good.files["capture"] / "below.h5"
     assert_refused(lambda: aj.files.load_capture(path), path, "cannot be read: not a directory", "name another")
 
@@ -457,11 +463,10 @@ def test_round_trip_of_a_calibration(tmp_path, good):
 def test_names_with_a_comma(tmp_path, good, held, earlier):
     """Lists of names are lists in the file; those that were one string with commas between are still read."""
     names = ("A", "B") if earlier else ("plate, left", "B")
-    lengths = [aj.ReferenceLength(*names, good.recording.capture.lengths[0].value, 0.01)]
-    capture = aj.Capture(dict(zip(names, good.recording.capture.sockets.values(), strict=True)), lengths)
+    record = renamed_sockets(good.record, *names)
     group = LeftOut(names, 15, 0.1, 0.1, np.array([0.2]), np.array([0.1]), True)
-    recording = good.recording._replace(capture=capture, nominal=good.recording.nominal._replace(held=held))
-    record = good.record._replace(recording=recording, held=held, validation=CrossValidation((group, group)))
+    recording = record.recording._replace(nominal=good.recording.nominal._replace(held=held))
+    record = record._replace(recording=recording, held=held, validation=CrossValidation((group, group)))
     path = tmp_path / "calibration.h5"
     aj.files.save_calibration(path, record)
     if earlier:
@@ -510,6 +515,9 @@ DIMENSIONS = {
     "calibrated_arm": JOINTS,
     "parameters": {"parameter": 8, "parameter_2": 8},
     "sockets": {"socket": 2, "axis": 3},
+    "observed": {"observation": 2},
+    "geometry": {"number": 6, "entry": 18},
+    "pose_weights": {"pose": 15},
     "shared_errors": {
         "shared_kind": 4,
         "shared_kind_variance": 1,
@@ -567,7 +575,7 @@ def test_files_say_where_they_come_from(good):
     for kind, path in good.files.items():
         with h5py.File(path) as file:
             attributes = dict(file.attrs)
-        assert (attributes["format"], attributes["kind"], attributes["format_version"]) == ("aacmm_jax", kind, 4)
+        assert (attributes["format"], attributes["kind"], attributes["format_version"]) == ("aacmm_jax", kind, 5)
         assert attributes["seed"] == 1
         for name in ("package_version", "created", "command"):
             assert attributes[name]

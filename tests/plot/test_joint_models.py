@@ -66,10 +66,5 @@ def test_marks_and_curve_are_the_error_of_the_encoder(records, model, joint):
     assert np.sqrt(np.mean((marks.get_ydata() - expected) ** 2)) < 0.1
 
 
-def test_refusals(records, capture):
+def test_what_cannot_be_drawn(records):
     assert_refused(lambda: aj.plot.joint_function(records[0], 7), "joints 1 to 6")
-    nominal = aj.files.load_specification("cheng2018-simulation")
-    sockets = aj.simulate(nominal.arm, {"A": (400, 200, 300)}, poses=40, encoder_arcsec=1, seed=1)
-    result = aj.identify(nominal.arm, sockets, nominal.bounds())
-    plain = aj.calibration.record_of(result, aj.Recording(sockets, nominal))
-    assert_refused(lambda: aj.plot.joint_function(plain, 1), "residuals of single poses")

@@ -154,7 +154,6 @@ def test_an_arm_is_drawn_in_space(record):
     [
         (lambda record: aj.plot.parameter_changes(record, "lengths"), "length or angle"),
         (lambda record: aj.plot.residuals_by_kind(record, "um"), "mm, standard deviations or deg"),
-        (lambda record: aj.plot.residuals_by_kind(record), "no observations besides sockets"),
         (lambda record: aj.plot.residuals_by_kind(record, "deg"), "no orientations"),
         (
             lambda record: aj.plot.acceptance_metrics(aj.acceptance.run(aj.acceptance.Measured({"A": np.eye(3)}))),

@@ -44,6 +44,34 @@ def test_a_wrong_reference_length(paper_arm, noisy_capture, factor, said):
     assert "Converged" not in text  # whatever the solver says
 
 
+@pytest.mark.parametrize(
+    ("narrow", "held", "noise", "named"),
+    [
+        ({}, (), None, ()),
+        ({"d_5": 0.05}, (), None, ("d_5 (upper bound)",)),  # on it after stage 1
+        ({"d_3": 0.5}, (), None, ("d_3 (lower bound)",)),  # beyond it after the division
+        ({}, ("a_2",), aj.Noise(encoder_arcsec=60.0), ("a_2 (fixed length)",)),
+        ({}, ("a_2",), None, ()),  # it sets the scale, so that nothing is divided
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.* already sets the scale")
+def test_what_stands_against_the_division_is_named(tmp_path, narrow, held, noise, named):
+    arm = aj.load_arm("cheng2018-simulation")
+    true = aj.perturbed_arm(aj.Parameters.free_of(arm), length=1.0, angle=0.0017, seed=1)
+    sockets, poses = {"A": (400, 200, 300), "B": (700, 500, 500)}, {"A": 70, "B": 10}
+    capture = aj.simulate(true, sockets, poses=poses, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seed=1)
+    held = (*aj.Parameters.free_of(arm).held, *held)
+    nominal = ArmSpecification(arm, "test", held=held, override=narrow)
+    result = aj.calibrate(arm, capture, nominal.bounds(), noise=noise, check_identifiability=False)
+    aj.files.save_calibration(tmp_path / "c.h5", aj.calibration.record_of(result, aj.Recording(capture, nominal)))
+    record = aj.files.load_calibration(tmp_path / "c.h5")
+    assert record.against_division == named
+    assert record.final_method == ("joint" if named else "two-stage")
+    assert record.divided == record.fixed_by_one_length == (not named and not record.scale_set_by)
+    said = [text for text in warnings.of_calibration(record) if "division" in text]
+    assert [named[0] in text for text in said] == [True] * len(named)
+
+
 def test_one_length_of_three_that_disagrees(paper_arm):
     sockets = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (400, 500, 300)}
     noise = {"encoder_arcsec": 2.0, "seating": 0.005}
