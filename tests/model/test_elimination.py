@@ -16,6 +16,7 @@ from aacmm_jax.model.elimination import Args, observed_model, observed_rows
 from aacmm_jax.model.layout import layout_of
 from aacmm_jax.model.observed import Observed
 from aacmm_jax.model.robust import Loss
+from aacmm_jax.model.rows import PriorRows
 from aacmm_jax.uncertainty.linear_propagation import propagated
 from aacmm_jax.uncertainty.linearisation import Linearisation
 
@@ -45,7 +46,8 @@ def problem(arm, parts, seed):
     geometry = observed.start(space, space.vector())
     random = np.random.default_rng(seed)
     z = np.concatenate([space.vector(), geometry]) + 1e-4 * random.normal(size=len(space.names) + len(geometry))
-    return Linearisation.at(observed, space, z, noise=to_numpy(NOISE), least=1e-3)
+    prior = PriorRows(np.asarray(space.vector()), 10 / np.asarray(space.scale))
+    return Linearisation.at(observed, space, z, noise=to_numpy(NOISE), least=1e-3, prior=prior)
 
 
 def dense(linear, loss=None):
@@ -103,7 +105,7 @@ def test_covariances_of_eliminated_geometry_are_the_dense_ones(paper_arm, parts,
     influence, p = linear.influence(), len(linear.space.names)
     unit = [np.moveaxis(np.tile(np.eye(rows.shape[0]), (rows.shape[1], 1, 1)), 0, -1) for rows in
             (block.white for block in linear.blocks[: len(linear.observed.layout.groups)])]  # fmt: skip
-    for found in (influence.covariance(), propagated(influence, unit, None, None, None)):
+    for found in (influence.covariance(), propagated(influence, unit, None, linear.whitening.prior, None)):
         u = np.sqrt(np.diag(inverse)[: linear.height])
         np.testing.assert_allclose(
             found.head / np.outer(u, u), inverse[: linear.height, : linear.height] / np.outer(u, u), atol=1e-4
