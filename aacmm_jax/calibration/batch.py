@@ -27,7 +27,7 @@ from ..model.observed import Observed
 from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
 from .batch_kernel import Form, Problems, pick, solve_chunk, without_lengths
-from .checks import check_method, check_noise_model
+from .checks import check_enough, check_method, check_noise_model
 from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
 from .results import ManyCalibrations, ManyIdentifications
 from .scale_anchor import default_method, scale_anchor, scale_from_slides
@@ -191,7 +191,7 @@ def _divided(batch: "_Batch", stage1: ManyIdentifications, method: str) -> ManyC
         "deltam": stage1.deltam / factor,
         "steps": np.array(stage1.steps),
         "reason": np.array(numbers_of(stage1.result)),
-        "active": np.asarray(bounds.active(scaled)) if anchor.can_scale else np.array(stage1.active),
+        "active": np.array(bounds.active(scaled) if anchor.can_scale else stage1.active),
         "divided": ~np.asarray(division.stands_against),
     }
     rows = np.flatnonzero(division.stands_against)
@@ -329,6 +329,8 @@ def _form(problems: Problems, space: Parameters, options: BatchOptions, with_len
         anchor = scale_anchor(space, arm, hold, options.noise, first.capture)
     of_first = Parameters(first.arm, space.names)
     observed = Observed.of(one, first.arm)
+    if options.prior is None and not one.observations and not one.lengths:
+        check_enough(one.sizes, len(space.names) - int(space.lengths.any()))
     known = unknown_parameters(of_first, anchor, options.prior, options.noise)
     check_observed(observed, of_first, np.asarray(first.start), known)
     return Form(

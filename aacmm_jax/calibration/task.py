@@ -19,7 +19,7 @@ from ..model.loss_names import LossName
 from ..model.observed import Observed
 from ..model.robust import Loss, check_loss
 from ..uncertainty.covariance import NoiseModel
-from .checks import check_noise_model, check_start
+from .checks import check_enough, check_noise_model, check_start
 from .scale_anchor import ScaleAnchor, scale_anchor
 
 NO_ANCHOR = ScaleAnchor(hold=None, free=False, set_by=(), partners=None)
@@ -87,6 +87,9 @@ def task_of(
     observed = Observed.of(capture, space.base)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         known, at = to_numpy((space, vector))
+        if prior is None and not capture.observations and not capture.lengths:
+            # Repeatability does not determine the scale: where lengths are free, it determines one parameter less.
+            check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
         check_observed(observed, known, at, unknown_parameters(space, anchor, prior, noise))
     if prior is not None and is_concrete(*jax.tree.leaves((prior, bounds))):
         check_means(prior, bounds)

@@ -5,14 +5,14 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from aacmm_jax.uncertainty.observed_covariance import covariance_of_noise
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import truth_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.model.observed import Observed, linear_rows, whitening_of
+from aacmm_jax.model.observed import Observed
+from aacmm_jax.uncertainty.linearisation import Linearisation
 
 from .test_observed import NOISE, SIMULATED
 
@@ -41,13 +41,11 @@ def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
     batch = truth.drawn(10, NOISE, np.random.default_rng(0))
     space = to_numpy(aj.Parameters(result.arm, FEW))  # NumPy compiles nothing
     z = np.concatenate([result.parameters, *(truth.geometry[name] for name in truth.observed.blocks)])
-    of_arm = [covariance_of_noise(errors, NOISE) for errors in truth.errors]
-    roots = whitening_of(truth.linear, truth.observed, of_arm, np.asarray(1e-4)).roots
     squares = []
     for trial in range(10):
         one = jax.tree.map(lambda leaf, trial=trial: leaf[trial], batch)
-        for part, root in zip(linear_rows(space, Observed.of(one, space.base), z), roots, strict=True):
-            squares.append(np.einsum("mab,bm->am", root, part.rows.values).ravel() ** 2)
+        linear = Linearisation.at(to_numpy(Observed.of(one, space.base)), space, z, noise=to_numpy(NOISE), least=1e-4)
+        squares += [white.ravel() ** 2 for white in linear.white()]
     squares = np.concatenate(squares)
     assert np.mean(squares) == pytest.approx(1.0, abs=5 * np.sqrt(2 / squares.size))
 

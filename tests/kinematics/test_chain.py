@@ -75,16 +75,21 @@ def test_pose_is_the_textbook_product(joints, prismatic, beta):
     ("beta", "prismatic"), [(False, ()), pytest.param(True, (), marks=pytest.mark.slow), (True, (1, 4))]
 )
 def test_the_tips_and_columns_of_a_batch_are_those_of_the_loop(beta, prismatic):
-    arm = random_arm(6, 1, beta=beta, batch=(4, 1), prismatic=prismatic)
+    arm = random_arm(6, 1, beta=beta, batch=(4,), prismatic=prismatic)
     q = random_readings(arm, 0, 5)
     kinds = ("alpha", "a", "d", "theta", "q", *(("beta",) if beta else ()))
     indices = (*((kind, i) for kind in kinds for i in (0, 3, 5)), ("probe", 2))
     given = arm.geometry, chain.joint_motion(arm.geometry, q)
-    compiled = jax.jit(lambda *given: jacobian.tip_and_columns(*given, indices)).lower(*given).compile()
-    forward = chain.forward_pass(*given)
-    tip, columns = compiled(*given)
-    np.testing.assert_allclose(tip, forward.tip, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(columns, jacobian.stacked_jacobian_columns(forward, indices), rtol=0, atol=1e-11)
+    batch = jax.vmap(lambda *given: jacobian.pose_columns(*given, indices, True), in_axes=(0, None))
+    compiled = jax.jit(batch).lower(*given).compile()
+    found = compiled(*given)
+    for i in range(4):
+        geometry = jax.tree.map(lambda leaf, i=i: leaf[i], arm.geometry)
+        forward = chain.forward_pass(geometry, given[1])
+        np.testing.assert_allclose(found.tip[i], forward.tip, rtol=0, atol=1e-11)
+        expected = jacobian.stacked_jacobian_columns(forward, indices)
+        np.testing.assert_allclose(found.columns[i], expected, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(found.turned[i], jacobian.rotation_columns(forward, indices), rtol=0, atol=1e-11)
     # XLA has not simplified the condition that keeps it from computing the chain again for every column.
     assert jax.default_backend() != "cpu" or " conditional(" in compiled.as_text()
 

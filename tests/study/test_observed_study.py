@@ -8,7 +8,8 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.model.observed import Observed, residual_rows
+from aacmm_jax.model.observed import Observed
+from aacmm_jax.model.rows import rows_at
 from aacmm_jax.study.blocks import Block
 from aacmm_jax.study.observed_trials import _recorded
 from aacmm_jax.study.statistics import study_summary
@@ -89,7 +90,7 @@ def test_without_errors_every_arm_agrees_with_its_data(paper_arm, held, which):
     for number in range(2):
         one = jax.tree.map(lambda leaf, number=number: leaf[number], batch)
         z = np.concatenate([drawn.true[number], _recorded(study).geometry])
-        for rows in residual_rows(space, Observed.of(one, study.nominal.arm), z):
+        for rows in rows_at(space, Observed.of(one, study.nominal.arm), z).rows:
             assert np.abs(rows.values).max() < 1e-9
         # What one configuration can follow, it does: only transforms ask for six things at once.
         assert all(np.abs(one.shift).max() < 1e-3 for one in one.observations if one.kind != "transforms")
