@@ -285,7 +285,7 @@ def _of_lengths(
             components[of][number, component, first : first + 3] += sign * between / size
             pulls.setdefault(name, np.zeros((count, 3)))[number] += sign * between / size
     for name, pull in pulls.items():
-        places += in_place[name] * pull @ pull.T
+        places += in_place.get(name, 0.0) * pull @ pull.T
     by_head = -sum(np.einsum("lKk,Kkh->lh", c, f) for c, f in zip(components, influence.follow, strict=True))
     pull = by_head[:, p:] @ problem.basis
     along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along

@@ -70,7 +70,7 @@ def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, 
         part = aj.Capture({name: capture.sockets[name] for name in names})
         expected = unseen_errors(aj.uncertainty_of(alone), part).of(names)
         assert found.poses == len(names) * 14
-        assert np.sqrt(found.mean_square) == pytest.approx(expected.rms, rel=1e-3)
+        assert np.sqrt(found.mean_square) == pytest.approx(expected.rms, rel=5e-3)
         assert np.sqrt(found.ratio) == pytest.approx(expected.rms / expected.predicted, rel=0.1)
 
 

@@ -34,7 +34,7 @@ def uncertainty_of(arm, noise, of_noise=np.inf):
 
 
 def test_sums_of_squares_are_those_of_the_whole_covariance(paper_arm, capture):
-    """V of all poses of two sockets as one matrix, from which their means are taken."""
+    """V of all poses of two sockets as one matrix, from which their weighted means are taken."""
     noise = aj.Noise(encoder_arcsec=3, seating=0.01)
     uncertainty = uncertainty_of(paper_arm, noise)
     found = unseen_errors(uncertainty, capture)
@@ -45,23 +45,27 @@ def test_sums_of_squares_are_those_of_the_whole_covariance(paper_arm, capture):
     errors = slopes @ np.asarray(uncertainty.covariance) @ slopes.T
     for pose, block in enumerate(own):
         errors[3 * pose : 3 * pose + 3, 3 * pose : 3 * pose + 3] += block
-    mean = np.array([[float(a == b) / capture.sizes[b] for b in capture.owner] for a in capture.owner])
-    project = np.kron(np.eye(13) - mean, np.eye(3))
+    weight = np.linalg.inv(own)
+    total = np.array([weight[capture.owner == a].sum(axis=0) for a in range(len(capture.sizes))])
+    share = [np.linalg.solve(total[a], weight[i]) for i, a in enumerate(capture.owner)]
+    tips = np.block([[share[i] * float(a == b) for i, b in enumerate(capture.owner)] for a in range(len(total))])
+    back = np.kron(np.array([[float(a == b) for a in range(len(total))] for b in capture.owner]), np.eye(3))
+    project = np.eye(39) - back @ tips
     both = (project @ errors @ project.T)[:36, :36]
     seen = found.of(["A", "B", "C"])
     assert seen.count == 12
     assert seen.predicted == pytest.approx(math.sqrt(np.trace(both) / 12), rel=1e-9)
     assert seen.degrees_of_freedom == pytest.approx(np.trace(both) ** 2 / np.sum(both**2), rel=1e-9)
     # Lengths between the means, which have one socket in common.
-    tips = np.array([[float(a == b) / capture.sizes[a] for b in capture.owner] for a in range(3)])
-    centroids = tips @ np.asarray(paper_arm.position(capture.q))
+    tips = tips.reshape(-1, 3, 39)
+    centroids = tips @ np.asarray(paper_arm.position(capture.q)).ravel()
     rows = []
     for start, end in ((0, 1), (1, 2)):
         between = centroids[end] - centroids[start]
-        rows.append(np.kron(tips[end] - tips[start], between / np.linalg.norm(between)))
+        rows.append(between / np.linalg.norm(between) @ (tips[end] - tips[start]))
     expected = np.array(rows) @ errors @ np.array(rows).T + np.diag([0.002**2, 0.003**2])
     np.testing.assert_allclose(found.length_covariance, expected, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(found.length_error, np.asarray(aj.evaluate(paper_arm, capture).error), atol=1e-12)
+    np.testing.assert_allclose(found.length_error, np.asarray(aj.evaluate(paper_arm, capture, noise=noise).error), atol=1e-9)
 
 
 def test_sockets_as_observations_are_judged_alike(paper_arm, capture):

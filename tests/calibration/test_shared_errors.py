@@ -120,7 +120,9 @@ def test_two_stages_leave_the_noise_of_single_poses_as_one_least_squares_does():
     stages, joint = (calibrated(made, capture, method, noise=None) for method in ("two-stage", "joint"))
     noise = stages.parameter_covariance.noise
     assert 0.003 < float(np.hypot(noise.seating, 500 * np.mean(np.asarray(noise.encoder)))) < 0.03
-    assert stages.shared.kinds == joint.shared.kinds
+    # With a length of 0.5 mm, how far places are off is what each way makes of nothing.
+    kinds = [tuple(kind for kind in one.shared.kinds if kind != "places") for one in (stages, joint)]
+    assert kinds[0] == kinds[1]
     assert not any("too small" in text for text in aj.warnings_of(stages, capture))
     assert any("too small" in text for text in aj.warnings_of(dataclasses.replace(stages, shared=None), capture))
     np.testing.assert_allclose(np.diag(stages.shared.moments), np.diag(joint.shared.moments), rtol=0.5)

@@ -118,7 +118,7 @@ def test_covariances_of_eliminated_geometry_are_the_dense_ones(paper_arm, parts,
                     matrix, inverse[np.ix_(index, index)], rtol=2e-3, atol=1e-5 * np.diag(matrix).max()
                 )
                 first = index[-1] + 1
-        assert first == p + linear.observed.layout.count
+        assert first == len(linear.z)
 
 
 def test_a_linear_component_is_no_unknown_of_the_solve(paper_arm):
