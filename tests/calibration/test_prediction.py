@@ -65,7 +65,9 @@ def test_sums_of_squares_are_those_of_the_whole_covariance(paper_arm, capture):
         rows.append(between / np.linalg.norm(between) @ (tips[end] - tips[start]))
     expected = np.array(rows) @ errors @ np.array(rows).T + np.diag([0.002**2, 0.003**2])
     np.testing.assert_allclose(found.length_covariance, expected, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(found.length_error, np.asarray(aj.evaluate(paper_arm, capture, noise=noise).error), atol=1e-9)
+    np.testing.assert_allclose(
+        found.length_error, np.asarray(aj.evaluate(paper_arm, capture, noise=noise).error), atol=1e-9
+    )
 
 
 def test_sockets_as_observations_are_judged_alike(paper_arm, capture):

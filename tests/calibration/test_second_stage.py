@@ -115,7 +115,8 @@ def test_a_fixed_length_that_sets_the_scale_comes_back_as_given(too_long, captur
     assert result.hold is None
     assert float(result.k) == pytest.approx(753 / 750, abs=2e-4)
     np.testing.assert_array_equal(result.parameters, result.stage1.parameters)
-    np.testing.assert_array_equal(result.covariance, result.stage1.covariance)
+    u = np.sqrt(np.diag(result.covariance))
+    np.testing.assert_allclose(result.covariance, result.stage1.covariance, atol=1e-9 * u.max() ** 2)
     nominal = aj.kinematics.ArmSpecification(too_long, "arm")
     record = aj.calibration.record_of(result, aj.Recording(capture, nominal))
     assert not record.fixed_by_one_length
@@ -150,7 +151,9 @@ def test_a_fixed_length_that_hardly_sees_the_scale_does_not_anchor_it(paper_arm)
     assert result.hold == "d_3"
     assert float(result.arm.probe[0]) == 0.58
     assert float(result.k) == pytest.approx(753 / 750, abs=2e-4)
-    assert float(result.length_after[0]) == pytest.approx(float(capture.lengths[0].value), abs=1e-8)
+    # The fixed length stands against the division, and everything is solved at once.
+    assert not result.divided
+    assert float(result.length_after[0]) == pytest.approx(float(capture.lengths[0].value), abs=0.002)
     error = (result.parameters - bounds.space.vector(true)) / np.sqrt(np.diag(result.covariance))
     assert np.max(np.abs(error)) < 4
 
@@ -171,14 +174,13 @@ def test_the_result_is_inside_the_box(too_long, capture, cut):
     i = cut.space.index("probe_z")
     assert float(result.parameters[i]) == float(cut.lower[i])
     assert float(result.covariance[i, i]) == 0
-    assert float(result.length_after[0]) == pytest.approx(float(capture.lengths[0].value), abs=1e-8)
-    # k of a calibration from there is 1 to rounding, which must not leave the length off its bound.
+    assert not result.divided
     repeated = aj.calibrate(too_long, capture, cut, start=result.parameters)
     assert repeated.active_names() == {"probe_z": "lower"}
-    # It is stage 1 with the anchor where k = 1: nothing is gained by another solve from there.
-    again = aj.identify(result.arm, capture, cut, hold="d_3")
-    np.testing.assert_allclose(again.parameters, result.parameters, atol=1e-8)
-    assert float(again.k) == pytest.approx(1, abs=1e-9)
+    # It is what the joint solve finds: nothing is gained by another from there.
+    again = aj.calibrate(result.arm, capture, cut, method="joint")
+    u = np.sqrt(np.diag(result.covariance))
+    np.testing.assert_array_less(np.abs(again.parameters - result.parameters), 1e-4 * u + 1e-9)
 
 
 @pytest.mark.slow
@@ -215,8 +217,8 @@ def test_many_equal_single_ones_where_a_fixed_length_has_no_partner(paper_arm, m
     assert many.stage1.sigma[0] == pytest.approx(float(one.stage1.after.sigma), rel=1e-9)
 
 
-def test_a_bound_on_the_adjusted_length(too_long, capture, cut):
-    """d_3 cannot reach the value for which k = 1: it ends on its bound, and the length keeps its error."""
+def test_a_bound_on_the_scale_anchor(too_long, capture, cut):
+    """d_3 cannot reach the value that the reference length asks for, and ends on its bound."""
     j = cut.space.index("d_3")
     bounds = aj.Bounds(cut.space, cut.lower.at[j].set(751.0), cut.upper)
     start = jnp.clip(cut.space.vector(too_long), bounds.lower, bounds.upper)
@@ -225,7 +227,7 @@ def test_a_bound_on_the_adjusted_length(too_long, capture, cut):
         aj.calibration.record_of(aj.calibrate(too_long, capture, box, start=start), nominal) for box in (cut, bounds)
     ]
     assert [record.active[j] for record in records] == [0, -1]
-    assert [record.fixed_by_one_length for record in records] == [True, False]
+    assert [record.fixed_by_one_length for record in records] == [False, False]
     assert [record.converged for record in records] == [True, True]
 
 
@@ -237,7 +239,6 @@ def tight(paper_arm, width: float, **nominal: float) -> tuple[aj.Arm, aj.Bounds]
     return arm, aj.Bounds.around(arm, space, length=15.0, override=dict.fromkeys(others, width))
 
 
-# Where bounds act, log k changes less than the anchor, or against it, and crosses zero more than once.
 @pytest.mark.parametrize(
     ("d_3", "width"),
     [
@@ -248,17 +249,15 @@ def tight(paper_arm, width: float, **nominal: float) -> tuple[aj.Arm, aj.Bounds]
         ),
     ],
 )
-def test_the_anchor_is_adjusted_however_much_bounds_act_from_the_start(paper_arm, capture, width, d_3):
+def test_the_start_does_not_matter_however_much_bounds_act_from_it(paper_arm, capture, width, d_3):
     """The arm lies in the box, so that it is found, and with the covariance of a start at the arm itself."""
     arm, bounds = tight(paper_arm, width, d_3=d_3)
     result = aj.calibrate(arm, capture, bounds)
     assert bool(result.converged)
-    assert float(result.length_after[0]) == pytest.approx(float(capture.lengths[0].value), abs=1e-8)
     near = aj.calibrate(arm, capture, bounds, start=bounds.space.vector(paper_arm))
-    np.testing.assert_allclose(result.parameters, near.parameters, atol=1e-7)
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(result.covariance)), np.sqrt(np.diag(near.covariance)), rtol=1e-3, atol=1e-12
-    )
+    u = np.sqrt(np.diag(near.covariance))
+    np.testing.assert_array_less(np.abs(result.parameters - near.parameters), 1e-2 * u + 1e-9)
+    np.testing.assert_allclose(np.sqrt(np.diag(result.covariance)), u, rtol=1e-2, atol=1e-9)
     many = aj.calibrate_many(arm, capture, bounds, start=bounds.space.vector(arm)[None])
     assert bool(many.converged[0])
     np.testing.assert_allclose(many.parameters[0], result.parameters, atol=1e-7)
@@ -273,22 +272,9 @@ def test_covariance_depends_on_the_solution_and_not_on_the_start(paper_arm, capt
     starts = [np.clip(bounds.space.vector(one), bounds.lower, bounds.upper) for one in (arm, paper_arm)]
     far, near = (aj.calibrate(arm, capture, bounds, start=start) for start in starts)
     assert float(near.stage1.after.sigma) > 2 * float(far.stage1.after.sigma)
-    np.testing.assert_allclose(far.parameters, near.parameters, atol=1e-7)
     u = [np.sqrt(np.diag(result.covariance)) for result in (far, near)]
-    np.testing.assert_allclose(u[0], u[1], rtol=1e-5, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_bounds_that_allow_no_scale_are_named(paper_arm, capture):
-    """a_2 is 2 mm too long and cannot be shortened, so the anchor alone would have to bring k to 1."""
-    arm, bounds = tight(paper_arm, 0.05, d_3=745.0, a_2=float(paper_arm.a[1]) + 2.0)
-    result = aj.calibrate(arm, capture, bounds)
-    record = aj.calibration.record_of(result, aj.Recording(capture, aj.kinematics.ArmSpecification(arm, "arm")))
-    assert (bool(result.converged), record.converged) == (False, False)
-    assert "because active bounds set the scale; widen these bounds: " in record.reason
-    assert "a_2 (lower)" in record.reason
-    many = aj.calibrate_many(arm, capture, bounds, start=bounds.space.vector(arm)[None])
-    assert (bool(many.converged[0]), bool((many.result == aj.Reason.scale)[0])) == (False, True)
+    np.testing.assert_array_less(np.abs(far.parameters - near.parameters), 1e-2 * u[1] + 1e-9)
+    np.testing.assert_allclose(u[0], u[1], rtol=1e-2, atol=1e-12)
 
 
 def test_many_start_inside_their_boxes(too_long, capture, cut):

@@ -66,15 +66,14 @@ def test_a_hobby_arm_may_leave_residuals_that_no_measuring_arm_leaves():
     sockets = {"A": (0, -200, 150), "B": (0, -230, 230), "C": (80, -180, 120)}
     right = aj.simulate(arm, sockets, poses=8, encoder_arcsec=500, seed=1)
     wrong = aj.Capture({name: np.asarray(q)[:, [0, 1, 3, 2, 4]] for name, q in right.sockets.items()})
-    recording = aj.Recording(right, aj.kinematics.ArmSpecification(arm, "test"))
-    record = aj.calibration.record_of(aj.identify(arm, right, bounds), recording)
     for capture, usual, implausible in (
         (right, None, True),
         (right, load_noise("so100"), False),
         (wrong, load_noise("so100"), True),
     ):
-        recorded = record._replace(recording=recording._replace(capture=capture, usual=usual))
-        assert recorded.implausible_residual == implausible
+        recording = aj.Recording(capture, aj.kinematics.ArmSpecification(arm, "test"), usual=usual)
+        record = aj.calibration.record_of(aj.identify(arm, capture, bounds), recording)
+        assert record.implausible_residual == implausible
 
 
 def test_a_simulated_capture_keeps_what_is_usual_for_its_arm(aacmm, tmp_path):

@@ -102,7 +102,7 @@ def test_covariances_of_eliminated_geometry_are_the_dense_ones(paper_arm, parts,
     triangle = np.linalg.qr(jacobian * steps, mode="r")
     root = np.linalg.inv(triangle)
     inverse = root @ root.T
-    influence, p = linear.influence(), len(linear.space.names)
+    influence = linear.influence()
     unit = [np.moveaxis(np.tile(np.eye(rows.shape[0]), (rows.shape[1], 1, 1)), 0, -1) for rows in
             (block.white for block in linear.blocks[: len(linear.observed.layout.groups)])]  # fmt: skip
     for found in (influence.covariance(), propagated(influence, unit, None, linear.whitening.prior, None)):
