@@ -395,7 +395,7 @@ class _RepeatedTask(NamedTuple):
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
         start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
         lengths = np.linalg.norm(start - end, axis=1)
-        scale = result.scale  # None where observations fix it, and not reference lengths alone
+        scale = result.scale if result.method == "two-stage" else None  # a joint solve divides by no k
         k, u_k = ([], []) if scale is None else ([float(scale.value)], [float(scale.u)])
         factor_k = [linear.expanded_k(level) / own for own in u_k]
         estimate = np.concatenate([result.parameters, k, lengths])

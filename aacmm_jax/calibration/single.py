@@ -19,7 +19,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
-from ..uncertainty.covariance import NoiseModel
+from ..uncertainty.covariance import STATED, NoiseModel
 from .checks import check_identifiable, check_method, check_single
 from .encoder_noise import with_noise_by_joint
 from .joint_model import with_joint_model
@@ -247,9 +247,10 @@ def _calibrated(
             found = jointly(task, capture, stage1, method)
             return found.calibration, found.sensitivities
         found = in_two_stages(stage1, capture)
-        if bool(found.stands_against):
-            found = jointly(task, capture, stage1, method)
-        return found.calibration, found.sensitivities
+        if not bool(found.stands_against):
+            return found.calibration, found.sensitivities
+        joint = jointly(task, capture, stage1, method)
+        return _with_components_of(found.calibration, joint.calibration), joint.sensitivities
 
 
 @eqx.filter_jit
@@ -261,5 +262,17 @@ def _traced(first: Task | None, task: Task, capture: Capture, method: str) -> Ca
     if not stage1.solution.identification.anchor.can_scale:
         return found.calibration
     return jax.lax.cond(
-        found.stands_against, lambda: jointly(task, capture, stage1, method).calibration, lambda: found.calibration
+        found.stands_against,
+        lambda: _with_components_of(found.calibration, jointly(task, capture, stage1, method).calibration),
+        lambda: found.calibration,
     )
+
+
+def _with_components_of(other: Calibration, result: Calibration) -> Calibration:
+    """With the components of another calibration that this one does not have, as zeros: the same structure."""
+    components, others = result.parameter_covariance.components, other.parameter_covariance.components
+    lacking = others.without(STATED)
+    if components.names == others.names or lacking is None:
+        return result
+    none = eqx.tree_at(lambda one: one.matrices, lacking, 0 * lacking.matrices)
+    return eqx.tree_at(lambda one: one.parameter_covariance.components, result, components.joined(none))

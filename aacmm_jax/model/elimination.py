@@ -95,7 +95,7 @@ def followed(
     if sum(sizes) >= _LONG * len(sizes):
         ends, r = np.cumsum(sizes), by_own.shape[1]
         pieces = [
-            (each[i].T @ _flat(by_own[..., end - size : end])).reshape(-1, r, size)
+            (each[i].T @ _flat(by_own[..., end - size : end])).reshape(each.shape[-1], r, size)
             for i, (end, size) in enumerate(zip(ends, sizes, strict=True))
         ]
         return pieces[0] if len(pieces) == 1 else xp.concatenate(pieces, axis=-1)
