@@ -317,9 +317,10 @@ class _Batch(NamedTuple):
 def _form(problems: Problems, space: Parameters, options: BatchOptions, with_lengths: bool) -> Form:
     """What is the same for all problems. Raises `InputError` where the data cannot determine the unknowns."""
     arm, capture, start, lower, upper, near = problems
-    box = (None if side is None or side.ndim == 1 else 0 for side in (start, lower, upper, near))
+    box: Any = (None if side is None or side.ndim == 1 else 0 for side in (start, lower, upper, near))
     of_arm = jax.tree.map(lambda leaf: 0 if leaf.ndim > 1 else None, arm)
-    axes = Problems(of_arm, jax.tree.map(lambda leaf: 0, capture) if capture.q.ndim > 2 else None, *box)
+    of_capture: Any = jax.tree.map(lambda leaf: 0, capture) if capture.q.ndim > 2 else None
+    axes = Problems(of_arm, of_capture, *box)
     first = _selected(problems, axes, 0)
     one = first.capture if with_lengths else without_lengths(first.capture)
     scaled = bool(one.lengths) or any(observation.fixes_scale for observation in one.observations)

@@ -309,7 +309,8 @@ def _solve_all(
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     def fresh(index: Int[Array, " w"]) -> Any:
-        return begin_steps(*starts(jnp.minimum(index, count - 1)), zeros)
+        first, box = starts(jnp.minimum(index, count - 1))
+        return begin_steps(first, box, zeros)
 
     def more(carry: Any) -> Bool[Array, ""]:
         return jnp.any(carry[1] < count)

@@ -160,10 +160,8 @@ def of_geometry(
     layout, found = observed.layout, {}
     for name, rows in observed.positions.items():
         of, component, first = layout.component_of(int(rows[0]))
-        if of is None:
-            known = influence.determined[p + rows]
-        else:
-            known = ~influence.open[of][component, first : first + len(rows)]
+        own = slice(first, first + len(rows))
+        known = influence.determined[p + rows] if of < 0 else ~influence.open[of][component, own]
         matrix = geometry_covariance(layout, covariance, p, rows) * np.outer(*(observed.steps[rows],) * 2)
         found[name] = xp.where(known[:, None] & known[None, :], matrix, np.nan)
     return found

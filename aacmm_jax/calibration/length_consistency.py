@@ -111,14 +111,13 @@ def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Relat
     linear = linearisation_of(record, record.names, noise=record.noise, lengths=False)
     influence, observed, p = linear.influence(), linear.observed, len(record.names)
     ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.own, capture)
-    error = ends.measured - ends.nominal
+    error = np.asarray(ends.measured - ends.nominal)
     if np.max(np.abs(error)) < _EXACT:
         return None
     # Positions follow the arm as the means of their tips do.
     followers = []
     for name in positions_at_ends(capture):
         of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        assert of is not None
         followers.append(-influence.follow[of][component, first : first + 3])
     slopes = np.einsum("lec,ech->lh", ends.by_positions, np.stack(followers))[:, :p]
     covariance, scale = np.asarray(ends.covariance(np.ones(()))), None

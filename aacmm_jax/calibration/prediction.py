@@ -8,7 +8,7 @@ with n degrees of freedom, the ratio of found to predicted has the F distributio
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.distributions import chance
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.observations.socket import position_of
 from ..data.visits import visits_of
@@ -154,9 +154,8 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
     uncertainty, capture = to_numpy((uncertainty.complete, capture))
     problem = _Unseen.of(uncertainty, capture)
     parts = {part.observation.name: _part_of(problem, number, part) for number, part in enumerate(problem.parts)}
-    error, covariance, *by_part = _of_lengths(problem, capture)
-    scatter = uncertainty.scatter_degrees_of_freedom
-    return UnseenErrors(parts, problem.common, error, covariance, *by_part, scatter)
+    lengths = _of_lengths(problem, capture)
+    return UnseenErrors(parts, problem.common, *lengths, uncertainty.scatter_degrees_of_freedom)
 
 
 class _Unseen(NamedTuple):
@@ -172,9 +171,9 @@ class _Unseen(NamedTuple):
     linear: Linearisation
     influence: Influence
     parts: list[ObservationRows]
-    white: list[Float[np.ndarray, "_ _"]]
-    own: list[Float[np.ndarray, "_ _ _"]]  # U of each observation's own geometry
-    joined: list[Float[np.ndarray, "w _ _"]]  # W but for these: of the shared geometry, and K A
+    white: Sequence[Float[AnyArray, "_ _"]]
+    own: Sequence[Float[AnyArray, "_ _ _"]]  # U of each observation's own geometry
+    joined: Sequence[Float[AnyArray, "w _ _"]]  # W but for these: of the shared geometry, and K A
     common: Float[np.ndarray, "w w"]  # S for these
     basis: Float[np.ndarray, "s b"]  # of the shared geometry's numbers, with which its columns are orthonormal
     along: Float[np.ndarray, "b p"]  # components of A along them
@@ -202,7 +201,7 @@ class _Unseen(NamedTuple):
         basis = vectors[:, known] / np.sqrt(values[known])
         of_shared = [np.einsum("sb,srm->brm", basis, rows) for rows in of_shared]
         of_parameters = [rows / scale for rows in of_parameters]
-        along = sum(_flat(b) @ _flat(a).T for b, a in zip(of_shared, of_parameters, strict=True))
+        along = np.sum([_flat(b) @ _flat(a).T for b, a in zip(of_shared, of_parameters, strict=True)], axis=0)
         joined = [
             np.concatenate([b, a - np.einsum("bp,brm->prm", along, b)])
             for b, a in zip(of_shared[:groups], of_parameters[:groups], strict=True)
@@ -225,7 +224,7 @@ def _own_basis(influence: Influence, number: int) -> Float[np.ndarray, "k r m"]:
         return np.zeros((0, *block.white.shape))
     values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
     roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
-    return followed(np.asarray(rows), np.swapaxes(roots, 1, 2), block.sizes)
+    return np.asarray(followed(np.asarray(rows), np.swapaxes(roots, 1, 2), block.sizes))
 
 
 def _flat(rows: Float[np.ndarray, "k r m"]) -> Float[np.ndarray, "k _"]:
@@ -235,7 +234,7 @@ def _flat(rows: Float[np.ndarray, "k r m"]) -> Float[np.ndarray, "k _"]:
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
     values, observation = np.asarray(part.values), part.observation
     r, m = values.shape
-    own, joined = (np.moveaxis(rows[number], -1, 0) for rows in (problem.own, problem.joined))  # (m, w, r)
+    own, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.own, problem.joined))  # (m, w, r)
     to_mm = np.linalg.inv(np.asarray(part.root))[:, :_POSITION_ROWS]
     weights = np.einsum("mca,mcb->mab", to_mm, to_mm)
     common, p = problem.common, len(problem.uncertainty.space.names)
@@ -281,12 +280,11 @@ def _of_lengths(
         error[number] = size - float(length.value)
         for name, index, sign in zip((length.start, length.end), rows, (-1.0, 1.0), strict=True):
             of, component, first = observed.layout.component_of(int(index[0]))
-            assert of is not None  # the position of a socket, which no other observation shares
             components[of][number, component, first : first + 3] += sign * between / size
             pulls.setdefault(name, np.zeros((count, 3)))[number] += sign * between / size
     for name, pull in pulls.items():
         places += in_place.get(name, 0.0) * pull @ pull.T
-    by_head = -sum(np.einsum("lKk,Kkh->lh", c, f) for c, f in zip(components, influence.follow, strict=True))
+    by_head = -np.sum([np.einsum("lKk,Kkh->lh", *of) for of in zip(components, influence.follow, strict=True)], axis=0)
     pull = by_head[:, p:] @ problem.basis
     along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
     scatter = sum(np.einsum("lKk,Kkj,gKj->lg", c, d, c) for c, d in zip(components, influence.own, strict=True))

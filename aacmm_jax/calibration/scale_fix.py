@@ -10,6 +10,7 @@ The division is a linear map of what stage 1 found, so its covariance is mapped 
 certified lengths, and the same poses as the parameters do.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -60,7 +61,7 @@ def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
     components = [xp.zeros((1, count, size)) for count, size in layout.classes]
     for name, derivative in zip(positions_at_ends(capture), by_positions, strict=True):
         of, component, first = layout.component_of(int(positions[name][0]))
-        if of is None:
+        if of < 0:
             head = set_at(head, (0, p + positions[name]), derivative)
         else:
             components[of] = set_at(components[of], (0, component, slice(first, first + 3)), derivative)
@@ -77,13 +78,12 @@ def positions_at_ends(capture: Capture) -> list[str]:
 
 
 def ends_between(
-    observed: Observed, geometry: Float[AnyArray, " g"], own: list[Float[AnyArray, "_ _ _"]], capture: Capture
+    observed: Observed, geometry: Float[AnyArray, " g"], own: Sequence[Float[AnyArray, "_ _ _"]], capture: Capture
 ) -> MeasuredEnds:
     """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
     xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
     for name in used:
         of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        assert of is not None  # a length's ends are sockets, which no other observation shares
         covariances.append(own[of][component, first : first + 3, first : first + 3])
     return MeasuredEnds(
         positions=xp.stack([geometry[observed.positions[name]] for name in used]),
@@ -160,7 +160,7 @@ class DividedUncertainty(NamedTuple):
     """Of the divided parameters, mm and rad."""
 
     covariance: Float[AnyArray, "p p"]
-    components: Components
+    components: Components | None
     rows: list[Float[AnyArray, "p _ _"]]  # how they follow the whitened rows of every block
 
 

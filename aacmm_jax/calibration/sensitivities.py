@@ -1,10 +1,12 @@
 """How the parameters of a calibration follow errors of its tips and joints, at its solution."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ..core.numpy_or_jax import AnyArray
 from ..uncertainty.linearisation import Linearisation
 
 
@@ -19,7 +21,7 @@ class Sensitivities(NamedTuple):
 
 def sensitivities_of_rows(
     linear: Linearisation,
-    rows: list[Float[np.ndarray, "p _ _"]],
+    rows: Sequence[Float[AnyArray, "p _ _"]],
     lengths: Float[np.ndarray, "l 3 M"],
 ) -> Sensitivities:
     """Of parameters that follow the whitened rows of every group so."""
@@ -31,7 +33,7 @@ def sensitivities_of_rows(
     return Sensitivities(tips_of_rows(linear, rows), by_joints, lengths)
 
 
-def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q _ _"]]) -> Float[np.ndarray, "q 3 M"]:
+def tips_of_rows(linear: Linearisation, rows: Sequence[Float[AnyArray, "q _ _"]]) -> Float[np.ndarray, "q 3 M"]:
     """Derivatives by the tips, of what follows the whitened rows so."""
     tips = [
         np.einsum("qbm,bcm->qcm", one, part.by_tip)
@@ -40,6 +42,7 @@ def tips_of_rows(linear: Linearisation, rows: list[Float[np.ndarray, "q _ _"]]) 
     return np.concatenate(linear.observed.by_observation(tips), axis=2)
 
 
-def _of_residuals(linear: Linearisation, rows: list[Float[np.ndarray, "q _ _"]]) -> list[Float[np.ndarray, "q _ _"]]:
+def _of_residuals(linear: Linearisation, rows: Sequence[Float[AnyArray, "q _ _"]]) -> list[Float[np.ndarray, "q _ _"]]:
     """Derivatives by the residuals before they are whitened."""
-    return [np.einsum("qam,mab->qbm", one, root) for one, root in zip(rows, linear.whitening.roots, strict=False)]
+    roots = [np.asarray(root) for root in linear.whitening.roots]
+    return [np.einsum("qam,mab->qbm", one, root) for one, root in zip(rows, roots, strict=False)]

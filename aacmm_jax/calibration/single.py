@@ -271,8 +271,8 @@ def _traced(first: Task | None, task: Task, capture: Capture, method: str) -> Ca
 def _with_components_of(other: Calibration, result: Calibration) -> Calibration:
     """With the components of another calibration that this one does not have, as zeros: the same structure."""
     components, others = result.parameter_covariance.components, other.parameter_covariance.components
-    lacking = others.without(STATED)
-    if components.names == others.names or lacking is None:
+    lacking = None if others is None else others.without(STATED)
+    if components is None or lacking is None:
         return result
     none = eqx.tree_at(lambda one: one.matrices, lacking, 0 * lacking.matrices)
     return eqx.tree_at(lambda one: one.parameter_covariance.components, result, components.joined(none))

@@ -52,8 +52,8 @@ def begin(task: Task, near: Float[AnyArray, " p"] | None = None) -> Begun:
     z = xp.concatenate([task.start[free], task.observed.start(space, task.start[free])])
     before = state = state_at(task, space, z, scatter_at_start(task, space, z))
     if near is not None:
-        near = xp.clip(near, task.bounds.lower, task.bounds.upper)[free]
-        z = xp.concatenate([near, task.observed.start(space, near)])
+        inside = xp.clip(near, task.bounds.lower, task.bounds.upper)[free]
+        z = xp.concatenate([inside, task.observed.start(space, inside)])
         state = state_at(task, space, z)
     return Begun(space, (sides[0], sides[1]), steps, before, z, state)
 

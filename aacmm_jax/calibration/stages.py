@@ -155,7 +155,7 @@ def _divided_metrics(
     for name in observed.names:
         geometry[name], own = parts[name], metrics.geometry_covariance[name]
         of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        if foot is not None and of is not None:
+        if foot is not None and of >= 0:
             by_k = (parts[name] - foot) / k
             mixed = with_k[of][component, first : first + 3][:, None] * by_k[None, :] / k
             own = own / k**2 - mixed - mixed.T + variance * by_k[:, None] * by_k[None, :]
@@ -186,7 +186,6 @@ def _of_lengths(solution: Solution, capture: Capture) -> Float[np.ndarray, "l 3 
         between = np.asarray(linear.z[p + ends[1]] - linear.z[p + ends[0]])
         for rows, sign in zip(ends, (-1.0, 1.0), strict=True):
             of, component, first = observed.layout.component_of(int(rows[0]))
-            assert of is not None
             components[of][number, component, first : first + 3] = sign * between / np.linalg.norm(between)
     rows = rows_of_functions(influence, np.zeros((count, linear.height)), components)
     return tips_of_rows(linear, rows)

@@ -114,7 +114,7 @@ def _inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batc
     if not p:
         return matrix
     if p <= _UNROLLED:
-        return _inverse_cholesky_by_entries(matrix)
+        return jnp.asarray(_inverse_cholesky_by_entries(matrix))
     identity = jnp.broadcast_to(jnp.eye(p), matrix.shape)
     return jnp.tril(_triangular(jnp.concatenate([matrix, identity], axis=-1))[..., p:])
 

@@ -61,7 +61,7 @@ def sums_by_component(
         ends = np.cumsum(sizes)
         pieces = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
         return xp.stack([_flat(one[..., of]) @ _flat(other[..., of]).T for of in pieces])
-    products = sum(one[:, None, r] * other[None, :, r] for r in range(one.shape[1]))
+    products: Any = sum(one[:, None, r] * other[None, :, r] for r in range(one.shape[1]))
     return xp.moveaxis(_summed(products, sizes), -1, 0)
 
 
@@ -219,7 +219,7 @@ def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
     whole = z if linear is None else namespace(z, linear).concatenate([z, linear])
     blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole, batch is not None), whitening)
     first = len(observed.layout.classes) - args.eliminated
-    return [_fitted(block) if block.of is not None and block.of >= first else block for block in blocks]
+    return [_fitted(block) if block.of >= first else block for block in blocks]
 
 
 def observed_model(z: Float[AnyArray, " z"], args: Args) -> QuadraticModel:
@@ -242,7 +242,7 @@ def observed_model(z: Float[AnyArray, " z"], args: Args) -> QuadraticModel:
         slope = added_to(slope, np.arange(p), prior.weight * residual)
     head = arrow.head
     for block in blocks[: len(layout.groups)]:
-        if block.of is not None and block.of >= kept:
+        if block.of >= kept:
             shifts = _shifts(block)
             head = head - shifts @ shifts.T
     return QuadraticModel(cost, joined(slope, *slopes), arrow._replace(head=head))
@@ -253,8 +253,8 @@ def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
     is minimised."""
     groups, found = len(args.observed.layout.groups), []
     for number, block in enumerate(_blocks(z, args)):
-        transformed = args.loss is not None and number < groups
-        found.append(args.loss.transformed(block.white) if transformed else block.white)
+        of_poses = number < groups
+        found.append(args.loss.transformed(block.white) if args.loss is not None and of_poses else block.white)
     prior = args.whitening.prior
     return tuple(found) if prior is None else (*found, prior.residual(z))
 
@@ -270,7 +270,7 @@ def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> Float[AnyArray
     fitted = [xp.zeros(shape) for shape in layout.classes[first:]]
     point = rows_at(space, observed, whole)
     for group, rows, root in zip(layout.groups, point.rows, whitening.roots, strict=True):
-        if group.of is not None and group.of >= first:
+        if group.of >= first:
             fitted[group.of - first] = _of_rows(rows, root, group)[1]
     return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)])
 
@@ -294,7 +294,7 @@ def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) 
     layout = observed.layout
     found: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
-        if group.of is not None and stack.linear:
+        if group.of >= 0 and stack.linear:
             found[group.of] = inverse_positive_definite(_of_rows(rows, root, group)[0])
     return found
 

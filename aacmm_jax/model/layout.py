@@ -36,7 +36,7 @@ class Group(NamedTuple):
     poses: tuple[tuple[int, int], ...]  # of each member, first and last but one among all
     roles: tuple[Role, ...]  # as the kind names its unknowns; then the place of the target, where there is one
     targeted: bool
-    of: int | None  # class of the components; None where no unknown is private
+    of: int  # class of the components; -1 where no unknown is private
     sizes: tuple[int, ...]  # poses of each component
     start: tuple[int, ...]  # of each member's private numbers within its component
 
@@ -71,10 +71,10 @@ class Layout(NamedTuple):
             first += len(units)
         return found
 
-    def component_of(self, index: int) -> tuple[int | None, int, int]:
-        """Class, component, and place in it of a number of the geometry; None, 0 and itself of a shared one."""
+    def component_of(self, index: int) -> tuple[int, int, int]:
+        """Class, component, and place in it of a number of the geometry; -1, 0 and itself of a shared one."""
         if index < self.shared:
-            return None, 0, index
+            return -1, 0, index
         first = self.shared
         for number, (count, size) in enumerate(self.classes):
             if index < first + count * size:
@@ -177,10 +177,10 @@ class _Problem:
         layout = Layout(parts, count, tuple(classes), linear, ())
         number_of = {kind: i for i, kind in enumerate(kinds)}
         ordered = (sorted(some, key=lambda number: place.get(self.component[number], 0)) for some in members.values())
-        groups = (self._group(some, layout, number_of.get(self.kind(some[0])), place) for some in ordered)
+        groups = (self._group(some, layout, number_of.get(self.kind(some[0]), -1), place) for some in ordered)
         return layout._replace(groups=tuple(groups))
 
-    def _group(self, members: list[int], layout: Layout, of: int | None, place: dict[int, int]) -> Group:
+    def _group(self, members: list[int], layout: Layout, of: int, place: dict[int, int]) -> Group:
         positions = layout.positions
         roles = tuple(
             Role(tuple(int(positions[name][0]) for name in names), len(self.units[names[0]]), names[0] in self.private)
@@ -190,7 +190,7 @@ class _Problem:
         counts = [self.observations[number].q.shape[-2] for number in members]
         poses = tuple((stops[number] - count, stops[number]) for number, count in zip(members, counts, strict=True))
         sizes, start = (), ()
-        if of is not None:
+        if of >= 0:
             components = [place[self.component[number]] for number in members]
             sizes = tuple(np.bincount(components, weights=counts, minlength=layout.classes[of][0]).astype(int).tolist())
             own = next(role for role in roles if role.private)

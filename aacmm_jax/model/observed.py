@@ -6,6 +6,7 @@ reference length is a relation between the positions of two sockets, a certified
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -175,7 +176,7 @@ class Observed(eqx.Module):
         found |= platform_frames(self.observations, tips)
         return namespace(arm, forward).concatenate([found[name] for name in self.blocks])
 
-    def by_observation(self, by_group: list[Float[AnyArray, "... _"]]) -> list[Float[AnyArray, "... _"]]:
+    def by_observation(self, by_group: Sequence[Float[AnyArray, "... _"]]) -> list[Float[AnyArray, "... _"]]:
         """Arrays with the poses of each group last, as one for each observation."""
         found: list[Any] = [None] * len(self.observations)
         for group, values in zip(self.layout.groups, by_group, strict=True):

@@ -58,7 +58,7 @@ class RowBlock(eqx.Module):
     # By the numbers of the component of each pose. None where it has none, or where the rows are coordinates less those
     # of a point, all of one weight.
     by_own: Float[AnyArray, "k r m"] | None
-    of: int | None = eqx.field(static=True)  # class of these components
+    of: int = eqx.field(static=True)  # class of these components; -1 without
     sizes: tuple[int, ...] = eqx.field(static=True)  # poses of each of them, in their order
 
 
@@ -74,7 +74,7 @@ def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], bat
     fastest there, through which no derivative passes."""
     p, found = len(space.names), []
     chain = observed.chain(space, z[:p], z[p:])
-    if batch and chain.corrections is None:
+    if batch and chain.corrections is None and observed.motion is not None:
         rotations = any(one.rotates for one in observed.stacks)
         forward = pose_columns(chain, observed.motion, space.indices(), rotations)
     else:
@@ -136,7 +136,7 @@ def row_blocks(
         if group.targeted:
             by_roles.append(times(rows.by_tip, xp.stack([axis[:, poses] for axis in forward.frame])))
         by_head = _by_head(by_parameters, by_roles, group, layout.shared)
-        size = 0 if group.of is None else layout.classes[group.of][1]
+        size = 0 if group.of < 0 else layout.classes[group.of][1]
         found.append(RowBlock(rows.values, by_head, _by_own(by_roles, group, size), group.of, group.sizes))
     return [*found, *_relations(observed, z[p:], whitening, p)]
 
@@ -168,7 +168,7 @@ def _by_head(
 
 def _by_own(by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, size: int) -> Float[AnyArray, "k r m"] | None:
     """Derivatives by the numbers of the component of each pose, in their order."""
-    if group.of is None:
+    if group.of < 0:
         return None
     private = [one for one, role in zip(by_roles, group.roles, strict=True) if role.private]
     xp = namespace(private)
@@ -228,19 +228,17 @@ def _relations(observed: Observed, geometry: Float[AnyArray, " g"], whitening: W
     numbers = xp.concatenate([(-slopes).ravel(), slopes.ravel(), *(whitening.certified[name] for name in certified)])
     found = []
     for of, places in _places(observed.layout, observed.ends, tuple(certified)).items():
-        height = p + layout.shared if of is None else layout.classes[of][1]
+        height = p + layout.shared if of < 0 else layout.classes[of][1]
         whole = xp.zeros((height, len(places.rows)))
-        at = places.columns + (p if of is None else 0), places.of_row
+        at = places.columns + (p if of < 0 else 0), places.of_row
         whole = set_at(whole, at, numbers[places.numbers])[:, None]
-        by = (whole, None) if of is None else (None, whole)
+        by = (whole, None) if of < 0 else (None, whole)
         found.append(RowBlock(white[places.rows][None], *by, of, places.sizes))
     return found
 
 
 @lru_cache(maxsize=32)
-def _places(
-    layout: Layout, ends: tuple[tuple[str, str], ...], certified: tuple[str, ...]
-) -> dict[int | None, _Relations]:
+def _places(layout: Layout, ends: tuple[tuple[str, str], ...], certified: tuple[str, ...]) -> dict[int, _Relations]:
     """Of the relations of each class: their rows sorted by component, and where their derivatives stand."""
     positions, count = layout.positions, len(ends)
     starts, stops = ([positions[pair[i]] for pair in ends] for i in (0, 1))
@@ -254,13 +252,13 @@ def _places(
         mine = np.array([i for i, place in enumerate(located) if place[0] == of])
         component = {int(row[i]): located[i][1] for i in mine}
         rows = sorted(component, key=lambda number: (component[number], number))
-        sizes = np.bincount([component[n] for n in rows], minlength=0 if of is None else layout.classes[of][0])
+        sizes = np.bincount([component[n] for n in rows], minlength=0 if of < 0 else layout.classes[of][0])
         found[of] = _Relations(
             rows=np.array(rows),
             numbers=mine,
             columns=np.array([located[i][2] for i in mine]),
             of_row=np.array([rows.index(number) for number in row[mine].tolist()]),
-            sizes=() if of is None else tuple(int(size) for size in sizes),
+            sizes=() if of < 0 else tuple(int(size) for size in sizes),
         )
     return found
 

@@ -119,7 +119,7 @@ def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Poo
 
 def _whitening(geometry: Geometry, q: Float[np.ndarray, "c n"], noise: Noise) -> Float[np.ndarray, "c 3 3"]:
     covariances = tip_covariances(geometry, joint_motion(geometry, q), noise)
-    return inverse_cholesky(np.moveaxis(np.asarray(covariances), -1, 0))
+    return np.asarray(inverse_cholesky(np.moveaxis(np.asarray(covariances), -1, 0)))
 
 
 def random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:

@@ -6,6 +6,7 @@ A the eliminated derivatives, W the weights of a robust loss and 1/G the informa
 -D^-1 (B W w + C dx).
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,7 +69,7 @@ class Influence(NamedTuple):
         rows = []
         for block in blocks:
             mine: Any = 0.0 if block.by_head is None else block.by_head * head[:, None, None]
-            if block.of is not None:
+            if block.of >= 0:
                 assert block.by_own is not None
                 mine = mine - followed(block.by_own, parts[block.of][..., None] * follow[block.of], block.sizes)
             rows.append(mine)
@@ -101,7 +102,7 @@ class Influence(NamedTuple):
     def own_rows(self, number: int) -> Float[AnyArray, "k r m"] | None:
         """B of a block in natural steps; None where it has no private geometry."""
         block = self.blocks[number]
-        if block.of is None:
+        if block.of < 0:
             return None
         assert block.by_own is not None
         steps = self.parts[block.of]
@@ -112,7 +113,7 @@ class Influence(NamedTuple):
 def rows_of_functions(
     influence: Influence,
     head: Float[AnyArray, "q h"],
-    components: list[Float[AnyArray, "q _ _"]],
+    components: Sequence[Float[AnyArray, "q _ _"]],
 ) -> list[Float[AnyArray, "q _ _"]]:
     """How linear functions of the unknowns follow the whitened rows of every block; ``head`` and ``components`` are
     their derivatives by the unknowns, natural steps."""
@@ -304,7 +305,7 @@ def of_shared_readings(
     moved, owners = [], []
     for one, error, root, mine in zip(rows, errors, whitening.roots, reading, strict=False):
         poses = np.flatnonzero(counts[mine] > 1)
-        if not len(poses):
+        if root is None or not len(poses):
             continue
         xp = namespace(root, error.by_readings)
         spread = xp.broadcast_to(noise.of_readings(error.kinds), (error.by_readings.shape[1],))
@@ -325,6 +326,6 @@ def geometry_covariance(
     places = [layout.component_of(int(i)) for i in index]
     of, component, _ = places[0]
     own = np.array([place[2] for place in places])
-    if of is None:
+    if of < 0:
         return covariance.head[np.ix_(p + own, p + own)]
     return covariance.components[of][component][np.ix_(own, own)]

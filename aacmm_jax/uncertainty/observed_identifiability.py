@@ -197,12 +197,12 @@ def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]
     left = [np.zeros((*own.shape[:2], influence.inverse.shape[0])) for own in influence.own]
     for number, (block, rows) in enumerate(zip(influence.blocks, influence.rows, strict=True)):
         own = influence.own_rows(number)
-        if own is not None and block.of is not None:
+        if own is not None and block.of >= 0:
             left[block.of] += sums_by_component(own, rows, block.sizes)
     found = [np.asarray(rows) for rows in influence.rows]
     for number, block in enumerate(influence.blocks):
         own = influence.own_rows(number)
-        if own is not None and block.of is not None:
+        if own is not None and block.of >= 0:
             found[number] = found[number] - followed(own, influence.own[block.of] @ left[block.of], block.sizes)
     return found
 

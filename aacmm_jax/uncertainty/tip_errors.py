@@ -9,7 +9,7 @@ from ..core.linear_algebra import inverse_positive_definite
 from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient, while_loop
 from ..data.noise import Noise
 from ..data.observations.observation import Rows
-from ..kinematics.chain import JointKinds
+from ..kinematics.chain import ForwardPass, JointKinds
 from ..kinematics.jacobian import reading_columns, reading_rotations
 from ..model.observed import Observed
 from ..model.robust import median_square
@@ -30,6 +30,7 @@ class ArmErrors(NamedTuple):
 def arm_errors(point: PointRows, observed: Observed) -> list[ArmErrors]:
     """Of every group."""
     forward = point.forward
+    assert isinstance(forward, ForwardPass)  # nobody asks for these where rows are those of a batch
     xp = namespace(forward)
     readings, rotations = reading_columns(forward), reading_rotations(forward)  # (n, 3, N)
     # An arm whose tips err by s turns them by about s over its size.

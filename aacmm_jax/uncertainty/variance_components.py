@@ -168,7 +168,7 @@ def _expected(
         of, sizes, b = block.of, block.sizes, influence.own_rows(number)
         by_form = products(a, form)
         of_form = of_form + _outer(by_form, a)
-        own_weighted = None if b is None else influence.weighted(number, b)
+        own_weighted: Any = None if b is None else influence.weighted(number, b)
         if b is not None:
             own_by_form = products(b, form)
             own_form[of] = own_form[of] + sums_by_component(own_by_form, b, sizes)

@@ -530,7 +530,7 @@ DIMENSIONS = {
         "shared_parameter": 8,
     },
     "components": {
-        "component": 1,
+        "component": 2,
         "component_variance": 1,
         "component_parameter": 8,
         "component_parameter_2": 8,
