@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.numpy_or_jax import AnyArray, added_to, namespace, set_at
 from ..data.noise import Noise
@@ -19,7 +19,6 @@ from ..uncertainty.linear_propagation import (
     UnknownsCovariance,
     alone,
     covariance_of_rows,
-    geometry_covariance,
     of_shared_readings,
     of_stated,
     propagated,
@@ -156,15 +155,29 @@ def of_geometry(
     linear: Linearisation, influence: Influence, covariance: UnknownsCovariance
 ) -> dict[str, Float[AnyArray, "_ _"]]:
     """Of each part; NaN for what the data leave open, such as the turn of a ball bar about itself."""
-    xp, observed, p = namespace(covariance), linear.observed, len(linear.space.names)
-    layout, found = observed.layout, {}
+    observed, p = linear.observed, len(linear.space.names)
+    layout, found, steps = observed.layout, {}, observed.steps
+    shared = np.arange(layout.shared)
+    square = np.ix_(p + shared, p + shared)
+    everything = [_known(covariance.head[square], influence.determined[p + shared], steps[shared])[None]]
+    first = layout.shared
+    for (count, size), matrices, opened in zip(layout.classes, covariance.components, influence.open, strict=True):
+        of_class = steps[first : first + count * size].reshape(count, size)
+        everything.append(_known(matrices, ~opened, of_class))
+        first += count * size
     for name, rows in observed.positions.items():
         of, component, first = layout.component_of(int(rows[0]))
         own = slice(first, first + len(rows))
-        known = influence.determined[p + rows] if of < 0 else ~influence.open[of][component, own]
-        matrix = geometry_covariance(layout, covariance, p, rows) * np.outer(*(observed.steps[rows],) * 2)
-        found[name] = xp.where(known[:, None] & known[None, :], matrix, np.nan)
+        found[name] = everything[1 + of][component, own, own]
     return found
+
+
+def _known(
+    matrix: Float[AnyArray, "*k g g"], known: Bool[AnyArray, "*k g"], steps: Float[np.ndarray, "*k g"]
+) -> Float[AnyArray, "*k g g"]:
+    """A covariance in natural steps as one in mm and rad, NaN for what is not known."""
+    scaled = matrix * (steps[..., None] * steps[..., None, :])
+    return namespace(matrix).where(known[..., None] & known[..., None, :], scaled, np.nan)
 
 
 def _expanded(covariance: ParameterCovariance, free: np.ndarray, size: int) -> ParameterCovariance:

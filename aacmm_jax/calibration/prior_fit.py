@@ -109,7 +109,8 @@ class PriorProblem(NamedTuple):
     def model(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> PriorModel:
         """The model of the parameters that have a prior, linear at a point."""
         xp, index = namespace(scales, z), self.prior.index
-        data: Any = observed_model(z, Args(self.space, self.task.observed, self.whitening(scales, None), self.loss))
+        args = Args(self.space, self.task.observed, self.whitening(scales, None), self.loss)
+        data: Any = observed_model(z, args, curved=False)
         pinned = (z <= self.sides[0]) | (z >= self.sides[1])
         deviation = (z[: self.prior.mean.shape[0]] - self.prior.mean)[index] / self.steps[index]
         gram, gradient = reduced(data.gram.scaled(self.steps), data.gradient * self.steps)

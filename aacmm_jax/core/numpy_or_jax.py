@@ -57,10 +57,10 @@ def to_jax(tree: Tree) -> Tree:
     """The tree with its arrays as JAX's, in one transfer."""
     check_x64()
     leaves, structure = jax.tree.flatten(tree)
-    known = [i for i, leaf in enumerate(leaves) if isinstance(leaf, (np.ndarray, np.generic))]
-    for i, leaf in zip(known, jax.device_put([leaves[i] for i in known]), strict=True):
-        leaves[i] = leaf
-    return jax.tree.unflatten(structure, leaves)
+    # A leaf that occurs twice, as those of stage 1 in a joint result, is transferred once.
+    known = {id(leaf): leaf for leaf in leaves if isinstance(leaf, (np.ndarray, np.generic))}
+    moved = dict(zip(known, jax.device_put(list(known.values())), strict=True))
+    return jax.tree.unflatten(structure, [moved.get(id(leaf), leaf) for leaf in leaves])
 
 
 def compiled(function: Callable | None = None, *, jit: Callable = jax.jit) -> Any:

@@ -126,6 +126,18 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
     )
 
 
+def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
+    """Rows whose products have the curvature of a robust loss (`Loss.along`) and the gradient of these."""
+    xp = namespace(block.white)
+    size = xp.sqrt(xp.sum(block.white**2, axis=0))
+    direction = block.white / xp.where(size > 0, size, 1.0)
+
+    def changed(by: Float[AnyArray, "k r m"] | None) -> Float[AnyArray, "k r m"] | None:
+        return None if by is None else by - ((1 - along) * xp.sum(direction * by, axis=1))[:, None] * direction
+
+    return RowBlock(block.white / along, changed(block.by_head), changed(block.by_own), block.of, block.sizes)
+
+
 def cost_and_weights(
     blocks: list[RowBlock], loss: Loss | None, groups: int
 ) -> tuple[AnyArray, list[Float[AnyArray, " _"] | None]]:
@@ -222,12 +234,16 @@ def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
     return [_fitted(block) if block.of >= first else block for block in blocks]
 
 
-def observed_model(z: Float[AnyArray, " z"], args: Args) -> QuadraticModel:
-    """Cost, gradient and information of `observed_rows`."""
+def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True) -> QuadraticModel:
+    """Cost and gradient of `observed_rows`, and their information: with a robust loss the curvature of the cost, as far
+    as it is positive, or that of the weighted rows where it is not to be ``curved``."""
     layout, p, prior = args.observed.layout, len(args.space.names), args.whitening.prior
     blocks = _blocks(z, args)
     cost, weights = cost_and_weights(blocks, args.loss, len(layout.groups))
-    blocks = [weighted(block, weight) for block, weight in zip(blocks, weights, strict=True)]
+    plain, blocks = blocks, [weighted(block, weight) for block, weight in zip(blocks, weights, strict=True)]
+    if args.loss is not None and curved:
+        for number in range(len(layout.groups)):
+            blocks[number] = _curved(blocks[number], args.loss.along(plain[number].white))
     kept = len(layout.classes) - args.eliminated
     arrow, slopes = arrow_of(blocks, layout.classes[:kept], p + layout.shared, prior)
     xp = namespace(arrow)

@@ -9,6 +9,7 @@ Everything here is static: it follows from names and numbers of poses, and fixes
 """
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -65,11 +66,7 @@ class Layout(NamedTuple):
     @property
     def positions(self) -> dict[str, np.ndarray]:
         """Indices of the numbers of each part among all of them."""
-        found, first = {}, 0
-        for name, units in self.parts:
-            found[name] = np.arange(first, first + len(units))
-            first += len(units)
-        return found
+        return _positions(self.parts)
 
     def component_of(self, index: int) -> tuple[int, int, int]:
         """Class, component, and place in it of a number of the geometry; -1, 0 and itself of a shared one."""
@@ -81,6 +78,12 @@ class Layout(NamedTuple):
                 return number, (index - first) // size, (index - first) % size
             first += count * size
         raise IndexError(index)
+
+
+@lru_cache(maxsize=32)
+def _positions(parts: tuple[tuple[str, Units], ...]) -> dict[str, np.ndarray]:
+    ends = np.cumsum([len(units) for _, units in parts])
+    return {name: np.arange(end - len(units), end) for (name, units), end in zip(parts, ends, strict=True)}
 
 
 def unknowns_of(observation: AbstractObservation) -> dict[str, Units]:

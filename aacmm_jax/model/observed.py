@@ -6,6 +6,7 @@ reference length is a relation between the positions of two sockets, a certified
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -137,8 +138,12 @@ class Observed(eqx.Module):
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         """Parts that have certified values: the values and their standard uncertainties."""
         found: dict[str, Any] = {}
-        for observation in self.observations:
-            found |= observation.certified
+        # Sockets have none, and there may be thousands.
+        others = [
+            group.members for group, stack in zip(self.layout.groups, self.stacks, strict=True) if not stack.linear
+        ]
+        for number in sorted(itertools.chain(*others)):
+            found |= self.observations[number].certified
         return found
 
     def forward(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> ForwardPass:

@@ -18,12 +18,25 @@ from ..core.numpy_or_jax import AnyArray, namespace
 from .loss_names import LOSSES, LossName
 
 _EFFICIENCY = 0.95  # for normal residuals
+# The least curvature of a loss along a residual, of that across: many losses have none there, or a negative one.
+_LEAST_CURVATURE = 0.01
 
 
 def check_loss(robust: object) -> None:
     """Raise `InputError` for what is neither the name of a loss nor None."""
     if robust is not None and not (isinstance(robust, str) and robust in LOSSES):
         raise InputError(f"robust is {shown(robust)}; it must be one of {', '.join(LOSSES)}, or None.")
+
+
+def _curvature(name: LossName, s: Float[AnyArray, " m"]) -> Float[AnyArray, " m"]:
+    """That of the cost along the residual, of that across it, which is the weight: 1 + 2 s rho'' / rho'."""
+    xp = namespace(s)
+    if name == "huber":
+        return xp.where(s <= 1, 1.0, 0.0)
+    if name == "cauchy":
+        return (1 - s) / (1 + s)
+    inside = xp.minimum(s, 0.5)  # beyond a fifth it is negative
+    return (1 - 5 * inside) / (1 - inside)
 
 
 def _rho_and_slope(name: LossName, s: Float[AnyArray, " m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
@@ -87,6 +100,16 @@ class Loss(eqx.Module):
         xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
         rho, weight = _rho_and_slope(self.name, xp.sum(white**2, axis=0) / c2)
         return 0.5 * c2 * rho, weight
+
+    def along(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
+        """Square root of the curvature of the cost of every pose along its residual, of that across.
+
+        Half the second derivative of the cost by the residual r is w (1 + (q - 1) u u^T), with the weight w, the
+        direction u of r and this q; negative ones, with which a step would lead uphill, are left out (Triggs et al.
+        2000, 4.3). Steps by weights alone converge the more slowly the more poses of a socket have a residual beyond c.
+        """
+        xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
+        return xp.sqrt(xp.maximum(_curvature(self.name, xp.sum(white**2, axis=0) / c2), _LEAST_CURVATURE))
 
     def transformed(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, "r m"]:
         """Residuals whose squares are twice the cost."""

@@ -183,26 +183,6 @@ def _by_own(by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, size: int) -
     return whole
 
 
-def relation_residuals(
-    observed: Observed, parts: dict[str, Float[AnyArray, " _"]], whitening: Whitening
-) -> tuple[Float[AnyArray, " l"], dict[str, Float[AnyArray, " k"]]]:
-    """Whitened residuals of reference lengths and of certified values."""
-    xp = namespace(parts, whitening)
-    vectors = _vectors(observed, parts)
-    lengths = whitening.lengths * (xp.sqrt(xp.sum(vectors**2, axis=1)) - observed.nominal)
-    certified = {
-        name: whitening.certified[name] * (parts[name] - value) for name, (value, _) in observed.certified().items()
-    }
-    return lengths, certified
-
-
-def _vectors(observed: Observed, parts: dict[str, AnyArray]) -> Float[AnyArray, "l 3"]:
-    xp = namespace(parts)
-    if not observed.ends:
-        return xp.zeros((0, 3))
-    return xp.stack([parts[end] - parts[start] for start, end in observed.ends])
-
-
 class _Relations(NamedTuple):
     """Where the relations of one class, or of the shared geometry, stand."""
 
@@ -218,12 +198,15 @@ def _relations(observed: Observed, geometry: Float[AnyArray, " g"], whitening: W
     certified = observed.certified()
     if not observed.ends and not certified:
         return []
-    parts, layout, xp = observed.split(geometry), observed.layout, namespace(geometry, whitening)
-    lengths, values = relation_residuals(observed, parts, whitening)
-    white = xp.concatenate([lengths, *values.values()])
-    vectors = _vectors(observed, parts)
-    size = xp.sqrt(xp.sum(vectors**2, axis=1, keepdims=True))
-    slopes = vectors / size * whitening.lengths[:, None]
+    xp, layout, positions = namespace(geometry, whitening), observed.layout, observed.positions
+    index = np.array([[positions[end] for end in pair] for pair in observed.ends], dtype=int).reshape(-1, 2, 3)
+    vectors = geometry[index[:, 1]] - geometry[index[:, 0]]
+    size = xp.sqrt(xp.sum(vectors**2, axis=1))
+    lengths = whitening.lengths * (size - observed.nominal)
+    each = certified.items()
+    values = [whitening.certified[name] * (geometry[positions[name]] - value) for name, (value, _) in each]
+    white = xp.concatenate([lengths, *values])
+    slopes = vectors * (whitening.lengths / size)[:, None]
     # Derivatives as a list of numbers, in the order in which `_places` lists where they stand.
     numbers = xp.concatenate([(-slopes).ravel(), slopes.ravel(), *(whitening.certified[name] for name in certified)])
     found = []

@@ -17,7 +17,6 @@ from ..core.numpy_or_jax import AnyArray, added_to, namespace
 from ..data.noise import Noise
 from ..data.observations.observation import Rows
 from ..model.elimination import arrow_of, followed, pseudo_inverse, sums_by_component, weighted
-from ..model.layout import Layout
 from ..model.rows import PriorRows, RowBlock, Whitening
 from .covariance import inverse_information
 from .tip_errors import ArmErrors, products
@@ -316,16 +315,3 @@ def of_shared_readings(
     each, owner = xp.concatenate(moved, axis=2), np.unique(np.concatenate(owners), return_inverse=True)[1]
     sums = each @ xp.asarray((owner[:, None] == np.arange(owner.max() + 1)[None, :]).astype(float))
     return _flat(sums) @ _flat(sums).T - _flat(each) @ _flat(each).T
-
-
-def geometry_covariance(
-    layout: Layout, covariance: UnknownsCovariance, p: int, index: np.ndarray
-) -> Float[AnyArray, "g g"]:
-    """Of some numbers of the geometry, natural steps, which are all shared or all of one component; there are ``p``
-    parameters."""
-    places = [layout.component_of(int(i)) for i in index]
-    of, component, _ = places[0]
-    own = np.array([place[2] for place in places])
-    if of < 0:
-        return covariance.head[np.ix_(p + own, p + own)]
-    return covariance.components[of][component][np.ix_(own, own)]

@@ -72,10 +72,11 @@ def moments(
         measured = _by(_by(each, xp.moveaxis(part.measured, 0, -1)), each, transposed=True)
         parts.append(_Covariances(products(readings, readings), products(seat, seat), measured))
     white = [block.white for block in influence.blocks[: len(rows)]]
+    columns = [_Column.of(influence, [getattr(part, name) for part in parts]) for name in _Covariances._fields]
     if not robust:
         counts = [xp.ones(values.shape[1]) for values in white]
         plain = [part.readings for part in parts], [part.seat for part in parts]
-        return _solved(influence, white, parts, *plain, counts, sigma, known)
+        return _solved(influence, white, columns, *plain, counts, sigma, known)
 
     def again(found: Moments, _: Any) -> tuple[Moments, Any]:
         forms_d, forms_t, counts = [], [], []
@@ -84,7 +85,7 @@ def moments(
             forms_d.append(_by(_by(by_covariance, part.readings), by_covariance))
             forms_t.append(_by(_by(by_covariance, part.seat), by_covariance))
             counts.append(count)
-        return _solved(influence, white, parts, forms_d, forms_t, counts, sigma, known), xp.zeros(())
+        return _solved(influence, white, columns, forms_d, forms_t, counts, sigma, known), xp.zeros(())
 
     return scan(again, Moments(xp.zeros(()), sigma**2), length=_ROUNDS)[0]
 
@@ -113,7 +114,7 @@ def _bounded(
 def _solved(
     influence: Influence,
     white: list[Float[AnyArray, "_ _"]],
-    parts: list[_Covariances],
+    columns: list["_Column"],
     forms_d: list[Float[AnyArray, "_ _ _"]],
     forms_t: list[Float[AnyArray, "_ _ _"]],
     counts: list[Float[AnyArray, " _"]],
@@ -123,7 +124,6 @@ def _solved(
     """The variances that explain both sums of quadratic forms of the residuals, of which ``known`` is the part of the
     unknowns' covariance that follows from a prior."""
     xp = namespace(influence.inverse, sigma)
-    columns = [[getattr(part, name) for part in parts] for name in ("readings", "seat", "measured")]
 
     def seen(forms: list[Any]) -> Any:
         each = zip(white, forms, counts, strict=True)
@@ -144,56 +144,76 @@ def _solved(
     )
 
 
+class _Column(NamedTuple):
+    """What the expectations of all forms need of one list of covariances, a form for each pose."""
+
+    covariances: list[Any]
+    by_rows: list[Any]  # of each group, its weighted rows times them; by those of the components besides
+    own_by_rows: list[Any]
+    of_head: Any  # sums over the rows
+    of_own: list[Any]  # of each class, None without rows of poses
+    of_both: list[Any]
+
+    @classmethod
+    def of(cls, influence: Influence, covariances: list[Any]) -> "_Column":
+        """Of covariances of the rows of every group."""
+        classes = len(influence.own)
+        by_rows, own_by_rows, of_head = [], [], 0.0
+        of_own: list[Any] = [0.0] * classes
+        of_both: list[Any] = [0.0] * classes
+        for number, covariance in enumerate(covariances):
+            block, weighted, b = influence.blocks[number], influence.weighted_rows(number), influence.own_rows(number)
+            by = products(weighted, covariance)
+            by_rows.append(by)
+            of_head = of_head + _outer(by, weighted)
+            own_by_rows.append(None)
+            if b is not None:
+                own = influence.weighted(number, b)
+                own_by_rows[-1] = own_by = products(own, covariance)
+                of_own[block.of] = of_own[block.of] + sums_by_component(own_by, own, block.sizes)
+                of_both[block.of] = of_both[block.of] + sums_by_component(own_by, weighted, block.sizes)
+        return cls(covariances, by_rows, own_by_rows, of_head, of_own, of_both)
+
+
 def _expected(
-    influence: Influence, forms: list[Any], columns: list[list[Any]], known: Float[AnyArray, "h h"] | None
+    influence: Influence, forms: list[Any], columns: list[_Column], known: Float[AnyArray, "h h"] | None
 ) -> list[Any]:
     """tr(Q M C M^T), the expectation of w.Qw, for each list of covariances C; that of the last with ``known``.
 
     With U = I - M and its two parts, of the head and of the components, this is
     tr(QC) - 2 tr(QUC) + tr(QUCU^T), each a sum over small matrices.
     """
-    xp, inverse = namespace(influence.inverse), influence.inverse
-    classes = range(len(influence.own))
-    both: list[Any] = [0.0] * len(columns)
-    mixed: list[Any] = [0.0] * len(columns)
-    crossed: list[Any] = [0.0] * len(columns)
+    xp, inverse, classes = namespace(influence.inverse), influence.inverse, len(influence.own)
     of_form: Any = 0.0
-    of_covariance: list[Any] = [0.0] * len(columns)
-    own_form: list[Any] = [0.0 for _ in classes]
-    own_covariance: list[list[Any]] = [[0.0 for _ in classes] for _ in columns]
-    form_by_head: list[Any] = [0.0 for _ in classes]
-    covariance_by_head: list[list[Any]] = [[0.0 for _ in classes] for _ in columns]
+    own_form: list[Any] = [None] * classes
+    form_by_head: list[Any] = [None] * classes
+    found: list[Any] = [0.0] * len(columns)
     for number, form in enumerate(forms):
-        block, a, weighted = influence.blocks[number], influence.rows[number], influence.weighted_rows(number)
-        of, sizes, b = block.of, block.sizes, influence.own_rows(number)
+        block, a, b = influence.blocks[number], influence.rows[number], influence.own_rows(number)
         by_form = products(a, form)
         of_form = of_form + _outer(by_form, a)
-        own_weighted: Any = None if b is None else influence.weighted(number, b)
-        if b is not None:
-            own_by_form = products(b, form)
-            own_form[of] = own_form[of] + sums_by_component(own_by_form, b, sizes)
-            form_by_head[of] = form_by_head[of] + sums_by_component(own_by_form, a, sizes)
         for i, column in enumerate(columns):
-            by_covariance = products(weighted, column[number])
-            both[i] = both[i] + xp.sum(form * column[number])
-            mixed[i] = mixed[i] + xp.sum(inverse * _outer(by_form, by_covariance))
-            of_covariance[i] = of_covariance[i] + _outer(by_covariance, weighted)
-            if b is not None:
-                own_by = products(own_weighted, column[number])
-                crossed[i] = crossed[i] + xp.sum(influence.own[of] * sums_by_component(own_by_form, own_by, sizes))
-                own_covariance[i][of] = own_covariance[i][of] + sums_by_component(own_by, own_weighted, sizes)
-                covariance_by_head[i][of] = covariance_by_head[i][of] + sums_by_component(own_by, weighted, sizes)
-    found = []
-    for i in range(len(columns)):
-        total = both[i] - 2 * (mixed[i] + crossed[i]) + xp.sum((inverse @ of_form) * (inverse @ of_covariance[i]).T)
-        for of in classes:
-            if isinstance(own_form[of], float):
+            both = xp.sum(form * column.covariances[number])
+            found[i] = found[i] + both - 2 * xp.sum(inverse * _outer(by_form, column.by_rows[number]))
+        if b is not None:
+            of, own_by_form = block.of, products(b, form)
+            sums = sums_by_component(own_by_form, b, block.sizes), sums_by_component(own_by_form, a, block.sizes)
+            own_form[of], form_by_head[of] = (
+                one if before is None else before + one
+                for before, one in zip((own_form[of], form_by_head[of]), sums, strict=True)
+            )
+            for i, column in enumerate(columns):
+                crossed = sums_by_component(own_by_form, column.own_by_rows[number], block.sizes)
+                found[i] = found[i] - 2 * xp.sum(influence.own[of] * crossed)
+    for i, column in enumerate(columns):
+        found[i] = found[i] + xp.sum((inverse @ of_form) * (inverse @ column.of_head).T)
+        for d, own, by_head, of_own, of_both in zip(
+            influence.own, own_form, form_by_head, column.of_own, column.of_both, strict=True
+        ):
+            if own is None:
                 continue  # a class of relations alone
-            d = influence.own[of]
-            turned = xp.swapaxes(d @ own_covariance[i][of], -1, -2)
-            total = total + xp.sum((d @ own_form[of]) * turned)
-            total = total + 2 * xp.sum((d @ covariance_by_head[i][of] @ inverse) * form_by_head[of])
-        found.append(total)
+            found[i] = found[i] + xp.sum((d @ own) * xp.swapaxes(d @ of_own, -1, -2))
+            found[i] = found[i] + 2 * xp.sum((d @ of_both @ inverse) * by_head)
     if known is not None:
         found[-1] = found[-1] + xp.sum(known * of_form)
     return found
