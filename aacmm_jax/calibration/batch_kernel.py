@@ -24,7 +24,7 @@ from ..kinematics.priors import Prior
 from ..model.elimination import observed_model, own_covariances, with_linear_geometry
 from ..model.observed import Observed
 from ..model.robust import Loss
-from ..model.rows import Whitening
+from ..model.rows import PointRows, Whitening
 from ..model.scale import scale_and_weights
 from ..solver.active_set import Box, choose
 from ..solver.levenberg_marquardt import Rules, advance
@@ -114,7 +114,12 @@ def _prepared(form: Form, problems: Problems) -> _Chunk:
         observed = jax.vmap(observed_of, in_axes=(axes.arm, axes.capture), axis_size=form.capacity)(
             arm, problems.capture
         )
-        of_observed = 0
+        # The joints before the problems, as the chain takes them.
+        turned = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), observed.motion)
+        of_observed: Any = eqx.tree_at(
+            lambda one: one.motion, jax.tree.map(lambda _: 0, observed), jax.tree.map(lambda _: 1, turned)
+        )
+        observed = eqx.tree_at(lambda one: one.motion, observed, turned)
     return _Chunk(problems, observed, _Chunk(axes, of_observed, None))  # pyright: ignore[reportArgumentType]
 
 
@@ -154,9 +159,11 @@ def pick(tree: Any, axis: Any, index: Any) -> Any:
     """The problems of an index of a tree with such axes; what is shared stays as it is."""
     if axis is None:
         return tree
-    if isinstance(axis, int):
-        return jax.tree.map(lambda leaf: leaf[index], tree)
-    return jax.tree.map(lambda a, leaf: leaf if a is None else leaf[index], axis, tree, is_leaf=_is_none)
+
+    def of(axis: int | None, leaf: Any) -> Any:
+        return leaf if axis is None else leaf[index] if not axis else leaf[:, index]
+
+    return jax.tree.map(of, axis, tree, is_leaf=_is_none)
 
 
 def _selected(form: Form, chunk: _Chunk, index: Any) -> tuple[Problems, Observed]:
@@ -184,15 +191,25 @@ def _in_groups(form: Form, chunk: _Chunk, work: Callable, *extra: Any) -> Any:
 
 def _first(task: Task, near: Float[AnyArray, " p"] | None) -> tuple[Float[AnyArray, " z"], Whitening]:
     """Where a solve begins, and its first weights."""
+    if task.needs_no_weights:
+        # Positions of sockets are no unknowns of the solve, so any will do.
+        start = task.start if near is None else jnp.clip(near, task.bounds.lower, task.bounds.upper)
+        whitening = Whitening((None,) * len(task.observed.layout.groups), jnp.zeros(0), {})
+        return jnp.concatenate([start[task.free], jnp.zeros(len(task.observed.steps))]), whitening
     begun = begin(task, near)
     return begun.z, weights(task, begun, begun.state, losses_of(task)[0])
 
 
 def _whole(
-    task: Task, loss: Loss | None, z: Float[AnyArray, " z"], whitening: Whitening, y: Float[AnyArray, " n"]
-) -> Float[AnyArray, " z"]:
-    """All unknowns after a least squares that began at z and ended at y."""
-    return with_linear_geometry(y, args_of(task, whitening, loss, z)[0])
+    task: Task,
+    loss: Loss | None,
+    z: Float[AnyArray, " z"],
+    whitening: Whitening,
+    y: Float[AnyArray, " n"],
+    batch: bool | None = None,
+) -> tuple[Float[AnyArray, " z"], PointRows]:
+    """All unknowns after a least squares that began at z and ended at y, and the rows there."""
+    return with_linear_geometry(y, args_of(task, whitening, loss, z)[0]._replace(batch=batch))
 
 
 def _again(
@@ -206,8 +223,9 @@ def _again(
 ) -> tuple[Float[AnyArray, " z"], Whitening]:
     """Where the next least squares begins, and its weights; ``losses`` are that of the last, and those to come."""
     task = one(problem, observed)
-    z, begun = _whole(task, losses[0], z, whitening, y), begin(task)
-    return z, weights(task, begun, state_after(task, begun, z, False), losses[1])
+    z, point = _whole(task, losses[0], z, whitening, y)
+    begun = begin(task)
+    return z, weights(task, begun, state_after(task, begun, z, point, False), losses[1])
 
 
 def _concluded(
@@ -228,14 +246,15 @@ def _concluded(
     if prior is not None:
         state = begun.state
         if len(losses_of(task)) > 1:
-            z = _whole(task, losses_of(task)[-2], z, whitening, y)
-            state = state_after(task, begun, z, False)
+            z, point = _whole(task, losses_of(task)[-2], z, whitening, y)
+            state = state_after(task, begun, z, point, False)
         z, state, found, of_prior = fitted_with_prior(task, prior, begun, state, z)
         found = found._replace(steps=steps + found.steps)
     else:
         assert reason is not None
-        z = _whole(task, loss, z, whitening, y)
-        state, found = state_after(task, begun, z, True), Fit(z, steps, reasons(reason), jnp.zeros(()))
+        tips_alone = task.needs_no_weights and not form.covariance
+        z, point = _whole(task, loss, z, whitening, y, tips_alone or None)
+        state, found = state_after(task, begun, z, point, True), Fit(z, steps, reasons(reason), jnp.zeros(()))
     free, spent = task.free, z.shape[0] if of_prior is None else of_prior.effective
     parameters, tips = set_at(task.start, free, z[: len(free)]), repeatability_of(state, task.observed)
     side = Bounds(begun.space, *(side[: len(free)] for side in begun.sides)).active(z[: len(free)])

@@ -151,7 +151,7 @@ def _fitted(args: Args, z: Float[AnyArray, " z"], free: np.ndarray) -> Float[Any
         sides = xp.where(free, -np.inf, z), xp.where(free, np.inf, z)
         steps = xp.asarray(np.concatenate([[1.0], observed.steps])[:count])
         z = fit(observed_rows, observed_model, z, args, sides, steps, _MAX_STEPS).parameters
-    return z if args.linear is None else with_linear_geometry(z, args)
+    return z if args.linear is None else with_linear_geometry(z, args)[0]
 
 
 def described(found: GeometryFit) -> ObservedEvaluation:

@@ -12,7 +12,7 @@ from ..core.numpy_or_jax import AnyArray, namespace, stop_gradient
 from ..kinematics.priors import ParameterPrior
 from ..model.elimination import Args, observed_model, observed_rows, with_linear_geometry
 from ..model.robust import Loss
-from ..model.rows import Whitening
+from ..model.rows import PointRows, Whitening
 from ..solver.levenberg_marquardt import Rules
 from .bounded_fit import RULES, Fit, fit
 from .conclusion import OfPrior, Solution, concluded
@@ -39,8 +39,8 @@ def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
             whitening = weights(task, begun, state, loss)
             args, count = args_of(task, whitening, loss, z)
             found = _fit(args, begun, z[:count], task, RULES if last else ROUGH)
-            z = with_linear_geometry(found.parameters, args)
-            state = state_after(task, begun, z, last)
+            z, point = with_linear_geometry(found.parameters, args)
+            state = state_after(task, begun, z, point, last)
         evaluations = evaluations + found.steps
     return concluded(task, begun, z, state, found._replace(steps=evaluations), of_prior)
 
@@ -115,11 +115,11 @@ def _fit(args: Args, begun: Begun, z: Float[AnyArray, " n"], task: Task, rules: 
     return fit(*functions, z, args, sides, begun.steps[:count], task.max_steps, **options)
 
 
-def state_after(task: Task, begun: Begun, z: Float[AnyArray, " z"], last: bool) -> State:
+def state_after(task: Task, begun: Begun, z: Float[AnyArray, " z"], point: PointRows, last: bool) -> State:
     """At the solution of a least squares; where the noise is given, only the last scatter matters, and its iteration
     costs as much as a few steps."""
     known = task.noise is not None and not last
-    return state_at(task, begun.space, z, scatter_at_start(task, begun.space, z) if known else None)
+    return state_at(task, begun.space, z, scatter_at_start(task, begun.space, z) if known else None, point=point)
 
 
 def fitted_with_prior(

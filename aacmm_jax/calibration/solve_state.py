@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, namespace
+from ..kinematics.chain import ForwardPass
 from ..kinematics.parameters import Parameters
 from ..model.rows import PointRows, PriorRows, Whitening, rows_at, whitening_of
 from ..uncertainty.tip_errors import (
@@ -46,11 +47,13 @@ def state_at(
     z: Float[AnyArray, " z"],
     sigma: Any = None,
     effective: Float[AnyArray, ""] | int | None = None,
+    point: PointRows | None = None,
 ) -> State:
-    """The state at a point; ``sigma`` is estimated unless it is given, and ``effective`` is how many unknowns the data
-    determine, by default all."""
-    point = rows_at(space, task.observed, z)
-    errors = arm_errors(point, task.observed)
+    """The state at a point, whose rows may be known (``point``); ``sigma`` is estimated unless it is given, and
+    ``effective`` is how many unknowns the data determine, by default all."""
+    point = rows_at(space, task.observed, z) if point is None else point
+    # Where a batch needs no weights, nobody asks for errors.
+    errors = arm_errors(point, task.observed) if isinstance(point.forward, ForwardPass) else []
     if sigma is None:
         xp = namespace(z, effective)
         spent = z.shape[0] if effective is None else effective

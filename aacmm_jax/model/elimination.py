@@ -275,20 +275,23 @@ def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
     return tuple(found) if prior is None else (*found, prior.residual(z))
 
 
-def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> Float[AnyArray, " z"]:
-    """All unknowns, with the components that the solve has no unknowns of where they fit best."""
-    space, observed, whitening, _, linear, _ = args
+def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> tuple[Float[AnyArray, " z"], PointRows]:
+    """All unknowns, with the components that the solve has no unknowns of where they fit best; and the rows there."""
+    space, observed, whitening, _, linear, batch = args
     if linear is None:
-        return z
+        return z, rows_at(space, observed, z)
     xp, layout = namespace(z, linear), observed.layout
     whole = xp.concatenate([z, linear])
     first = len(layout.classes) - layout.linear
     fitted = [xp.zeros(shape) for shape in layout.classes[first:]]
-    point = rows_at(space, observed, whole)
-    for group, rows, root in zip(layout.groups, point.rows, whitening.roots, strict=True):
+    point = rows_at(space, observed, whole, batch is not None)
+    found = list(point.rows)
+    for number, (group, root) in enumerate(zip(layout.groups, whitening.roots, strict=True)):
         if group.of >= first:
-            fitted[group.of - first] = _of_rows(rows, root, group)[1]
-    return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)])
+            rows = point.rows[number]
+            fitted[group.of - first] = shift = _of_rows(rows, root, group)[1]
+            found[number] = rows._replace(values=rows.values - to_poses(shift.T, group.sizes))
+    return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)]), point._replace(rows=found)
 
 
 def _of_rows(
