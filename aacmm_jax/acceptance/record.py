@@ -215,7 +215,7 @@ def evaluation_of(
         u_test=u_test,
         maxima=dict(maxima or {}),
         standards=made_for(recording) if standards is None else checked_standards(standards),
-        uncertainty=to_numpy(uncertainty_of(record)),
+        uncertainty=uncertainty_of(record),
         calibration_warnings=tuple(calibration_warnings),
         influences=influences,
         rule=rule,

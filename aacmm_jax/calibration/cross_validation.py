@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from ..core.arguments import checked_arguments, items_of
 from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, names_in, part_of
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
@@ -200,7 +201,7 @@ def _chosen(
 
 def _left_out(result: Calibration, left: Capture, names: tuple[str, ...]) -> LeftOut:
     """How a calibration without a group agrees with it."""
-    found = unseen_errors(uncertainty_of(result), left)
+    found = unseen_errors(uncertainty_of(to_numpy(result)), left)
     poses, lengths = found.of(found.parts), found.of_lengths()
     return LeftOut(
         sockets=names,

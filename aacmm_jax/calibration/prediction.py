@@ -151,7 +151,7 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
         >>> print(unseen.length_error.round(3), unseen.length_u.round(3))
         [-0.003 -0.001] [0.005 0.008]
     """
-    uncertainty, capture = to_numpy((uncertainty.complete, capture))
+    uncertainty, capture = to_numpy((to_numpy(uncertainty).complete, capture))
     problem = _Unseen.of(uncertainty, capture)
     parts = {part.observation.name: _part_of(problem, number, part) for number, part in enumerate(problem.parts)}
     lengths = _of_lengths(problem, capture)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core._compat import member_numbers
 from ..core.arguments import checked_arguments
-from ..core.numpy_or_jax import to_jax
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
@@ -296,7 +296,7 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         result: what `calibrate` or `identify` returned, or the record of a calibration.
 
     Returns:
-        Standard uncertainties of parameters, tips and lengths, mm and rad.
+        Standard uncertainties of parameters, tips and lengths, mm and rad; those of a record are arrays of NumPy.
 
     Example:
         >>> uncertainty = aj.uncertainty_of(result)
@@ -304,15 +304,18 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         [0.007 0.006 0.009] mm
     """
     if isinstance(result, CalibrationRecord):
+        arm, noise, components, shared = to_numpy(
+            (result.calibrated.arm, result.noise, result.components, result.shared)
+        )
         return Uncertainty(
-            arm=result.calibrated.arm,
-            covariance=to_jax(result.covariance),
-            open=to_jax(result.open),
-            noise=result.noise,
-            u_k=None if np.isnan(result.u_k) else to_jax(np.asarray(result.u_k)),
-            shared=result.shared,
-            components=_parts(result.components, result.shared),
-            surplus_k=to_jax(np.asarray(result.surplus_k)),
+            arm=arm,
+            covariance=np.asarray(result.covariance),
+            open=np.asarray(result.open),
+            noise=noise,
+            u_k=None if np.isnan(result.u_k) else np.asarray(result.u_k),
+            shared=shared,
+            components=_parts(components, shared),
+            surplus_k=np.asarray(result.surplus_k),
             names=result.names,
             scatter_degrees_of_freedom=result.degrees_of_freedom,
             lengths=len(result.recording.capture.lengths),

@@ -26,6 +26,17 @@ def student_tail(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarra
     return 2 * np.where(many, special.ndtr(-np.abs(value)), finite)
 
 
+def student_density(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
+    """Density of Student's t; normal for infinite degrees of freedom."""
+    from scipy import special
+
+    many = np.asarray(degrees_of_freedom) > _NORMAL
+    half = 0.5 * np.where(many, 1.0, degrees_of_freedom)
+    factor = np.exp(special.gammaln(half + 0.5) - special.gammaln(half)) / np.sqrt(2 * np.pi * half)
+    finite = factor * np.exp(-(half + 0.5) * np.log1p(value**2 / (2 * half)))
+    return np.where(many, np.exp(-0.5 * value**2) / np.sqrt(2 * np.pi), finite)
+
+
 def chi_square_quantile(probability: float, degrees_of_freedom: float) -> float:
     """Quantile of the chi-square distribution."""
     from scipy import special

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, correction_names, parameter_names, parameter_unit, value_of
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -131,7 +130,7 @@ def _compared(
     before, after = (_values(arm, names) for arm in arms)
     reasons = _reasons(old, new, names)
     known = np.array([not reason for reason in reasons])
-    both = [to_numpy(uncertainty_of(record)) for record in (old, new)]
+    both = [uncertainty_of(record) for record in (old, new)]
     law = both[0].law.joined(both[1].law)
     parts = np.concatenate([_parts(uncertainty, names) for uncertainty in both], axis=1)
     parts = np.where(known[:, None], parts, 0.0)

@@ -150,7 +150,7 @@ def joint_test(
 
 def _parts_of(record: CalibrationRecord) -> list[tuple[Float[np.ndarray, "p p"], float]]:
     """Parts of the covariance of a calibration's parameters, each with its degrees of freedom."""
-    uncertainty = to_numpy(uncertainty_of(record))
+    uncertainty = uncertainty_of(record)
     others = [] if uncertainty.components is None else list(np.asarray(uncertainty.components.matrices))
     each = degrees_of_freedom(np.eye(1 + len(others)), uncertainty.law)
     return list(zip([record.covariance - sum(others, np.zeros_like(record.covariance)), *others], each, strict=True))
@@ -251,7 +251,7 @@ def length_change(
 ) -> LengthChange:
     """Change of ``lengths``: their length, mm, and the configurations at both ends (``(v, n)`` each)."""
     length, start, end = lengths
-    both = [to_numpy(uncertainty_of(record)) for record in (old, new)]
+    both = [uncertainty_of(record) for record in (old, new)]
     (before, *of_old), (after, *of_new) = ([np.asarray(part) for part in _measured(one, start, end)] for one in both)
     law = both[0].law.joined(both[1].law)
     each, mean = (np.concatenate(pair, axis=-1) for pair in zip(of_old, of_new, strict=True))

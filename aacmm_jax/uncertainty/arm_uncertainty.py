@@ -62,7 +62,7 @@ class Uncertainty(eqx.Module):
         if shared is None or not shared.names:
             return self
         xp, k = namespace(self), len(shared.names)
-        crossed = shared.follow @ shared.moments
+        arm, crossed = with_further_corrections(self.arm, shared.names), shared.follow @ shared.moments
         above = xp.concatenate([self.covariance, crossed], axis=1)
         below = xp.concatenate([crossed.T, shared.moments], axis=1)
         parts = shared.of_functions
@@ -70,7 +70,7 @@ class Uncertainty(eqx.Module):
             wider = xp.pad(self.components.matrices, ((0, 0), (0, k), (0, k)))
             parts = Components(self.components.names, wider, self.components.law).joined(parts)
         return Uncertainty(
-            arm=with_further_corrections(self.arm, shared.names),
+            arm=to_numpy(arm) if xp is np else arm,
             covariance=xp.concatenate([above, below]),
             open=xp.asarray(np.pad(np.asarray(self.open), (0, k))),
             noise=self.noise,

@@ -21,7 +21,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.distributions import student_quantile, student_tail
+from ..core.distributions import student_density, student_quantile, student_tail
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 
@@ -167,12 +167,18 @@ def _of_mixtures(
     freedom = effective_degrees_of_freedom(each, np.asarray(law.degrees_of_freedom))
     root = np.sqrt(possible / total[:, None])
     both = student_quantile(0.5 + level / 2, freedom) * root
-    low, high = np.log(both.min(axis=1)), np.log(both.max(axis=1))
+    low, high = both.min(axis=1), both.max(axis=1)
+    # Newton's method: what lies outside is a convex function of the factor, so it converges from below, and from above
+    # its first step ends below.
+    found = np.sum(weights * both, axis=1)
     for _ in range(_ROUNDS):
-        middle = 0.5 * (low + high)
-        outside = np.sum(weights * student_tail(np.exp(middle)[:, None] / root, freedom), axis=1)
-        low, high = np.where(outside > 1 - level, middle, low), np.where(outside > 1 - level, high, middle)
-    return np.exp(0.5 * (low + high))
+        scaled = found[:, None] / root
+        outside = np.sum(weights * student_tail(scaled, freedom), axis=1)
+        slope = -2 * np.sum(weights * student_density(scaled, freedom) / root, axis=1)
+        last, found = found, np.clip(found - (outside - (1 - level)) / slope, low, high)
+        if np.all(np.abs(found - last) <= 1e-9 * found):
+            break
+    return found
 
 
 def _combinations(
