@@ -18,7 +18,7 @@ from ..core.numpy_or_jax import AnyArray, namespace
 from .loss_names import LOSSES, LossName
 
 _EFFICIENCY = 0.95  # for normal residuals
-# The least curvature of a loss along a residual, of that across: many losses have none there, or a negative one.
+# The least curvature of a loss along a residual, relative to that across it: beyond c it would be 0 or negative.
 _LEAST_CURVATURE = 0.01
 
 
@@ -29,7 +29,7 @@ def check_loss(robust: object) -> None:
 
 
 def _curvature(name: LossName, s: Float[AnyArray, " m"]) -> Float[AnyArray, " m"]:
-    """That of the cost along the residual, of that across it, which is the weight: 1 + 2 s rho'' / rho'."""
+    """Curvature of the cost along the residual over that across it, which is the weight: 1 + 2 s rho'' / rho'."""
     xp = namespace(s)
     if name == "huber":
         return xp.where(s <= 1, 1.0, 0.0)
@@ -102,11 +102,11 @@ class Loss(eqx.Module):
         return 0.5 * c2 * rho, weight
 
     def along(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
-        """Square root of the curvature of the cost of every pose along its residual, of that across.
+        """Square roots of the ratios q of two curvatures of the cost of every pose: along its residual, and across it.
 
-        Half the second derivative of the cost by the residual r is w (1 + (q - 1) u u^T), with the weight w, the
-        direction u of r and this q; negative ones, with which a step would lead uphill, are left out (Triggs et al.
-        2000, 4.3). Steps by weights alone converge the more slowly the more poses of a socket have a residual beyond c.
+        The second derivative of the cost by the residual r is w (1 + (q - 1) u u^T), with the weight w and the
+        direction u of r. Negative curvatures, by which a step would lead uphill, are left out (Triggs et al. 2000,
+        4.3). Steps by weights alone (q = 1) converge the more slowly the more poses of a socket are beyond c.
         """
         xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
         return xp.sqrt(xp.maximum(_curvature(self.name, xp.sum(white**2, axis=0) / c2), _LEAST_CURVATURE))

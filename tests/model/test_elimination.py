@@ -19,6 +19,7 @@ from aacmm_jax.model.robust import Loss
 from aacmm_jax.model.rows import PriorRows
 from aacmm_jax.uncertainty.linear_propagation import propagated
 from aacmm_jax.uncertainty.linearisation import Linearisation
+from tests.example_counts import example_count
 
 NOISE = aj.Noise(encoder_arcsec=5.0, seating=0.01)
 BOX = [[200, -300, 100], [600, 300, 500]]
@@ -61,7 +62,7 @@ def dense(linear, loss=None):
 PARTS = st.lists(st.sampled_from(sorted(EVERY)), max_size=4)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=example_count(3), deadline=None)
 @given(PARTS, st.integers(0, 1000))
 def test_the_arrow_is_the_dense_normal_matrix(paper_arm, parts, seed):
     linear = problem(paper_arm, parts, seed)
@@ -90,9 +91,17 @@ def test_a_robust_cost_is_that_of_its_residuals(paper_arm, loss):
     assert model.cost == pytest.approx(0.5 * residual @ residual, rel=1e-9)
     size = np.linalg.norm(jacobian, axis=0) + 1e-12
     np.testing.assert_allclose(model.gradient / size, jacobian.T @ residual / size, atol=1e-7 * np.abs(residual).max())
+    by_weights = observed_model(
+        linear.z, Args(linear.space, linear.observed, linear.whitening, Loss(loss)), curved=False
+    )
+    np.testing.assert_allclose(model.gradient, by_weights.gradient, rtol=1e-6, atol=1e-9 * np.abs(model.gradient).max())
+    # No direction has more curvature than by weights alone.
+    less = by_weights.gram.diagonal() - model.gram.diagonal()
+    assert np.all(less >= -1e-9 * by_weights.gram.diagonal())
+    assert less.max() > 0
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=example_count(3), deadline=None)
 @given(PARTS, st.integers(0, 1000))
 def test_covariances_of_eliminated_geometry_are_the_dense_ones(paper_arm, parts, seed):
     """With rows of variance 1, every part has the covariance of the dense inverse, and so has what is propagated."""

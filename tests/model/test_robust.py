@@ -59,3 +59,20 @@ def test_cost_weight_and_transformed_residual(name):
     by_transformed = jax.jit(jax.grad(lambda x: 0.5 * (loss.transformed(x) ** 2).sum()))(white)
     np.testing.assert_allclose(by_transformed, gradient, rtol=1e-6, atol=1e-12)
     assert np.all(np.diff(weight[np.argsort(np.sum(white**2, axis=0))]) <= 1e-12)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_the_curvature_is_that_of_the_cost(name):
+    """Along a residual and across it, up to where it is no longer positive."""
+    loss, c = Loss(name), tuning_constant(name, 3)
+    direction = np.array([2.0, -1.0, 2.0]) / 3
+    hessian = jax.hessian(lambda residual: loss.cost_and_weight(residual[:, None])[0][0])
+    for size in (0.1, 0.3, 0.42, 0.6, 0.9, 1.5, 4.0):
+        white = size * c * direction
+        across = float(loss.cost_and_weight(white[:, None])[1][0])
+        along = direction @ np.asarray(hessian(white)) @ direction
+        square = float(loss.along(white[:, None])[0] ** 2)
+        if along > 0.02 * across:
+            assert square == pytest.approx(along / across, rel=1e-9)
+        else:
+            assert square == pytest.approx(0.01)
