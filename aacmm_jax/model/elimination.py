@@ -130,12 +130,15 @@ def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
     """Rows whose products have the curvature of a robust loss (`Loss.along`) and the gradient of these."""
     xp = namespace(block.white)
     size = xp.sqrt(xp.sum(block.white**2, axis=0))
-    direction = block.white / xp.where(size > 0, size, 1.0)
+    direction = block.white / xp.where(size > 0, size, 1.0)[None]
 
     def changed(by: Float[AnyArray, "k r m"] | None) -> Float[AnyArray, "k r m"] | None:
-        return None if by is None else by - ((1 - along) * xp.sum(direction * by, axis=1))[:, None] * direction
+        if by is None:
+            return None
+        less = (1 - along)[None] * xp.sum(direction[None] * by, axis=1)
+        return by - less[:, None] * direction[None]
 
-    return RowBlock(block.white / along, changed(block.by_head), changed(block.by_own), block.of, block.sizes)
+    return RowBlock(block.white / along[None], changed(block.by_head), changed(block.by_own), block.of, block.sizes)
 
 
 def cost_and_weights(
