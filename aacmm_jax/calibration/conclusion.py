@@ -129,7 +129,7 @@ def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: St
         prior = None
         if whitening.prior is not None:
             own = np.arange(whitening.prior.mean.shape[0])
-            squares = (whitening.prior.weight * linear.steps[own] * ~influence.fixed[own]) ** 2
+            squares = xp.where(influence.fixed[own], 0.0, whitening.prior.weight * linear.steps[own]) ** 2
             prior = added_to(xp.zeros((linear.height, linear.height)), (own, own), squares)
         robust = task.loss is not None
         return noise_from(moments(influence, state.point.rows, state.errors, whitening, state.sigma, robust, prior))

@@ -107,7 +107,7 @@ def _owner(capture: Capture) -> np.ndarray:
 
 
 def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M c"]]:
-    """Square roots of the covariances of a tip coordinate over the poses, of each kind that moves tips."""
+    """Square roots of the covariances of a tip coordinate over the poses, one for each kind that moves tips."""
     found, owner = [], _owner(capture)
     total = len(owner)
     for kind, sd in zip(shared.kinds, np.asarray(shared.sd), strict=True):
@@ -118,11 +118,12 @@ def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M 
             visits[: len(capture.visits)] = capture.visits
             found.append(sd * (visits[:, None] == [number for number in np.unique(visits) if number >= 0]))
         elif kind == SUCCESSIVE:
+            root = np.zeros((total, total))
             for i, size in enumerate(np.bincount(owner)):
-                order, own = np.arange(size), np.zeros((total, size))
+                order, own = np.arange(size), np.flatnonzero(owner == i)
                 kernel = np.exp(-np.abs(order[:, None] - order) / float(shared.correlation_length))
-                own[owner == i] = sd * np.linalg.cholesky(kernel)
-                found.append(own)
+                root[np.ix_(own, own)] = sd * np.linalg.cholesky(kernel)
+            found.append(root)
     return found
 
 

@@ -251,7 +251,7 @@ def test_file_and_summary(tmp_path, paper_arm, space, bounds, capture):
 # Of whole calibrations with JAX, whose compilation takes a minute each.
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_many_are_as_one(paper_arm, space, bounds, true):
     captures = [aj.simulate(true, POINTS, poses=12, lengths=[LENGTH], noise=NOISE, seed=seed) for seed in range(3)]
     prior = aj.Prior({"lengths": 0.3}, learn=["angles"])
