@@ -31,11 +31,11 @@ from ..solver.levenberg_marquardt import Rules, advance
 from ..solver.levenberg_marquardt import begin as begin_steps
 from ..solver.reason import MAX_STEPS, RUNNING, numbers_of, reasons
 from ..uncertainty.covariance import NoiseModel
-from .bounded_fit import RULES, Fit
+from .bounded_fit import Fit
 from .conclusion import concluded, repeatability_of
 from .scale_anchor import ScaleAnchor
 from .scale_fix import ends_between
-from .solve import ROUGH, args_of, begin, box_of, fitted_with_prior, losses_of, prior_of, state_after, weights
+from .solve import args_of, begin, box_of, fitted_with_prior, losses_of, prior_of, rules_of, state_after, weights
 from .solve_state import whitening_at
 from .task import Task
 
@@ -87,10 +87,10 @@ def solve_chunk(
     steps, reason, losses = jnp.zeros(form.capacity, dtype=jnp.int64), None, losses_of(first)
     solved = (z, whitening, z)
     for number, loss in enumerate(losses, 1):
-        last = number == len(losses)
+        last, rules = number == len(losses), rules_of(number, len(losses))
         if last and prior_of(first) is not None:
             break
-        y, more, reason = _solve_all(form, chunk, one, loss, RULES if last else ROUGH, z, whitening, count)
+        y, more, reason = _solve_all(form, chunk, one, loss, rules, z, whitening, count)
         steps, solved = steps + more, (z, whitening, y)
         if not last:
             z, whitening = _in_groups(form, chunk, partial(_again, one, losses[number - 1 :]), *solved)

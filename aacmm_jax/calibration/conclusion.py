@@ -210,12 +210,12 @@ def observed_metrics(
         xp.ones(square.shape) if weight is None else weight
         for square, weight in zip(squares, linear.weights, strict=False)
     ]
-    each = zip(observed.by_observation(squares), observed.observations, strict=True)
-    chi = [xp.sqrt(xp.mean(square) / one.rows) for square, one in each]
+    rows = np.array([observation.rows for observation in observed.observations], dtype=float)
+    chi = xp.sqrt(observed.mean_by_observation(squares) / rows)
     total = sum(xp.sum(square) for square in squares)
     for state in (before, after):
-        distances = observed.by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in state.point.rows])
-        rms.append(xp.stack([xp.sqrt(xp.mean(square)) for square in distances]))
+        distances = [xp.sum(rows.values[:3] ** 2, axis=0) for rows in state.point.rows]
+        rms.append(xp.sqrt(observed.mean_by_observation(distances)))
     degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
     parts = observed.split(linear.z[len(linear.space.names) :])
     metrics = ObservedMetrics(
@@ -223,7 +223,7 @@ def observed_metrics(
         kinds=tuple(observation.kind for observation in observed.observations),
         rms_before=rms[0],
         rms_after=rms[1],
-        reduced_chi=xp.stack(chi),
+        reduced_chi=chi,
         reduced_chi_of_all=xp.sqrt(total / degrees_of_freedom),
         sigma=after.sigma,
         geometry={name: parts[name] for name in observed.names},

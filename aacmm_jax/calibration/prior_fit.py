@@ -30,7 +30,7 @@ from ..uncertainty.evidence import (
     learned_log_variances,
     slope_of_expectation,
 )
-from .bounded_fit import Fit, fit
+from .bounded_fit import NEAR, Fit, fit
 from .results import PriorMetrics
 from .solve_state import State, state_at, whitening_at
 from .task import Task
@@ -104,7 +104,7 @@ class PriorProblem(NamedTuple):
         tight = xp.clip(stop_gradient(self.sd(scales)), _LEAST_SCALE, 1.0)
         step = set_at(self.steps, index, self.steps[index] * tight)
         functions, limit = (observed_rows, observed_model), self.task.max_steps
-        return fit(*functions, z, args, self.sides, step, limit, differentiable=differentiable)
+        return fit(*functions, z, args, self.sides, step, limit, rules=NEAR, differentiable=differentiable)
 
     def model(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> PriorModel:
         """The model of the parameters that have a prior, linear at a point."""

@@ -14,14 +14,13 @@ from ..model.elimination import Args, observed_model, observed_rows, with_linear
 from ..model.robust import Loss
 from ..model.rows import PointRows, Whitening
 from ..solver.levenberg_marquardt import Rules
-from .bounded_fit import RULES, Fit, fit
+from .bounded_fit import NEAR, RULES, Fit, fit
 from .conclusion import OfPrior, Solution, concluded
 from .prior_fit import PriorProblem, fit_with_prior
 from .solve_state import Begun, State, scatter_at_start, state_at, whitening_at
 from .task import Task
 
-# Of the solves whose result only gives the weights of the next, or its start: a few standard uncertainties' millionths.
-ROUGH = RULES._replace(rtol=1e-5)
+_ROUGH = 1e-7  # tolerance of solves whose result only gives the weights of the next, or its start
 
 
 def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
@@ -38,7 +37,7 @@ def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
         else:
             whitening = weights(task, begun, state, loss)
             args, count = args_of(task, whitening, loss, z)
-            found = _fit(args, begun, z[:count], task, RULES if last else ROUGH)
+            found = _fit(args, begun, z[:count], task, rules_of(number, len(losses)))
             z, point = with_linear_geometry(found.parameters, args)
             state = state_after(task, begun, z, point, last)
         evaluations = evaluations + found.steps
@@ -77,6 +76,12 @@ def losses_of(task: Task) -> list[Loss | None]:
     if task.loss is not None:
         return [None, Loss("huber"), task.loss, task.loss]
     return [None] if task.needs_no_weights else [None, None]
+
+
+def rules_of(number: int, count: int) -> Rules:
+    """When one of ``count`` solves ends, the first of which has the number 1."""
+    rules = RULES if number == 1 else NEAR
+    return rules if number == count else rules._replace(rtol=_ROUGH)
 
 
 def weights(task: Task, begun: Begun, state: State, loss: Loss | None) -> Whitening:

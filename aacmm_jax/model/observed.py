@@ -8,27 +8,30 @@ reference length is a relation between the positions of two sockets, a certified
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
+from ..core.pytree import pytree, static
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.measured_points import AbstractMeasured
 from ..data.observations.observation import AbstractObservation, Tips, offset_of
 from ..data.observations.platform import platform_frames
-from ..data.observations.socket import Socket, position_of
+from ..data.observations.socket import position_of, sockets_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import ForwardPass, Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
 from .layout import Group, Layout, layout_of, unknowns_of
+from .socket_sums import means_over_sockets
 
 _STEPS = {"mm": 1.0, "rad": 1e-3}  # natural steps, as those of the arm's parameters
 
 
-class Observed(eqx.Module):
+@pytree
+class Observed:
     """Everything that a capture observed, as arrays: sockets first, then its other observations."""
 
     observations: tuple[AbstractObservation, ...]
@@ -37,8 +40,8 @@ class Observed(eqx.Module):
     motion: JointMotion | None  # None where the arm does not matter, but only what is unknown
     nominal: Float[AnyArray, " l"]  # reference lengths, mm
     u: Float[AnyArray, " l"]
-    ends: tuple[tuple[str, str], ...] = eqx.field(static=True)  # names of the positions at their ends
-    layout: Layout = eqx.field(static=True)
+    ends: tuple[tuple[str, str], ...] = static()  # names of the positions at their ends
+    layout: Layout = static()
 
     @classmethod
     def of(cls, capture: Capture, arm: Arm | None, *, lengths: bool = True) -> "Observed":
@@ -52,8 +55,7 @@ class Observed(eqx.Module):
         if arm is not None:
             check_readings(capture, arm)
         xp = namespace(capture)
-        sockets = tuple(Socket(name, readings) for name, readings in capture.sockets.items())
-        observations = to_numpy((*sockets, *capture.observations))
+        observations = to_numpy((*sockets_of(capture.sockets), *capture.observations))
         q = xp.concatenate([observation.q for observation in observations])
         known = capture.lengths if lengths else ()
         ends = tuple((position_of(length.start), position_of(length.end)) for length in known)
@@ -93,12 +95,12 @@ class Observed(eqx.Module):
     def _with_observations(self, observations: tuple[AbstractObservation, ...]) -> "Observed":
         return dataclasses.replace(self, observations=observations, stacks=_stacks(observations, self.layout))
 
-    @property
+    @cached_property
     def blocks(self) -> dict[str, tuple[str, ...]]:
         """The parts of the unknown geometry in the order of its numbers, and the unit of each of these."""
         return dict(self.layout.parts)
 
-    @property
+    @cached_property
     def names(self) -> list[str]:
         """The parts in the order in which the observations name them."""
         return list(dict.fromkeys(name for one in self.observations for name in unknowns_of(one)))
@@ -108,12 +110,12 @@ class Observed(eqx.Module):
         """Indices of the numbers of each part among all of them."""
         return self.layout.positions
 
-    @property
+    @cached_property
     def steps(self) -> np.ndarray:
         """Natural step of each number: 1 mm, 1 mrad."""
         return np.array([_STEPS[unit] for units in self.blocks.values() for unit in units])
 
-    @property
+    @cached_property
     def slices(self) -> list[slice]:
         """The poses of each observation."""
         ends = np.cumsum([observation.q.shape[0] for observation in self.observations]).tolist()
@@ -121,7 +123,7 @@ class Observed(eqx.Module):
             slice(end - observation.q.shape[0], end) for observation, end in zip(self.observations, ends, strict=True)
         ]
 
-    @property
+    @cached_property
     def equations(self) -> int:
         """Number of equations: rows of all poses, reference lengths and certified values."""
         rows = sum(observation.rows * observation.q.shape[0] for observation in self.observations)
@@ -153,7 +155,7 @@ class Observed(eqx.Module):
     def chain(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> Geometry:
         """The chain with the tip that each pose held."""
         arm = space.geometry(vector)
-        if any(observation.target for observation in self.observations):
+        if any(group.targeted for group in self.layout.groups):
             xp, parts = namespace(arm, geometry), self.split(geometry)
             offsets = [
                 xp.broadcast_to(
@@ -180,6 +182,13 @@ class Observed(eqx.Module):
             found = new | found  # what another observation has found stays
         found |= platform_frames(self.observations, tips)
         return namespace(arm, forward).concatenate([found[name] for name in self.blocks])
+
+    def mean_by_observation(self, by_group: Sequence[Float[AnyArray, " _"]]) -> Float[AnyArray, " k"]:
+        """Means over the poses of each observation of values with the poses of each group."""
+        xp = namespace(by_group)
+        members = np.concatenate([group.members for group in self.layout.groups])
+        each = zip(self.layout.groups, by_group, strict=True)
+        return xp.concatenate([means_over_sockets(values, group.counts) for group, values in each])[np.argsort(members)]
 
     def by_observation(self, by_group: Sequence[Float[AnyArray, "... _"]]) -> list[Float[AnyArray, "... _"]]:
         """Arrays with the poses of each group last, as one for each observation."""

@@ -1,5 +1,6 @@
 """A socket: the tip is at one point, whose position is unknown."""
 
+import copy
 import dataclasses
 from collections.abc import Hashable, Mapping
 from typing import ClassVar
@@ -90,6 +91,21 @@ class Socket(AbstractObservation):
             by_unknowns={self.position: -identity},
             measured=no_covariance(3, self.q.shape[0]),
         )
+
+
+def sockets_of(readings: Mapping[str, Float[AnyArray, "m n"]]) -> tuple[Socket, ...]:
+    """Sockets whose names and readings a capture has checked: each as a copy of the first, since equinox takes 0.1 ms
+    to make and check one, and there may be thousands."""
+    made: list[Socket] = []
+    for name, q in readings.items():
+        if not made:
+            made.append(Socket(name, q))
+            continue
+        one = copy.copy(made[0])
+        object.__setattr__(one, "name", name)
+        object.__setattr__(one, "q", q)
+        made.append(one)
+    return tuple(made)
 
 
 def position_of(socket: str) -> str:
