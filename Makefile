@@ -33,8 +33,8 @@ OPTIMISED := XLA_FLAGS=
 # The others would be collected for nothing, in 7 s of CPU for each worker.
 OPTIMISED_FILES = $(shell grep -rlw --include "test_*.py" mark.optimised tests)
 # Numerics, differentiation, storage and the command line on real captures: what a change of a dependency breaks first.
-SELECTION := tests/test_package.py tests/kinematics --ignore=tests/kinematics/test_reading_check.py tests/solver \
-	tests/calibration/test_single.py tests/files/test_storage.py tests/test_real_captures.py
+SELECTION := tests/test_package.py tests/kinematics tests/solver \
+	tests/pipeline/test_single.py tests/files/test_storage.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
 SUMMARY := sed '/^Warning/,$$d'
 # As a processor of 2008 rounds: SSE4.2 and the linear algebra of that time (without effect on other architectures).

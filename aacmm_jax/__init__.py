@@ -4,7 +4,8 @@ The names below are those that most scripts need; everything else is grouped by 
 
 * `kinematics`: the arm. `data`: captures, noise, simulation. `solver`: bounded least squares.
 * `model`: the residual of a capture for an arm. `uncertainty`: what data determine, and how well.
-* `calibration`: identify and calibrate, one and many. `study`: calibrations by the thousand.
+* `calibration`: the solve, one and many, and its results. `diagnostics`: what judges a result or its data.
+* `pipeline`: identify and calibrate. `study`: calibrations by the thousand.
 * `acceptance`, `drift`, `planning`: tests by standards, calibrations compared, which poses to take.
 * `files`: every format. `summaries`: sentences and tables. `report`, `plot`, `certificate`, `cli`: what people read.
 * `core`: arrays, errors, `units`.

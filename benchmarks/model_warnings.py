@@ -1,4 +1,4 @@
-"""How often calibrations are warned of: where nothing is wrong, and where something is (`calibration.model_tests`).
+"""How often calibrations are warned of: where nothing is wrong, and where something is (`diagnostics.model_tests`).
 
 ``python benchmarks/model_warnings.py [--trials N]`` calibrates simulated captures of the paper's arm (2 arcsec, 5 um)
 and of the Panda (20 arcsec, 20 um), with new errors in every trial, and writes ``results/model-warnings-DATE.json``:
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.missing_terms import missing_terms
+from aacmm_jax.diagnostics.missing_terms import missing_terms
 from aacmm_jax.summaries.warnings import observed, of_calibration
 
 # Beginnings of the warnings that chance or an error can raise.

@@ -1,4 +1,4 @@
-"""Whether intervals hold where poses share errors that the model does not have (`calibration.shared_errors`).
+"""Whether intervals hold where poses share errors that the model does not have (`diagnostics.shared_errors`).
 
 ``python benchmarks/shared_errors.py [--trials N] [--only simulated|mukca|ur10]`` writes
 ``results/shared-errors-DATE.json``. Simulated: captures of the paper's arm (2 arcsec, 5 um, 80 poses in four sockets),

@@ -288,7 +288,7 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
     assert unknowns == len(space.names) - any(space.lengths)
     assert equations < unknowns
     assert 3 * (needed - sockets) >= unknowns > 3 * (needed - 1 - sockets)
-    monkeypatch.setattr("aacmm_jax.calibration.single._identified", reached)
+    monkeypatch.setattr("aacmm_jax.pipeline.single._identified", reached)
     more = needed - sum(sizes)
     refusal(lambda: run((sizes[0] + more - 1, *sizes[1:])))
     with pytest.raises(Reached):

@@ -25,6 +25,8 @@ LAYERS = (
     {"study"},
     {"files", "summaries"},
     {"acceptance", "drift", "planning"},
+    {"pipeline"},
+    {"diagnostics"},
     {"calibration"},
     {"uncertainty"},
     {"model"},

@@ -1,10 +1,5 @@
-from .contradictions import contradictions_of as contradictions_of
-from .contradictions import remove_contradicting as remove_contradicting
-from .contradictions import session_metrics as session_metrics
 from .evaluation import Evaluation as Evaluation
 from .left_out import CrossValidation as CrossValidation
-from .model_errors import model_tests as model_tests
-from .model_ladder import ComparedModels as ComparedModels
 from .prediction import unseen_errors as unseen_errors
 from .record import CalibrationRecord as CalibrationRecord
 from .record import record_of as record_of

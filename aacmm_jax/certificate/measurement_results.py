@@ -8,9 +8,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.capture import ReferenceLength
+from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import Arm, parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters

@@ -6,8 +6,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ..calibration.pose_residuals import ObservationResiduals, rms
 from ..data.observations.observation import AbstractObservation, Quantity, certified_quantities
+from ..diagnostics.pose_residuals import ObservationResiduals, rms
 from ..files.administrative_data import NOT_STATED
 from .xml_elements import MILLIMETRE, ONE, RADIAN, add, add_english, add_real, add_text
 

@@ -230,7 +230,7 @@ def calibrate(
             result = with_spinner("Calibrating", lambda: solved(recording.capture))
             record = record_of(result, recording, robust=robust, others=others)
             if remove_contradicting:
-                from ..calibration.contradictions import remove_contradicting as removed
+                from ..diagnostics.contradictions import remove_contradicting as removed
 
                 record = with_spinner("Comparing groups", lambda: removed(record, solved))
                 result = solved(record.recording.capture) if record.removed and monte_carlo else result
@@ -243,7 +243,7 @@ def calibrate(
                 and recording.true is None
                 and _several(capture_used, len(bounds.space.names))
             ):
-                from ..calibration.cross_validation import cross_validate as validated
+                from ..pipeline.cross_validation import cross_validate as validated
 
                 if scale != "measured":
                     raise InputError("--cross-validate needs a calibrated scale; leave out --scale nominal.")
@@ -316,8 +316,8 @@ def _solved(
     bounds: Any, capture: Any, scale: str, method: Any, solving: dict[str, Any], strict: bool, shared_errors: bool
 ) -> Any:
     """Both stages, or stage 1 alone."""
-    from ..calibration.single import calibrate as run
-    from ..calibration.single import identify
+    from ..pipeline.single import calibrate as run
+    from ..pipeline.single import identify
 
     if scale == "measured":
         # The summary has its own look at what is determined.
@@ -400,6 +400,6 @@ def _several(capture: Any, parameters: int) -> bool:
     """Whether the reference length was measured in several placements, so that each can be left out."""
     if len(capture.lengths) < 2:
         return False
-    from ..calibration.cross_validation import can_cross_validate
+    from ..pipeline.cross_validation import can_cross_validate
 
     return can_cross_validate(capture, parameters)

@@ -8,7 +8,6 @@ import numpy as np
 
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord, record_of
-from ..calibration.single import calibrate
 from ..core.errors import InputError
 from ..core.extras import MissingExtra, require
 from ..core.text import shorten
@@ -21,6 +20,7 @@ from ..files.captures import load_capture, save_capture
 from ..files.inputs import fingerprint
 from ..files.outputs import together
 from ..kinematics.parameters import ArmSpecification, perturbed_arm
+from ..pipeline.single import calibrate
 from ..summaries.calibration import calibration_summary, capture_summary
 
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1

@@ -79,12 +79,12 @@ def compare_models(
 
     Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
     """
-    from ..calibration.model_ladder import compare_models as compared
     from ..data.drawing import draw_poses
     from ..files.captures import load_capture
     from ..files.compared_models import save_compared_models
     from ..files.inputs import InputFile, fingerprint
     from ..files.joint_models import masses_of
+    from ..pipeline.model_ladder import compare_models as compared
     from ..summaries.compared_models import compared_models_summary
 
     with together(output):

@@ -76,8 +76,8 @@ def _of_capture(specification: Any, path: Path) -> dict[str, Any]:
 
 
 def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
+    from ..diagnostics.reading_check import check_readings
     from ..files.commanded_poses import read_known_poses
-    from ..kinematics.reading_check import check_readings
     from ..summaries.reading_check import standing_rows
 
     joints = specification.arm.joints

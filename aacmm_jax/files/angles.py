@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS, length_unit
-from ..kinematics.reading_fit import Explanation
+from ..diagnostics.reading_fit import Explanation
 from .inputs import InputFile
 from .manifest import manifest_model, readings_of_manifest
 from .manifest_angles import Angles

@@ -171,7 +171,7 @@ def _pick(table: str, entry: Any, header: Sequence[str], columns: Sequence[int])
 
 def _rms(recording: Recording, given: Recording) -> float | None:
     """Distance of the tips from their geometry after a calibration of the same parameters, mm."""
-    from ..calibration.single import calibrate, identify
+    from ..pipeline.single import calibrate, identify
 
     capture, bounds = recording.capture, given.nominal.bounds()
     arm, scaled = bounds.space.base, capture.lengths or any(one.fixes_scale for one in capture.observations)

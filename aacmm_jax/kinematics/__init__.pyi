@@ -14,16 +14,11 @@ from .correction import corrected_readings as corrected_readings
 from .correction import readings_at_poses as readings_at_poses
 from .inverse_kinematics import project_to_targets as project_to_targets
 from .inverse_kinematics import solve_to_targets as solve_to_targets
-from .joint_travel import StandingJoint as StandingJoint
-from .joint_travel import standing_joints as standing_joints
 from .parameters import ArmSpecification as ArmSpecification
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters
 from .parameters import perturbed_arm as perturbed_arm
 from .prior_scales import default_prior as default_prior
 from .priors import Prior as Prior
-from .reading_check import ReadingCheck as ReadingCheck
-from .reading_check import check_readings as check_readings
-from .reading_fit import Explanation as Explanation
 from .workspace import arm_reach as arm_reach
 from .workspace import closest_approach as closest_approach

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import DEG
+from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..kinematics.arm import is_length, parameter_unit
 from ..summaries.harmonics import listed_apart
 from .style import (

@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..calibration.joint_functions import function_of_joint
-from ..calibration.model_ladder import ComparedModels
-from ..calibration.pose_residuals import observation_residuals
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.units import DEG
+from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import Arm
+from ..pipeline.model_ladder import ComparedModels
 from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes
 
 _IN_A_BIN, _MOST_BINS = 8, 80  # poses, and bins of a joint's travel

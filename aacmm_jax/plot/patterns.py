@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.pose_residuals import signed_residuals
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.units import DEG
+from ..diagnostics.pose_residuals import signed_residuals
 from ..kinematics.arm import by_joint
 from .style import ACCENT, DARK, LIGHT, new_figure
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.pose_residuals import distances_of, observation_residuals
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read
+from ..diagnostics.pose_residuals import distances_of, observation_residuals
 from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for, lengths_sentence, two_digits

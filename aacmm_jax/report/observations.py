@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.pose_residuals import ObservationResiduals, observation_residuals
 from ..calibration.record import CalibrationRecord
 from ..core.text import pluralise
 from ..core.units import DEG
+from ..diagnostics.pose_residuals import ObservationResiduals, observation_residuals
 from ..model.metrics import pose_outliers
 from ..summaries.observations import capture_observations
 from ..summaries.tables import expanded_words, quantity_words

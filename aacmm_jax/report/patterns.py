@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from ..calibration.pose_residuals import SignedResiduals, signed_residuals
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG
+from ..diagnostics.pose_residuals import SignedResiduals, signed_residuals
 from . import charts
 from .elements import Chart, Section
 

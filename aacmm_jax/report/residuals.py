@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.pose_residuals import distances_of
 from ..data.capture import Capture
+from ..diagnostics.pose_residuals import distances_of
 from ..model.metrics import pose_outliers
 from ..summaries.tables import METRICS, decimals_for
 from . import charts

@@ -6,10 +6,10 @@ import numpy as np
 
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG
+from ..diagnostics.tried_poses import TriedPoses, tried_poses
 from ..kinematics.arm import joint_limits
 from ..summaries.tables import two_digits
 from ..summaries.uncertainty_sentences import tried_sentence
-from ..uncertainty.tried_poses import TriedPoses, tried_poses
 from ..uncertainty.volume import VolumetricUncertainty
 from . import charts
 from .elements import Chart, ReportTable, Section, number_cell, text_cell

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.model_errors import model_tests
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics, active_names
 from ..core.text import csv_text, pluralise
@@ -14,13 +13,14 @@ from ..core.units import people_read
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
+from ..diagnostics.model_errors import model_tests
+from ..diagnostics.tried_poses import tried_poses
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.corrections.kinds import coefficient_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.shared_errors import SharedErrors
-from ..uncertainty.tried_poses import tried_poses
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .model_errors import noisy_encoder_rows, summary_of_tests
 from .observations import capture_observations, observed_summary

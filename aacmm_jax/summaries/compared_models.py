@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from ..calibration.model_ladder import ComparedModel, ComparedModels
+from ..pipeline.model_ladder import ComparedModel, ComparedModels
 from .tables import rms_difference
 
 _EXCESS = 2.0  # of the mean squared normalised error, from which the uncertainty is said to be too small

@@ -1,9 +1,9 @@
 """Sockets, placements, stations and sessions that contradict the others of a calibration, in sentences."""
 
-from ..calibration.contradictions import Cause, Contradiction, Suspect, contradictions_of
-from ..calibration.group_equations import PROBE
 from ..calibration.record import CalibrationRecord, Removed
 from ..core.units import DEG
+from ..diagnostics.contradictions import Cause, Contradiction, Suspect, contradictions_of
+from ..diagnostics.group_equations import PROBE
 
 _NAMED_ALIKE = ("socket", "observation")  # kinds whose groups are chosen by their own names
 

@@ -8,7 +8,6 @@ from ..acceptance.decision import RULES
 from ..acceptance.influences import Influences
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
-from ..calibration.cross_validation import groups_of
 from ..calibration.evaluation import Evaluation, evaluate
 from ..calibration.prediction import NOTHING, Agreement, unseen_errors
 from ..core.errors import InputError
@@ -17,6 +16,7 @@ from ..data.capture import Capture, names_in, part_of
 from ..data.noise import Noise
 from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm
+from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length
 from .validation import agreement_row, finite, no_better, surprise

@@ -4,12 +4,12 @@ import math
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from ..calibration.length_consistency import Lengths
-from ..calibration.missing_terms import FoundTerm
-from ..calibration.model_errors import LEVEL, Misfit, ModelTests
 from ..calibration.results import NoisyEncoder
 from ..core.text import shorten
 from ..core.units import ARCSEC
+from ..diagnostics.length_consistency import Lengths
+from ..diagnostics.missing_terms import FoundTerm
+from ..diagnostics.model_errors import LEVEL, Misfit, ModelTests
 from ..kinematics.arm import Arm
 from ..kinematics.corrections.kind import Term
 from ..kinematics.corrections.kinds import all_sought, model_of

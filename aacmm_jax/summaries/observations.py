@@ -6,14 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.contradictions import session_metrics
 from ..calibration.evaluation import Evaluation
-from ..calibration.pose_residuals import (
-    ObservationResiduals,
-    distances_of,
-    observation_residuals,
-    rms,
-)
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..calibration.results import ObservedMetrics
 from ..core.rotations import inverse_frame
@@ -26,6 +19,13 @@ from ..data.observations.observation import (
     offset_of,
     quantities_by_unit,
     stated_quantities,
+)
+from ..diagnostics.contradictions import session_metrics
+from ..diagnostics.pose_residuals import (
+    ObservationResiduals,
+    distances_of,
+    observation_residuals,
+    rms,
 )
 from ..model.observed import Observed
 from .tables import observed_words

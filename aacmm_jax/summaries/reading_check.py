@@ -10,12 +10,12 @@ from ..core.text import pluralise
 from ..core.units import DEG, LENGTH_UNITS, length_unit
 from ..data.capture import Capture
 from ..data.observations.measured_points import AbstractMeasured
+from ..diagnostics.fixed_parameters import fixed_parameters
+from ..diagnostics.joint_travel import lost_by_standing, standing_joints
+from ..diagnostics.reading_check import ReadingCheck, check_readings
+from ..diagnostics.reading_fit import Explanation
 from ..kinematics.arm import Arm
-from ..kinematics.joint_travel import lost_by_standing, standing_joints
 from ..kinematics.parameters import ArmSpecification
-from ..kinematics.reading_check import ReadingCheck, check_readings
-from ..kinematics.reading_fit import Explanation
-from ..uncertainty.fixed_parameters import fixed_parameters
 
 _LISTED = 5
 _SIGMA = 0.05  # mm; of tips where nothing better is known
@@ -24,7 +24,7 @@ _QUARTERS = 1e-9  # rad
 
 
 def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
-    """`kinematics.check_readings` of what was recorded in sockets, or as one station of an instrument saw it.
+    """`diagnostics.check_readings` of what was recorded in sockets, or as one station of an instrument saw it.
 
     Args:
         arm: One arm, nominal.

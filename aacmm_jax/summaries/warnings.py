@@ -6,8 +6,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..calibration.checks import plausible
-from ..calibration.contradictions import session_metrics
-from ..calibration.model_errors import ModelTests, model_tests
 from ..calibration.record import REPEATABILITY, CalibrationRecord, record_of
 from ..calibration.results import Calibration, Identification, active_names
 from ..calibration.scale_anchor import scale_set_by_clause
@@ -17,6 +15,8 @@ from ..core.units import INCH, UM, M
 from ..data.capture import Capture
 from ..data.noise import Noise, tip_covariances
 from ..data.recording import Recording
+from ..diagnostics.contradictions import session_metrics
+from ..diagnostics.model_errors import ModelTests, model_tests
 from ..kinematics.chain import joint_motion, reading_units
 from ..kinematics.parameters import ArmSpecification, Bounds, Parameters
 from ..model.metrics import pose_outliers
@@ -111,7 +111,7 @@ def warnings_of(
 ) -> list[str]:
     """What should be read about a calibration before its numbers: one sentence each, the most serious first.
 
-    The command line prints the same. The numbers behind the tests of model and noise: `calibration.model_tests`.
+    The command line prints the same. The numbers behind the tests of model and noise: `diagnostics.model_tests`.
 
     Args:
         result: What `calibrate` or `identify` returned.

@@ -1,6 +1,6 @@
 """What data determine, and how well: covariance, propagation to k, tips and lengths, identifiability.
 
-Monte Carlo and cross-validation, which repeat calibrations: `calibration.sampling` and `calibration.cross_validation`.
+Monte Carlo and cross-validation, which repeat calibrations: `calibration.sampling` and `pipeline.cross_validation`.
 """
 
 import lazy_loader as _lazy_loader

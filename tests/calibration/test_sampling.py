@@ -5,9 +5,9 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration import sampling
-from aacmm_jax.calibration.cross_validation import groups_of
 from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
 from aacmm_jax.calibration.sampling import numerical_tolerance
+from aacmm_jax.pipeline.cross_validation import groups_of
 from aacmm_jax.summaries import warnings as cautions
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.diagnostics import reading_check, reading_search
 from aacmm_jax.files.commanded_poses import read_known_poses
-from aacmm_jax.kinematics import reading_check, reading_search, with_corrections
+from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.planning import first_capture
 from aacmm_jax.summaries import arm_survey
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.missing_terms import FoundTerm
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.core.numpy_or_jax import to_numpy
+from aacmm_jax.diagnostics.missing_terms import FoundTerm
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motion, joints_first

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.model_errors import model_tests
-from aacmm_jax.calibration.shared_errors import missing_functions
 from aacmm_jax.certificate.measurement_results import _in_d_si
 from aacmm_jax.cli import calibration_display
+from aacmm_jax.diagnostics.model_errors import model_tests
+from aacmm_jax.diagnostics.shared_errors import missing_functions
 from aacmm_jax.files.joint_models import with_model
 from aacmm_jax.files.priors import prior_of_text
 from aacmm_jax.kinematics import default_prior, with_corrections

@@ -116,7 +116,7 @@ def test_figures_hold_the_numbers(record, made):
 
 def test_patterns_in_the_residuals(record):
     """A panel for each joint, one for each axis, and the histogram; with the numbers of the calibration."""
-    from aacmm_jax.calibration.pose_residuals import signed_residuals
+    from aacmm_jax.diagnostics.pose_residuals import signed_residuals
 
     panels = aj.plot.residual_patterns(record).axes
     assert len(panels) == 6 + 3 + 1

@@ -1,0 +1,284 @@
+"""Sockets, stations, placements and sessions that contradict the others of a calibration; and it without them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..calibration.record import CalibrationRecord, Removed, record_of
+from ..calibration.results import Calibration, Identification
+from ..core.errors import InputError
+from ..data.capture import Capture, part_of
+from ..data.observations.socket import Socket
+from ..uncertainty.group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of
+from .group_equations import PROBE, Equations, Rows, equations_of
+
+# Mean square that a group adds over that of the others: errors outside the D-H model make it 7 on real arms, and it
+# is 1 where there are none.
+_LEAST_RATIO = 9.0
+# The same for parameters of a session's or station's own, and for a probe of its own: on real arms 5 and 9 between
+# halves of one session, 43 and 239 between sessions with a remounted probe.
+_LEAST_DIFFERENCE, _LEAST_REMOUNTED = 16.0, 50.0
+_LEVEL = 0.01
+_EXPLAINS = 0.67  # share of a contradiction that a single cause must explain to be named
+_EXACT = 1e-6  # mm: smaller contradictions are rounding errors of a simulation without noise
+_LARGE = ("session", "station")  # kinds of groups with more poses than parameters
+
+
+class Cause(NamedTuple):
+    """An error of one group alone that explains why it contradicts the others."""
+
+    names: tuple[str, ...]  # the joint's zero, or the three coordinates of the probe
+    values: Float[np.ndarray, " k"]  # what they are there, less what they are for the others, rad or mm
+    share: float  # of the contradiction that this explains
+    ratio: float  # F of these unknowns
+
+
+class Suspect(NamedTuple):
+    """A group without which the others agree."""
+
+    group: str
+    members: tuple[str, ...]  # sockets and observations
+    test: GroupTest
+    rms: tuple[float, float]  # mm: of its poses, in the calibration from all and in that from the others
+    rms_others: tuple[float, float]
+    cause: Cause | None
+
+
+class Contradiction(NamedTuple):
+    """A group that contradicts the others; where the data do not show which of several is wrong, all of these."""
+
+    kind: str  # "socket", "observation", "placement", "station", "target", "index" or "session"
+    suspects: tuple[Suspect, ...]
+
+
+def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
+    """Kinds of groups, the largest ones first -> sockets and observations with their group of this kind."""
+    names = [*capture.names, *(observation.name for observation in capture.observations)]
+    kinds: dict[str, dict[str, str | None]] = {}
+    if capture.sessions:
+        kinds["session"] = {name: capture.session_of(name) for name in names}
+    sockets = {*capture.names, *(o.name for o in capture.observations if isinstance(o, Socket))}
+    for kind in ("station", "target", "index"):
+        kinds[kind] = dict.fromkeys(names) | {o.name: getattr(o, kind, None) for o in capture.observations}
+    kinds["target"] = {name: label or None for name, label in kinds["target"].items()}
+    placed = {o.name: getattr(o, "placement", None) for o in capture.observations}
+    alone = len(sockets) == len(names)
+    placed |= {name: name.rpartition("/")[0] or (name if alone else None) for name in sockets}
+    each: dict[str, str | None] = {name: name for name in names}
+    # Of equal divisions the first is kept, and it is named in the words of a user.
+    kinds |= {"socket": each, "placement": placed} if alone else {"placement": placed, "observation": each}
+    found: dict[str, dict[str, str | None]] = {}
+    seen: set[frozenset[frozenset[str]]] = set()
+    for kind, labels in kinds.items():
+        by_label: dict[str, list[str]] = {}
+        for name, label in labels.items():
+            if label is not None:
+                by_label.setdefault(label, []).append(name)
+        rest = [name for name, label in labels.items() if label is None]
+        parts = [*by_label.values(), *([rest] if rest else [])]
+        division = frozenset(frozenset(part) for part in parts)
+        if by_label and len(division) > 1 and division not in seen:
+            found[kind] = labels
+            seen.add(division)
+    return found
+
+
+def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
+    """The groups that contradict the others; nearly always none.
+
+    Every group is tested by the poses of the others (`uncertainty.group_test`), which takes milliseconds. Of all kinds
+    of groups the one that shows the contradiction best is reported: an error of a whole placement shows less in one of
+    its sockets, and that of one socket less in its placement.
+
+    Args:
+        record: a calibration from sockets, lengths and any other observations.
+
+    Returns:
+        One for each group to take out, one after the other.
+
+    Example:
+        >>> print(aj.diagnostics.contradictions_of(record))
+        []
+    """
+    equations = equations_of(record)
+    best: tuple[float, str, list[list[GroupTest]]] = (0.0, "", [])
+    kinds = groupings(record.recording.capture)
+    for kind, labels in kinds.items():
+        blocks = equations.grouped(labels)
+        with np.errstate(all="ignore"):
+            found = contradicting_groups(blocks, level=_LEVEL, least_ratio=_LEAST_RATIO)
+            # An unlikely error of a few poses does not hide one that all poses of a session share.
+            if kind in _LARGE:
+                found = max(found, _different(equations, blocks, labels), key=_first_ratio)
+        if found and _first_ratio(found) > best[0]:
+            best = _first_ratio(found), kind, found
+    _, kind, found = best
+    if not found:
+        return []
+    labels = kinds[kind]
+    result = [
+        Contradiction(kind, tuple(_suspect(equations, labels, test) for test in tests)) for tests in found
+    ]  # fmt: skip
+    return [] if result[0].suspects[0].rms_others[0] < _EXACT else result
+
+
+def _first_ratio(found: Sequence[Sequence[GroupTest]]) -> float:
+    return found[0][0].ratio if found else 0.0
+
+
+def _different(
+    equations: Equations, blocks: Sequence[Block], labels: Mapping[str, str | None]
+) -> list[list[GroupTest]]:
+    """The group whose own parameters, or own probe, differ from those of the others, and those that do so as well."""
+    tests = different_groups(blocks)
+    found = []
+    for test in tests:
+        cause = _cause(equations, [name for name, label in labels.items() if label == test.group])
+        remounted = cause is not None and cause.names == PROBE and cause.ratio > _LEAST_REMOUNTED
+        significant = test.probability * len(tests) < _LEVEL
+        if significant and (test.ratio > _LEAST_DIFFERENCE or remounted):
+            found.append(test)
+    return [[test for test in found if test.variance < 1.1 * found[0].variance]] if found else []
+
+
+def _suspect(equations: Equations, labels: Mapping[str, str | None], test: GroupTest) -> Suspect:
+    members = tuple(name for name, label in labels.items() if label == test.group)
+    own = [rows for rows in equations.rows if rows.name in members]
+    others = [rows for rows in equations.rows if rows.name not in members]
+    # Geometry that only this group has is open in the least squares of the others, and follows its poses.
+    loose = ~np.any([np.any(rows.shared, axis=(0, 1)) for rows in others], axis=0)
+    step = np.where(loose, 0.0, test.step)
+    following = [
+        block._replace(residual=block.residual + block.shared @ step, shared=block.shared[:, loose])
+        for block in (rows.block("") for rows in own)
+    ]
+    step[loose] = fit_of(following).step
+    still = np.zeros_like(step)
+    return Suspect(
+        group=str(test.group),
+        members=members,
+        test=test,
+        rms=(rms_of(own, still), rms_of(own, step)),
+        rms_others=(rms_of(others, still), rms_of(others, step)),
+        cause=_cause(equations, members),
+    )
+
+
+def rms_of(rows: Sequence[Rows], step: Float[np.ndarray, " s"]) -> float:
+    """Root mean square distance of poses from their geometry, mm, after a step."""
+    return float(np.sqrt(np.mean(np.concatenate([each.squares(step) for each in rows]))))
+
+
+def _cause(equations: Equations, members: Sequence[str]) -> Cause | None:
+    """The zero of a joint, or else the probe, that explains why some observations contradict the others."""
+    one = [block._replace(group="members" if block.fixture in members else block.group) for block in equations.blocks()]
+    whole = fit_of(one)
+    apart = sum(fit_of([b for b in one if b.group in (group, None)]).cost for group in ("", "members"))
+    contradicted = max(whole.cost - apart, 1e-300)
+    best = None
+    for names in (*((name,) for name in equations.extra if name not in PROBE), PROBE):
+        fitted = fit_of(equations.blocks(members, names))
+        added = whole.degrees_of_freedom - fitted.degrees_of_freedom
+        gain, variance = whole.cost - fitted.cost, max(fitted.cost / max(fitted.degrees_of_freedom, 1), 1e-300)
+        if added == len(names) and gain > _EXPLAINS * contradicted and (best is None or gain > 1.05 * best[0]):
+            indices = [equations.extra.index(name) for name in names]
+            values = fitted.step[-added:] * equations.steps[indices]
+            best = gain, Cause(names, values, gain / contradicted, gain / added / variance)
+    return None if best is None else best[1]
+
+
+def session_metrics(record: CalibrationRecord) -> dict[str, tuple[int, float, float]]:
+    """Sessions -> number of poses, their RMS distance from the geometry, and that which the session would have alone
+    (one Gauss-Newton step away), mm; nothing without sessions. A socket's single pose, whose distance is 0, does not
+    count.
+
+    Args:
+        record: A calibration of captures that `join_sessions` joined.
+
+    Example:
+        >>> monday = aj.simulate(true, {"A": (400, 200, 300)}, poses=20, noise=noise, seed=1)
+        >>> friday = aj.simulate(true, {"A": (500, 200, 300)}, poses=20, noise=noise, seed=2)
+        >>> both = aj.join_sessions({"monday": monday, "friday": friday})
+        >>> stage1 = aj.identify(arm, both, bounds)
+        >>> of_both = aj.calibration.record_of(stage1, aj.Recording(both, nominal))
+        >>> for session, (poses, rms, alone) in aj.diagnostics.session_metrics(of_both).items():
+        ...     print(session, poses, f"{rms:.3f} mm")
+        monday 20 0.011 mm
+        friday 20 0.010 mm
+    """
+    capture = record.recording.capture
+    if not capture.sessions:
+        return {}
+    equations, found = equations_of(record), {}
+    for session in capture.sessions:
+        own = [rows for rows in equations.rows if capture.session_of(rows.name) == session]
+        if own:
+            alone = fit_of([*(rows.block("") for rows in own), *equations.relations]).step
+            poses = sum(len(rows.residual) for rows in own)
+            found[session] = poses, rms_of(own, np.zeros_like(alone)), rms_of(own, alone)
+    return found
+
+
+def remove_contradicting(
+    record: CalibrationRecord, solve: Callable[[Capture], Calibration | Identification]
+) -> CalibrationRecord:
+    """A calibration without the groups that contradict the others, one after the other; as it is where none does.
+
+    Where the data do not show which of several groups is wrong, none of them is taken out.
+
+    Args:
+        record: the calibration of everything.
+        solve: calibrates another capture likewise.
+
+    Returns:
+        The calibration of what remains. ``removed`` says what was taken out, why, and what that changed.
+
+    Example:
+        >>> kept = aj.diagnostics.remove_contradicting(record, lambda other: aj.calibrate(arm, other, bounds))
+        >>> print(kept.removed)
+        ()
+    """
+    most = sum(len(set(labels.values())) for labels in groupings(record.recording.capture).values()) // 2
+    for _ in range(most):
+        clear = [found for found in contradictions_of(record) if len(found.suspects) == 1]
+        if not clear:
+            break
+        (suspect,) = clear[0].suspects
+        capture = record.recording.capture
+        kept = tuple(
+            name
+            for name in (*capture.names, *(observation.name for observation in capture.observations))
+            if name not in suspect.members
+        )
+        try:
+            rest = part_of(capture, kept)
+            again = record_of(solve(rest), record.recording._replace(capture=rest), robust=record.robust)
+        except InputError:  # what is left does not determine the arm, so nothing can be said without this group
+            break
+        record = again._replace(
+            others=record.others, removed=(*record.removed, _removed(record, again, clear[0].kind, suspect))
+        )
+    return record
+
+
+def _removed(before: CalibrationRecord, after: CalibrationRecord, kind: str, suspect: Suspect) -> Removed:
+    equations = equations_of(after)
+    changed = np.abs(after.vectors()["calibrated"] - before.vectors()["calibrated"])
+    u = np.sqrt(np.diag(before.covariance))
+    changes = np.where(u > 0, changed / np.where(u > 0, u, 1.0), 0.0)
+    worst = int(np.argmax(changes))
+    still = np.zeros(equations.rows[0].shared.shape[2])
+    return Removed(
+        kind=kind,
+        group=suspect.group,
+        members=suspect.members,
+        ratio=suspect.test.ratio,
+        degrees_of_freedom=suspect.test.degrees_of_freedom,
+        probability=suspect.test.probability,
+        rms_with=suspect.rms_others[0],
+        rms_without=rms_of(equations.rows, still),
+        changed_most=after.names[worst],
+        change=float(changes[worst]),
+    )

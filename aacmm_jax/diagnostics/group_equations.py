@@ -1,0 +1,219 @@
+"""The equations of a calibration at its solution, observation by observation, for tests of groups of them."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..calibration.batch_kernel import without_lengths
+from ..calibration.record import CalibrationRecord
+from ..core.numpy_or_jax import to_numpy
+from ..data.noise import Noise
+from ..kinematics.arm import by_joint, is_length, value_of
+from ..kinematics.parameters import Parameters
+from ..model.observed import Observed
+from ..uncertainty.group_test import Block
+from ..uncertainty.linearisation import Linearisation
+
+PRIOR = "prior"  # name of its rows
+PROBE = ("probe_x", "probe_y", "probe_z")
+LEAST_U = 1e-6  # mm: smallest standard deviation of a length or certified value
+_MOST_POSES = 2000  # that tests of residuals look at: more would only find errors that do not matter
+_CHUNK = 100  # poses of one observation that are kept together
+EXACT = 1e-6  # mm: smaller residuals are rounding errors of a simulation without noise
+
+
+class Rows(NamedTuple):
+    """The m poses of one observation, r rows each, in standard deviations and natural steps."""
+
+    name: str
+    residual: Float[np.ndarray, "m r"]
+    shared: Float[np.ndarray, "m r s"]  # derivatives by the parameters, and by the geometry of several observations
+    own: Float[np.ndarray, "m r k"]  # by the geometry of this observation alone
+    extra: Float[np.ndarray, "m r e"]  # by what may be wrong in some of the poses: `Equations.extra`
+    in_mm: Float[np.ndarray, "m 3 r"]  # the residual's position in mm
+    by_tip: Float[np.ndarray, "m r 3"]  # derivatives by the tip's position
+    poses: Int[np.ndarray, " m"]  # their numbers among all poses: sockets first, then other observations
+
+    def block(self, group: str | None, extra: Sequence[int] = (), concerned: bool = True) -> Block:
+        """For the test; with columns of ``extra`` after the shared ones, which are 0 where it is not concerned."""
+        shared = np.concatenate([self.shared, self.extra[..., list(extra)] * concerned], axis=2)
+        flat = (array.reshape(self.residual.size, array.shape[2]) for array in (shared, self.own))
+        return Block(self.name, group, self.residual.ravel(), *flat)
+
+    def squares(self, step: Float[np.ndarray, " s"]) -> Float[np.ndarray, " m"]:
+        """Squared distance of each pose from the geometry, mm^2, after a step; its own geometry follows."""
+        moved = self.residual + self.shared @ step
+        own = self.own.reshape(self.residual.size, self.own.shape[2])
+        moved = moved - self.own @ (np.linalg.pinv(own) @ moved.ravel())
+        return np.sum(np.einsum("mcr,mr->mc", self.in_mm, moved) ** 2, axis=1)
+
+
+class Equations(NamedTuple):
+    """All equations of a calibration."""
+
+    rows: list[Rows]  # of the observations, sockets first; sockets with one pose are not among them
+    relations: list[Block]  # of reference lengths and certified values, which belong to no group
+    extra: tuple[str, ...]  # zeros of the joints, and the probe
+    steps: Float[np.ndarray, " e"]  # their natural steps, rad and mm
+
+    def blocks(self, members: Sequence[str] = (), names: Sequence[str] = ()) -> list[Block]:
+        """All in one group; with some of ``extra`` as unknowns that only certain observations have."""
+        columns = [self.extra.index(name) for name in names]
+        found = [rows.block("", columns, rows.name in members) for rows in self.rows]
+        return [*found, *wider(self.relations, len(columns))]
+
+    def grouped(self, groups: Mapping[str, str | None]) -> list[Block]:
+        """By the group of each observation."""
+        return [*(rows.block(groups[rows.name]) for rows in self.rows), *self.relations]
+
+
+def equations_of(record: CalibrationRecord) -> Equations:
+    """The equations of a calibration, linear at its solution; as weighted by its robust loss."""
+    kinds = by_joint(record.calibrated.arm, "theta", "d")  # where a reading is added
+    extra = (*(f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)), *PROBE)
+    steps = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
+    return Equations(*_rows_and_relations(record, extra), extra, steps)
+
+
+def equations_in_chunks(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
+    """The equations of poses in chunks, or of very many an even choice of these, and those of relations.
+
+    Unknowns of an observation that is divided become shared ones.
+    """
+    equations = equations_of(record)
+    divided = [each for each in equations.rows if len(each.poses) > _CHUNK]
+    added = sum(each.own.shape[2] for each in divided)
+    chunks, position = [], 0
+    for each in equations.rows:
+        shared = np.pad(each.shared, ((0, 0), (0, 0), (0, added)))
+        if len(each.poses) <= _CHUNK:
+            chunks.append(each._replace(shared=shared))
+            continue
+        width = each.own.shape[2]
+        shared[..., each.shared.shape[2] + position :][..., :width] = each.own
+        position += width
+        whole = each._replace(shared=shared, own=each.own[..., :0])
+        for start in range(0, len(each.poses), _CHUNK):
+            of = slice(start, start + _CHUNK)
+            chunks.append(whole._replace(**{name: getattr(whole, name)[of] for name in Rows._fields if name != "name"}))
+    step = -(-sum(len(each.poses) for each in chunks) // _MOST_POSES)
+    return chunks[:: max(step, 1)], wider(equations.relations, added)
+
+
+def residual_rms(rows: Sequence[Rows]) -> float:
+    """Root mean square of a coordinate of the residuals, mm."""
+    squares = [np.einsum("mcr,mr->mc", each.in_mm, each.residual).ravel() ** 2 for each in rows]
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def wider(relations: Sequence[Block], added: int) -> list[Block]:
+    """Relations where there are further shared unknowns, of which they say nothing."""
+    return [block._replace(shared=np.pad(block.shared, ((0, 0), (0, added)))) for block in relations]
+
+
+def linearisation_of(
+    record: CalibrationRecord, names: Sequence[str], *, noise: Noise | None, lengths: bool = True
+) -> Linearisation:
+    """A calibration linear at its solution, by some parameters, weighted by the noise, or where that is None by the
+    scatter of its tips; with reference lengths as relations, or without."""
+    capture = record.recording.capture if lengths else without_lengths(record.recording.capture)
+    arm = record.calibrated.arm
+    observed, arm, noise = to_numpy((Observed.of(capture, arm), arm, noise))
+    space, metrics = Parameters(arm, tuple(names)), record.observed
+    geometry = [np.asarray(metrics.geometry[part]) for part in observed.blocks]
+    z, sigma = np.concatenate([np.asarray(space.vector()), *geometry]), np.asarray(metrics.sigma)
+    found = Linearisation.at(observed, space, z, noise=noise, sigma=sigma, least=LEAST_U)
+    weights = [np.asarray(one) for one in metrics.weights]
+    if all(np.all(one == 1) for one in weights):
+        return found
+    of_groups = [np.concatenate([weights[number] for number in group.members]) for group in observed.layout.groups]
+    return found._replace(weights=[*of_groups, *found.weights[len(of_groups) :]])
+
+
+def lengths_in_solve(record: CalibrationRecord) -> bool:
+    """Whether reference lengths took part in the least squares, and not only as the scale afterwards."""
+    return record.final_method == "joint" and bool(record.recording.capture.lengths)
+
+
+def _kept(record: CalibrationRecord) -> str | None:
+    """The length that the equations keep: none where anything but repeatability says what the scale is."""
+    if lengths_in_solve(record):
+        return None
+    known = record.prior is not None or any(one.fixes_scale for one in record.recording.capture.observations)
+    return record.hold if known else scale_anchor_of(record)
+
+
+def _rows_and_relations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple[list[Rows], list[Block]]:
+    anchor = _kept(record)
+    names = tuple(name for name in record.names if name != anchor)
+    every = (*names, *(name for name in extra if name not in names))
+    linear = linearisation_of(record, every, noise=record.noise, lengths=lengths_in_solve(record))
+    observed, p, free = linear.observed, len(every), len(names)
+    steps, columns = np.asarray(linear.steps), np.array([every.index(name) for name in extra])
+    common = _common(observed)
+    rows = []
+    parts = zip(linear.parts(), linear.white(), linear.by_head(), linear.by_private(), linear.private(), strict=True)
+    for part, white, head, private, index in parts:
+        weight = np.sqrt(np.asarray(part.weight))
+        root = weight[:, None, None] * np.asarray(part.root)
+        by = np.moveaxis(np.asarray(head) * weight, (0, 1, 2), (2, 1, 0)) * steps[: linear.height]
+        own = np.moveaxis(np.asarray(private) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + index]
+        among = np.isin(index, common)
+        shared = np.zeros((*by.shape[:2], free + len(common)))
+        shared[..., :free] = by[..., :free]
+        shared[..., free : free + observed.layout.shared] = by[..., p:]
+        shared[..., free + np.searchsorted(common, index[among])] = own[..., among]
+        rows.append(
+            Rows(
+                part.observation.name,
+                (np.asarray(white) * weight).T,
+                shared,
+                own[..., ~among],
+                by[..., columns],
+                np.linalg.pinv(root)[:, :3],
+                root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
+                np.arange(part.poses.start, part.poses.stop),
+            )
+        )
+    rows = [one for one in rows if not _only_pose(record, one)]
+    derivatives, residual, u = linear.relations()
+    u = np.maximum(u, LEAST_U)
+    chosen = np.concatenate([np.arange(free), p + common])
+    block = Block("", None, residual / u, (derivatives * steps)[:, chosen] / u[:, None], np.zeros((len(u), 0)))
+    prior = _of_prior(record, np.asarray(linear.z), steps[:free], len(chosen))
+    return rows, [*([block] if len(u) else []), *prior]
+
+
+def _only_pose(record: CalibrationRecord, rows: Rows) -> bool:
+    """Whether it is a socket with one pose, which shows no scatter, and which no length in the solve needs."""
+    return len(rows.poses) == 1 and rows.own.shape[2] == 3 and not lengths_in_solve(record)
+
+
+def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, shared: int) -> list[Block]:
+    """The rows of the prior, which belong to no group."""
+    prior = record.prior
+    if prior is None:
+        return []
+    mean, weight = np.asarray(prior.mean), np.asarray(prior.weight)
+    known = np.flatnonzero(weight)
+    residual = weight[known] * (z[: len(steps)] - mean)[known]
+    derivatives = np.eye(shared)[known] * (weight * steps)[known][:, None]
+    return [Block(PRIOR, None, residual, derivatives, np.zeros((len(known), 0)))]
+
+
+def _common(observed: Observed) -> np.ndarray:
+    """Indices of the geometry that several observations, reference lengths or certified values depend on."""
+    related = {end for ends in observed.ends for end in ends} | observed.certified().keys()
+    private = [observed.positions[part] for part in observed.blocks if part in related]
+    own = np.concatenate(private) if private else np.zeros(0, dtype=int)
+    return np.union1d(np.arange(observed.layout.shared), own)
+
+
+def scale_anchor_of(record: CalibrationRecord) -> str | None:
+    """The length that is kept, because residuals of sockets vanish where the whole arm shrinks."""
+    lengths = [name for name in record.names if is_length(name)]
+    if record.hold is not None or record.scale_set_by or not lengths:
+        return record.hold
+    return max(lengths, key=lambda name: abs(value_of(record.calibrated.arm, name)))

@@ -1,0 +1,153 @@
+"""Whether the reference lengths of a calibration agree: with each other, and with the arm that the poses determine."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..calibration.drawn_errors import covariance_of_lengths
+from ..calibration.record import CalibrationRecord
+from ..calibration.scale_fix import ends_between, positions_at_ends
+from ..core.distributions import chi_square_tail, f_tail
+from ..core.numpy_or_jax import to_numpy
+from ..model.observed import Observed
+from ..uncertainty.group_test import Block
+from ..uncertainty.residual_tests import consistency
+from .group_equations import LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
+
+_EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
+# A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
+_CLEAR, _AGREE = 9.0, 0.05
+
+
+class Lengths(NamedTuple):
+    """Reference lengths and certified values against each other, by the arm that the poses determine."""
+
+    birge_ratio: float
+    degrees_of_freedom: int
+    probability: float
+    number: int
+    odd: str = ""  # the one without which the others agree
+    difference: float = 0.0  # of that one from what the others say, mm
+
+
+def length_test(
+    record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block], spare: int
+) -> Lengths | None:
+    """Lengths and certified values against the arm as the poses alone determine it, but for its scale.
+
+    Errors that poses share, where the calibration has found them, are part of what is expected, unless a single length
+    is what all others contradict.
+
+    Args:
+        record: The calibration.
+        rows: Its equations of poses.
+        relations: Its equations of lengths and certified values, where it has any.
+        spare: Degrees of freedom of the noise, where it was estimated.
+
+    Returns:
+        None where there are too few to contradict each other.
+    """
+    afterwards = bool(record.recording.capture.lengths) and not lengths_in_solve(record)
+    related = lengths_of_sockets(record, rows) if afterwards else _of_observations(record, rows, relations)
+    if related is None:
+        return None
+    plain = _tested(record, related, related.covariance, spare)
+    if plain is None or plain.odd or record.shared is None or not record.recording.capture.lengths:
+        return plain
+    arm = to_numpy(record.calibrated.arm)
+    by_shared = covariance_of_lengths(record.shared, arm, record.names, record.recording.capture)
+    number = len(by_shared)  # they come before certified values
+    by_shared = by_shared / (related.units[:number, None] * related.units[:number])
+    others = len(related.names) - number
+    return _tested(record, related, related.covariance + np.pad(by_shared, (0, others)), spare)
+
+
+def _tested(
+    record: CalibrationRecord, related: "Related", covariance: Float[np.ndarray, "l l"], spare: int
+) -> Lengths | None:
+    names, units = related.names, related.units
+    found = consistency(related.poses, related.relations, covariance, related.scale)
+    if found.degrees_of_freedom < 1:
+        return None
+
+    def probability(square: float, number: int) -> float:
+        if record.given_noise is not None:
+            return chi_square_tail(square, number)
+        return f_tail(square / number, number, spare)
+
+    worst, number = int(np.argmax(found.gains)), found.degrees_of_freedom
+    square = max(found.square, 0.0)
+    rest = max(square - found.gains[worst], 0.0)
+    clear = number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square
+    return Lengths(
+        birge_ratio=float(np.sqrt(square / number)),
+        degrees_of_freedom=number,
+        probability=probability(square, number),
+        number=len(names),
+        odd=names[worst] if clear else "",
+        difference=float(found.shifts[worst] * units[worst]) if clear else 0.0,
+    )
+
+
+class Related(NamedTuple):
+    """Lengths and certified values, and the equations of the poses that say what they should be."""
+
+    names: list[str]
+    units: Float[np.ndarray, " l"]  # of their residuals, mm
+    poses: list[Block]
+    relations: Block
+    covariance: Float[np.ndarray, "l l"]
+    scale: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None  # derivatives by the scale anchor
+
+
+def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Related | None:
+    """The positions of sockets are eliminated: a length has the scatter of its ends besides its own u."""
+    names, anchor = _names_of_lengths(record), scale_anchor_of(record)
+    if not names:
+        return None
+    capture, kept = record.recording.capture, np.array([name != anchor for name in record.names])
+    linear = linearisation_of(record, record.names, noise=record.noise, lengths=False)
+    influence, observed, p = linear.influence(), linear.observed, len(record.names)
+    ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.own, capture)
+    error = np.asarray(ends.measured - ends.nominal)
+    if np.max(np.abs(error)) < _EXACT:
+        return None
+    # Positions follow the arm as the means of their tips do.
+    followers = []
+    for name in positions_at_ends(capture):
+        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        followers.append(-influence.follow[of][component, first : first + 3])
+    slopes = np.einsum("lec,ech->lh", ends.by_positions, np.stack(followers))[:, :p]
+    covariance, scale = np.asarray(ends.covariance(np.ones(()))), None
+    if anchor is not None:
+        by_anchor = np.asarray(record.calibrated.arm.jacobian(capture.readings, (anchor,)))
+        scale = np.concatenate([(each.by_tip @ by_anchor[each.poses]).ravel() for each in rows]), slopes[:, ~kept][:, 0]
+    further = rows[0].shared.shape[2] - int(kept.sum())  # unknowns of sockets with very many poses
+    relations = Block("", None, error, np.pad(slopes[:, kept], ((0, 0), (0, further))), np.zeros((len(error), 0)))
+    return Related(names, np.ones(len(names)), [each.block("") for each in rows], relations, covariance, scale)
+
+
+def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> Related | None:
+    lengths = [block for block in relations if block.fixture != PRIOR]
+    if not lengths:
+        return None
+    capture, anchor = record.recording.capture, scale_anchor_of(record)
+    certified = Observed.of(capture, None).certified()
+    names = [*_names_of_lengths(record), *(part for part, (value, _) in certified.items() for _ in np.asarray(value))]
+    own = [*(length.u for length in capture.lengths), *(u for _, of in certified.values() for u in np.asarray(of))]
+    units = np.maximum(np.array(own, dtype=float), LEAST_U)
+    # What a prior says counts as the poses do: lengths are compared with all else.
+    poses, (related,), scale = [each.block("") for each in rows], lengths, None
+    poses += [block for block in relations if block.fixture == PRIOR]
+    measured = any(one.fixes_scale and not one.certified for one in capture.observations)
+    if anchor is not None and (record.hold is None or lengths_in_solve(record)) and not measured:
+        column = record.names.index(anchor)
+        scale = np.concatenate([block.shared[:, column] for block in poses]), related.shared[:, column]
+        *poses, related = (b._replace(shared=np.delete(b.shared, column, axis=1)) for b in (*poses, related))
+    return Related(names, units, poses, related, np.eye(len(units)), scale)
+
+
+def _names_of_lengths(record: CalibrationRecord) -> list[str]:
+    return [f"{length.start} - {length.end}" for length in record.recording.capture.lengths]

@@ -1,0 +1,116 @@
+"""Residuals of a calibration pose by pose, in mm and in standard deviations, with the weights of its last solve."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord
+from ..data.capture import Capture
+from ..data.observations.observation import AbstractObservation
+from ..uncertainty.linearisation import ObservationRows
+from .group_equations import equations_of, linearisation_of
+
+_POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
+_LEAST_LEVER = 1e-6  # mm per rad: a joint whose axis the tip is on explains nothing
+
+
+class ObservationResiduals(NamedTuple):
+    """How far the poses of one observation are from its geometry."""
+
+    observation: AbstractObservation
+    distance: Float[np.ndarray, " m"]  # mm
+    angle: Float[np.ndarray, " m"] | None  # rad; None where no orientation was measured
+    # Root mean square over the pose's rows in standard deviations: about 1, whatever the kind.
+    normalised: Float[np.ndarray, " m"]
+    weight: Float[np.ndarray, " m"]  # below 1 where a robust loss took weight from the pose
+    u: float  # standard uncertainty of a coordinate or distance that was measured, RMS over the poses, mm
+    u_angle: float | None  # of an orientation about each axis, rad
+    by_joint: Float[np.ndarray, "n m"]  # change of each reading that alone would explain most of the residual, rad
+    lever: Float[np.ndarray, "n m"]  # what the tip moves with that reading, mm per rad; a slide: mm, mm per mm
+
+
+def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResiduals, ...]:
+    """The residuals of a calibration from observations, or with a robust loss; sockets first, in the capture's order.
+
+    Arm, geometry and the standard deviations of the rows are those of its last solve, so that the root mean square of
+    ``normalised`` over an observation is its ``reduced_chi``.
+
+    Args:
+        record: The calibration.
+
+    Returns:
+        One for each observation.
+    """
+    linear = linearisation_of(record, record.names, noise=record.given_noise)
+    return tuple(_residuals(part) for part in linear.parts())
+
+
+def _residuals(part: ObservationRows) -> ObservationResiduals:
+    values = np.asarray(part.values)
+    moved = np.asarray(part.by_readings)[:_POSITION_ROWS]
+    lever = np.linalg.norm(moved, axis=0)
+    white = np.einsum("mab,bm->am", part.root, values)
+    variances = np.diagonal(np.asarray(part.measured), axis1=1, axis2=2)
+    turned = values.shape[0] > _POSITION_ROWS
+    return ObservationResiduals(
+        observation=part.observation,
+        distance=np.linalg.norm(values[:_POSITION_ROWS], axis=0),
+        angle=np.linalg.norm(values[_POSITION_ROWS:], axis=0) if turned else None,
+        normalised=np.sqrt(np.mean(white**2, axis=0)),
+        weight=np.asarray(part.weight),
+        u=float(np.sqrt(np.mean(variances[:, :_POSITION_ROWS]))),
+        u_angle=float(np.sqrt(np.mean(variances[:, _POSITION_ROWS:]))) if turned else None,
+        by_joint=-np.einsum("rm,rnm->nm", values[:_POSITION_ROWS], moved) / np.maximum(lever, _LEAST_LEVER) ** 2,
+        lever=lever,
+    )
+
+
+def distances_of(capture: Capture, evaluation: Evaluation) -> tuple[Float[np.ndarray, " m"], ...]:
+    """Distances of all poses from their geometry in an evaluation, mm: of each socket, then of each observation."""
+    if evaluation.observed is not None:
+        rows = (np.asarray(values)[:_POSITION_ROWS] for values in evaluation.observed.residuals)
+        return tuple(np.linalg.norm(values, axis=0) for values in rows)
+    return tuple(np.split(np.asarray(evaluation.distances), np.cumsum(capture.sizes)[:-1]))
+
+
+def rms(values: Sequence[float] | Float[np.ndarray, " m"]) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+class SignedResiduals(NamedTuple):
+    """The residuals of a calibration with their directions, for those poses that have one; N poses, n joints."""
+
+    poses: Int[np.ndarray, " N"]  # their numbers among all poses: sockets first, then other observations
+    vector: Float[np.ndarray, "N 3"]  # in the base frame, mm; of a distance or plane, along what it measures
+    along_joint: Float[np.ndarray, "N n"]  # component along which each joint moves the tip, mm; NaN where it does not
+    normalised: Float[np.ndarray, " k"]  # every row of every pose, in standard deviations
+
+
+def signed_residuals(record: CalibrationRecord) -> SignedResiduals | None:
+    """The residuals of a calibration with their directions; None where no pose has one.
+
+    A joint whose angle is wrong moves the tip along its own direction alone, so that what the model lacks in one joint
+    shows in ``along_joint`` against the reading of that joint.
+
+    Args:
+        record: The calibration.
+    """
+    rows, joints = equations_of(record).rows, record.calibrated.arm.joints
+    if not rows:
+        return None
+    parts = []
+    for each in rows:
+        in_mm = np.einsum("mcr,mr->mc", each.in_mm, each.residual)
+        vector = np.einsum("mcr,mrx,mc->mx", each.in_mm, each.by_tip, in_mm)
+        moves = each.in_mm @ each.extra[..., :joints]
+        size = np.linalg.norm(moves, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            along = np.where(size > 1e-6 * size.max(), np.einsum("mc,mcn->mn", in_mm, moves) / size, np.nan)
+        parts.append((each.poses, vector, along, each.residual.ravel()))
+    poses, *arrays = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(poses, kind="stable")
+    return SignedResiduals(poses[order], arrays[0][order], arrays[1][order], arrays[2])

@@ -1,0 +1,266 @@
+"""Whether joint readings are those of an arm, and if not, which order, signs, zeros and units make them so.
+
+The best hypotheses of `reading_search`, for the nominal arm, are refitted: first with free zeros of the joints, then
+with those zeros alone that are needed. Every other parameter may leave its nominal value as an arm's real ones do, so
+that residuals of a few millimetres, which a nominal arm has anyway, do not decide.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.arguments import checked_arguments
+from ..core.arrays import Numbers, as_array
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..core.units import DEG, INCH, M
+from ..kinematics.arm import Arm, is_single, joint_limits
+from ..kinematics.jacobian import tip_position
+from ..kinematics.workspace import total_link_length
+from .joint_travel import standing_joints
+from .reading_fit import Explanation, ReadingFit
+from .reading_search import Evidence, Found, Hypothesis, as_recorded, search
+
+_EXPLAINED = 0.003  # of the arm's size: a smaller residual is left by a nominal arm, once its parameters are adjusted
+_AS_GOOD = 2.0  # the factor by which residuals of two explanations must differ to tell them apart
+_REFITTED = 24  # hypotheses
+_EQUAL = 1e-6, 2e-4  # of a residual, and mm: the same cost but for rounding
+_LISTED = 200  # hypotheses of equal cost that are looked at
+_TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
+_NEVER = 8 * np.pi
+_LENGTHS = (M, 1 / M, INCH, 1 / INCH)
+_NEAREST, _FARTHEST = 0.05, 1.3  # of the arm's size: distances of known positions from the base
+_APART = 50 * DEG  # zeros that differ by less are adjusted, not confused
+_SAME = 5 * DEG  # alternatives whose zeros differ by less are one
+_COMMON = 200  # readings at which two hypotheses are compared
+_ALIKE = 1e-6  # of the arm's size
+
+
+class ReadingCheck(NamedTuple):
+    """What `check_readings` found.
+
+    Example:
+        >>> found = aj.diagnostics.check_readings(arm, capture.q[:20], positions=true.position(capture.q[:20]))
+        >>> print(found.fits, found.explained, found.poses)
+        True True 20
+    """
+
+    given: Explanation  # nothing changed
+    best: Explanation  # the simplest of the best; ``given`` where the readings fit as they are
+    others: tuple[Explanation, ...]  # as good on these data, but not everywhere
+    equal: int  # further ones that have the tip in the same positions everywhere, whatever the readings
+    explained: bool  # whether the best leaves residuals that an arm of this kind has
+    size: float  # of the arm, mm: its links together
+    poses: int
+    known_positions: bool  # in the base frame
+    tried: int  # hypotheses
+    # Of the nominal arm as the best has it, with the tip where it fits in the last frame, mm; None: it is not free.
+    rms_with_tip: float | None = None
+    free_tip: bool = False  # whether the place of the tip was said to be unknown
+
+    @property
+    def fits(self) -> bool:
+        """Whether the readings fit as they are."""
+        return self.explained and self.best == self.given
+
+
+@checked_arguments
+def check_readings(
+    arm: Arm,
+    q: Numbers,
+    *,
+    sockets: Numbers | None = None,
+    positions: Numbers | None = None,
+    rotations: Numbers | None = None,
+    own_frame: bool = False,
+    free_tip: bool = False,
+) -> ReadingCheck:
+    """Find the order, signs, zeros and units with which recorded readings fit an arm best.
+
+    Either the tip was held in sockets, whose positions are unknown; or it was at known positions. Where two
+    explanations have the tip in the same positions for all readings (a wrist that is flipped, a joint whose axis goes
+    through the tip), the simpler one is given; where they differ only beyond these data, all are listed.
+
+    Args:
+        arm: One arm, nominal.
+        q: Readings ``(m, n)``, a column each for as many joints as the arm has, rad.
+        sockets: Number or name of the socket of each pose ``(m,)``.
+        positions: Instead: where the tip was ``(m, 3)``, mm.
+        rotations: With positions in the base frame: orientation of the last frame ``(m, 3, 3)``.
+        own_frame: Whether positions are in the frame of an instrument, at an unknown place, instead of the base frame.
+        free_tip: Whether the place of the tip in the last frame is unknown, such as that of a reflector.
+
+    Returns:
+        The explanation, others that are as good, and whether anything explains the readings.
+
+    Raises:
+        InputError: Shapes do not fit, or there are too few poses to say anything.
+
+    Example:
+        >>> in_another_order = capture.q[:20, [1, 0, 2, 3, 4, 5]]
+        >>> found = aj.diagnostics.check_readings(arm, in_another_order, positions=true.position(capture.q[:20]))
+        >>> print(found.fits, found.best.order)
+        False (1, 0, 2, 3, 4, 5)
+    """
+    arm = to_numpy(arm)
+    evidence = _evidence(arm, q, sockets, positions, rotations, own_frame)
+    size = max(total_link_length(arm), 1e-9)
+    fit = ReadingFit(arm, evidence, size, free_tip)
+    given = fit.explanation(as_recorded(arm.joints), 1.0, 1.0)
+    candidates, tried = [], 0
+    for angle, length in _units(arm, evidence, size):
+        found = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
+        tried += found.tried
+        for members in _groups(found, size):
+            members.sort(key=lambda one: (fit.outside(one, angle) > 0, one.changes))
+            candidates.append((members, angle, length, *fit.with_free_zeros(members[0], angle, length)))
+    possible = float(np.abs(evidence.q).max()) <= _NEVER
+    bound = _bound(min([rms for *_, rms in candidates] + [given.rms_fitted] * possible), fit)
+    good = [
+        (members, fit.needed_zeros(members[0], angle, length, zeros, rms))
+        for members, angle, length, zeros, rms in candidates
+        if rms <= bound
+    ]
+    every = [one for _, one in good] + [given] * (possible and given.rms_fitted <= bound)
+    explained = min(one.rms_fitted for one in every) <= _EXPLAINED * size
+    simplest = min(every, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
+    best = simplest if explained else min(every, key=lambda one: one.rms_fitted)
+    others, equal = _others(fit, best, good) if explained else ((), 0)
+    best = best if best == given else fit.within_limits(best)
+    return ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)._replace(
+        rms_with_tip=fit.with_tip_found(best) if own_frame else None, free_tip=free_tip
+    )
+
+
+def _bound(rms: float, fit: ReadingFit) -> float:
+    """Residuals up to here are as good as these."""
+    return _AS_GOOD * rms + fit.typical
+
+
+def _evidence(
+    arm: Arm, q: Numbers, sockets: Numbers | None, positions: Numbers | None, rotations: Numbers | None, own: bool
+) -> Evidence:
+    """What was recorded, checked; poses sorted by socket."""
+    if not is_single(arm):
+        raise InputError("check_readings takes one arm, not a batch; give one of its arms.")
+    values = np.asarray(as_array(q, "q", like=arm.alpha))
+    if values.ndim != 2 or values.shape[1] != arm.joints or not len(values):
+        raise InputError(f"q has shape {values.shape}; give a row for each pose and {arm.joints} columns.")
+    if (sockets is None) == (positions is None):
+        raise InputError("give either the sockets of the poses or the positions of the tip.")
+    if not np.all(np.isfinite(values)):
+        raise InputError("a reading is not finite; correct it.")
+    if sockets is not None:
+        names, owner = np.unique(np.asarray(sockets), return_inverse=True)
+        if owner.shape != (len(values),):
+            raise InputError(
+                f"sockets has shape {owner.shape}; give one number or name for each of {len(values)} poses."
+            )
+        if np.bincount(owner, minlength=len(names)).max() < 2:
+            raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
+        order = np.argsort(owner, kind="stable")
+        return Evidence(values[order], owner[order])
+    points = np.asarray(as_array(positions, "positions", like=arm.alpha))  # pyright: ignore[reportArgumentType]
+    turned = None if rotations is None else np.asarray(as_array(rotations, "rotations", like=arm.alpha))
+    for what, part, shape in (("positions", points, (3,)), ("rotations", turned, (3, 3))):
+        if part is not None and (part.shape != (len(values), *shape) or not np.all(np.isfinite(part))):
+            raise InputError(f"{what} has shape {part.shape}; give finite numbers of shape {(len(values), *shape)}.")
+    if own and (len(values) < 4 or turned is not None):
+        raise InputError(
+            "in a frame of their own four positions are needed, and orientations are not used; give more, or positions "
+            "in the base frame."
+        )
+    return Evidence(values, np.zeros(len(values), dtype=int), points, turned, own)
+
+
+def _units(arm: Arm, evidence: Evidence, size: float) -> Iterator[tuple[float, float]]:
+    """Factors of readings and of positions that are possible: 1, and others where the numbers look like them."""
+    largest = float(np.abs(evidence.q).max())
+    angles = [1.0] if largest <= _NEVER else []
+    angles += [DEG] if largest > _TURN else [1 / DEG] if 0 < largest < _TURN * DEG else []
+    lengths = [1.0]
+    if evidence.points is not None:
+        points = evidence.points
+        distances = np.linalg.norm(points - (points.mean(axis=0) if evidence.own_frame else 0.0), axis=1)
+        farthest, span = float(distances.max()), size + abs(float(np.asarray(arm.d)[0]))
+        if not _NEAREST * span <= farthest <= _FARTHEST * span:
+            possible = [x for x in _LENGTHS if _NEAREST * span <= x * farthest <= _FARTHEST * span]
+            lengths = [1.0] * (farthest < _FARTHEST * span or not possible) + possible  # small ones are possible, too
+    yield from itertools.product(angles, lengths)
+
+
+def _groups(found: Found, size: float) -> list[list[Hypothesis]]:
+    """The first hypotheses by residual, those of equal residual together."""
+    groups: list[list[Hypothesis]] = []
+    before = -np.inf
+    for rms, hypothesis in zip(found.rms, found.hypotheses, strict=True):
+        if rms - before > _EQUAL[0] * rms + _EQUAL[1] * size / M:
+            if len(groups) == _REFITTED:
+                break
+            groups.append([])
+            before = rms
+        groups[-1].append(hypothesis)
+    return groups
+
+
+def _others(
+    fit: ReadingFit, best: Explanation, good: Sequence[tuple[list[Hypothesis], Explanation]]
+) -> tuple[tuple[Explanation, ...], int]:
+    """Explanations that are as good, but differ from the best beyond these data; and the number of those that do not.
+
+    Hypotheses of equal cost are compared as they were tried, with zeros at multiples of 45 degrees.
+    """
+    bound, others, equal, own = _bound(best.rms_fitted, fit), [], 0, False
+    for members, one in good:
+        of_best = not own and (best.hypothesis in members or best == one)
+        own = own or of_best
+        base = members[0] if of_best and best.hypothesis not in members else best.hypothesis
+        for member in members[:_LISTED] if of_best else [one.hypothesis]:
+            same, mirrored = _compared(fit, member, base)
+            if same or any(_compared(fit, member, other)[0] for other, _ in others):
+                equal += same and member != base
+                continue
+            found = fit.refitted(member, one.angle, one.length) if of_best else one
+            if found.rms_fitted <= bound and (best.outside > 0 or not found.outside) and _distinct(found, best):
+                others.append((member, found._replace(mirrored=mirrored)))
+    # Of a joint that stands still, unless there is a single pose, nothing that an alternative says could be tested.
+    still = [joint.joint - 1 for joint in standing_joints(fit.arm, best.angle * fit.evidence.q)]
+    still = still if len(still) < fit.arm.joints else []
+    kept: list[Explanation] = []
+    for _, other in others:
+        moved = other.angle == best.angle and any(_of_joint(other, i) != _of_joint(best, i) for i in still)
+        if not moved and all(_distinct(other, one, _SAME) for one in kept):
+            kept.append(other)
+    return tuple(sorted(kept, key=lambda other: (other.changes, other.rms_fitted))), equal
+
+
+def _of_joint(one: Explanation, i: int) -> tuple[int, int, float]:
+    """What an explanation says of joint i, from 0."""
+    return one.order[i], one.signs[i], one.offsets[i]
+
+
+def _distinct(one: Explanation, other: Explanation, apart: float = _APART) -> bool:
+    """Whether two explanations differ by more than zeros that are hardly determined."""
+    if one[:2] != other[:2] or (one.angle, one.length) != (other.angle, other.length):
+        return True
+    return any(abs(math.remainder(x - y, 2 * math.pi)) > apart for x, y in zip(one.offsets, other.offsets, strict=True))
+
+
+def _compared(fit: ReadingFit, one: Hypothesis, other: Hypothesis) -> tuple[bool, bool]:
+    """Whether two hypotheses have the tip in the same positions for all readings, but for the place of the base where
+    that is unknown; and whether in mirror images of them."""
+    limits = np.asarray(joint_limits(fit.arm, None))
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_COMMON, fit.arm.joints))
+    tips = [np.asarray(tip_position(to_numpy(fit.arm.geometry), each.readings(q))) for each in (one, other)]
+    if fit.evidence.in_base:
+        return bool(np.abs(tips[0] - tips[1]).max() < _ALIKE * fit.size), False
+    first, second = (tip - tip.mean(axis=0) for tip in tips)
+    u, _, v = np.linalg.svd(first.T @ second)
+    far = {}
+    for sign in (1.0, -1.0):
+        turn = u @ np.diag([1.0, 1.0, sign * np.linalg.det(u @ v)]) @ v
+        far[sign] = float(np.abs(first @ turn - second).max())
+    return far[1.0] < _ALIKE * fit.size, far[-1.0] < _ALIKE * fit.size

@@ -1,0 +1,232 @@
+"""How well an order, signs and zeros of joint readings fit an arm, whose parameters may leave their nominal values as
+those of real arms do."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ..core.numpy_or_jax import to_numpy
+from ..core.rotations import fitted_frame, rotation_matrix
+from ..core.units import DEG
+from ..kinematics.arm import Arm, by_joint, is_length, joint_limits, locate, parameter_names, value_of, with_values
+from ..kinematics.chain import forward_pass, joint_motion
+from ..kinematics.jacobian import rotation_columns, stacked_jacobian_columns
+from .reading_search import Evidence, Hypothesis
+
+# Standard deviations: of a real arm's parameters from nominal ones (lengths relative to the arm's size), of the tips.
+_LENGTH, _PROBE, _TWIST, _TIP = 0.004, 0.03, 0.5 * DEG, 5e-4
+_TIGHT, _FREE = 1.5 * DEG, math.pi / 2  # likewise of zeros
+_ZERO = 4 * DEG  # a smaller error of a zero is left to calibration
+_STEPS = 20
+_FITTED = 120, 24  # poses of a fit, in all and in one socket
+_MARGIN = 3 * DEG  # of readings beyond their limits
+_EXACT = 1e-5  # of the arm's size: residuals below it do not differ
+_NEARLY = 1.5  # the factor up to which residuals with fewer changed zeros are as good
+
+
+class Explanation(NamedTuple):
+    """One order, set of signs and zeros, and units that fit the readings to the arm.
+
+    Reading i of the arm is ``signs[i] * (angle * q[:, order[i]]) + offsets[i]``; points are ``length`` times those that
+    were given.
+
+    Example:
+        >>> readings = capture.q[:20] * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+        >>> found = aj.diagnostics.check_readings(arm, readings, positions=true.position(capture.q[:20]))
+        >>> print(found.best.signs, f"{found.best.rms:.1f} mm instead of {found.given.rms:.0f} mm")
+        (1, 1, -1, 1, 1, 1) 2.2 mm instead of 431 mm
+    """
+
+    order: tuple[int, ...]  # the recorded column of each joint, from 0
+    signs: tuple[int, ...]
+    offsets: tuple[float, ...]  # rad; exact multiples of a quarter where they are within 4 degrees
+    angle: float  # 1, DEG (degrees were taken for radians) or 1 / DEG
+    length: float  # 1, or the unit that positions are in, mm
+    rms: float  # residual of the nominal arm, mm
+    rms_fitted: float  # of the most probable arm, with what its changes of parameters cost, mm
+    outside: int  # readings outside the joint limits
+    mirrored: bool = False  # whether it has the tip in the mirror image of the best explanation's positions
+
+    @property
+    def hypothesis(self) -> Hypothesis:
+        """Order, signs and zeros."""
+        return Hypothesis(self.order, self.signs, self.offsets)
+
+    @property
+    def changes(self) -> int:
+        """Number of mistakes that it names."""
+        return self.hypothesis.changes + (self.angle != 1) + (self.length != 1)
+
+
+class ReadingFit:
+    """Residuals of hypotheses, with nominal and with adjusted parameters."""
+
+    def __init__(self, arm: Arm, evidence: Evidence, size: float, free_tip: bool):
+        self.arm, self.evidence, self.size, self.lever = arm, evidence, size, size / 4
+        self._few = evidence.thinned(*_FITTED)
+        names = parameter_names(arm)
+        self._nominal = np.array([value_of(arm, name) for name in names], dtype=float)
+        self._indices = tuple(locate(arm, name) for name in names)
+        lengths = [is_length(name) for name in names]
+        self._deviations = np.where(lengths, _LENGTH * size, _TWIST)
+        self._zeros = np.array([name.startswith("theta") for name in names])
+        self._tip = np.array([name.startswith("probe") for name in names])
+        self._deviations[self._tip] = size / 2 if free_tip else _PROBE * size
+        rows = (3 if evidence.rotations is None else 6) * len(self._few.q)
+        unknown = 0 if evidence.in_base else 6 if evidence.own_frame else 3 * (1 + int(self._few.owner.max()))
+        self._enough = rows - unknown >= 3 * arm.joints
+        # The residual of parameters that deviate from nominal ones by as much as those of real arms do.
+        self.typical = _TIP * size * math.sqrt(min(rows, len(names)) / len(self._few.q))
+
+    def explanation(self, hypothesis: Hypothesis, angle: float, length: float) -> Explanation:
+        """With the zeros as they are in the hypothesis."""
+        whole = self.evidence.scaled(angle, length)
+        residual = self._residual(whole, self._nominal, hypothesis.readings(whole.q))[0]
+        fitted, _ = self._adjusted(hypothesis, angle, length, _TIGHT)
+        outside = self.outside(hypothesis, angle)
+        return Explanation(*hypothesis, angle, length, _rms(residual, len(whole.q)), fitted, outside)
+
+    def outside(self, hypothesis: Hypothesis, angle: float) -> int:
+        """Readings beyond the arm's limits, where it has some."""
+        if self.arm.limits is None:
+            return 0
+        low, high = np.asarray(joint_limits(self.arm, None)).T
+        readings = hypothesis.readings(angle * self.evidence.q)
+        # A reading may be whole revolutions away.
+        readings = readings - 2 * np.pi * np.round((readings - (low + high) / 2) / (2 * np.pi))
+        return int(np.sum((readings < low - _MARGIN) | (readings > high + _MARGIN)))
+
+    def within_limits(self, one: Explanation) -> Explanation:
+        """The same with zeros whole revolutions away: as many readings as can be are then within the joint limits, and
+        of these the zeros are the smallest."""
+        low, high = (np.full(self.arm.joints, x) for x in (-np.inf, np.inf))
+        if self.arm.limits is not None:
+            low, high = np.asarray(joint_limits(self.arm, None)).T
+        readings, offsets = one.hypothesis.readings(one.angle * self.evidence.q), np.array(one.offsets)
+        for i in np.flatnonzero(by_joint(self.arm, True, False)):
+            turns = 2 * np.pi * (np.arange(-2, 3) - round(offsets[i] / (2 * np.pi)))
+            moved = readings[:, i] + turns[:, None]
+            outside = np.sum((moved < low[i] - _MARGIN) | (moved > high[i] + _MARGIN), axis=1)
+            offsets[i] += turns[np.lexsort((np.abs(offsets[i] + turns), outside))[0]]
+        return one._replace(offsets=tuple(offsets.tolist()))
+
+    def with_free_zeros(
+        self, hypothesis: Hypothesis, angle: float, length: float
+    ) -> tuple[Float[np.ndarray, " n"], float]:
+        """Changes of the zeros that fit best, rad, and the residual with them; none where there are too few poses."""
+        fitted, zeros = self._adjusted(hypothesis, angle, length, _FREE if self._enough else _TIGHT)
+        return zeros if self._enough else 0 * zeros, fitted
+
+    def needed_zeros(
+        self, hypothesis: Hypothesis, angle: float, length: float, zeros: Float[np.ndarray, " n"], rms: float
+    ) -> Explanation:
+        """The explanation with as few changed zeros as are needed, the largest first."""
+        offsets = np.array(hypothesis.offsets)
+        waiting = [i for i in np.argsort(-np.abs(zeros)).tolist() if abs(zeros[i]) > _ZERO]
+        while True:
+            found = self.explanation(hypothesis._replace(offsets=tuple(offsets.tolist())), angle, length)
+            if found.rms_fitted <= _NEARLY * rms + _EXACT * self.size or not waiting:
+                return found
+            joint = waiting.pop(0)
+            offset = math.remainder(offsets[joint] + zeros[joint], 2 * math.pi)
+            quarter = round(offset / (math.pi / 2)) * (math.pi / 2)
+            offsets[joint] = quarter if abs(offset - quarter) < _ZERO else offset
+
+    def refitted(self, hypothesis: Hypothesis, angle: float, length: float) -> Explanation:
+        """The explanation with the zeros that fit best, as few of them changed as are needed."""
+        return self.needed_zeros(hypothesis, angle, length, *self.with_free_zeros(hypothesis, angle, length))
+
+    def with_tip_found(self, one: Explanation) -> float:
+        """The residual of the nominal arm with the tip where it fits best in the last frame, mm."""
+        evidence, vector = self.evidence.scaled(one.angle, one.length), self._nominal.copy()
+        readings, tip = one.hypothesis.readings(evidence.q), np.flatnonzero(self._tip)
+        residual, columns = self._residual(evidence, vector, readings)
+        best = _rms(residual, len(readings))
+        for _ in range(_STEPS):
+            vector[tip] -= np.linalg.lstsq(columns[:, tip], residual, rcond=1e-10)[0]
+            residual, columns = self._residual(evidence, vector, readings)
+            before, best = best, min(best, _rms(residual, len(readings)))
+            if best > 0.99 * before:
+                break
+        return best
+
+    def _adjusted(
+        self, hypothesis: Hypothesis, angle: float, length: float, zero: float
+    ) -> tuple[float, Float[np.ndarray, " n"]]:
+        """The most probable arm, whose zeros have this standard deviation: its residual and the changes of its zeros.
+
+        The residual counts how improbable the change of each parameter is, too: with changes that no real arm has,
+        many wrong readings can be fitted. The method of Levenberg and Marquardt.
+        """
+        evidence = self._few.scaled(angle, length)
+        readings = hypothesis.readings(evidence.q)
+        nominal = self._nominal
+        deviations = np.where(self._zeros, zero, self._deviations)
+        sigma, change, damping = _TIP * self.size, np.zeros(len(nominal)), 1e-3
+        residual, columns = self._residual(evidence, nominal, readings)
+        cost = np.sum(residual**2) / sigma**2
+        for _ in range(_STEPS):
+            rows = np.concatenate([columns * deviations / sigma, np.eye(len(change)), damping * np.eye(len(change))])
+            right = np.concatenate([-residual / sigma, -change, np.zeros(len(change))])
+            new = change + np.linalg.lstsq(rows, right, rcond=None)[0]
+            tried = self._residual(evidence, nominal + new * deviations, readings)
+            new_cost = np.sum(tried[0] ** 2) / sigma**2 + np.sum(new**2)
+            if not new_cost < cost:
+                damping *= 10
+                continue
+            done = cost - new_cost < 1e-3 * cost
+            change, cost, (residual, columns), damping = new, new_cost, tried, damping / 10
+            if done:
+                break
+        return sigma * math.sqrt(cost / len(readings)), (change * deviations)[self._zeros]
+
+    def _residual(
+        self, evidence: Evidence, vector: Float[np.ndarray, " p"], readings: Float[np.ndarray, "m n"]
+    ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
+        """Residuals, mm, and their derivatives, with the unknown geometry eliminated."""
+        geometry = to_numpy(self.arm.geometry)
+        geometry = geometry._replace(**with_values(geometry, vector, self._indices))
+        forward = forward_pass(geometry, joint_motion(geometry, readings))
+        tips = np.asarray(forward.tip).T
+        columns = np.moveaxis(np.asarray(stacked_jacobian_columns(forward, self._indices)), -1, 0).swapaxes(1, 2)
+        if evidence.points is None:
+            residual, columns = (part - _means(part, evidence.owner) for part in (tips, columns))
+            return residual.ravel(), columns.reshape(residual.size, -1)
+        flat = columns.reshape(tips.size, -1)
+        if evidence.own_frame:
+            residual, basis = _aligned(tips, evidence.points)
+            return residual.ravel(), flat - basis @ (basis.T @ flat)
+        residual = (tips - evidence.points).ravel()
+        if evidence.rotations is None:
+            return residual, flat
+        found = np.stack(forward.frame, axis=1).T.swapaxes(1, 2)
+        turned = Rotation.from_matrix(found @ evidence.rotations.swapaxes(1, 2)).as_rotvec().ravel()
+        by_angles = np.moveaxis(np.asarray(rotation_columns(forward, self._indices)), -1, 0).swapaxes(1, 2)
+        rows = self.lever * by_angles.reshape(turned.size, -1)
+        return np.concatenate([residual, self.lever * turned]), np.concatenate([flat, rows])
+
+
+def _means(values: Float[np.ndarray, "m ..."], owner: np.ndarray) -> Float[np.ndarray, "m ..."]:
+    """The mean of each pose's socket."""
+    sizes = np.bincount(owner)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    return (np.add.reduceat(values, starts) / sizes.reshape(-1, *(1,) * (values.ndim - 1)))[owner]
+
+
+def _aligned(
+    tips: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "r 6"]]:
+    """Residuals of the tips from points that are moved rigidly to fit, and an orthonormal basis of rigid movements."""
+    frame = np.asarray(fitted_frame(points.T, tips.T))
+    placed = points @ np.asarray(rotation_matrix(frame[:3])).T + frame[3:]
+    centred = placed - placed.mean(axis=0)
+    turns = [np.cross(axis, centred).ravel() for axis in np.eye(3)]
+    shifts = [np.tile(axis, len(points)) for axis in np.eye(3)]
+    return tips - placed, np.linalg.qr(np.stack([*turns, *shifts], axis=1))[0]
+
+
+def _rms(residual: Float[np.ndarray, " r"], poses: int) -> float:
+    return float(np.sqrt(np.sum(residual**2) / poses))

@@ -1,0 +1,384 @@
+"""Errors that poses share, found in the residuals of a calibration and added to its uncertainty.
+
+Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
+all poses of a visit share (marked in the capture, or successive poses where none are), and functions of the readings
+that the model lacks (`uncertainty.shared_errors`). The gate keeps the intervals of a calibration in which nothing is
+wrong as they are. Errors that all poses of a socket share, which only reference lengths show, are always allowed for
+where three lengths or more compare them, as far as these leave them possible. After a robust loss, poses count with the
+weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..calibration.drawn_errors import functions_of, places_of
+from ..calibration.record import CalibrationRecord, record_of
+from ..calibration.results import Calibration
+from ..calibration.sensitivities import Sensitivities
+from ..core._compat import inside_trace
+from ..core.arrays import is_concrete
+from ..core.distributions import chi_square_tail, f_tail
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..data.recording import Recording
+from ..kinematics.arm import Arm, correction_names, natural_steps
+from ..kinematics.corrected_arm import with_corrections, with_further_corrections
+from ..kinematics.corrections.kinds import coefficient_of, shared_model
+from ..kinematics.parameters import ArmSpecification
+from ..kinematics.prior_scales import default_prior
+from ..uncertainty.covariance import DISAGREEMENT
+from ..uncertainty.degrees_of_freedom import Law
+from ..uncertainty.residual_tests import block_diagonal, form_of_poses, form_test, score_tests
+from ..uncertainty.shared_errors import (
+    NULL,
+    Effects,
+    Moments,
+    OneVariance,
+    SharedErrors,
+    group_deviations,
+    one_variance,
+    second_moments,
+)
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
+from .group_equations import EXACT, PRIOR, Rows, equations_in_chunks, lengths_in_solve, residual_rms
+from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, with_lengths
+
+_GATE = 0.1  # probability of a test below which an effect is looked at
+# Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as
+# alike in all, which poses do not show.
+_LENGTHS, _PART = (2.0, 5.0, 15.0), 3
+_MOST_PATTERNS = 8  # of successive poses of one socket: slower ones matter, faster ones are like noise
+# Part of the residuals of poses above which the size of the arm explains them, to which residuals of sockets are in
+# proportion: parameters, or errors of places, of which poses say nothing.
+_MOST_OF_POSES = 0.5
+_NEIGHBOURS = 1.0  # rad, over which errors of neighbouring configurations are alike
+# Of the weight of a pose after a robust loss: less remains beyond 13 standard deviations with Huber, 4 with Tukey.
+# Shared errors of a few standard deviations cost weight, too, and are what is looked for.
+_TRUSTED = 0.1
+_FEWEST = 6  # degrees of freedom
+# Median of the standard deviation of errors of the tip that poses share, of that of the residuals, as it is expected
+# beforehand; three lengths say so little that it decides how wide intervals are (`benchmarks/NOTES.md`).
+_USUAL = 1.25
+# Differences between lengths from which errors of places are always allowed for. So few do not show that there are
+# none: with three lengths, a gate closes in a third of the captures in which places err by as much as single poses.
+_FEW = 2
+
+
+def with_shared_errors(
+    result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]
+) -> Calibration:
+    """The calibration with the errors that its poses share in its covariance; as it is where its values are traced.
+
+    What is left of an estimated noise is that of single poses. The covariance by the noise of all stays: where chance
+    looks like shared errors, intervals do not become narrower.
+    """
+    if inside_trace() or not is_concrete(*jax.tree.leaves((result, capture))) or result.implausible_residual:
+        return result
+    with np.errstate(all="ignore"):
+        found = _found(to_numpy(result), to_numpy(capture), sensitivities)
+    if found is None:
+        return result
+    before = result.parameter_covariance
+    if PLACES in found.shared.kinds:
+        before = before.without(DISAGREEMENT)
+    covariance = before._replace(
+        matrix=before.matrix + found.added,
+        noise=jax.tree.map(lambda leaf: np.sqrt(found.variance) * leaf, before.noise),
+    )
+    if not np.all(np.isfinite(covariance.matrix)):
+        return result
+    return eqx.tree_at(
+        lambda r: (r.parameter_covariance, r.shared), result, (covariance, found.shared), is_leaf=lambda x: x is None
+    )
+
+
+class _Found(NamedTuple):
+    shared: SharedErrors
+    added: Float[np.ndarray, "p p"]
+    variance: float  # of independent errors, over that of all
+
+
+def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]) -> _Found | None:
+    record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
+    if not record.converged:
+        return None
+    rows, relations = equations_in_chunks(record)
+    rows = _trusted(record, rows)
+    if not rows or residual_rms(rows) < EXACT:
+        return None
+    known = [block for block in relations if block.fixture == PRIOR]
+    of_poses = problem_of_poses(record, rows, known, sensitivities)
+    whole = sum(float(np.sum(each.residual**2)) for each in rows)
+    if lengths_in_solve(record) and of_poses.left.cost < _MOST_OF_POSES * whole:
+        relations = [*relations, scale_of_lengths(record, relations)]
+        of_poses = problem_of_poses(record, rows, [*known, relations[-1]], sensitivities)
+    if of_poses.left.degrees_of_freedom < _FEWEST:
+        return None
+    problem = with_lengths(of_poses, relations)
+    tips, functions = _visits(of_poses), _functions(of_poses)
+    # All but places by the poses alone: lengths that contradict each other would be put down to whatever moves them.
+    effects = Effects.none(of_poses.left, record.given_noise is not None)
+    for probability, effect in sorted([(tips.probability, tips.kind), (functions.probability, "")]):
+        if probability >= _GATE:
+            continue
+        if effect == tips.kind:
+            tips = tips.of(of_poses, effects)
+            effects = tips.joined(of_poses, effects)
+        else:
+            found = group_deviations(effects, functions.columns, functions.members)
+            functions = functions._replace(sd=found[0], degrees_of_freedom=found[1])
+            effects = effects.joined(functions.columns, functions.sd**2 @ functions.members)
+    with_tips = tips.joined(problem, Effects.none(problem.left, effects.given))
+    every = functions.joined(problem, with_tips)
+    places = _places(problem, every)
+    if tips.learned is None and places.learned is None and not len(functions.sd):
+        return None
+    return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
+
+
+def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
+    """Without poses that lost most of their weight to a robust loss: what is left of their errors is no noise."""
+    weights, found = np.concatenate([np.asarray(one) for one in record.observed.weights]), []
+    for each in rows:
+        kept = weights[each.poses] > _TRUSTED
+        found.append(each._replace(**{name: getattr(each, name)[kept] for name in Rows._fields if name != "name"}))
+    return [each for each in found if len(each.poses)]
+
+
+def _summed(
+    problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
+) -> _Found:
+    """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
+    found = [effect for effect in tips if effect.learned is not None]
+    kinds, units = [effect.kind for effect in found], ["mm" for _ in found]
+    laws = [effect.learned for effect in found if effect.learned is not None]
+    sds, p = [np.sqrt(law.variance) for law in laws], len(problem.record.names)
+    added = np.zeros((len(found), p, p))
+    for whole, effect, law in zip(added, found, laws, strict=True):
+        by_effect = problem.by_patterns(effect.patterns[0])
+        whole += law.variance * by_effect @ by_effect.T
+    law = Law(
+        np.full(len(laws), np.inf), np.array([law.ratios for law in laws]), np.array([law.weights for law in laws])
+    )
+    follow, moments, names = np.zeros((p, 0)), Moments(np.zeros((0, 0)), np.zeros((0, 0, 0))), ()
+    if len(functions.sd):
+        names, follow, steps = functions.names, functions.follow, functions.steps
+        moments = second_moments(without, problem.turned(*functions.turned), functions.sd, functions.members)
+        moments = moments.in_units(steps)
+        kinds, units = [*kinds, *functions.kinds], [*units, *functions.units]
+        sds += [sd * steps[np.argmax(own)] for sd, own in zip(functions.sd, functions.members, strict=True)]
+        of_functions = Law.of(functions.degrees_of_freedom)
+        law = law.joined(of_functions) if laws else of_functions
+    lengths = [effect.length for effect in found if np.isfinite(effect.length)]
+    shared = SharedErrors(
+        kinds=tuple(kinds),
+        units=tuple(units),
+        names=names,
+        sd=np.array(sds),
+        moments=moments.matrix,
+        follow=follow,
+        correlation_length=np.asarray(lengths[0] if lengths else np.nan),
+        added=added,
+        by_group=moments.by_group,
+        law=law,
+    )
+    return _Found(shared, added.sum(axis=0) + follow @ moments.matrix @ follow.T, every.variance)
+
+
+class _Tips(NamedTuple):
+    """Errors of the tip that poses share: patterns over all poses, of which the most likely ones are taken."""
+
+    kind: str
+    probability: float
+    patterns: list[Float[np.ndarray, "M c"]]
+    lengths: tuple[float, ...] = (np.nan,)  # of correlation, for each of the patterns
+    learned: OneVariance | None = None
+    length: float = np.nan
+
+    def of(self, problem: SharedProblem, effects: Effects) -> "_Tips":
+        """With the variance of the most likely patterns.
+
+        Errors that poses share are about as large as those of single poses.
+        """
+        usual = _USUAL * residual_rms(problem.rows)
+        every = [one_variance(effects, problem.moved(patterns), usual) for patterns in self.patterns]
+        best = int(np.argmax([one.log_likelihood for one in every]))
+        return self._replace(patterns=[self.patterns[best]], learned=every[best], length=self.lengths[best])
+
+    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
+        """Effects with this one."""
+        if self.learned is None:
+            return effects
+        columns = problem.moved(self.patterns[0])
+        return effects.joined(columns, np.full(columns.shape[1], self.learned.variance))
+
+
+def _visits(problem: SharedProblem) -> _Tips:
+    """Of visits as they are marked, or of successive poses."""
+    capture, rows = problem.record.recording.capture, problem.rows
+    relative = problem.record.given_noise is None
+    total = len(np.asarray(capture.readings))
+    marked = np.full(total, -1)
+    if capture.visits is not None:
+        marked[: len(capture.visits)] = capture.visits
+    columns, kernel, patterns = [], [], []
+    for each in rows:
+        own = marked[each.poses]
+        columns.append(block_diagonal(each.by_tip))
+        if capture.visits is not None:
+            alike = ((own[:, None] == own) & (own >= 0)[:, None]).astype(float)
+        else:
+            alike = (np.eye(len(own), k=1) + np.eye(len(own), k=-1)) / 2
+        kernel.append(np.kron(alike - np.diag(np.diag(alike)), np.eye(3)))
+    nothing = _Tips(VISITS if capture.visits is not None else SUCCESSIVE, 1.0, [])
+    if not any(np.any(matrix) for matrix in kernel):
+        return nothing
+    probability = form_test(problem.left, form_of_poses(problem.left, columns, kernel), relative).probability
+    if not probability < _GATE:
+        return nothing
+    if capture.visits is not None:
+        numbers = [number for number in np.unique(marked) if number >= 0]
+        return _Tips(VISITS, probability, [(marked[:, None] == numbers).astype(float)])
+    most = max(float(np.median([len(each.poses) for each in rows])) / _PART, _LENGTHS[0])
+    lengths = tuple(length for length in _LENGTHS if length <= most)
+    for length in lengths:
+        found = []
+        for each in rows:
+            order = np.arange(len(each.poses))
+            values, vectors = np.linalg.eigh(np.exp(-np.abs(order[:, None] - order) / length))
+            chosen = np.argsort(values)[::-1][:_MOST_PATTERNS]
+            own = np.zeros((total, len(chosen)))
+            own[each.poses] = vectors[:, chosen] * np.sqrt(values[chosen])
+            found.append(own)
+        patterns.append(np.concatenate(found, axis=1))
+    return _Tips(SUCCESSIVE, probability, patterns, lengths)
+
+
+class _Functions(NamedTuple):
+    """Functions of the readings that the model lacks, in groups."""
+
+    probability: float
+    names: tuple[str, ...]
+    kinds: list[str]
+    units: list[str]
+    members: Float[np.ndarray, "g k"]
+    steps: Float[np.ndarray, " k"]
+    turned: tuple[Float[np.ndarray, "M k"], np.ndarray, Float[np.ndarray, " k"]]  # what `SharedProblem.turned` takes
+    columns: Float[np.ndarray, "R k"]
+    follow: Float[np.ndarray, "p k"]
+    sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
+    degrees_of_freedom: Float[np.ndarray, " g"] = np.zeros(0)
+
+    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
+        """Effects with these."""
+        if not len(self.sd):
+            return effects
+        return effects.joined(problem.turned(*self.turned), self.sd**2 @ self.members)
+
+    @classmethod
+    def none(cls, parameters: int) -> "_Functions":
+        """No function."""
+        empty, none = np.zeros(0), np.zeros((0, 0))
+        turned = none, np.zeros(0, dtype=int), empty
+        return cls(1.0, (), [], [], none, empty, turned, none, np.zeros((parameters, 0)))
+
+
+def _functions(problem: SharedProblem) -> _Functions:
+    """What the arm does not have of the functions that joints may follow."""
+    arm: Arm = to_numpy(problem.record.calibrated.arm)
+    q = np.asarray(problem.record.recording.capture.readings)
+    names, nothing = missing_functions(arm), _Functions.none(len(problem.record.names))
+    if not names:
+        return nothing
+    values, joints = functions_of(names, arm, q)
+    steps = natural_steps(names)
+    columns = problem.turned(values, joints, steps)
+    prior = default_prior(with_further_corrections(arm, names)).of(names, np.zeros(len(names)))
+    assert prior is not None
+    members = np.zeros((len(prior.members), len(names)))
+    for row, own in zip(members, prior.members, strict=True):
+        row[list(own)] = 1.0
+    groups = [members[:, i] for i in range(len(names))]
+    candidates = {}
+    for i in range(len(names)):
+        candidates.setdefault((joints[i], tuple(groups[i])), []).append(i)
+    tests = score_tests(problem.left, [columns[:, own] for own in candidates.values()])
+    number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
+    probability = min(min((test.probability for test in tests), default=1.0) * number, 1.0)
+    return nothing._replace(
+        probability=probability,
+        names=names,
+        kinds=list(prior.groups),
+        units=list(prior.units),
+        members=members,
+        steps=steps,
+        turned=(values, joints, steps),
+        columns=columns,
+        follow=problem.by_functions(values, joints),
+    )
+
+
+def missing_functions(arm: Arm) -> tuple[str, ...]:
+    """Coefficients of the functions that joints may follow and that an arm does not have."""
+    if arm.prismatic:
+        return ()
+    known = correction_names(arm)
+    every = {name: coefficient_of(name) for name in correction_names(with_corrections(arm, shared_model()))}
+    # By known masses a joint bends with one coefficient, and by unknown ones with one for each link.
+    by_gravity = [] if arm.corrections is None else arm.corrections.functions.by_gravity
+    bends = bool(np.any(by_gravity))
+    return tuple(
+        name
+        for name, one in every.items()
+        if one is not None and name not in known and not (bends and one.kind.rows == 3)
+    )
+
+
+def _places(problem: SharedProblem, effects: Effects) -> _Tips:
+    """Errors that all poses of a socket share, which only lengths show."""
+    capture = problem.record.recording.capture
+    nothing = _Tips(PLACES, 1.0, [])
+    if len(capture.lengths) < 2:
+        return nothing
+    patterns = places_of(capture)
+    columns = problem.moved(patterns)
+    information, r = effects.product(columns, columns), effects.left.values[:, None]
+    values, vectors = np.linalg.eigh(information)
+    known = values > NULL * max(values.max(initial=0.0), 1e-300)
+    if not known.any():
+        return nothing
+    by_poses = np.where(np.arange(len(r))[:, None] < sum(each.residual.size for each in problem.rows), r, 0.0)
+    explained = np.sum((vectors[:, known].T @ effects.product(columns, by_poses)[:, 0]) ** 2 / values[known])
+    if explained > _MOST_OF_POSES * float(effects.product(by_poses, by_poses)[0, 0]):
+        return nothing
+    number, spare = int(known.sum()), effects.left.degrees_of_freedom - int(known.sum())
+    found = nothing._replace(patterns=[patterns])
+    if number >= _FEW:
+        return found.of(problem, effects)
+    square = float(np.sum((vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2 / values[known]))
+    if effects.given:
+        probability = chi_square_tail(square, number)
+    else:
+        rest = max(float(effects.product(r, r)[0, 0]) - square, 1e-300)
+        probability = f_tail(square / number / (rest / spare), number, spare)
+    if not len(effects.variances):
+        probability = min(probability, _neighbours(problem))
+    return found.of(problem, effects) if probability < _GATE else nothing
+
+
+def _neighbours(problem: SharedProblem) -> float:
+    """Probability that poses of one socket at neighbouring configurations err so much alike by chance."""
+    q = np.asarray(problem.record.recording.capture.readings)
+    columns, kernel = [], []
+    for each in problem.rows:
+        own = q[each.poses]
+        distance = np.sqrt(np.sum(4 * np.sin((own[:, None] - own) / 2) ** 2, axis=2))
+        columns.append(block_diagonal(each.by_tip))
+        kernel.append(np.kron(np.exp(-distance / _NEIGHBOURS) - np.eye(len(own)), np.eye(3)))
+    relative = problem.record.given_noise is None
+    return form_test(problem.left, form_of_poses(problem.left, columns, kernel), relative).probability

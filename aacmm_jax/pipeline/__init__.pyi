@@ -1,0 +1,1 @@
+from .model_ladder import ComparedModels as ComparedModels

@@ -1,0 +1,229 @@
+"""Which model of its joints an arm needs: models from simple to rich, judged by regions that they have not seen.
+
+Errors of poses like those that a model was fitted to hardly tell models apart, and a random part of the poses is such.
+Regions exclude each model whose mean square error exceeds that of the best by more than chance explains, region by
+region: what two models have in common (a region that is hard for both) cancels in the difference (Breiman et al. 1984,
+section 3.4.3, with paired differences). A model that is richer than the best has nothing to show for it. Of those left,
+which predict equally well as far as the regions can tell, the simplest is chosen that makes the measurement nearly as
+probable as the most probable one (`log_evidence`).
+"""
+
+import time
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..calibration.joint_model import default_bounds, with_coefficients
+from ..calibration.record import record_of
+from ..calibration.results import Calibration
+from ..core.arguments import checked_arguments, items_of
+from ..core.arrays import Numbers
+from ..core.distributions import student_quantile
+from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
+from ..data.capture import Capture
+from ..data.noise import Noise
+from ..data.recording import Recording
+from ..diagnostics.group_equations import equations_of
+from ..kinematics.arm import DOWN, Arm, without_corrections
+from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.parameters import ArmSpecification, Bounds
+from ..kinematics.prior_scales import default_prior
+from .model_evidence import log_evidence
+from .single import calibrate
+from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
+
+_LEVEL = 0.05  # of the test by regions
+_EVIDENCE = 3.0  # of a log evidence: 20 times as probable, from which evidence is "strong" (Kass and Raftery)
+DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
+
+
+class ComparedModel(NamedTuple):
+    """One model: errors inside and outside what it was fitted to, mm."""
+
+    model: str
+    parameters: int  # free ones of the arm
+    effective_parameters: float  # how many of them the data determine
+    rms_inside: float  # root mean square distance from the geometry, of all poses, calibrated with all
+    regions: tuple[UnseenRegion, ...]
+    cpu_seconds: float
+    result: Calibration  # with all poses
+    log_evidence: float = 0.0  # but for what all models of the capture have in common
+
+    @property
+    def mean_squares(self) -> Float[np.ndarray, " f"]:
+        """Mean square error of each region, of a calibration without it, mm^2."""
+        return np.array([region.mean_square for region in self.regions])
+
+    @property
+    def rms_outside(self) -> float:
+        """Root of their mean, mm."""
+        return float(np.sqrt(np.mean(self.mean_squares)))
+
+    @property
+    def u_outside(self) -> float:
+        """Standard error of `rms_outside` by the scatter of the regions, mm."""
+        squares = self.mean_squares
+        return float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / max(2 * self.rms_outside, 1e-300))
+
+    @property
+    def ratio(self) -> float:
+        """Mean of (error / predicted standard deviation)^2 outside; about 1 where noise and prior are right.
+
+        Errors that poses share are not in this prediction, which is to show what a model lacks; they are in the
+        uncertainty of ``result``.
+        """
+        return float(np.mean([region.ratio for region in self.regions]))
+
+
+class ComparedModels(NamedTuple):
+    """Models from simple to rich, and which of them to use.
+
+    Example:
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> print(compared.best, compared.recommended.model)
+        0 dh
+    """
+
+    models: tuple[ComparedModel, ...]
+
+    @property
+    def best(self) -> int:
+        """Number of the model with the smallest error outside."""
+        return int(np.argmin([np.mean(model.mean_squares) for model in self.models]))
+
+    @property
+    def differences(self) -> list[tuple[float, float]]:
+        """Of each model from the best: mean difference of the mean square errors, and its standard error, mm^2."""
+        best = self.models[self.best].mean_squares
+        paired = [model.mean_squares - best for model in self.models]
+        return [(float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(len(each)))) for each in paired]
+
+    @property
+    def as_good(self) -> tuple[ComparedModel, ...]:
+        """The best outside, and simpler ones that the regions cannot tell from it.
+
+        By Student's t of the differences, at 5 % for all together (Bonferroni): the best is what chance favoured most.
+        """
+        level = _LEVEL / max(len(self.models) - 1, 1)
+        factor = float(student_quantile(1 - level / 2, len(self.models[0].regions) - 1))
+        simpler = slice(self.best + 1)
+        differences = zip(self.models[simpler], self.differences[simpler], strict=True)
+        return tuple(model for model, (mean, u) in differences if mean <= factor * u)
+
+    @property
+    def recommended(self) -> ComparedModel:
+        """The simplest of these whose log evidence is within 3 of the largest among them."""
+        least = max(model.log_evidence for model in self.as_good) - _EVIDENCE
+        return next(model for model in self.as_good if model.log_evidence >= least)
+
+
+def default_models(arm: Arm, capture: Capture) -> tuple[str, ...]:
+    """`DEFAULT_MODELS`; where the capture has temperatures, each of them also with thermal expansion."""
+    if capture.columns == arm.joints:
+        return DEFAULT_MODELS
+    warmed = ((model, "expansion" if model == "dh" else f"{model},expansion") for model in DEFAULT_MODELS)
+    return tuple(model for pair in warmed for model in pair)
+
+
+@checked_arguments
+def compare_models(
+    arm: Arm,
+    capture: Capture,
+    bounds: Bounds | None = None,
+    *,
+    models: Iterable[str] | None = None,
+    regions: Iterable[str] | None = None,
+    noise: Noise | None = None,
+    mass: Numbers | None = None,
+    centre: Numbers | None = None,
+    gravity: Numbers = DOWN,
+) -> ComparedModels:
+    """Fit models of the joints, each with its prior's scales learned, and predict regions that they have not seen.
+
+    Recommended is, of the models that the regions cannot tell from the best, the simplest whose log evidence is within
+    3 of the largest. A region is a placement, a station or another group that shares an unknown geometry, where there
+    are at least three; otherwise either half of each joint's travel. Errors are distances of the poses from their
+    geometry; reference lengths take part in the fits only.
+
+    Args:
+        arm: The nominal arm; corrections that it has are replaced by those of each model.
+        capture: Sockets, reference lengths and other observations.
+        bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those
+            that such data determine. Coefficients of corrections are free in each model that has them.
+        models: Models from simple to rich, as for `kinematics.with_corrections`; "dh" is the arm alone. The default
+            (`default_models`) takes some ten seconds for 500 poses, most of them for "functions" (harmonics=1-31, 62
+            coefficients a joint).
+        regions: What to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
+        noise: Standard deviations of readings and seat, as for `calibrate`.
+        mass: Mass of each link ``(n,)``, kg, as for `kinematics.with_corrections`.
+        centre: Centre of mass of each link ``(n, 3)``, mm.
+        gravity: Direction of gravity in the base frame ``(3,)``.
+
+    Returns:
+        The errors of each model, and the recommended one with its calibration.
+
+    Raises:
+        InputError: A model is unknown, fewer than two regions can be left out, or as `calibrate` does.
+
+    Example:
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> for model in compared.models:
+        ...     print(f"{model.model}: {model.rms_inside:.4f} mm inside, {model.rms_outside:.4f} mm outside")
+        dh: 0.0125 mm inside, 0.0307 mm outside
+        harmonics=1: 0.0124 mm inside, 0.0310 mm outside
+        >>> print("recommended:", compared.recommended.model)
+        recommended: dh
+    """
+    named = default_models(arm, capture) if models is None else items_of(models, "models")
+    if not named or not all(isinstance(model, str) and model.strip() for model in named):
+        raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
+    if len(set(named)) < len(named):
+        raise InputError(f"models names '{max(named, key=named.count)}' twice; name each once.")
+    plain = without_corrections(arm)
+    bounds = default_bounds(plain, capture) if bounds is None else bounds
+    left_out = regions_of(to_numpy(capture), regions, arm.joints)
+
+    def compared(model: str) -> ComparedModel:
+        begun = time.process_time()
+        corrected = with_corrections(plain, model, mass=mass, centre=centre, gravity=gravity)
+        return _compared(corrected, model, capture, bounds, left_out, noise, begun)
+
+    return ComparedModels(tuple(compared(model) for model in named))
+
+
+def _compared(
+    arm: Arm,
+    model: str,
+    capture: Capture,
+    bounds: Bounds,
+    regions: tuple[Region, ...],
+    noise: Noise | None,
+    begun: float,
+) -> ComparedModel:
+    widened = with_coefficients(bounds, arm)
+    arm = widened.space.base
+    prior = default_prior(arm)
+    result = calibrate(
+        *(arm, capture, widened),
+        method="joint",
+        noise=noise,
+        prior=prior,
+        replace_noise=False,  # so that all models are compared with the same
+        check_identifiability=False,
+    )
+    record = record_of(result, Recording(capture, ArmSpecification(arm)))
+    assert record.prior is not None
+    equations = equations_of(record)
+    return ComparedModel(
+        model=model,
+        parameters=len(record.names),
+        effective_parameters=float(np.sum(record.prior.effective)),
+        rms_inside=record.observed.rms,
+        regions=unseen_regions(record, regions, equations),
+        cpu_seconds=time.process_time() - begun,
+        result=result,
+        log_evidence=log_evidence(equations, record.prior, {group: float(sd) for group, sd in prior.sd.items()}),
+    )

@@ -1,0 +1,278 @@
+"""Stage 1 (`identify`), both stages (`calibrate`), and the joint solve."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ..calibration.checks import check_identifiable, check_method, check_single
+from ..calibration.joint_model import with_joint_model
+from ..calibration.results import Calibration, Identification
+from ..calibration.scale_anchor import default_method, scale_from_slides, warn_of_a_known_scale
+from ..calibration.sensitivities import Sensitivities
+from ..calibration.stages import identified, in_two_stages, jointly
+from ..calibration.task import Task, task_of
+from ..core._compat import inside_trace
+from ..core.arguments import check_finite, checked_arguments
+from ..core.arrays import Numbers, is_concrete
+from ..core.errors import IdentifiabilityWarning, InputError
+from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
+from ..data.capture import Capture
+from ..data.noise import Noise
+from ..diagnostics.encoder_noise import with_noise_by_joint
+from ..diagnostics.shared_errors import with_shared_errors
+from ..kinematics.arm import Arm
+from ..kinematics.parameters import Bounds
+from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
+from ..uncertainty.covariance import STATED, NoiseModel
+
+_MAX_STEPS = 300
+
+
+@checked_arguments
+def identify(
+    arm: Arm,
+    capture: Capture,
+    bounds: Bounds,
+    *,
+    hold: str | None = "longest",
+    start: Numbers | None = None,
+    noise: Noise | None = None,
+    noise_model: NoiseModel | None = None,
+    robust: LossName | None = None,
+    prior: Prior | None = None,
+    replace_noise: bool = True,
+    max_steps: int = _MAX_STEPS,
+) -> Identification:
+    """Stage 1: the parameters that make the poses of every socket agree, within bounds.
+
+    Minimises the summed squared distance of the tips from their socket's centroid (Cheng et al. 2018, section 2.2).
+    Repeatability does not determine the scale of the arm, and noise makes it shrink, so one length, the scale anchor,
+    is kept at its start.
+
+    Differentiable with respect to angles, bounds and the arm, exactly, also where a bound is active (not in directions
+    that the data leave open, such as the scale of noise-free data without an anchor). Failure to converge is data
+    (``result``).
+
+    Args:
+        arm: the arm to identify; its values are the start, and the fixed parameters stay as it has them.
+        capture: joint readings by socket, rad, or mm of prismatic joints.
+        bounds: box of the free parameters ``(p,)``, mm and rad.
+        hold: the scale anchor. A free length by name; "longest", the longest free link, or none where fixed lengths or
+            the slides of prismatic joints determine the scale well; None, no anchor, as in the paper (then expect
+            active bounds).
+        start: free parameters ``(p,)`` to start from instead of the arm's, mm and rad.
+        noise: standard deviations of readings and seat. Where given, every pose is weighted by the inverse covariance
+            of its tip, and the covariance of the result follows from it; else both are estimated from the residuals.
+        noise_model: another model of the tips' errors, one of `uncertainty.covariance.NOISE_MODELS`.
+        robust: a robust loss, "huber", "cauchy" or "tukey", of each pose's whitened residual; None, least squares.
+        prior: what is known of the parameters, as a mean (by default ``arm``'s values) and a standard deviation. It
+            weighs against the data, whose noise is given or estimated; bounds hold as well. The scale anchor has none.
+        replace_noise: where the residuals show that some encoders are noisier than given, or than the others, solve
+            once more with their noise as estimated (``noisy_encoders`` of the result). Not inside jit, vmap or a
+            derivative, in batches, with a robust loss, or where ``noise_model`` is named.
+        max_steps: most evaluations of the residual.
+
+    Returns:
+        Parameters, repeatability, active bounds, covariance, and why the solve ended.
+
+    Raises:
+        InputError: too few poses, a start outside the box, names that do not fit, or a batch (see `identify_many`).
+
+    Example:
+        >>> stage1 = aj.identify(arm, capture, bounds)
+        >>> print(f"scale anchor {stage1.hold}, DE {stage1.de:.4f} mm")
+        scale anchor d_3, DE 0.0124 mm
+    """
+    task = _task("identify_many", arm, capture, bounds, start, noise, hold, noise_model, max_steps, robust, prior)
+    capture = to_numpy(capture)
+    result = to_jax(_identified(to_numpy(task), capture))
+    if not replace_noise or noise_model in ("common", "robust") or robust is not None:
+        return result
+    options = {"hold": hold, "start": start, "prior": prior, "max_steps": max_steps, "replace_noise": False}
+    return with_noise_by_joint(result, capture, lambda found: identify(arm, capture, bounds, noise=found, **options))
+
+
+def _task(
+    many: str,
+    arm: Arm,
+    capture: Capture,
+    bounds: Bounds,
+    start: Numbers | None,
+    noise: Noise | None,
+    hold: str | None,
+    *options: Any,
+) -> Task:
+    """The checked task of stage 1, in which lengths take no part."""
+    check_single(arm, capture, bounds, many)
+    for sentence in () if inside_trace() else capture.repeated.sentences():
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
+    check_finite(arm=arm, capture=capture, noise=noise)
+    return task_of(arm, without_lengths(capture), bounds, start, noise, hold, *options)
+
+
+def without_lengths(capture: Capture) -> Capture:
+    """The capture without its reference lengths."""
+    return eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
+
+
+@compiled(jit=eqx.filter_jit)
+def _identified(task: Task, capture: Capture) -> Identification:
+    return identified(task, capture).solution.identification
+
+
+@checked_arguments
+def calibrate(
+    arm: Arm,
+    capture: Capture,
+    bounds: Bounds | None = None,
+    *,
+    model: str | None = None,
+    method: Literal["two-stage", "joint"] | None = None,
+    hold: str | None = "longest",
+    start: Numbers | None = None,
+    noise: Noise | None = None,
+    noise_model: NoiseModel | None = None,
+    robust: LossName | None = None,
+    prior: Prior | None = None,
+    replace_noise: bool = True,
+    shared_errors: bool = True,
+    check_identifiability: bool = True,
+    strict: bool = False,
+    max_steps: int = _MAX_STEPS,
+) -> Calibration:
+    """Both stages: identify from repeatability, then fix the scale with the reference lengths.
+
+    "two-stage" divides the arm of stage 1 by k = measured / nominal. Fixed parameters stay as they are, to the bit, and
+    the result is inside the box: where a bound or a fixed length stands against the division, everything is solved at
+    once instead, and ``divided`` of the result is false. Where fixed lengths set the scale, k changes nothing, and an
+    `IdentifiabilityWarning` says so. The uncertainty of k, ``scale.u``, takes parameters on a bound as exact.
+
+    "joint" is one least squares of everything, each weighted by its standard deviation: that of a tip coordinate from
+    the residuals, that of a length from its u.
+
+    Args:
+        arm: as for `identify`, like all arguments that are not named here.
+        capture: sockets, and at least one reference length, mm; none is needed where the slides of prismatic joints
+            determine the scale.
+        bounds: box of the free parameters ``(p,)``, mm and rad; by default around those that such data determine.
+        model: what the joints do besides their readings, as on the command line: "gravity,harmonics=1" (see
+            `kinematics.with_corrections`). Corrections that the arm has are replaced; all coefficients are free.
+        method: "two-stage" or "joint"; by default two-stage, but joint where the capture has observations besides
+            sockets and lengths, the arm has prismatic joints (whose readings say something about the scale too), the
+            loss is robust, or there is a prior, which a division by k would ignore.
+        hold: the scale anchor of stage 1.
+        start: free parameters ``(p,)`` to start from, mm and rad.
+        noise: standard deviations of readings and seat.
+        noise_model: another model of the tips' errors.
+        robust: a robust loss, as for `identify`.
+        prior: what is known of the parameters, as for `identify`; of a model, by default `kinematics.default_prior`.
+        replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
+        shared_errors: add errors that poses share, as far as residuals show any, to the covariance (`SharedErrors`).
+        check_identifiability: warn where free parameters are not determined by these data; the check takes about as
+            long as the calibration.
+        strict: raise instead of warn where free parameters are not determined by these data.
+        max_steps: most evaluations of each solve.
+
+    Returns:
+        The calibrated arm and its parameters, k, repeatability, lengths, covariance, and the result of stage 1.
+
+    Raises:
+        InputError: as `identify` does, and without a reference length.
+
+    Example:
+        >>> calibrated = aj.calibrate(arm, capture, bounds)
+        >>> print(f"DE {calibrated.de:.4f} mm, Deltam {calibrated.deltam:.4f} mm, k = {calibrated.scale.value:.5f}")
+        DE 0.0124 mm, Deltam 0.0153 mm, k = 0.99923
+        >>> error = calibrated.arm.position(q) - true.position(q)
+        >>> print(f"{np.abs(arm.position(q) - true.position(q)).max():.2f} mm become {np.abs(error).max():.4f} mm")
+        1.80 mm become 0.0032 mm
+    """
+    arm, bounds, prior = with_joint_model(arm, capture, bounds, model, prior)
+    by_slides = scale_from_slides(arm, capture, bounds.space, noise)
+    general = bool(capture.observations) or robust is not None or prior is not None or by_slides
+    method = default_method(arm, general) if method is None else method
+    check_method(method, general)
+    if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
+        raise InputError(
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
+            "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
+        )
+    options = noise_model, max_steps, robust, prior
+    first = None if general else _task("calibrate_many", arm, capture, bounds, start, noise, hold, *options)
+    if general:
+        check_single(arm, capture, bounds, "calibrate_many")
+        check_finite(arm=arm, capture=capture, noise=noise)
+    elif hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
+        raise InputError(
+            "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
+            "hold."
+        )
+    task = task_of(arm, capture, bounds, start, noise, None, *options)
+    if check_identifiability or strict:
+        check_identifiable(capture, task.bounds, prior, strict)
+    if method == "two-stage" and first is not None and not inside_trace():
+        warn_of_a_known_scale(first.anchor.set_by, bool(arm.prismatic))
+    first, task, capture = to_numpy((first, task, capture))
+    result, sensitivities = _calibrated(first, task, capture, method)
+    if replace_noise and noise_model not in ("common", "robust") and robust is None:
+        again = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
+        again |= {"check_identifiability": False, "replace_noise": False, "shared_errors": shared_errors}
+        found = with_noise_by_joint(
+            result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **again)
+        )
+        if found is not result:
+            return found
+    if shared_errors and sensitivities is not None:
+        result = with_shared_errors(result, capture, sensitivities)
+    return to_jax(result)
+
+
+def _calibrated(
+    first: Task | None, task: Task, capture: Capture, method: str
+) -> tuple[Calibration, Callable[[], Sensitivities] | None]:
+    """Both stages, or the joint solve; and how the parameters follow the data, where values are known.
+
+    ``first`` is stage 1's task where reference lengths alone fix the scale.
+    """
+    if namespace((first, task, capture)) is not np:
+        return _traced(first, task, capture, method), None
+    with np.errstate(all="ignore"):
+        stage1 = None if first is None else identified(first, capture)
+        if method == "joint" or stage1 is None:
+            found = jointly(task, capture, stage1, method)
+            return found.calibration, found.sensitivities
+        found = in_two_stages(stage1, capture)
+        if not bool(found.stands_against):
+            return found.calibration, found.sensitivities
+        joint = jointly(task, capture, stage1, method)
+        return _with_components_of(found.calibration, joint.calibration), joint.sensitivities
+
+
+@eqx.filter_jit
+def _traced(first: Task | None, task: Task, capture: Capture, method: str) -> Calibration:
+    stage1 = None if first is None else identified(first, capture)
+    if method == "joint" or stage1 is None:
+        return jointly(task, capture, stage1, method).calibration
+    found = in_two_stages(stage1, capture)
+    if not stage1.solution.identification.anchor.can_scale:
+        return found.calibration
+    return jax.lax.cond(
+        found.stands_against,
+        lambda: _with_components_of(found.calibration, jointly(task, capture, stage1, method).calibration),
+        lambda: found.calibration,
+    )
+
+
+def _with_components_of(other: Calibration, result: Calibration) -> Calibration:
+    """With the components of another calibration that this one does not have, as zeros: the same structure."""
+    components, others = result.parameter_covariance.components, other.parameter_covariance.components
+    lacking = None if others is None else others.without(STATED)
+    if components is None or lacking is None:
+        return result
+    none = eqx.tree_at(lambda one: one.matrices, lacking, 0 * lacking.matrices)
+    return eqx.tree_at(lambda one: one.parameter_covariance.components, result, components.joined(none))

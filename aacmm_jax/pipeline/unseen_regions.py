@@ -1,0 +1,180 @@
+"""How a calibration without a region of joint space predicts that region, for many regions at little cost.
+
+The calibration without it is one Gauss-Newton step away from the calibration of everything, by the normal equations
+less the region's part of them (case deletion: Cook and Weisberg 1982, section 3.6). Weights and the learned standard
+deviations of the prior stay: a few numbers, which one region hardly changes.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..calibration.record import CalibrationRecord
+from ..core.arguments import items_of
+from ..core.errors import InputError
+from ..core.linear_algebra import inverse_cholesky
+from ..core.text import common_labels
+from ..data.capture import Capture, names_in
+from ..diagnostics.group_equations import PRIOR, Equations, equations_of
+from .cross_validation import groups_of
+
+_GROUPS = 3  # of placements or stations, fewer of which say nothing of the scatter between them
+_POSES = 5  # in a region, at least
+_MOVES = 0.02  # rad or mm: the least travel of a joint that has halves
+_RIDGE = 1e-12  # of a unit diagonal
+_NOTHING = 1e-12  # mm^2: what is fitted exactly has no error to compare
+
+
+class Region(NamedTuple):
+    """Poses that are left out together."""
+
+    label: str
+    poses: Bool[np.ndarray, " M"]  # of all, sockets first
+
+
+class UnseenRegion(NamedTuple):
+    """Errors of the poses of a region, of a calibration without it."""
+
+    label: str
+    poses: int
+    mean_square: float  # distance from the geometry, mm^2
+    ratio: float  # mean of (error / predicted standard deviation)^2 over coordinates
+
+
+def regions_of(
+    capture: Capture, patterns: Iterable[str] | None = None, joints: int | None = None
+) -> tuple[Region, ...]:
+    """The regions to leave out: groups by name; or placements, stations and the like, where there are at least three;
+    or either half of each joint's travel, of the first ``joints`` columns of readings.
+
+    Raises:
+        InputError: A pattern names nothing or everything, or there are too few poses.
+    """
+    names = names_in(capture)
+    sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
+    owner = np.repeat(np.arange(len(names)), sizes)
+    if patterns is not None:
+        chosen = {pattern: names_in(capture.select(pattern)) for pattern in items_of(patterns, "regions")}
+        found = [Region(pattern, np.isin(owner, [names.index(name) for name in of])) for pattern, of in chosen.items()]
+    elif len(groups := groups_of(capture)) >= _GROUPS:
+        members = [np.isin(owner, [names.index(name) for name in group]) for group in groups]
+        found = [Region(label, poses) for label, poses in zip(common_labels(groups), members, strict=True)]
+    else:
+        sockets = [capture.q] if capture.sizes else []
+        q = np.concatenate([*sockets, *(observation.q for observation in capture.observations)])
+        found = _halves(q[:, :joints])
+    whole = [region.label for region in found if region.poses.all()]
+    if whole:
+        raise InputError(f"nothing is left without '{whole[0]}', so nothing can be calibrated; leave out less.")
+    found = [region for region in found if region.poses.sum() >= _POSES and (~region.poses).sum() >= _POSES]
+    if len(found) < 2:
+        raise InputError(
+            "models are compared by regions that they have not seen, and these poses make fewer than two; record more."
+        )
+    return tuple(found)
+
+
+def _halves(q: Float[np.ndarray, "M n"]) -> list[Region]:
+    found = []
+    for joint in np.flatnonzero(np.ptp(q, axis=0) > _MOVES):
+        upper = q[:, joint] >= np.median(q[:, joint])
+        found += [
+            Region(f"joint {joint + 1}, {side} half", half) for side, half in (("lower", ~upper), ("upper", upper))
+        ]
+    return found
+
+
+class _Dense(NamedTuple):
+    """All equations of a calibration, by all unknowns: what is shared, then the geometry of each observation."""
+
+    white: Float[np.ndarray, "M r P"]  # derivatives, in standard deviations; rows that a kind does not have are 0
+    residual: Float[np.ndarray, "M r"]
+    in_mm: Float[np.ndarray, "M 3 r"]
+    relations: Float[np.ndarray, "l P"]
+    relation_residual: Float[np.ndarray, " l"]
+    of_prior: Bool[np.ndarray, " l"]
+    poses: np.ndarray  # number of each among all poses
+    geometry: Bool[np.ndarray, " P"]  # which unknowns are no parameters
+
+
+def _dense(equations: Equations, parameters: int) -> _Dense:
+    shared = equations.rows[0].shared.shape[2]
+    size = shared + sum(rows.own.shape[2] for rows in equations.rows)
+    most, first, parts = max(rows.residual.shape[1] for rows in equations.rows), shared, []
+    for rows in equations.rows:
+        (m, r), k = rows.residual.shape, rows.own.shape[2]
+        white, residual, in_mm = np.zeros((m, most, size)), np.zeros((m, most)), np.zeros((m, 3, most))
+        white[:, :r, :shared], white[:, :r, first : first + k] = rows.shared, rows.own
+        residual[:, :r], in_mm[:, :, :r] = rows.residual, rows.in_mm
+        parts.append((white, residual, in_mm))
+        first += k
+    relations = [np.pad(block.shared, ((0, 0), (0, size - shared))) for block in equations.relations]
+    of_prior = [np.full(len(block.residual), block.fixture == PRIOR) for block in equations.relations]
+    white, residual, in_mm = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return _Dense(
+        white,
+        residual,
+        in_mm,
+        np.concatenate([np.zeros((0, size)), *relations]),
+        np.concatenate([np.zeros(0), *(block.residual for block in equations.relations)]),
+        np.concatenate([np.zeros(0, dtype=bool), *of_prior]),
+        np.concatenate([rows.poses for rows in equations.rows]),
+        np.arange(size) >= parameters,
+    )
+
+
+def unseen_regions(
+    record: CalibrationRecord, regions: Iterable[Region], equations: Equations | None = None
+) -> tuple[UnseenRegion, ...]:
+    """Errors of each region, of a calibration without it; geometry that only the region shows is fitted to its poses.
+
+    Reference lengths with an end that only the region shows are left out with it.
+
+    Args:
+        record: The calibration of everything, solved with observations or a prior.
+        regions: What to leave out, one after the other.
+        equations: Those of the calibration, where they are known already.
+    """
+    dense = _dense(
+        equations_of(record) if equations is None else equations, len(record.names) - (record.hold is not None)
+    )
+    flat = dense.white.reshape(-1, dense.white.shape[2])
+    whole = flat.T @ flat, flat.T @ dense.residual.ravel()
+    return tuple(_without(dense, *whole, region) for region in regions)
+
+
+def _without(
+    dense: _Dense, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"], region: Region
+) -> UnseenRegion:
+    left = region.poses[dense.poses]
+    out = dense.white[left].reshape(-1, len(gram))
+    lost = dense.geometry & ~np.any(dense.white[~left] != 0, axis=(0, 1))
+    kept = ~lost
+    related = dense.of_prior | ~np.any(dense.relations[:, lost] != 0, axis=1)
+    rows, values = dense.relations[related][:, kept], dense.relation_residual[related]
+    information = (gram - out.T @ out)[np.ix_(kept, kept)] + rows.T @ rows
+    slope = (gradient - out.T @ dense.residual[left].ravel())[kept] + rows.T @ values
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    root = inverse_cholesky(scale[:, None] * information * scale + _RIDGE * np.eye(len(scale))) * scale
+    step = -root.T @ (root @ slope)
+    in_mm = dense.in_mm[left]
+    errors = np.einsum("mcr,mr->mc", in_mm, dense.residual[left])
+    moved = np.einsum("mcr,mrp->mcp", in_mm, dense.white[left])
+    by_kept, by_lost = (moved[:, :, which].reshape(errors.size, -1) for which in (kept, lost))
+    errors, of_parameters = errors.ravel() + by_kept @ step, by_kept @ root.T
+    noise = in_mm @ np.swapaxes(in_mm, 1, 2)
+    variance = np.diagonal(noise, axis1=1, axis2=2).ravel()
+    if lost.any():
+        basis, sizes, _ = np.linalg.svd(by_lost, full_matrices=False)
+        basis = basis[:, sizes > 1e-9 * sizes.max(initial=1e-300)]
+        errors = errors - basis @ (basis.T @ errors)
+        of_parameters = of_parameters - basis @ (basis.T @ of_parameters)
+        crossed = (noise @ basis.reshape(*in_mm.shape[:2], -1)).reshape(basis.shape)
+        variance = variance + np.sum(basis * (basis @ (basis.T @ crossed) - 2 * crossed), axis=1)
+    variance = variance + np.sum(of_parameters**2, axis=1)
+    seen = variance > _NOTHING
+    poses = int(seen.reshape(-1, 3).any(axis=1).sum())
+    ratio = float(np.mean(errors[seen] ** 2 / variance[seen])) if poses else np.nan
+    return UnseenRegion(region.label, poses, float(np.sum(errors[seen] ** 2)) / max(poses, 1), ratio)

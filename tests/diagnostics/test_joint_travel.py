@@ -1,0 +1,38 @@
+"""Joints that stand still are found, with what is lost by it."""
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.diagnostics.joint_travel import lost_by_standing, standing_joints
+
+DEG = np.pi / 180
+
+
+def test_still_is_less_than_a_degree(paper_arm, paper_capture):
+    q = np.array(paper_capture.q)
+    assert not standing_joints(paper_arm, q)
+    q[:, 4] = 0.3 + np.linspace(0, 0.9 * DEG, len(q)) + 2 * np.pi * (np.arange(len(q)) % 2)  # revolutions do not count
+    q[:, 1] = np.linspace(0, 1.1 * DEG, len(q))
+    (found,) = standing_joints(paper_arm, q)
+    assert (found.joint, found.poses) == (5, len(q))
+    assert found.range == pytest.approx(0.9 * DEG)
+
+
+def test_a_slide_may_move_by_millimetres():
+    arm = aj.Arm(alpha=[0.0, 0.0], a=[0.0, 100.0], d=[0.0, 0.0], theta=[0.0, 0.0], probe=[0, 0, 0], prismatic=(1,))
+    q = np.stack([np.linspace(0, 15, 10), np.linspace(0, 1, 10)], axis=1)
+    assert [one.joint for one in standing_joints(arm, q)] == [1]
+
+
+@pytest.mark.parametrize("joint", [2, 4, 5])
+def test_a_link_between_joints_that_do_not_move_has_four_parameters_too_many(paper_arm, paper_capture, joint):
+    """Two links become one, so that of their eight parameters only four can be told apart."""
+    (lost,) = lost_by_standing(paper_arm, paper_capture, [joint])
+    assert set(lost) == {f"{kind}_{joint}" for kind in ("alpha", "a", "d", "theta")}
+
+
+def test_two_joints_lose_twice_as_much(paper_arm, paper_capture):
+    lost = lost_by_standing(paper_arm, paper_capture, [3, 5])
+    assert [len(names) for names in lost] == [4, 4]
+    assert not set(lost[0]) & set(lost[1])

@@ -1,0 +1,209 @@
+"""Models of joints compared: predictions of regions against calibrations without them, and which model is found."""
+
+from inspect import unwrap  # calls a function without its run-time types
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.calibration.joint_model import with_joint_model
+from aacmm_jax.calibration.prediction import unseen_errors
+from aacmm_jax.calibration.record import record_of
+from aacmm_jax.data import observations as kinds
+from aacmm_jax.data.recording import Recording
+from aacmm_jax.diagnostics.group_equations import equations_of
+from aacmm_jax.kinematics import with_corrections
+from aacmm_jax.kinematics.parameters import ArmSpecification
+from aacmm_jax.pipeline.model_evidence import log_evidence
+from aacmm_jax.pipeline.model_ladder import (
+    DEFAULT_MODELS,
+    ComparedModel,
+    ComparedModels,
+    compare_models,
+    default_models,
+)
+from aacmm_jax.pipeline.unseen_regions import Region, UnseenRegion, _dense, regions_of, unseen_regions
+
+NOISE = aj.Noise(encoder_arcsec=10, seating=0.02)
+FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
+BOX = [[200, -300, 100], [600, 300, 500]]
+MODELS = ("dh", "gravity", "harmonics=1")
+
+
+@pytest.fixture(scope="module")
+def space(paper_arm):
+    return aj.Parameters.independent(paper_arm)
+
+
+@pytest.fixture(scope="module")
+def bounds(paper_arm, space):
+    return aj.Bounds.around(paper_arm, space)
+
+
+def seen_by_a_tracker(paper_arm, space, model="dh", poses=50, seed=1, **coefficients):
+    true = with_corrections(aj.perturbed_arm(space, length=0.3, angle=5e-4, seed=seed), model).replace(**coefficients)
+    points = [kinds.SimulatedPoints("T", BOX, poses, FRAME, u=0.01)]
+    return aj.simulate(true, {}, observations=points, noise=NOISE, seed=seed)
+
+
+def sockets(paper_arm, space):
+    true = aj.perturbed_arm(space, length=0.3, angle=5e-4, seed=1)
+    points = {"A": (400, 200, 300), "B": (500, 300, 100), "C": (300, -300, 300), "D": (450, 0, 400)}
+    return aj.simulate(true, points, poses=14, lengths=[("A", "B", 0.002)], noise=NOISE, seed=2)
+
+
+def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
+    """Of sockets, whose positions only the region shows, and a reference length between two of them."""
+    capture, prior = sockets(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
+    solving = {"noise": NOISE, "prior": prior, "check_identifiability": False}
+    record = record_of(
+        aj.calibrate(paper_arm, capture, bounds, **solving), Recording(capture, ArmSpecification(paper_arm))
+    )
+    for names in (("A", "B"), ("C",)):
+        left = np.isin(np.array(capture.names)[capture.owner], names)
+        (found,) = unseen_regions(record, [Region("", left)])
+        rest = aj.Capture(
+            {name: q for name, q in capture.sockets.items() if name not in names},
+            [] if "A" in names else capture.lengths,
+        )
+        alone = aj.identify(paper_arm, rest, bounds, noise=NOISE, prior=prior, hold=None)
+        part = aj.Capture({name: capture.sockets[name] for name in names})
+        expected = unseen_errors(aj.uncertainty_of(alone), part).of(names)
+        assert found.poses == len(names) * 14
+        assert np.sqrt(found.mean_square) == pytest.approx(expected.rms, rel=5e-3)
+        assert np.sqrt(found.ratio) == pytest.approx(expected.rms / expected.predicted, rel=0.1)
+
+
+def test_half_of_a_travel_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
+    """The frame of the tracker is known from the other half."""
+    capture, prior = seen_by_a_tracker(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
+    solving = {"noise": NOISE, "prior": prior, "check_identifiability": False}
+    result = aj.calibrate(paper_arm, capture, bounds, **solving)
+    region = regions_of(capture)[3]
+    assert region.label == "joint 2, upper half"
+    (found,) = unseen_regions(record_of(result, Recording(capture, ArmSpecification(paper_arm))), [region])
+    (points,) = capture.observations
+    parts = [aj.Capture({}, [], [points.select(np.flatnonzero(which))]) for which in (~region.poses, region.poses)]
+    alone = aj.calibrate(paper_arm, parts[0], bounds, **solving)
+    errors = aj.evaluate(alone.arm, parts[1], geometry=alone.stage1.observed.geometry).observed
+    assert found.poses == 25
+    assert np.sqrt(found.mean_square) == pytest.approx(float(errors.rms[0]), rel=1e-3)
+
+
+def test_nothing_wrong_needs_no_correction(paper_arm, space, bounds):
+    found = compare_models(paper_arm, seen_by_a_tracker(paper_arm, space), bounds, models=MODELS)
+    assert found.recommended.model == "dh"
+    assert [len(model.regions) for model in found.models] == [12, 12, 12]
+    assert 0.6 < found.recommended.ratio < 1.5
+
+
+@pytest.mark.slow
+def test_an_eccentric_encoder_is_recognised(paper_arm, space, bounds):
+    """Also in an arm that comes with other corrections, which do not count."""
+    capture = seen_by_a_tracker(paper_arm, space, "harmonics=1", cos1_2=4e-4, sin1_2=-3e-4)
+    found = compare_models(with_corrections(paper_arm, "gear"), capture, bounds, models=MODELS)
+    chosen = found.recommended
+    assert chosen.model == "harmonics=1"
+    assert found.models[0].rms_outside > 1.2 * chosen.rms_outside
+    assert "gear_2" not in chosen.result.space.names
+    # Mean and cosine of the second joint are hardly apart, as its travel is short; its sine is found.
+    names = chosen.result.space.names
+    u = np.sqrt(np.diag(chosen.result.covariance))
+    for name, true in (("cos1_2", 4e-4), ("sin1_2", -3e-4)):
+        i = names.index(name)
+        assert abs(float(chosen.result.parameters[i]) - true) < 3 * u[i]
+
+
+def test_a_model_by_name_is_a_corrected_arm_with_its_prior(paper_arm, space, bounds):
+    """In one line what takes four; in place of other corrections, and with the prior that is given instead."""
+    capture = seen_by_a_tracker(paper_arm, space, "harmonics=1", cos1_2=4e-4)
+    arm = with_corrections(paper_arm, "harmonics=1")
+    names = (*space.names, *(name for name in aj.kinematics.parameter_names(arm) if name[:3] in ("cos", "sin")))
+    own = aj.Parameters(arm, names)
+    box = [np.concatenate([side, np.full(12, end)]) for side, end in ((bounds.lower, -np.inf), (bounds.upper, np.inf))]
+    options = {"check_identifiability": False}
+    expected = aj.calibrate(arm, capture, aj.Bounds(own, *box), prior=aj.kinematics.default_prior(arm), **options)
+    found = aj.calibrate(with_corrections(paper_arm, "gear"), capture, bounds, model="dh,harmonics=1", **options)
+    np.testing.assert_array_equal(found.parameters, expected.parameters)
+    assert (found.space.names, found.prior.groups) == (names, ("lengths", "angles", "harmonics=1"))
+    tight = aj.calibrate(paper_arm, capture, bounds, model="harmonics=1", prior=aj.Prior({"all": 1e-4}), **options)
+    assert tight.prior.groups == ("all",)
+    plain = aj.calibrate(paper_arm, capture, model="dh", **options)
+    assert plain.prior is None
+    assert plain.space.names == aj.Parameters.independent(paper_arm).names
+    for model, message in (("grvity", "did you mean 'gravity'"), (5, "the model is 5; give a text")):
+        with pytest.raises(aj.InputError, match=message):
+            unwrap(with_joint_model)(paper_arm, capture, bounds, model, None)
+
+
+def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
+    capture = sockets(paper_arm, space)
+    assert [region.label for region in regions_of(capture)] == ["A, B", "C", "D"]
+    assert [region.label for region in regions_of(capture, ["A", "[BC]"])] == ["A", "[BC]"]
+    assert regions_of(capture, ["A", "[BC]"])[1].poses.sum() == 28
+    with pytest.raises(aj.InputError, match="nothing is left without"):
+        regions_of(capture, ["*"])
+    with pytest.raises(aj.InputError, match="fewer than two"):
+        regions_of(capture, ["A"])
+
+
+@pytest.mark.parametrize(
+    ("squares", "evidence", "expected"),
+    [
+        ([[4.0, 4.1, 4.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]], (0.0, 0.0, 0.0), "b"),
+        # However probable, a model that regions exclude is not recommended. One that is hard for all does not count.
+        ([[1.5, 1.6, 13.5], [1.0, 1.0, 13.0], [1.0, 1.0, 13.0]], (50.0, 0.0, 0.0), "b"),
+        # Nor one that is richer than the best.
+        ([[4.0, 4.1, 4.0], [1.0, 1.0, 1.0], [1.0, 1.1, 1.0]], (0.0, 0.0, 50.0), "b"),
+        # 0.1 on average, with a standard error of 0.06 from three regions: Student's factor is 6.2.
+        ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], (0.0, 2.9, 50.0), "a"),
+        ([[1.0, 1.1, 13.2], [1.0, 1.0, 13.0], [2.0, 2.0, 14.0]], (0.0, 3.1, 50.0), "b"),
+    ],
+)
+def test_regions_exclude_and_evidence_decides_among_the_others(squares, evidence, expected):
+    def model(name, values, log_evidence):
+        regions = tuple(UnseenRegion(str(i), 10, value, 1.0) for i, value in enumerate(values))
+        return ComparedModel(name, 1, 1.0, 0.1, regions, 0.0, None, log_evidence)
+
+    models = tuple(model(*of) for of in zip("abc", squares, evidence, strict=True))
+    assert ComparedModels(models).recommended.model == expected
+
+
+def test_the_evidence_is_that_of_a_gaussian(paper_arm, space, bounds):
+    """Of two models that differ in one scale alone, by the covariance of the data: B S B^T + 1, all in one matrix."""
+    capture, found = sockets(paper_arm, space), []
+    for sd in (0.3, 3.0):
+        solving = {"noise": NOISE, "prior": aj.Prior({"lengths": sd, "angles": 5e-4}), "check_identifiability": False}
+        result = aj.calibrate(paper_arm, capture, bounds, **solving)
+        record = record_of(result, Recording(capture, ArmSpecification(paper_arm)))
+        equations = equations_of(record)
+        dense = _dense(equations, len(record.names))
+        data = [dense.white.reshape(-1, dense.white.shape[2]), dense.relations[~dense.of_prior]]
+        by, of_geometry = np.concatenate(data), dense.geometry
+        left = np.concatenate([dense.residual.ravel(), dense.relation_residual[~dense.of_prior]])
+        prior = dense.relations[dense.of_prior][:, ~of_geometry]
+        basis = np.linalg.qr(by[:, of_geometry], mode="complete")[0][:, int(of_geometry.sum()) :]
+        by = basis.T @ by[:, ~of_geometry] @ np.linalg.inv(prior)
+        covariance = by @ by.T + np.eye(len(by))
+        # At the prior's mean, where the residual is what the solution left and what the parameters explain.
+        mean = basis.T @ left - by @ dense.relation_residual[dense.of_prior]
+        expected = -0.5 * (mean @ np.linalg.solve(covariance, mean) + np.linalg.slogdet(covariance)[1])
+        found.append((log_evidence(equations, record.prior, {}), expected))
+    (one, first), (other, second) = found
+    assert other - one == pytest.approx(second - first, abs=0.02)
+
+
+def test_refused(paper_arm, space, bounds):
+    with pytest.raises(aj.InputError, match="names no model"):
+        compare_models(paper_arm, sockets(paper_arm, space), bounds, models=[])
+    with pytest.raises(aj.InputError, match="unknown model 'grvity'"):
+        compare_models(paper_arm, sockets(paper_arm, space), bounds, models=["dh,grvity"])
+
+
+def test_default_models_of_a_capture_with_temperatures(paper_arm, space):
+    capture = sockets(paper_arm, space)
+    assert default_models(paper_arm, capture) == DEFAULT_MODELS
+    warm = {name: np.pad(q, ((0, 0), (0, 1)), constant_values=21.0) for name, q in capture.sockets.items()}
+    found = default_models(paper_arm, aj.Capture(warm))
+    assert found[:4] == ("dh", "expansion", "gravity", "gravity,expansion")
+    assert len(found) == 2 * len(DEFAULT_MODELS)
