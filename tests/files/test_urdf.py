@@ -173,7 +173,7 @@ def test_manifest_and_arm_file_name_a_urdf(tmp_path, nominal):
     stated = aj.files.load_specification(arm)
     assert (stated.held, stated.urdf.tip, stated.name) == (("d_1",), "tool0", "arm")
     np.testing.assert_array_equal(stated.arm.probe, found.arm.probe)
-    assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is no URDF", "leave out base and tip")
+    assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is not a URDF", "leave out base and tip")
     assert_refused(lambda: aj.load_arm("panda", probe=(0, 0, 1)), "states the probe itself")
     both = written(tmp_path, head + "joint = [{alpha = 0, a = 1, d = 0}]\n", "both.toml")
     assert_refused(lambda: aj.load_arm(both), "either joint", "or urdf")
