@@ -216,6 +216,7 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     by_slides = scale_from_slides(arm, capture, bounds.space, given.noise)
     general = bool(capture.observations) or given.robust is not None or prior is not None or by_slides
     method = default_method(arm, general) if given.method is None else given.method
+    check_method(method, general)
     given = given._replace(model=None, method=method, prior=prior)
     _check_solvable(arm, capture, bounds, given, general, by_slides)
     first = None if general else _stage1_task("calibrate_many", arm, capture, bounds, given)
@@ -243,11 +244,10 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
 def _check_solvable(
     arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions, general: bool, by_slides: bool
 ) -> None:
-    """Raise `InputError` where nothing fixes the scale, or the method cannot solve these data.
+    """Raise `InputError` where nothing fixes the scale, or a single solve cannot take what was given.
 
     ``general``: everything is one least squares; ``by_slides``: the slides of prismatic joints determine the scale.
     """
-    check_method(options.method, general)
     if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
