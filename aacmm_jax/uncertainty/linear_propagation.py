@@ -202,7 +202,9 @@ def covariance_of_rows(
 ) -> Float[AnyArray, "q q"]:
     """Covariance of functions that follow rows so."""
     pairs = zip(by_covariances(rows, covariances), rows, strict=True)
-    return sum((_flat(moved) @ _flat(plain).T for moved, plain in pairs), namespace(rows).zeros((rows[0].shape[0],) * 2))
+    return sum(
+        (_flat(moved) @ _flat(plain).T for moved, plain in pairs), namespace(rows).zeros((rows[0].shape[0],) * 2)
+    )
 
 
 def covariance_with(
