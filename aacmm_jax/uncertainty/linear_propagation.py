@@ -233,9 +233,10 @@ class RowErrors(NamedTuple):
 
 
 def row_errors(
-    rows: Rows, errors: ArmErrors, root: Float[AnyArray, "m r r"], spread: Float[AnyArray, "*n"]
+    rows: Rows, errors: ArmErrors, root: Float[AnyArray, "m r r"] | None, spread: Float[AnyArray, "*n"]
 ) -> RowErrors:
     """Of a group whose rows ``root`` whitens; ``spread`` is the standard deviation of the readings."""
+    assert root is not None  # only rows of a stage without covariances have none
     xp = namespace(root, errors.by_seat, spread)
     whitening = xp.moveaxis(root, 0, -1)
     readings = errors.by_readings * xp.broadcast_to(spread, (errors.by_readings.shape[1],))[None, :, None]
