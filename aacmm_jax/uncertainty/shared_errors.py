@@ -49,33 +49,33 @@ class SharedErrors(eqx.Module):
 
     def without_functions(self) -> "SharedErrors":
         """Those that move the tips of poses alike."""
-        own = len(self.added)
+        count = len(self.added)
         return SharedErrors(
-            kinds=self.kinds[:own],
-            units=self.units[:own],
+            kinds=self.kinds[:count],
+            units=self.units[:count],
             names=(),
-            sd=self.sd[:own],
+            sd=self.sd[:count],
             moments=np.zeros((0, 0)),
             follow=self.follow[:, :0],
             correlation_length=self.correlation_length,
             added=self.added,
             by_group=np.zeros((0, 0, 0)),
-            law=Law(*(of[:own] for of in self.law)),
+            law=Law(*(of[:count] for of in self.law)),
         )
 
     @property
     def of_tips(self) -> Components | None:
         """What errors of the tip add to the covariance of the parameters."""
-        own = len(self.added)
-        return Components(self.kinds[:own], self.added, Law(*(of[:own] for of in self.law))) if own else None
+        count = len(self.added)
+        return Components(self.kinds[:count], self.added, Law(*(of[:count] for of in self.law))) if count else None
 
     @property
     def of_functions(self) -> Components:
         """By how much the covariance of parameters and coefficients grows with the logarithm of each variance."""
-        xp, own = namespace(self), len(self.added)
+        xp, count = namespace(self), len(self.added)
         by_coefficients = xp.concatenate([self.follow, xp.asarray(np.eye(len(self.names)))])
         grown = by_coefficients @ self.by_group @ by_coefficients.T
-        return Components(self.kinds[own:], grown, Law(*(of[own:] for of in self.law)))
+        return Components(self.kinds[count:], grown, Law(*(of[count:] for of in self.law)))
 
     def sd_of(self, *kinds: str) -> Float[AnyArray, ""] | float:
         """Standard deviation of a tip coordinate by effects of some kinds, mm; 0 without."""
@@ -100,23 +100,23 @@ class Effects(NamedTuple):
         variance = 1.0 if given else left.cost / left.degrees_of_freedom
         return cls(left, given, np.zeros((len(left.values), 0)), np.zeros(0), variance)
 
-    def product(self, one: Float[np.ndarray, "R a"], other: Float[np.ndarray, "R b"]) -> Float[np.ndarray, "a b"]:
+    def product(self, left: Float[np.ndarray, "R a"], right: Float[np.ndarray, "R b"]) -> Float[np.ndarray, "a b"]:
         """one^T (I + D diag(variances / variance) D^T)^-1 other."""
         if not len(self.variances):
-            return one.T @ other
+            return left.T @ right
         d = self.columns * np.sqrt(self.variances / self.variance)
-        return one.T @ other - (one.T @ d) @ np.linalg.solve(np.eye(d.shape[1]) + d.T @ d, d.T @ other)
+        return left.T @ right - (left.T @ d) @ np.linalg.solve(np.eye(d.shape[1]) + d.T @ d, d.T @ right)
 
     def joined(self, columns: Float[np.ndarray, "R c"], variances: Float[np.ndarray, " c"]) -> "Effects":
         """With a further effect, whose columns the model has not explained; the variance of independent errors is the
         one with which the residuals are as large as they should be."""
-        found = self._replace(
+        both = self._replace(
             columns=np.concatenate([self.columns, columns], axis=1),
             variances=np.concatenate([self.variances, variances]),
         )
         if self.given:
-            return found
-        d, r = found.columns * np.sqrt(found.variances), self.left.values
+            return both
+        d, r = both.columns * np.sqrt(both.variances), self.left.values
         values, vectors = np.linalg.eigh(d.T @ d)
         seen, values = (vectors.T @ (d.T @ r)) ** 2, np.maximum(values, 0.0)
         variance = self.variance
@@ -126,7 +126,7 @@ class Effects(NamedTuple):
             change, variance = abs(np.log(new / variance)), new
             if change < _TOLERANCE:
                 break
-        return found._replace(variance=variance)
+        return both._replace(variance=variance)
 
 
 class OneVariance(NamedTuple):
@@ -154,9 +154,9 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: flo
     """
     information = effects.product(columns, columns)
     values, vectors = np.linalg.eigh(information)
-    known = values > NULL * max(values.max(initial=0.0), 1e-300)
-    values, r = values[known], effects.left.values[:, None]
-    squares = (vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2
+    determined = values > NULL * max(values.max(initial=0.0), 1e-300)
+    values, r = values[determined], effects.left.values[:, None]
+    squares = (vectors[:, determined].T @ effects.product(columns, r)[:, 0]) ** 2
     total, freedom = float(effects.product(r, r)[0, 0]), effects.left.degrees_of_freedom
     ratio = (usual * np.geomspace(*_RANGE, _GRID)) ** 2 / effects.variance
     explained = np.sum(ratio[:, None] * squares / (1 + ratio[:, None] * values), axis=1)
@@ -237,5 +237,5 @@ def second_moments(
     mean = covariance @ effects.product(columns, r) / variance
     grown = [covariance @ (weight[:, None] * covariance) for weight in weights]
     moved = [covariance @ (weight[:, None] * mean) for weight in weights]
-    by_group = [one + step @ mean.T + mean @ step.T for one, step in zip(grown, moved, strict=True)]
+    by_group = [of_spread + step @ mean.T + mean @ step.T for of_spread, step in zip(grown, moved, strict=True)]
     return Moments(covariance + mean @ mean.T, np.array(by_group))
