@@ -1,14 +1,4 @@
-"""Errors that poses share, as random effects: how large they are by the residuals, and what they do to a calibration.
-
-The model of a calibration leaves residuals r = M e of whitened errors e, M the projector onto what its unknowns cannot
-explain (`residual_tests`). Errors that poses share are e = w + sum_g Z_g c_g: independent ones w of one variance s, and
-columns Z_g (the tips of all poses of a visit move alike; a joint turns by an unknown coefficient times a known
-function) times coefficients of variance v_g. The likelihood of r depends on the variances through D_g = M Z_g alone
-(REML: Patterson and Thompson 1971, Biometrika 58, 545-554). The calibration stays as it is. Its parameters follow a
-shared error as they follow any other error of the tips, z = K c, so its covariance grows by K v K^T.
-"""
-
-from typing import NamedTuple
+"""Errors that poses share, as random effects: what a calibration keeps of them (`diagnostics.shared_errors`)."""
 
 import equinox as eqx
 import numpy as np
@@ -16,15 +6,6 @@ from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, namespace
 from .degrees_of_freedom import Components, Law
-from .evidence import Groups, PriorModel, covariance_of_log_variances, learned_log_variances
-from .residual_tests import Residuals
-
-_ROUNDS = 40  # of the variance of independent errors; usually 5
-_TOLERANCE = 1e-6
-NULL = 1e-6  # eigenvalues of an effect's information below this, of the largest, are zero
-# Standard deviations at which the likelihood of one effect is computed: how many, and between which parts of the usual.
-_GRID, _RANGE = 80, (0.01, 100.0)
-_LEAST_LOG = 2 * np.log(1e-4)  # smallest log variance of a learned group, in natural steps
 
 
 class SharedErrors(eqx.Module):
@@ -80,6 +61,7 @@ class SharedErrors(eqx.Module):
     def sd_of(self, *kinds: str) -> Float[AnyArray, ""] | float:
         """Standard deviation of a tip coordinate by effects of some kinds, mm; 0 without."""
         return sum((self.sd[i] ** 2 for i, kind in enumerate(self.kinds) if kind in kinds), 0.0) ** 0.5
+<<<<<<< HEAD
 
 
 class Effects(NamedTuple):
@@ -239,3 +221,5 @@ def second_moments(
     moved = [covariance @ (weight[:, None] * mean) for weight in weights]
     by_group = [of_spread + step @ mean.T + mean @ step.T for of_spread, step in zip(grown, moved, strict=True)]
     return Moments(covariance + mean @ mean.T, np.array(by_group))
+=======
+>>>>>>> main
