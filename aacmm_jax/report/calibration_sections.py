@@ -196,7 +196,9 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
         f"U of a {volume.length:g} mm length [mm]": volume.expanded_length,
         "with readings [mm]": volume.expanded_length_reading,
     }
-    positions = {f"{axis} [mm]": lambda i, k=k: number(float(volume.start[i, k]), 0) for k, axis in enumerate("xyz")}
+    positions: Columns = {
+        f"{axis} [mm]": lambda i, k=k: number(float(volume.start[i, k]), 0) for k, axis in enumerate("xyz")
+    }
     positions |= {name: lambda i, values=values: with_u_digits(float(values[i])) for name, values in u.items()}
     every = table("All positions", range(len(volume.start)), positions)
     chart = with_table(volume_chart(volume), every)
