@@ -76,7 +76,9 @@ def functions_chart(record: CalibrationRecord) -> Chart | None:
     if not plots or corrections is None:
         return None
     kinds = {
-        term.kind.description: term.kind.of_own_reading for term in corrections.functions.terms if isinstance(term, Term)
+        term.kind.description: term.kind.of_own_reading
+        for term in corrections.functions.terms
+        if isinstance(term, Term)
     }
     drawn, others = ([words for words, own_reading in kinds.items() if own_reading is by] for by in (True, False))
     description = (
