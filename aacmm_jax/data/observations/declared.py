@@ -180,6 +180,8 @@ def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
     value = checked(value, entry.annotation, what, sizes)
     if entry.dimensions[:1] == ("pose",) and len(value) != sizes["m"]:
         raise InputError(f"{what} has {len(value)} values; give one for each of the {sizes['m']} poses.")
+    if entry.content == "points":
+        return {name: tuple(map(float, point)) for name, point in value.items()}
     if entry.content == "count":
         Range(least=1, most=MOST_POSES)(value, what, sizes)
     elif entry.content == "number" and value is not None and not np.ndim(value) and not entry.dimensions:
