@@ -110,8 +110,8 @@ def plan(
         lengths: ``(start, end)`` or ``(start, end, u)`` for each length between given sockets.
         cone: Directions from which the tool may come to the sockets: one `Cone` for all or socket name -> `Cone`; by
             default all directions, with (0, 0, 1) as the normal.
-        **options: Options of all plans, such as ``noise=``, ``region=``, ``margin=``, ``cell=``, ``candidates=`` and
-            ``seed=``: the fields of `PlanOptions`.
+        **options: Fields of `PlanOptions`, like all arguments that are not named here: ``noise``, ``region``,
+            ``margin``, ``cell``, ``candidates``, ``seed`` and others.
 
     Returns:
         The plan, with predicted uncertainties.

@@ -93,8 +93,8 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         kit: What is at hand: observations to simulate, with their uncertainties, as they stand; or `KitItem`, which are
             placed. How many poses each has is chosen.
         poses: Number of poses in all.
-        **options: Options of all plans, such as ``noise=``, ``region=``, ``margin=``, ``cell=``, ``candidates=`` and
-            ``seed=``: the fields of `PlanOptions`.
+        **options: Fields of `PlanOptions`, like all arguments that are not named here: ``noise``, ``region``,
+            ``margin``, ``cell``, ``candidates``, ``seed`` and others.
 
     Returns:
         The plan, with predicted uncertainties, also without each part of the kit.

@@ -56,6 +56,11 @@ class PlanOptions(NamedTuple):
         check_length: Length that predictions are of, mm (as in `volumetric_uncertainty`).
         seed: Seed of the search.
         progress: Called with the name of the stage and the fraction of it that is done.
+
+    Example:
+        >>> fine = aj.planning.PlanOptions(noise=aj.Noise(encoder_arcsec=1.0), margin=0.2, seed=1)
+        >>> print(fine.criterion, fine.farthest)
+        length 0.95
     """
 
     space: Parameters | None = None
