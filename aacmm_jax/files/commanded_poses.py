@@ -54,16 +54,8 @@ def read_commanded_poses(
     ``unit`` unless the header says it), and the readings to begin with in columns as above, or ``near``. A column
     temperature_C is the arm's.
 
-    Args:
-        path: The table (CSV or other text).
-        arm: The nominal arm; readings of its prismatic joints are in mm.
-        unit: ``"deg"`` or ``"rad"`` of the others; needed where the header does not say it.
-        near: Readings to begin with, in ``unit``, where the table has none.
-        columns: Columns of the joint readings, by name, shell pattern or number from 1, where their names say nothing.
-        length_unit: Unit of positions whose header states none; by default mm.
-
-    Raises:
-        InputError: Columns are missing, or a unit is missing or differs.
+    ``unit``, deg or rad, is that of revolute joints where the header does not say it, and of ``near``; ``length_unit``
+    that of positions whose header states none, by default mm. Raises `InputError`.
     """
     table, joints = TextTable(path), arm.joints
     orientation = _orientation(table)
@@ -104,15 +96,8 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
 
     Readings are in columns named as for `read_commanded_poses`; positions in x, y, z or px, py, pz,
     perhaps with an orientation. Without positions all poses are of one socket, or of those that a column ``socket``
-    names. A table without header has a column for each joint, and after them perhaps x, y and z.
-
-    Args:
-        path: The table (CSV or other text).
-        joints: Number of joints.
-        unit: ``"deg"`` or ``"rad"``; without it and a header that says it, readings up to a revolution are in rad.
-
-    Raises:
-        InputError: Columns are missing, or units differ.
+    names. A table without header has a column for each joint, and after them perhaps x, y and z. Where neither ``unit``
+    (deg or rad) nor the header says it, readings up to a revolution are in rad. Raises `InputError`.
     """
     table = TextTable(path)
     position, orientation = position_columns(table), _orientation(table)
@@ -141,12 +126,7 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
 def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> str:
     """The table with corrected readings in place of those commanded, or after the other columns, in the same unit.
 
-    The readings of rows that are not reached are left empty, so that nobody sends an arm there by mistake.
-
-    Args:
-        commanded: What was read.
-        q: Corrected readings, rad and mm.
-        reached: Which rows have some.
+    The readings (rad and mm) of rows that are not ``reached`` are left empty, so that nobody sends an arm there.
     """
     table, arm = commanded.table, commanded.arm
     rows = (q / np.array(by_joint(arm, _ANGLES[commanded.unit], 1.0))).T
