@@ -27,8 +27,8 @@ def largest_file() -> int:
 class InputFile(os.PathLike):
     """A file that is read once: what is parsed and what `fingerprint` identifies are the same bytes.
 
-    Functions that read a file take one in place of a path, and so does this class. Refused is what is missing, cannot be
-    read, is not an ordinary file, or is larger than this ``share`` of `largest_file`.
+    Functions that read a file take one in place of a path, and so does this class. Refused is what is missing, cannot
+    be read, is not an ordinary file, or is larger than this ``share`` of `largest_file`.
     """
 
     def __init__(self, path: str | os.PathLike, share: float = 1.0):

@@ -185,8 +185,8 @@ class TextTable:
     def unit(self, picked: Sequence[int], stated_unit: str | None = None, key: str = "q") -> str | None:
         """The unit that the header states for columns, counted from 0, or None.
 
-        ``stated_unit``, that of the manifest, decides what the ambiguous grad is; ``key`` is what the manifest calls the
-        quantity in ``units``. Raises `InputError` where the header states several units, or one that is not clear.
+        ``stated_unit``, that of the manifest, decides what the ambiguous grad is; ``key`` is what the manifest calls
+        the quantity in ``units``. Raises `InputError` where the header states several units, or one that is not clear.
         """
         stated = {self._header[i]: unit_in(self._header[i]) for i in picked if self._header}
         found = {unit: name for name, unit in stated.items() if unit is not None}
