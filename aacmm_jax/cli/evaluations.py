@@ -35,7 +35,8 @@ def evaluated(
             sources=(*map(fingerprint, read), *recording.sources),
             measuring_range=measuring_range or recording.measuring_range,
         )
-        found = evaluation_of(record, recording, **of_test, calibration_warnings=_warnings_of(read[0], record))
+        found = evaluation_of(record, recording, **of_test)
+        found = found._replace(calibration_warnings=tuple(_warnings_of(read[0], record)))
         summary = with_spinner("Evaluating", lambda: evaluation_summary(found))
         if not summary["acceptance"]:
             _refuse_options_of_tests(of_test, measuring_range)
