@@ -126,7 +126,7 @@ def load_cell(
     return LoadedCell(Cell(body, obstacles, content.clearance), notes)
 
 
-def _obstacles(content: _CellFile) -> tuple[Obstacle, ...]:
+def _obstacles(content: Any) -> tuple[Obstacle, ...]:
     obstacles = (
         *(HalfSpace(row.name, tuple(row.normal), tuple(row.point)) for row in content.half_space),
         *(Box(row.name, tuple(row.centre), tuple(row.size), tuple(row.rotation)) for row in content.box),

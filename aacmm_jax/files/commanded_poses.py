@@ -192,7 +192,7 @@ def _poses(
         poses[:, :3, :3] = _rotations(path, table.numbers(columns))
     elif columns:
         vectors = (angle if rotation_unit is None else _ANGLES[rotation_unit]) * table.numbers(columns)
-        poses[:, :3, :3] = np.moveaxis(rotation_matrix(vectors.T), -1, 0)
+        poses[:, :3, :3] = np.moveaxis(np.asarray(rotation_matrix(vectors.T)), -1, 0)
     return poses
 
 

@@ -217,7 +217,9 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
         # Where another tip than the arm's own probe was held, it is an observation.
         seats = [seated for seated in recorded.sockets.values() if not seated.target]
         targets = [seated for seated in recorded.sockets.values() if seated.target]
-        observed = [(seated.session, Socket(seated.name, seated.poses, target=seated.target)) for seated in targets]
+        observed: list[tuple[str, AbstractObservation]] = [
+            (seated.session, Socket(seated.name, seated.poses, target=seated.target)) for seated in targets
+        ]
         for kind in TABLES:
             for entry in () if kind is Socket else getattr(model, kind.table):
                 for values in _fields(path.parent, entry, kind.table):
