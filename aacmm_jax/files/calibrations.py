@@ -88,7 +88,7 @@ def save_calibration(
         f"measured_{stage}": (np.asarray(evaluation.measured), "mm", f"length as the {stage} arm measures it")
         for stage, evaluation in evaluations.items()
     }
-    tables["reference"] = Table(dict(tables["reference"].variables) | columns("length", **measured))
+    tables["reference"] = Table(tables["reference"].variables | columns("length", **measured))
     tables |= {"stage1_arm": arm_table(record.stage1), "calibrated_arm": arm_table(record.calibrated)}
     tables["parameters"] = _parameter_table(record)
     tables["sockets"] = _socket_table(record.recording.capture, evaluations)
@@ -167,7 +167,7 @@ def _parameter_table(record: CalibrationRecord) -> Table:
         "u": (np.sqrt(np.diag(record.covariance)), "see unit", "standard uncertainty"),
     }
     derived |= {stage: (vector, "see unit", f"value in the {stage} arm") for stage, vector in record.vectors().items()}
-    return Table(dict(table.variables) | columns("parameter", **derived), table.attributes)
+    return Table(table.variables | columns("parameter", **derived), table.attributes)
 
 
 def _socket_table(capture: Capture, evaluations: Mapping[str, Evaluation]) -> Table:
@@ -177,12 +177,12 @@ def _socket_table(capture: Capture, evaluations: Mapping[str, Evaluation]) -> Ta
     )
     for stage, evaluation in evaluations.items():
         metrics = evaluation.repeatability
-        by_name = {
-            f"de_{stage}": (metrics.socket_de, "mm", f"mean distance from the centroid, {stage} arm"),
-            f"deltam_{stage}": (metrics.socket_deltam, "mm", f"largest half range, {stage} arm"),
-            f"rms_{stage}": (metrics.socket_rms, "mm", f"root mean square distance from the centroid, {stage} arm"),
-        }
-        variables |= columns("socket", **{name: (np.asarray(x), *said) for name, (x, *said) in by_name.items()})
+        for name, values, says in (
+            ("de", metrics.socket_de, "mean distance from the centroid"),
+            ("deltam", metrics.socket_deltam, "largest half range"),
+            ("rms", metrics.socket_rms, "root mean square distance from the centroid"),
+        ):
+            variables |= columns("socket", **{f"{name}_{stage}": (np.asarray(values), "mm", f"{says}, {stage} arm")})
     centroids = np.asarray(evaluations["calibrated"].repeatability.centroids)
     return Table(variables | {"centroid": Variable(("socket", "axis"), centroids, "mm", "socket position")})
 
@@ -192,7 +192,7 @@ def _observed_tables(observed: ObservedMetrics, units: Mapping[str, tuple[str, .
     table = rows_table("observation", map(_Agreement, *columns_of_all, observed.weights), schema.OBSERVED)
     attributes = {"sigma_mm": float(observed.sigma), "reduced_chi_of_all": float(observed.reduced_chi_of_all)}
     numbers = [
-        _GeometryNumber(name, units[name][i], value, observed.geometry_covariance[name][i])
+        _GeometryNumber(name, units[name][i], float(value), np.asarray(observed.geometry_covariance[name])[i])
         for name, values in observed.geometry.items()
         for i, value in enumerate(values)
     ]

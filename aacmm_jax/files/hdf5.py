@@ -51,7 +51,7 @@ class Table(NamedTuple):
     A variable named like its only dimension is the coordinate of it; dimensions without one are numbered from 1.
     """
 
-    variables: Mapping[str, Variable]
+    variables: dict[str, Variable]
     attributes: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -181,7 +181,7 @@ def _write_group(group: Any, table: Table) -> None:
         for dimension, size in zip(variable.dimensions, np.shape(variable.values), strict=True):
             if dimension not in table.variables:
                 coordinates[dimension] = _coordinate(dimension, size, table.variables)
-    variables = coordinates | dict(table.variables)
+    variables = coordinates | table.variables
     for name, variable in variables.items():
         values = np.asarray(variable.values)
         truth = values.dtype.kind == "b"

@@ -133,7 +133,7 @@ def values_in(cls: type, fields: Fields, arrays: Entries, attributes: Entries) -
             continue
         source, key = (arrays, field.name or name) if field.dimensions else (attributes, _attribute(name, field))
         value = source.get(key) if NoneType in get_args(hint) or not hints.get(name) else source[key]
-        values[name] = json.loads(value) if field.content == "json" else restored(hint, value)
+        values[name] = json.loads(str(value)) if field.content == "json" else restored(hint, value)
     return values
 
 

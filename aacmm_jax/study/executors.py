@@ -67,7 +67,7 @@ def dask_executor(address: str, workers: int | None = None) -> Iterator[tuple[Ex
     require("dask", "a study on a Dask cluster")
     import distributed
 
-    target = {"scheduler_file": address} if os.path.isfile(address) else {"address": address}
+    target: dict[str, Any] = {"scheduler_file": address} if os.path.isfile(address) else {"address": address}
     try:
         connected: Any = distributed.Client(**target, timeout=5)
     except Exception as error:  # of a dozen types: no such file or host, no answer, not a scheduler's file

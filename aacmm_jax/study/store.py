@@ -36,7 +36,8 @@ _TRIALS_IN_MEMORY = 50_000
 def write_part(path: Path, block: Block, results: Mapping[str, np.ndarray], layout: Layout) -> None:
     """Write a finished block: its file appears complete, or not at all."""
     target, content = part_of(path, block, layout), io.BytesIO()
-    np.savez(content, block=np.array(target.name), **{name: np.asarray(results[name]) for name in VARIABLES})
+    arrays: dict[str, Any] = {name: np.asarray(results[name]) for name in VARIABLES}
+    np.savez(content, block=np.array(target.name), **arrays)
     with write_atomically(target, _ADVICE, leftovers=False) as temporary:
         temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: nobody else may change a block
         temporary.write_bytes(content.getbuffer())
