@@ -159,11 +159,11 @@ def calibrate_many(
     _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
     method, at_once = method_of(arm, capture, space, given.solving, method, given.covariance)
     if at_once:
-        options = given._replace(hold=None)
-        many = _Batch.of("calibrate", arm, capture, lower, upper, start, options, with_lengths=True).identify()
+        given = given._replace(hold=None)
+        many = _Batch.of("calibrate", arm, capture, lower, upper, start, given, with_lengths=True).identify()
         return _of_joint(many, many, None)
-    options = given._replace(covariance=False)
-    batch = _Batch.of("calibrate", arm, capture, lower, upper, start, options, with_lengths=False)
+    given = given._replace(covariance=False)
+    batch = _Batch.of("calibrate", arm, capture, lower, upper, start, given, with_lengths=False)
     return _in_two_stages(batch, batch.identify(), method)
 
 

@@ -222,9 +222,7 @@ def _beginning(problem: Problems, task: Task) -> tuple[Float[AnyArray, " z"], Wh
     return begun.z, weights(task, begun, begun.state, losses_of(task)[0])
 
 
-def _fields(
-    form: Form, losses: list[Loss | None], problem: Problems, task: Task, ended: _Ended
-) -> dict[str, Any]:
+def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task, ended: _Ended) -> dict[str, Any]:
     """The fields of one problem after its last least squares; that with a prior is still to come."""
     begun, prior, of_prior = begin(task), prior_of(task), None
     if prior is not None:
@@ -301,7 +299,8 @@ def _solve_all(
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     def fresh(index: Int[Array, " w"]) -> Any:
-        return begin_steps(*starts(jnp.minimum(index, count - 1)), zeros)
+        first, box = starts(jnp.minimum(index, count - 1))
+        return begin_steps(first, box, zeros)
 
     def once(carry: Any) -> Any:
         progress, index, upcoming, results = carry

@@ -151,9 +151,7 @@ class PriorProblem(NamedTuple):
         gram, gradient = reduced(data.gram.scaled(steps), data.gradient * steps)
         return eliminated(gram, gradient, deviation, index, xp.asarray(pinned)[: gram.shape[0]])
 
-    def log_sigma(
-        self, z: Float[AnyArray, " z"], effective: Float[AnyArray, " k"]
-    ) -> Float[AnyArray, " 1"]:
+    def log_sigma(self, z: Float[AnyArray, " z"], effective: Float[AnyArray, " k"]) -> Float[AnyArray, " 1"]:
         """The tips' standard deviation by the residuals; as in the reference where the noise is given."""
         if self.task.noise is not None:
             return _log_sigma(self.reference.sigma)

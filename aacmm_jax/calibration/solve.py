@@ -1,10 +1,10 @@
 """The engine's solve: the parameters and every unknown geometry that agree best with all that was observed.
 
 `solve` runs the least squares of a task one after the other (`least_squares`; with a prior the last is repeated until
-the weights agree with what it leads to, `prior_fit`), and concludes: at the solution z the problem is linear with
-whitened rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, with G the inverse information
-(`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows, which is that of the
-given noise, or of noise estimated from the residuals.
+the weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with
+whitened rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, where G is the inverse of the
+information A^T W A (`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows,
+which is that of the given noise, or of noise estimated from the residuals.
 
 Example, of the parameters of stage 1 and their standard uncertainties:
     solution = solve(task_of(arm, without_lengths(capture), bounds, Solving()))
@@ -114,12 +114,14 @@ def concluded(
     noise = _noise_of(task, linear, influence, state)
     covariances, shared, reading = _of_rows(task, linear, influence, noise)
     by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales.added(influence.inverse)
-    unknowns = propagated(influence, covariances, shared, prior_rows, by_scales)
+    unknowns = propagated(influence, covariances, shared, by_scales)
     parameters = set_at(task.start, free, z[:p])
     spent = p + count if of_prior is None else of_prior.effective
-    observed = observed_metrics(task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent)
+    observed = observed_metrics(
+        task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent
+    )
     after = repeatability_of(state, task.observed, state.sigma)
-    identification = Identification(
+    identification = Identification(  # pyright: ignore[reportCallIssue] - `stage1` is itself
         arm=task.bounds.space.arm(parameters),
         parameters=parameters,
         de=after.de,
@@ -188,10 +190,10 @@ def _of_parameters(
     task: Task, linear: Linearisation, influence: Influence, unknowns: UnknownsCovariance, noise: Noise
 ) -> ParameterCovariance:
     """Of all parameters, of which the scale anchor is exact."""
-    xp, free, size, whitening = namespace(linear.z), task.free, len(task.bounds.space.names), linear.whitening
+    xp, free, size = namespace(linear.z), task.free, len(task.bounds.space.names)
     p, grid = len(free), np.ix_(free, free)
     scale = linear.steps[:p, None] * linear.steps[None, :p]
-    stated = of_stated(influence, linear.point.rows, whitening, whitening.prior)[:p, :p] * scale
+    stated = of_stated(influence, linear.point.rows, linear.whitening)[:p, :p] * scale
     parts = Components.of({STATED: (stated, np.inf)})
     return ParameterCovariance(
         set_at(xp.zeros((size, size)), grid, unknowns.head[:p, :p] * scale),

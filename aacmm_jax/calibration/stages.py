@@ -40,16 +40,15 @@ class Sensitivities(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        linear: Linearisation,
-        rows: Sequence[Float[AnyArray, "p _ _"]],
-        lengths: Sequence[Float[AnyArray, "l _ _"]] | None,
+        cls, linear: Linearisation, rows: Sequence[Float[AnyArray, "p _ _"]], lengths: Float[np.ndarray, "l 3 M"]
     ) -> "Sensitivities":
-        """Of parameters, and of measured lengths, that follow the whitened rows of every group so."""
-        moved, turned = [part.by_tip for part in linear.point.rows], [error.by_readings for error in linear.errors]
-        none = np.zeros((0, 3, linear.observed.q.shape[0]))
-        of_lengths = none if lengths is None else _through(linear, lengths, moved)
-        return cls(_through(linear, rows, moved), _through(linear, rows, turned), of_lengths)
+        """Of parameters that follow the whitened rows of every group so."""
+        by_readings = [error.by_readings for error in linear.errors]
+        return cls(_by_tips(linear, rows), _through(linear, rows, by_readings), lengths)
+
+
+def _by_tips(linear: Linearisation, rows: Sequence[Float[AnyArray, "q _ _"]]) -> Float[np.ndarray, "q 3 M"]:
+    return _through(linear, rows, [part.by_tip for part in linear.point.rows])
 
 
 def _through(
@@ -128,9 +127,7 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     task, solution, measured, of_bounds = stage1
     assert measured is not None
     identification, bounds = solution.identification, task.bounds
-    division = divided(
-        task.anchor, bounds, identification.active, identification.parameters, measured.scale.value
-    )
+    division = divided(task.anchor, bounds, identification.active, identification.parameters, measured.scale.value)
     parameters = division.parameters
     uncertainty = divided_uncertainty(solution, measured, parameters)
     linear = _at_divided(task, solution, parameters)
@@ -217,8 +214,8 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
     )
 
 
-def _of_lengths(solution: Solution, capture: Capture) -> list[Float[AnyArray, "l _ _"]]:
-    """How measured lengths follow the whitened rows, where the arm is given and positions are means."""
+def _of_lengths(solution: Solution, capture: Capture) -> Float[np.ndarray, "l 3 M"]:
+    """Derivatives of the measured lengths by the tips, where the arm is given and positions are means."""
     linear, influence = solution.linear, solution.influence._replace(inverse=np.zeros_like(solution.influence.inverse))
     observed, p, count = linear.observed, len(linear.space.names), len(capture.lengths)
     components = [np.zeros((count, *own.shape[:2])) for own in influence.own]
@@ -228,7 +225,7 @@ def _of_lengths(solution: Solution, capture: Capture) -> list[Float[AnyArray, "l
         for rows, sign in zip(ends, (-1.0, 1.0), strict=True):
             number, component, first = observed.layout.component_of(int(rows[0]))
             components[number][i, component, first : first + 3] = sign * between / np.linalg.norm(between)
-    return rows_of_functions(influence, np.zeros((count, linear.height)), components)
+    return _by_tips(linear, rows_of_functions(influence, np.zeros((count, linear.height)), components))
 
 
 def _measured_lengths(parts: dict[str, Any], capture: Capture) -> Float[AnyArray, " l"]:
@@ -253,6 +250,7 @@ def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str
     calibration = _calibration(task, capture, first, result, method, False)
 
     def sensitivities() -> Sensitivities:
-        return Sensitivities.of(solution.linear, solution.rows_of_parameters(), None)
+        none = np.zeros((0, 3, task.observed.q.shape[0]))
+        return Sensitivities.of(solution.linear, solution.rows_of_parameters(), none)
 
     return Stages(calibration, sensitivities)

@@ -13,7 +13,7 @@ from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
 from ..kinematics.parameters import Parameters
-from ..model.elimination import cost_and_weights, sums_by_component
+from ..model.elimination import cost_and_weights
 from ..model.observed import Observed
 from ..model.robust import Loss
 from ..model.rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at, whitening_of
@@ -116,17 +116,8 @@ class Linearisation(NamedTuple):
     def fitted(self, fixed: Bool[AnyArray, " z"]) -> Float[AnyArray, " z"]:
         """The unknowns one step of Gauss and Newton further, but for the fixed ones; of steps that change no row, the
         shortest. A prior takes no part."""
-        xp, influence = namespace(self.z, fixed), self.influence(fixed)
-        slope, slopes = xp.zeros(self.height), [xp.zeros(own.shape[:2]) for own in influence.own]
-        for number, block in enumerate(self.blocks):
-            slope = slope + influence.weighted_rows(number).reshape(self.height, -1) @ block.white.reshape(-1)
-            own = influence.own_rows(number)
-            if own is not None:
-                sums = sums_by_component(influence.weighted(number, own), block.white[None], block.sizes)
-                slopes[block.of] = slopes[block.of] + sums[..., 0]
-        head, each = -influence.inverse @ slope, zip(influence.own, influence.follow, slopes, strict=True)
-        parts = [-(own @ part[..., None])[..., 0] - follow @ head for own, follow, part in each]
-        return self.z + self.steps * joined(head, *parts)
+        head, components = self.influence(fixed).response([block.white[None] for block in self.blocks])
+        return self.z + self.steps * joined(head[:, 0], *(part[..., 0] for part in components))
 
     def parts(self) -> list[ObservationRows]:
         """The rows, observation by observation."""

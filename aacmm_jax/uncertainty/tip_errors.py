@@ -73,6 +73,11 @@ def products(one: Float[AnyArray, "r c m"], other: Float[AnyArray, "s c m"]) -> 
     return sum(others, first)
 
 
+def matrix_products(one: Float[AnyArray, "r s m"], other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
+    """The product of two matrices a pose."""
+    return products(one, namespace(other).swapaxes(other, 0, 1))
+
+
 def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -> Float[AnyArray, "r m"]:
     """A matrix a pose times its vector."""
     return products(namespace(matrices).moveaxis(matrices, 0, -1), vectors[None])[:, 0]
@@ -121,8 +126,8 @@ def scatter_of(
 
 def root_of_sum(value: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
     """The square root of a sum of squares; its derivative at 0, where it has none, is set to 0."""
-    xp, zero = namespace(value), value == 0
-    return xp.where(zero, 0.0, xp.sqrt(xp.where(zero, 1.0, value)))
+    xp, positive = namespace(value), value > 0
+    return xp.where(positive, xp.sqrt(xp.where(positive, value, 1.0)), 0.0)
 
 
 def robust_scatter_of(

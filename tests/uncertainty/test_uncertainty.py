@@ -10,9 +10,8 @@ import pytest
 from scipy import stats
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.batch_kernel import without_lengths
 from aacmm_jax.calibration.stages import identified, in_two_stages, jointly
-from aacmm_jax.calibration.task import task_of
+from aacmm_jax.calibration.task import Solving, task_of, without_lengths
 from aacmm_jax.core.linear_algebra import inverse_cholesky
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.units import ARCSEC
@@ -108,9 +107,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
             for length, value in zip(capture.lengths, values, strict=True)
         ]
         moved = aj.Capture(blocks, lengths)
-        return aj.calibrate(
-            paper_arm, moved, bounds, method=method, noise=noise, check_identifiability=False
-        ).parameters
+        return aj.calibrate(paper_arm, moved, bounds, method=method, noise=noise, undetermined="ignore").parameters
 
     slopes = np.stack([parameters(q + step * turn, values) - parameters(q - step * turn, values) for turn in turns]) / (
         2 * step
@@ -118,11 +115,11 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     found = aj.calibrate(paper_arm, capture, bounds, method=method, noise=noise)
     # With arrays of NumPy, which compiles nothing; tests/core/test_numpy_or_jax.py has both libraries.
     found, arm, space, capture, noise = to_numpy((found, paper_arm, space, capture, noise))
-    options = bounds, None, noise, "longest", None, 300, None, None
-    first = to_numpy(task_of(arm, without_lengths(capture), *options))
+    solving = Solving(noise=noise)
+    first = to_numpy(task_of(arm, without_lengths(capture), bounds, solving))
     stage1 = identified(first, capture)
     if method == "joint":
-        whole = jointly(to_numpy(task_of(arm, capture, *options)), capture, stage1, "joint")
+        whole = jointly(to_numpy(task_of(arm, capture, bounds, solving)), capture, stage1, "joint")
     else:
         whole = in_two_stages(stage1, capture)
     follow = whole.sensitivities()
@@ -177,7 +174,7 @@ def test_coverage(paper_arm, space, bounds, trials, noise, noise_model, least, m
 
     def covered(q, value):
         capture = aj.Capture({"A": q[:70], "B": q[70:]}, [aj.ReferenceLength("A", "B", value, 0.002)])
-        options = {"noise": noise, "noise_model": noise_model, "check_identifiability": False}
+        options = {"noise": noise, "noise_model": noise_model, "undetermined": "ignore"}
         found = aj.calibrate(paper_arm, capture, bounds, **options)
         return np.abs(found.parameters - space.vector()) <= 1.97 * np.sqrt(np.diag(found.covariance))
 

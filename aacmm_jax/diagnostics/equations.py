@@ -6,15 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..calibration.batch_kernel import without_lengths
 from ..calibration.record import CalibrationRecord
+from ..calibration.task import without_lengths
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise
 from ..kinematics.arm import by_joint, is_length, value_of
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
-from ..uncertainty.group_test import Block
 from ..uncertainty.linearisation import Linearisation
+from .group_test import Block
 
 PRIOR = "prior"  # name of its rows
 PROBE = ("probe_x", "probe_y", "probe_z")
