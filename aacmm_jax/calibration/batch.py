@@ -6,6 +6,7 @@ The batch is cut into chunks, which threads compute on the machine's cores or de
 import dataclasses
 import math
 import os
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -381,8 +382,19 @@ def _run(run: Callable, chunks: Sequence[range], devices: Sequence[Any], workers
     """
     if len(chunks) == 1:
         return [run(chunks[0], devices[0])]
+    failed = threading.Event()
+
+    def work(i: int) -> Any:
+        if failed.is_set():  # the failure is raised in the place of what is missing
+            return None
+        try:
+            return run(chunks[i], devices[i % len(devices)])
+        except BaseException:
+            failed.set()
+            raise
+
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(lambda i: run(chunks[i], devices[i % len(devices)]), range(len(chunks))))
+        return list(pool.map(work, range(len(chunks))))
 
 
 def _lay_out(
