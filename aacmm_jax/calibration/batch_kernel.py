@@ -31,12 +31,12 @@ from ..solver.levenberg_marquardt import Rules, advance
 from ..solver.levenberg_marquardt import begin as begin_steps
 from ..solver.reason import MAX_STEPS, RUNNING, numbers_of, reasons
 from ..uncertainty.covariance import NoiseModel
-from .least_squares import Fit, State, args_of, begin, box_of, losses_of, rules_of, state_after, whitening_at
 from .prior_fit import OfPrior, fitted_with_prior, prior_of, weights
 from .scale_anchor import ScaleAnchor
 from .scale_fix import ends_between
 from .solve import concluded, repeatability_of
 from .task import Task, without_lengths
+from .weighted_least_squares import Fit, State, args_of, begin, box_of, losses_of, rules_of, state_after, whitening_at
 
 
 class Problems(NamedTuple):

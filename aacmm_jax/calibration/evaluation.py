@@ -30,10 +30,10 @@ from ..model.socket_sums import to_poses
 from ..solver.arrow import split
 from ..uncertainty.linear_propagation import variances_of_functions
 from ..uncertainty.linearisation import Linearisation
-from .least_squares import begin, whitening_at
 from .scale_anchor import ScaleAnchor
 from .solve import minimised
 from .task import Task
+from .weighted_least_squares import begin, whitening_at
 
 _MAX_STEPS = 300
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position

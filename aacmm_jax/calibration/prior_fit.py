@@ -29,9 +29,9 @@ from ..uncertainty.evidence import (
     learned_log_variances,
     slope_of_expectation,
 )
-from .least_squares import NEAR, Begun, Fit, State, fit, state_at, whitening_at
 from .results import PriorMetrics
 from .task import Task
+from .weighted_least_squares import NEAR, Begun, Fit, State, fit, state_at, whitening_at
 
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
 # Largest change of the log of a variance that no further round is worth, where derivatives pass through, and elsewhere.

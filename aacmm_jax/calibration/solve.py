@@ -1,7 +1,7 @@
 """The engine's solve: the parameters and every unknown geometry that agree best with all that was observed.
 
-`solve` runs the least squares of a task one after the other (`least_squares`; with a prior the last is repeated until
-the weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with
+`solve` runs the least squares of a task one after the other (`weighted_least_squares`; with a prior the last is repeated
+until the weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with
 whitened rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, where G is the inverse of the
 information A^T W A (`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows,
 which is that of the given noise, or of noise estimated from the residuals.
@@ -38,10 +38,21 @@ from ..uncertainty.linear_propagation import (
 )
 from ..uncertainty.linearisation import Linearisation
 from ..uncertainty.variance_components import Moments, moments, noise_from
-from .least_squares import Begun, Fit, State, args_of, begin, fit, losses_of, rules_of, state_after, whitening_at
 from .prior_fit import OfPrior, fitted_with_prior, prior_of, weights
 from .results import Identification, ObservedMetrics
 from .task import Task
+from .weighted_least_squares import (
+    Begun,
+    Fit,
+    State,
+    args_of,
+    begin,
+    fit,
+    losses_of,
+    rules_of,
+    state_after,
+    whitening_at,
+)
 
 
 class Solution(NamedTuple):

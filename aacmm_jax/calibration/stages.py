@@ -20,12 +20,12 @@ from ..model.observed import Observed
 from ..uncertainty.active_bounds import of_active_bounds
 from ..uncertainty.linear_propagation import covariance_with, rows_of_functions
 from ..uncertainty.linearisation import Linearisation
-from .least_squares import state_at
 from .results import Calibration, Identification, ObservedMetrics
 from .scale_anchor import fixes_scale
 from .scale_fix import MeasuredScale, divided, divided_uncertainty, measured_scale
 from .solve import Solution, repeatability_of, solve
 from .task import Task
+from .weighted_least_squares import state_at
 
 _LEAST_U = 1e-9  # mm: an exact certified value would be a row of infinite weight
 
