@@ -1,6 +1,6 @@
 """The engine's solve: the parameters and every unknown geometry that agree best with all that was observed.
 
-`solve` runs the least squares of a task one after the other (`weighted_least_squares`; with a prior the last is repeated
+`solve` runs the least squares of a task in turn (`weighted_least_squares`; with a prior the last of them is repeated
 until the weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with
 whitened rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, where G is the inverse of the
 information A^T W A (`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows,
