@@ -50,8 +50,8 @@ def exported(
     if form == "python":
         title = ", ".join(part for part in (specification.name, source) if part)
         return controllers.python_program(specification.arm, title=title, base=base), ()
-    convention, units = convention or "standard", units or "mm-deg"
-    table = controllers.dh_table(specification.arm, convention=convention, units=units, base=base)
+    options: Any = {"convention": convention or "standard", "units": units or "mm-deg"}
+    table = controllers.dh_table(specification.arm, base=base, **options)
     return table, _without_corrections(specification.arm, record.recording.capture.readings)
 
 

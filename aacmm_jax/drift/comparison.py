@@ -230,7 +230,7 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[s
     poses = [{row.tobytes() for row in np.asarray(record.recording.capture.readings)} for record in (old, new)]
     if poses[0] == poses[1]:
         values = [_values(record.calibrated.arm, old.names) for record in (old, new)]
-        same = old.names == new.names and np.array_equal(*values)
+        same = old.names == new.names and np.array_equal(values[0], values[1])
         what = "are one and the same calibration" if same else "are of the same capture"
         yield f"Not independent: {labels[0]} and {labels[1]} {what}, so drift cannot be seen."
     elif common := len(poses[0] & poses[1]):

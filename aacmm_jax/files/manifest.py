@@ -21,7 +21,8 @@ from pydantic import (
 from ..acceptance.standards import Standard
 from ..core.errors import InputError
 from ..core.text import shorten
-from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
+from ..data.capture import Capture, ReferenceLength, check_readings
+from ..data.joined_captures import join_sessions
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from ..data.recording import Recording

@@ -1,0 +1,81 @@
+"""Observations to simulate: the true geometry, where the tip goes, and what is then recorded."""
+
+import abc
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from ...core.errors import InputError
+from .declared import Declared, count, number, text
+from .observation import AbstractObservation, classes
+
+
+class AbstractSimulated(Declared):
+    """An observation to simulate.
+
+    Every kind declares an entry ``poses``: the number of poses, of each place where there are several (points of an
+    artefact, two planes).
+    """
+
+    keyword_only: ClassVar[bool] = False
+    table: ClassVar[str]  # name of its tables in the file of a kit
+    poses: int
+
+    @property
+    def offset(self) -> Float[np.ndarray, " 3"] | None:
+        """The true place of the target in the last frame, mm; None for the arm's own probe."""
+        return None
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self | None:
+        """The same thing under another name and moved rigidly: by a rotation vector (rad) about the base's origin, and
+        then by a translation (mm). None where there is nothing to place, such as for an instrument that sees all."""
+        return None
+
+    @property
+    def orientation(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation of its own frame in the base frame; the identity where it has none."""
+        return np.eye(3)
+
+    @abc.abstractmethod
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        """Where the tip is, mm, without the noise of the seat."""
+
+    @abc.abstractmethod
+    def recorded(
+        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
+    ) -> AbstractObservation:
+        """The observation from the readings, and from the true transforms of the tip."""
+
+
+class AbstractInBox(AbstractSimulated):
+    """What an instrument measures at random places in a box."""
+
+    box: Float[np.ndarray, "2 3"] = number("lowest and highest coordinates of the tip in the base frame", "mm")
+    poses: int = count("number of poses")
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        return random.uniform(self.box[0], self.box[1], (self.poses, 3))
+
+
+class AbstractOfTarget(AbstractSimulated):
+    """What may be recorded with a target in place of the arm's own probe."""
+
+    target: str = text("name of the target", default="")
+    place: Float[np.ndarray, "3"] | None = number("true place of the target in the last frame", "mm", default=None)
+
+    def completed(self, where: str) -> Mapping[str, Any]:
+        if bool(self.target) != (self.place is not None):
+            raise InputError(f"{where} needs both, a target and its place in the last frame, or neither.")
+        return {}
+
+    @property
+    def offset(self) -> Float[np.ndarray, " 3"] | None:
+        return self.place
+
+
+def simulated_kinds() -> dict[str, type[AbstractSimulated]]:
+    """Everything that can be simulated, by the name of its tables."""
+    found = {one.__name__: one for one in classes() if issubclass(one, AbstractSimulated)}
+    return {found[name].table: found[name] for name in sorted(found)}
