@@ -94,7 +94,7 @@ def covered(trials: Trials, effect: float, seeds: range) -> Coverage:
         method, given = ("two-stage", "joint")[seed // POSE_SETS % 2], seed // POSE_SETS % 4 > 1
         noise = trials.setup.noise if given else None
         result = aj.calibrate(
-            trials.specification.arm, capture, trials.bounds, method=method, noise=noise, check_identifiability=False
+            trials.specification.arm, capture, trials.bounds, method=method, noise=noise, undetermined="ignore"
         )
         uncertainty, (start, end) = aj.uncertainty_of(result), ends[number]
         between = np.subtract(*(np.asarray(result.arm.position(q)) for q in (start, end)))

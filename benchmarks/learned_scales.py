@@ -45,7 +45,7 @@ def coverage(poses: int, trials: int, given: bool) -> dict[str, Any]:
             method="joint",
             prior=aj.Prior(learn=True),
             noise=NOISE if given else None,
-            check_identifiability=False,
+            undetermined="ignore",
         )
         factor = aj.uncertainty_of(found).factor(0.95)
         z = (np.asarray(found.parameters) - vector) / np.sqrt(np.diag(np.asarray(found.covariance)))

@@ -141,7 +141,7 @@ def trial(fault: str, seed: int) -> dict[str, Any]:
         for name in wrong
         if name.rpartition("_")[2] not in elsewhere
     ]
-    alone = aj.calibrate(plain, capture, bounds, check_identifiability=False)
+    alone = aj.calibrate(plain, capture, bounds, undetermined="ignore")
     said = [text for text in aj.warnings_of(alone, capture) if not text.startswith(STATEMENTS)]
     return {
         "recommended": compared.recommended.model,

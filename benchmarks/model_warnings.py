@@ -131,7 +131,7 @@ class Trials:
             self.bounds,
             method=method,
             noise=self.setup.noise if given else None,
-            check_identifiability=False,
+            undetermined="ignore",
         )
         record = aj.calibration.record_of(result, aj.Recording(capture, self.specification))
         if seed % POSE_SETS not in self.seen:

@@ -82,7 +82,7 @@ def simulated(scenario: Mapping[str, Any], number: int) -> dict[str, Any]:
                     trials.bounds,
                     method=method,
                     noise=noise,
-                    check_identifiability=False,
+                    undetermined="ignore",
                     shared_errors=shared,
                 )
                 uncertainty = aj.uncertainty_of(result)
@@ -170,7 +170,7 @@ def ur10() -> dict[str, Any]:
                     method="joint",
                     prior=default_prior(arm),
                     shared_errors=shared,
-                    check_identifiability=False,
+                    undetermined="ignore",
                 )
                 unseen = aj.calibration.unseen_errors(aj.uncertainty_of(result), series[1].capture)
                 every = unseen.of(unseen.parts)

@@ -39,7 +39,7 @@ def probabilities(arm: aj.Arm, true: aj.Arm, bounds: aj.Bounds, seed: int, known
         true, sockets, poses=15, lengths=lengths, observations=observations, noise=NOISE, seed=2 * seed + 1
     )
     noise = NOISE if known else None
-    result = aj.calibrate(arm, seen, bounds, method="joint", noise=noise, check_identifiability=False)
+    result = aj.calibrate(arm, seen, bounds, method="joint", noise=noise, undetermined="ignore")
     found = aj.calibration.unseen_errors(aj.uncertainty_of(result), new)
     return [found.of(found.parts).probability, found.of_lengths().probability]
 

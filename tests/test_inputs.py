@@ -539,7 +539,7 @@ space = aj.Parameters.free_of(arm)
 bounds = aj.Bounds.around(arm, space)
 capture = length(100.0)
 start = space.vector()[None]
-result = aj.calibrate(arm, capture, bounds, check_identifiability=False)
+result = aj.calibrate(arm, capture, bounds, undetermined="ignore")
 said = []
 for call in json.load(sys.stdin):
     try:

@@ -321,7 +321,8 @@ def _solved(
 
     if scale == "measured":
         # The summary has its own look at what is determined.
-        options: dict[str, Any] = {"strict": strict, "shared_errors": shared_errors, "check_identifiability": False}
+        undetermined = "raise" if strict else "ignore"
+        options: dict[str, Any] = {"shared_errors": shared_errors, "undetermined": undetermined}
         options |= solving
         return run(bounds.space.base, capture, bounds, method=method, **options)
     if method is not None or strict:

@@ -179,7 +179,7 @@ def _rms(recording: Recording, given: Recording) -> float | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", IdentifiabilityWarning)
             if scaled:
-                result = calibrate(arm, capture, bounds, shared_errors=False, check_identifiability=False)
+                result = calibrate(arm, capture, bounds, shared_errors=False, undetermined="ignore")
             else:
                 result = identify(arm, capture, bounds)
     except InputError:

@@ -1,1 +1,2 @@
 from .model_ladder import ComparedModels as ComparedModels
+from .single import CalibrationOptions as CalibrationOptions

@@ -1,26 +1,24 @@
 """Cross-validation: the arm identified without some of the sockets or observations, and evaluated on those left out."""
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from ..calibration.joint_model import with_joint_model
 from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.prediction import unseen_errors
 from ..calibration.record import uncertainty_of
 from ..calibration.results import Calibration
-from ..core.arguments import checked_arguments, items_of
+from ..core.arguments import checked_arguments, items_of, with_options
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, names_in, part_of
-from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
-from ..kinematics.priors import Prior
-from ..model.loss_names import LossName
 from ..model.observed import Observed
-from .single import calibrate
+from .single import CalibrationOptions, calibrate
 
 _REGIONS = 4  # a power of two
 _POSES_A_REGION = 10
@@ -100,19 +98,9 @@ def _determines(capture: Capture, parameters: int) -> bool:
 
 
 @checked_arguments
+@with_options(CalibrationOptions)
 def cross_validate(
-    arm: Arm,
-    capture: Capture,
-    bounds: Bounds,
-    *,
-    method: Literal["two-stage", "joint"] | None = None,
-    hold: str | None = "longest",
-    noise: Noise | None = None,
-    robust: LossName | None = None,
-    prior: Prior | None = None,
-    replace_noise: bool = True,
-    shared_errors: bool = True,
-    groups: Iterable[str] | None = None,
+    arm: Arm, capture: Capture, bounds: Bounds, *, groups: Iterable[str] | None = None, **options: Any
 ) -> CrossValidation:
     """Calibrate once without each group of sockets and observations, and evaluate the result on that group.
 
@@ -127,14 +115,9 @@ def cross_validate(
         arm: the nominal arm.
         capture: sockets, reference lengths and other observations.
         bounds: box of the free parameters ``(p,)``, mm and rad.
-        method: as for `calibrate`.
-        hold: the scale anchor of stage 1, as for `calibrate`.
-        noise: standard deviations of readings and seat, as for `calibrate`.
-        robust: robust loss of the calibrations, as for `calibrate`; bad poses of what is left out count in full.
-        prior: what is known of the parameters, as for `calibrate`.
-        replace_noise: estimate the noise of encoders that prove noisier, as for `calibrate`.
-        shared_errors: whether the predictions include errors that poses share, as for `calibrate`.
         groups: what to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
+        options: how each calibration is solved, as for `calibrate`; nothing is said of what data do not determine, and
+            bad poses of what is left out count in full, whatever the loss is.
 
     Returns:
         Errors of each group, found and predicted, mm.
@@ -149,6 +132,9 @@ def cross_validate(
         >>> print(f"error {left_out.rms:.3f} mm, predicted {left_out.rms_predicted:.3f} mm")
         error 0.016 mm, predicted 0.016 mm
     """
+    given = CalibrationOptions(**options)
+    arm, bounds, prior = with_joint_model(arm, capture, bounds, given.model, given.prior)
+    given = given._replace(model=None, prior=prior, undetermined="ignore")
     if groups is not None:
         parts = _chosen(capture, groups, len(bounds.space.names))
     elif can_cross_validate(capture, len(bounds.space.names)):
@@ -160,14 +146,8 @@ def cross_validate(
             "the parameters; place the reference length somewhere else too, or leave cross-validation out "
             "(--no-cross-validate)."
         )
-    solving = {"method": method, "hold": hold, "noise": noise, "robust": robust, "prior": prior}
-    solving |= {
-        "check_identifiability": False,
-        "replace_noise": replace_noise,
-        "shared_errors": shared_errors,
-    }
     return CrossValidation(
-        tuple(_left_out(calibrate(arm, rest, bounds, **solving), left, group) for rest, left, group in parts)
+        tuple(_left_out(calibrate(arm, rest, bounds, **given._asdict()), left, group) for rest, left, group in parts)
     )
 
 

@@ -212,7 +212,7 @@ def _compared(
         noise=noise,
         prior=prior,
         replace_noise=False,  # so that all models are compared with the same
-        check_identifiability=False,
+        undetermined="ignore",
     )
     record = record_of(result, Recording(capture, ArmSpecification(arm)))
     assert record.prior is not None

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from ..calibration.sensitivities import Sensitivities
 from ..calibration.stages import identified, in_two_stages, jointly
 from ..calibration.task import Task, task_of
 from ..core._compat import inside_trace
-from ..core.arguments import check_finite, checked_arguments
+from ..core.arguments import check_finite, checked_arguments, with_options
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
@@ -30,7 +30,42 @@ from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
 from ..uncertainty.covariance import STATED, NoiseModel
 
-_MAX_STEPS = 300
+
+class CalibrationOptions(NamedTuple):
+    """How a calibration is solved: the keyword arguments of `calibrate`, described there, and their defaults.
+
+    Example:
+        >>> options = aj.pipeline.CalibrationOptions(method="joint", noise=noise)
+        >>> print(bool(aj.calibrate(arm, capture, bounds, **options._asdict()).converged))
+        True
+    """
+
+    model: str | None = None
+    method: Literal["two-stage", "joint"] | None = None
+    hold: str | None = "longest"
+    start: Numbers | None = None
+    noise: Noise | None = None
+    noise_model: NoiseModel | None = None
+    robust: LossName | None = None
+    prior: Prior | None = None
+    replace_noise: bool = True
+    shared_errors: bool = True
+    undetermined: Literal["warn", "raise", "ignore"] = "warn"
+    max_steps: int = 300
+
+    @property
+    def of_stage1(self) -> dict[str, Any]:
+        """Those that `identify` takes too."""
+        others = ("model", "method", "shared_errors", "undetermined")
+        return {name: value for name, value in self._asdict().items() if name not in others}
+
+    @property
+    def may_replace_noise(self) -> bool:
+        """Whether the noise of noisy encoders may be replaced: a robust loss and other models of noise have none."""
+        return self.replace_noise and self.noise_model not in ("common", "robust") and self.robust is None
+
+
+_DEFAULT = CalibrationOptions()
 
 
 @checked_arguments
@@ -39,14 +74,14 @@ def identify(
     capture: Capture,
     bounds: Bounds,
     *,
-    hold: str | None = "longest",
+    hold: str | None = _DEFAULT.hold,
     start: Numbers | None = None,
     noise: Noise | None = None,
     noise_model: NoiseModel | None = None,
     robust: LossName | None = None,
     prior: Prior | None = None,
-    replace_noise: bool = True,
-    max_steps: int = _MAX_STEPS,
+    replace_noise: bool = _DEFAULT.replace_noise,
+    max_steps: int = _DEFAULT.max_steps,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
 
@@ -88,31 +123,33 @@ def identify(
         >>> print(f"scale anchor {stage1.hold}, DE {stage1.de:.4f} mm")
         scale anchor d_3, DE 0.0124 mm
     """
-    task = _task("identify_many", arm, capture, bounds, start, noise, hold, noise_model, max_steps, robust, prior)
+    options = CalibrationOptions(None, None, hold, start, noise, noise_model, robust, prior, replace_noise)
+    options = options._replace(max_steps=max_steps)
+    task = _stage1_task("identify_many", arm, capture, bounds, options)
     capture = to_numpy(capture)
     result = to_jax(_identified(to_numpy(task), capture))
-    if not replace_noise or noise_model in ("common", "robust") or robust is not None:
+    if not options.may_replace_noise:
         return result
-    options = {"hold": hold, "start": start, "prior": prior, "max_steps": max_steps, "replace_noise": False}
-    return with_noise_by_joint(result, capture, lambda found: identify(arm, capture, bounds, noise=found, **options))
+    again = options._replace(noise_model=None, replace_noise=False)
+
+    def with_noise(replaced: Noise) -> Identification:
+        return identify(arm, capture, bounds, **again._replace(noise=replaced).of_stage1)
+
+    return with_noise_by_joint(result, capture, with_noise)
 
 
-def _task(
-    many: str,
-    arm: Arm,
-    capture: Capture,
-    bounds: Bounds,
-    start: Numbers | None,
-    noise: Noise | None,
-    hold: str | None,
-    *options: Any,
-) -> Task:
-    """The checked task of stage 1, in which lengths take no part."""
+def _stage1_task(many: str, arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions) -> Task:
+    """The checked task of stage 1, in which lengths take no part; ``many`` is the function that takes batches."""
     check_single(arm, capture, bounds, many)
     for sentence in () if inside_trace() else capture.repeated.sentences():
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
-    check_finite(arm=arm, capture=capture, noise=noise)
-    return task_of(arm, without_lengths(capture), bounds, start, noise, hold, *options)
+    check_finite(arm=arm, capture=capture, noise=options.noise)
+    return _task(arm, without_lengths(capture), bounds, options, options.hold)
+
+
+def _task(arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions, hold: str | None) -> Task:
+    solve = options.noise_model, options.max_steps, options.robust, options.prior
+    return task_of(arm, capture, bounds, options.start, options.noise, hold, *solve)
 
 
 def without_lengths(capture: Capture) -> Capture:
@@ -126,25 +163,8 @@ def _identified(task: Task, capture: Capture) -> Identification:
 
 
 @checked_arguments
-def calibrate(
-    arm: Arm,
-    capture: Capture,
-    bounds: Bounds | None = None,
-    *,
-    model: str | None = None,
-    method: Literal["two-stage", "joint"] | None = None,
-    hold: str | None = "longest",
-    start: Numbers | None = None,
-    noise: Noise | None = None,
-    noise_model: NoiseModel | None = None,
-    robust: LossName | None = None,
-    prior: Prior | None = None,
-    replace_noise: bool = True,
-    shared_errors: bool = True,
-    check_identifiability: bool = True,
-    strict: bool = False,
-    max_steps: int = _MAX_STEPS,
-) -> Calibration:
+@with_options(CalibrationOptions)
+def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **options: Any) -> Calibration:
     """Both stages: identify from repeatability, then fix the scale with the reference lengths.
 
     "two-stage" divides the arm of stage 1 by k = measured / nominal. Fixed parameters stay as they are, to the bit, and
@@ -173,9 +193,8 @@ def calibrate(
         prior: what is known of the parameters, as for `identify`; of a model, by default `kinematics.default_prior`.
         replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
         shared_errors: add errors that poses share, as far as residuals show any, to the covariance (`SharedErrors`).
-        check_identifiability: warn where free parameters are not determined by these data; the check takes about as
-            long as the calibration.
-        strict: raise instead of warn where free parameters are not determined by these data.
+        undetermined: what to do where these data do not determine free parameters: "warn", "raise" (`InputError`) or
+            "ignore", which leaves out the check; it takes about as long as the calibration.
         max_steps: most evaluations of each solve.
 
     Returns:
@@ -192,44 +211,56 @@ def calibrate(
         >>> print(f"{np.abs(arm.position(q) - true.position(q)).max():.2f} mm become {np.abs(error).max():.4f} mm")
         1.80 mm become 0.0032 mm
     """
-    arm, bounds, prior = with_joint_model(arm, capture, bounds, model, prior)
-    by_slides = scale_from_slides(arm, capture, bounds.space, noise)
-    general = bool(capture.observations) or robust is not None or prior is not None or by_slides
-    method = default_method(arm, general) if method is None else method
+    given = CalibrationOptions(**options)
+    arm, bounds, prior = with_joint_model(arm, capture, bounds, given.model, given.prior)
+    by_slides = scale_from_slides(arm, capture, bounds.space, given.noise)
+    general = bool(capture.observations) or given.robust is not None or prior is not None or by_slides
+    method = default_method(arm, general) if given.method is None else given.method
     check_method(method, general)
+    given = given._replace(model=None, method=method, prior=prior)
+    _check_solvable(arm, capture, bounds, given, general, by_slides)
+    first = None if general else _stage1_task("calibrate_many", arm, capture, bounds, given)
+    task = _task(arm, capture, bounds, given, None)
+    if given.undetermined != "ignore":
+        check_identifiable(capture, task.bounds, prior, given.undetermined == "raise")
+    if method == "two-stage" and first is not None and not inside_trace():
+        warn_of_a_known_scale(first.anchor.set_by, bool(arm.prismatic))
+    first, task, capture = to_numpy((first, task, capture))
+    result, sensitivities = _calibrated(first, task, capture, method)
+    if given.may_replace_noise:
+        again = given._replace(noise_model=None, replace_noise=False, undetermined="ignore")
+
+        def with_noise(replaced: Noise) -> Calibration:
+            return calibrate(arm, capture, bounds, **again._replace(noise=replaced)._asdict())
+
+        replaced = with_noise_by_joint(result, capture, with_noise)
+        if replaced is not result:
+            return replaced
+    if given.shared_errors and sensitivities is not None:
+        result = with_shared_errors(result, capture, sensitivities)
+    return to_jax(result)
+
+
+def _check_solvable(
+    arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions, general: bool, by_slides: bool
+) -> None:
+    """Raise `InputError` where nothing fixes the scale, or a single solve cannot take what was given.
+
+    ``general``: everything is one least squares; ``by_slides``: the slides of prismatic joints determine the scale.
+    """
     if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
         raise InputError(
             "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
             "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
         )
-    options = noise_model, max_steps, robust, prior
-    first = None if general else _task("calibrate_many", arm, capture, bounds, start, noise, hold, *options)
     if general:
         check_single(arm, capture, bounds, "calibrate_many")
-        check_finite(arm=arm, capture=capture, noise=noise)
-    elif hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
+        check_finite(arm=arm, capture=capture, noise=options.noise)
+    elif options.hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
             "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
             "hold."
         )
-    task = task_of(arm, capture, bounds, start, noise, None, *options)
-    if check_identifiability or strict:
-        check_identifiable(capture, task.bounds, prior, strict)
-    if method == "two-stage" and first is not None and not inside_trace():
-        warn_of_a_known_scale(first.anchor.set_by, bool(arm.prismatic))
-    first, task, capture = to_numpy((first, task, capture))
-    result, sensitivities = _calibrated(first, task, capture, method)
-    if replace_noise and noise_model not in ("common", "robust") and robust is None:
-        again = {"method": method, "hold": hold, "start": start, "prior": prior, "max_steps": max_steps}
-        again |= {"check_identifiability": False, "replace_noise": False, "shared_errors": shared_errors}
-        found = with_noise_by_joint(
-            result, capture, lambda found: calibrate(arm, capture, bounds, noise=found, **again)
-        )
-        if found is not result:
-            return found
-    if shared_errors and sensitivities is not None:
-        result = with_shared_errors(result, capture, sensitivities)
-    return to_jax(result)
 
 
 def _calibrated(

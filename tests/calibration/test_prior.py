@@ -40,7 +40,7 @@ def capture(true):
 
 def calibrate(arm, capture, bounds, **options):
     """Without what tests of the residuals change: solves that agree to rounding may lie on either side of a level."""
-    unchanged = {"check_identifiability": False, "replace_noise": False, "shared_errors": False}
+    unchanged = {"undetermined": "ignore", "replace_noise": False, "shared_errors": False}
     return aj.calibrate(arm, capture, bounds, **unchanged | options)
 
 

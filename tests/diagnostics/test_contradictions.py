@@ -37,7 +37,7 @@ def true(paper_arm):
 def calibrate(specification):
     def run(capture, **options):
         bounds = specification.bounds()
-        result = aj.calibrate(specification.arm, capture, bounds, check_identifiability=False, **options)
+        result = aj.calibrate(specification.arm, capture, bounds, undetermined="ignore", **options)
         return aj.calibration.record_of(result, aj.Recording(capture, specification))
 
     return run
@@ -78,7 +78,7 @@ def test_joint_3_shifted_in_one_station_or_placement(calibrate, mixed, name, kin
 
 def solved(record, capture):
     arm = record.recording.nominal.arm
-    return aj.calibrate(arm, capture, record.recording.nominal.bounds(), check_identifiability=False)
+    return aj.calibrate(arm, capture, record.recording.nominal.bounds(), undetermined="ignore")
 
 
 def test_nothing_is_left_out_of_right_data(calibrate, mixed):

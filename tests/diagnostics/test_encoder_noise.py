@@ -40,7 +40,7 @@ def captured(paper_arm):
 
 def calibrated(arm, capture, **options):
     bounds = aj.Bounds.around(arm, aj.Parameters.free_of(arm), length=10.0, angle=0.0175)
-    return aj.calibrate(arm, capture, bounds, check_identifiability=False, **options)
+    return aj.calibrate(arm, capture, bounds, undetermined="ignore", **options)
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def captured(paper_arm):
 def calibrated(arm, capture, given, **options):
     space = aj.Parameters.free_of(arm)
     bounds = aj.Bounds.around(arm, space, length=10.0, angle=0.0175)
-    options = {"noise": NOISE if given else None, "check_identifiability": False} | options
+    options = {"noise": NOISE if given else None, "undetermined": "ignore"} | options
     return aj.calibrate(arm, capture, bounds, **options)
 
 

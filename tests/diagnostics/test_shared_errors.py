@@ -58,7 +58,7 @@ def captured(poses, seed, *, shift=0.0, visit=VISIT, error=None, marked=False, l
 def calibrated(poses, capture, method="joint", noise=NOISE, **options):
     specification, bounds, *_ = poses
     return aj.calibrate(
-        specification.arm, capture, bounds, method=method, noise=noise, check_identifiability=False, **options
+        specification.arm, capture, bounds, method=method, noise=noise, undetermined="ignore", **options
     )
 
 

@@ -75,7 +75,7 @@ def calibrated(paper_arm, specification, space):
             seating=0.005,
             seed=number,
         )
-        calibration = aj.calibrate(paper_arm, capture, bounds, check_identifiability=False)
+        calibration = aj.calibrate(paper_arm, capture, bounds, undetermined="ignore")
         made = aj.calibration.record_of(calibration, Recording(capture, specification))
         assert made.converged
         return made
@@ -576,7 +576,7 @@ def test_sessions_of_a_real_arm_with_the_ball_remounted(mukca):
     for name in ("panda_3", "panda_3_bis"):
         recording = aj.files.read_manifest(mukca / f"{name}.toml")
         bounds = recording.nominal.bounds()
-        result = aj.calibrate(bounds.space.base, recording.capture, bounds, check_identifiability=False)
+        result = aj.calibrate(bounds.space.base, recording.capture, bounds, undetermined="ignore")
         records.append(aj.calibration.record_of(result, recording))
     drift = compare(*records, points=50)
     assert drift.joint_test.probe.remounted

@@ -83,7 +83,7 @@ def nominal(paper_arm):
 
 @pytest.fixture(scope="module")
 def record(captured, nominal):
-    result = aj.calibrate(nominal.arm, captured, nominal.bounds(), method="joint", check_identifiability=False)
+    result = aj.calibrate(nominal.arm, captured, nominal.bounds(), method="joint", undetermined="ignore")
     return aj.calibration.record_of(result, aj.Recording(captured, nominal))
 
 
@@ -96,7 +96,7 @@ def test_a_calibration_finds_it(record):
 def test_residuals_without_it_name_it(paper_arm, captured):
     space = aj.Parameters.free_of(paper_arm)
     bounds = aj.Bounds.around(paper_arm, space, length=5.0, angle=0.01)
-    result = aj.calibrate(paper_arm, captured, bounds, method="joint", check_identifiability=False)
+    result = aj.calibrate(paper_arm, captured, bounds, method="joint", undetermined="ignore")
     assert ("bow", 2) in {(term.kind, term.joint) for term in model_tests(result, captured).terms}
     (sentence,) = (text for text in aj.warnings_of(result, captured) if text.startswith("Residuals follow"))
     assert "a bent scale" in sentence

@@ -55,7 +55,7 @@ def sockets(paper_arm, space):
 def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
     """Of sockets, whose positions only the region shows, and a reference length between two of them."""
     capture, prior = sockets(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
-    solving = {"noise": NOISE, "prior": prior, "check_identifiability": False}
+    solving = {"noise": NOISE, "prior": prior, "undetermined": "ignore"}
     record = record_of(
         aj.calibrate(paper_arm, capture, bounds, **solving), Recording(capture, ArmSpecification(paper_arm))
     )
@@ -77,7 +77,7 @@ def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, 
 def test_half_of_a_travel_is_predicted_as_by_a_calibration_without_it(paper_arm, space, bounds):
     """The frame of the tracker is known from the other half."""
     capture, prior = seen_by_a_tracker(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
-    solving = {"noise": NOISE, "prior": prior, "check_identifiability": False}
+    solving = {"noise": NOISE, "prior": prior, "undetermined": "ignore"}
     result = aj.calibrate(paper_arm, capture, bounds, **solving)
     region = regions_of(capture)[3]
     assert region.label == "joint 2, upper half"
@@ -121,7 +121,7 @@ def test_a_model_by_name_is_a_corrected_arm_with_its_prior(paper_arm, space, bou
     names = (*space.names, *(name for name in aj.kinematics.parameter_names(arm) if name[:3] in ("cos", "sin")))
     own = aj.Parameters(arm, names)
     box = [np.concatenate([side, np.full(12, end)]) for side, end in ((bounds.lower, -np.inf), (bounds.upper, np.inf))]
-    options = {"check_identifiability": False}
+    options = {"undetermined": "ignore"}
     expected = aj.calibrate(arm, capture, aj.Bounds(own, *box), prior=aj.kinematics.default_prior(arm), **options)
     found = aj.calibrate(with_corrections(paper_arm, "gear"), capture, bounds, model="dh,harmonics=1", **options)
     np.testing.assert_array_equal(found.parameters, expected.parameters)
@@ -173,7 +173,7 @@ def test_the_evidence_is_that_of_a_gaussian(paper_arm, space, bounds):
     """Of two models that differ in one scale alone, by the covariance of the data: B S B^T + 1, all in one matrix."""
     capture, found = sockets(paper_arm, space), []
     for sd in (0.3, 3.0):
-        solving = {"noise": NOISE, "prior": aj.Prior({"lengths": sd, "angles": 5e-4}), "check_identifiability": False}
+        solving = {"noise": NOISE, "prior": aj.Prior({"lengths": sd, "angles": 5e-4}), "undetermined": "ignore"}
         result = aj.calibrate(paper_arm, capture, bounds, **solving)
         record = record_of(result, Recording(capture, ArmSpecification(paper_arm)))
         equations = equations_of(record)

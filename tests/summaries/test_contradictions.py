@@ -16,7 +16,7 @@ PLACEMENTS = {
 
 def calibrated(arm, capture):
     specification = aj.kinematics.ArmSpecification(arm, "test")
-    result = aj.calibrate(arm, capture, specification.bounds(), check_identifiability=False)
+    result = aj.calibrate(arm, capture, specification.bounds(), undetermined="ignore")
     return aj.calibration.record_of(result, aj.Recording(capture, specification))
 
 
@@ -82,6 +82,6 @@ def test_the_placement_that_its_authors_removed(mukca, removed, expected):
         sockets[f"high/{hole}"] = np.loadtxt(mukca / "panda_2" / "high" / f"hole_{hole}.csv", delimiter=",")
     capture = aj.Capture({name: q for name, q in sockets.items() if name not in removed}, recording.capture.lengths)
     bounds = recording.nominal.bounds()
-    result = aj.calibrate(bounds.space.base, capture, bounds, check_identifiability=False)
+    result = aj.calibrate(bounds.space.base, capture, bounds, undetermined="ignore")
     found = contradictions(aj.calibration.record_of(result, recording._replace(capture=capture)))
     assert [text[: len(start)] for text, start in zip(found, expected, strict=True)] == expected

@@ -110,7 +110,7 @@ def test_calibrate_warns_or_refuses(paper_arm, paper_capture):
     with pytest.warns(aj.IdentifiabilityWarning, match="alpha_6 and d_6 trade off"):
         aj.calibrate(paper_arm, paper_capture, bounds)
     with pytest.raises(aj.InputError, match="alpha_6 and d_6 trade off"):
-        aj.calibrate(paper_arm, paper_capture, bounds, strict=True)
+        aj.calibrate(paper_arm, paper_capture, bounds, undetermined="raise")
 
 
 def test_what_few_poses_need(paper_arm, paper_capture):

@@ -167,4 +167,4 @@ def test_calibrate_warns_of_what_observations_leave_open(paper_arm):
     with pytest.warns(aj.IdentifiabilityWarning, match="theta_1 and frame of T trade off"):
         aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space), noise=NOISE)
     with pytest.raises(aj.InputError, match="theta_1 and frame of T trade off"):
-        aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space), noise=NOISE, strict=True)
+        aj.calibrate(paper_arm, capture, aj.Bounds.around(paper_arm, space), noise=NOISE, undetermined="raise")

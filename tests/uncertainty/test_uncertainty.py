@@ -108,9 +108,7 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
             for length, value in zip(capture.lengths, values, strict=True)
         ]
         moved = aj.Capture(blocks, lengths)
-        return aj.calibrate(
-            paper_arm, moved, bounds, method=method, noise=noise, check_identifiability=False
-        ).parameters
+        return aj.calibrate(paper_arm, moved, bounds, method=method, noise=noise, undetermined="ignore").parameters
 
     slopes = np.stack([parameters(q + step * turn, values) - parameters(q - step * turn, values) for turn in turns]) / (
         2 * step
@@ -177,7 +175,7 @@ def test_coverage(paper_arm, space, bounds, trials, noise, noise_model, least, m
 
     def covered(q, value):
         capture = aj.Capture({"A": q[:70], "B": q[70:]}, [aj.ReferenceLength("A", "B", value, 0.002)])
-        options = {"noise": noise, "noise_model": noise_model, "check_identifiability": False}
+        options = {"noise": noise, "noise_model": noise_model, "undetermined": "ignore"}
         found = aj.calibrate(paper_arm, capture, bounds, **options)
         return np.abs(found.parameters - space.vector()) <= 1.97 * np.sqrt(np.diag(found.covariance))
 
