@@ -103,7 +103,7 @@ def capture(summary: dict[str, Any]) -> View:
     if summary["sockets"]:
         yield listed("", summary["sockets"], {"socket": "socket", "poses": "poses"})
     if summary["observations"]:
-        columns = {key: key for key in ("observation", "kind", "target", "poses")}
+        columns: dict[str, Any] = {key: key for key in ("observation", "kind", "target", "poses")}
         columns["unknown geometry"] = lambda row: ", ".join(row["unknowns"])
         yield listed("\nOther observations", summary["observations"], columns)
     for row in summary["observations"]:
@@ -150,9 +150,7 @@ def calibration(summary: dict[str, Any]) -> View:
         title = "\nOn the poses it was identified from [mm]"
         yield by_stage(title, summary, stages, fitted=summary["fixed_by_one_length"])
     if "truth" in summary:
-        rows = [
-            (text, *(factor * summary["truth"][stage][key] for stage in _STAGES)) for key, text, factor in _TRUTH
-        ]
+        rows = [(text, *(factor * summary["truth"][stage][key] for stage in _STAGES)) for key, text, factor in _TRUTH]
         yield Table("\nAgainst the true arm of the simulation", ("", *_STAGES.values()), rows)
     yield from _parameters(summary["parameters"])
     if summary["held"]:
@@ -347,7 +345,7 @@ def _parameters(rows: list[dict[str, Any]]) -> View:
     """Every free parameter in its own unit, to two digits of its standard uncertainty; hundreds of coefficients joint
     by joint."""
 
-    def scaled(row: dict[str, Any]) -> tuple[str, ...]:
+    def scaled(row: Mapping[str, Any]) -> tuple[str, ...]:
         factor, unit = people_read(row["unit"])
         nominal, value = factor * row["nominal"], factor * row["calibrated"]
         u = None if row["u"] is None else factor * row["u"]
@@ -355,7 +353,7 @@ def _parameters(rows: list[dict[str, Any]]) -> View:
         numbers = f"{nominal:z.4f}", f"{value:z.{decimals}f}", f"{value - nominal:+z.{decimals}f}"
         return row["parameter"], unit, *numbers, "-" if u is None else f"{u:.{decimals}f}", row["bound"] or ""
 
-    def of_joint(row: dict[str, Any]) -> tuple[Any, ...]:
+    def of_joint(row: Mapping[str, Any]) -> tuple[Any, ...]:
         factor, unit = people_read(row["unit"])
         largest = row["largest"]
         u = None if largest["u"] is None else factor * largest["u"]

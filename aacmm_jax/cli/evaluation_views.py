@@ -53,7 +53,7 @@ def evaluation(summary: dict[str, Any]) -> View:
 
 def _observations(part: dict[str, Any], predicted: bool) -> View:
     """Residuals of the other observations; of held-out ones also by kind, and by what shares a geometry or a length."""
-    numbers = {"RMS": "rms_mm"} | ({"predicted": "rms_predicted_mm"} if predicted else {})
+    numbers: dict[str, Any] = {"RMS": "rms_mm"} | ({"predicted": "rms_predicted_mm"} if predicted else {})
     numbers["in s.d."] = lambda row: formatted(row["reduced_chi"], 2)
     rows = part["observations"]
     if rows:

@@ -235,7 +235,7 @@ def plan(
     show_summary(summary, as_json, plan_views.plan)
 
 
-def _specification(arm: str, links: Mapping[str, str | None], held: str | None, model: str | None) -> Any:
+def _specification(arm: str, links: Mapping[str, Any], held: str | None, model: str | None) -> Any:
     from ..files.arms import load_specification
 
     specification = load_specification(arm, **links)
@@ -370,10 +370,13 @@ def assumed_noise(
     from ..files.arms import load_noise
 
     assumed = load_noise(arm, **links)
-    usual = (assumed.noise.encoder_arcsec, assumed.noise.seating, assumed.noise.linear_encoder)
-    encoder, seating, linear = (default if given is None else given for given, default in zip(noise, usual))
-    stated = Noise(encoder_arcsec=encoder, seating=seating, linear_encoder=linear)
-    return assumed._replace(noise=stated, source=assumed.source if noise[0] is None else "as given")
+    encoder, seating, linear = noise
+    stated = Noise(
+        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
+        seating=assumed.noise.seating if seating is None else seating,
+        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
+    )
+    return assumed._replace(noise=stated, source=assumed.source if encoder is None else "as given")
 
 
 def planned_arm(

@@ -1,6 +1,6 @@
 """What people see of a plan."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -69,7 +69,7 @@ def kit_plan(summary: dict[str, Any]) -> View:
 
     def poses_without(name: str) -> int:
         """Poses of a plan but those with one thing of the kit, whose places are named after it."""
-        others = [row for row in summary["observations"] if f"{row['observation']}/".partition(f"{name}/")[0]]
+        others = [row for row in summary["observations"] if not f"{row['observation']}/".startswith(f"{name}/")]
         return sum(place["poses"] for row in others for place in row["places"])
 
     without = [
@@ -84,12 +84,12 @@ def _position() -> dict[str, Callable[[dict[str, Any]], str]]:
     return {f"{axis} [mm]": lambda row, i=i: f"{row['position_mm'][i]:.0f}" for i, axis in enumerate("xyz")}
 
 
-def _predictions(summary: dict[str, Any], random: str, others: list[tuple[str, dict[str, float] | None]] = []) -> View:
+def _predictions(summary: dict[str, Any], random: str, others: Sequence[tuple[str, Any]] = ()) -> View:
     """U of a length by this plan, and by what it is compared with; the noise it assumes; how the arm moves."""
     length = f"{summary['check_length_mm']:g} mm"
     yield ["\n", Styled(f"U that the calibration adds to lengths of {length} over the volume [mm, k = 2]")]
     named = [
-        (text.format(random=random, **summary), summary[key])
+        (text.format(**summary | {"random": random}), summary[key])
         for key, text in _PREDICTED.items()
         if summary[key] is not None
     ]

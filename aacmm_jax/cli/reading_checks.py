@@ -97,8 +97,8 @@ def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any
     if positions is not None:
         capture = Capture({}, observations=[MeasuredPoints("table", table.q, positions, station="table")])
     else:
-        owner = np.array(table.sockets)
-        capture = Capture({name: table.q[owner == name] for name in dict.fromkeys(table.sockets)})
+        owner = np.array(table.sockets or ())
+        capture = Capture({name: table.q[owner == name] for name in dict.fromkeys(owner.tolist())})
     summary = _summary(specification, check, table.unit, table.length_unit, None)
     summary["standing"] = standing_rows(specification.arm, capture)
     return summary
