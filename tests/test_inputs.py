@@ -154,7 +154,7 @@ def test_arm(paper_arm, changes, parts):
             ["'d_1' is held, not free", "such as 'alpha_1'"],
         ),
         (lambda x: aj.Bounds.around(x.arm, x.space, length=-1.0), ["half-width of a_1 is -1", "zero or a positive"]),
-        (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_3": np.nan}), ["half-width of d_3 is nan"]),
+        (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_3": np.nan}), ["override['d_3'] is nan"]),
         (
             lambda x: aj.Bounds(x.space, x.start, shifted(x, a_2=-1.5)),
             ["bounds of a_2 are 62 to 60.5", "not above the upper"],
@@ -358,7 +358,7 @@ def test_values_are_not_looked_at_inside_jit(given):
 WRONG_TYPES = {
     "aj.Capture({'A': q, 'B': -q}, [('A', 'B', 100.0)])": "no reference length; give aj.ReferenceLength(",
     "aj.Capture({1: q})": "a socket has the name 1",
-    "aj.identify(arm, capture, bounds, noise=2.0)": "noise is a float; give a Noise.",
+    "aj.identify(arm, capture, bounds, noise=2.0)": "noise is 2.0; give a Noise.",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=2.5)": "'A' is given 2.5 poses; give at least one, and a whole",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=1, seed=1.5)": "seed is 1.5; give a whole number",
     "aj.load_arm(None)": "a file is named by a NoneType",

@@ -76,10 +76,10 @@ def concluded(
     covariances, shared, reading = _of_rows(task, linear, influence, noise)
     by_scales = None if of_prior is None else of_prior.by_scales
     added = None if by_scales is None else by_scales.added(influence.inverse)
-    unknowns = propagated(influence, covariances, shared, whitening.prior, added)
+    unknowns = propagated(influence, covariances, shared, added)
     both = steps[:p, None] * steps[None, :p]
     matrix = unknowns.head[:p, :p] * both
-    stated = of_stated(influence, state.point.rows, whitening, whitening.prior)[:p, :p]
+    stated = of_stated(influence, state.point.rows, whitening)[:p, :p]
     parts = Components.of({STATED: (stated * both, np.inf)})
     covariance = ParameterCovariance(matrix, influence.determined[:p], influence.lost[:p, :p], noise, parts)
     parameters = set_at(task.start, free, z[:p])

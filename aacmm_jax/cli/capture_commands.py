@@ -172,17 +172,8 @@ def _tested(nominal: Any, true: Any, standard: Any, noise: Any, seed: int) -> An
     """The recording of an acceptance test."""
     from ..acceptance.procedure import plan_procedure, simulate_procedure
 
-    return simulate_procedure(
-        plan_procedure(nominal.arm, standard),
-        nominal,
-        true,
-        encoder_arcsec=float(noise.encoder_arcsec),
-        seating=noise.seating,
-        linear_encoder=noise.linear_encoder,
-        u_length=_U_ARTEFACT,
-        u_diameter=_U_ARTEFACT,
-        seed=seed,
-    )
+    u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
+    return simulate_procedure(plan_procedure(nominal.arm, standard), nominal, true, noise=noise, **u, seed=seed)
 
 
 @app.command(

@@ -1,43 +1,170 @@
-"""Checks of the arguments of public functions against their annotations, in one place.
+"""Checks of arguments, stated once: in the annotations of a public function, of its fields, or of declared data.
 
-A wrong argument (a number in place of a capture, 2.5 trials) would otherwise end in an exception of NumPy or JAX from
-deep inside, or in a result that means nothing.
+Without them a wrong argument (a number in place of a capture, 2.5 trials) would end in an exception of NumPy or JAX
+from deep inside, or in a result that means nothing. A function states what it takes, and `checked_arguments` does the
+rest: it converts lists to arrays, compares shapes across arguments, and raises `InputError` with one sentence::
+
+    @checked_arguments(where="sphere '{name}'")
+    def sphere(
+        name: Name,
+        q: Float[AnyArray, "poses joints"],
+        u: Annotated[Float[AnyArray, ""] | Float[AnyArray, "poses"], Range(least=0)] = 0.0,
+        *,
+        diameter: Annotated[float, Range(above=0, unit="mm")],
+        method: Literal["joint", "two-stage"] = "joint",
+        lengths: Sequence[ReferenceLength] = (),
+        trials: Count = 100,
+    ): ...
+
+    sphere("S", [[0.1, 0.2]], diameter=-1)  # diameter of sphere 'S' is -1 mm; it must be positive.
+    sphere("S", [[0.1, 0.2]], [1, 2], diameter=9)  # u of sphere 'S' has shape (2,); give one number, or (1,).
+    sphere("S", [[0.1, 0.2]], diameter=9, method="jiont")  # method of sphere 'S' is 'jiont'; did you mean 'joint'?
+
+| annotation | what passes, and what the function gets |
+|---|---|
+| ``int``, ``float``, ``bool``, ``str`` | such a value as it is; a ``float`` may be an integer or a scalar array |
+| a class of this package | an instance |
+| `Float` of `AnyArray` | finite real numbers as float64: NumPy's stay NumPy's. Of `np.ndarray`: always NumPy's |
+| `Literal`, ``Annotated[str, OneOf(names)]`` | one of the names; the sentence has the nearest |
+| ``Sequence[X]``, ``Iterable[X]``, ``tuple[X, ...]`` | a tuple, each item checked as X; a string is no list |
+| ``Mapping[str, X]`` | a dictionary, each value checked as X |
+| ``X or None``, ``X or Y`` | what passes one of them |
+| ``Annotated[X, rule, ...]`` | X that also keeps the rules: `Range`, `OneOf`, `ONE_LINE`, `NOT_EMPTY`, `ANY_NUMBER` |
+| anything else | is the function's own business |
+
+Dimensions have names, as jaxtyping writes them; a name means the same size in all arguments of one call. Values of
+tracers (inside jit, vmap or a derivative) are unknown, so that of these only the shapes are checked.
+
+`checked` does the same for one value, such as an entry of a file, and `checked_fields` for an object's fields.
 """
 
+import dataclasses
 import inspect
 import math
-from collections.abc import Callable
-from functools import wraps
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import cache, wraps
 from types import NoneType, UnionType
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, overload
 
-import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import AbstractArray
 
-from .arrays import is_concrete
-from .errors import InputError
+from .arrays import as_array, is_concrete
+from .errors import InputError, nearest
 
 Function = TypeVar("Function", bound=Callable)
+Sizes = dict[str, int]  # of dimensions, by name
+# Takes a value, its name for messages, and sizes; returns the value as it is used, or raises `InputError`.
+Check = Callable[..., Any]
 
 
-def checked_arguments(function: Function) -> Function:
-    """Decorator: `InputError` for an argument that is not what its annotation says.
+class Range(NamedTuple):
+    """A rule: every number is finite and in this range."""
 
-    Looked at are annotations of classes of this package, ``int``, ``float`` and ``bool``, also with None; others are
-    the function's own business.
+    least: float = -math.inf
+    most: float = math.inf
+    above: float = -math.inf
+    below: float = math.inf
+    unit: str = ""
+
+    def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
+        """The value, or `InputError`."""
+        if is_concrete(value):
+            x = np.asarray(value, dtype=float)
+            inside = (self.least <= x) & (x <= self.most) & (self.above < x) & (x < self.below) & np.isfinite(x)
+            _check_each(x, inside, what, f"it must be {self._in_words()}", f" {self.unit}" if self.unit else "")
+        return value
+
+    def _in_words(self) -> str:
+        limits = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
+        words = [f"{word} {limit:g}" for word, limit in limits.items() if math.isfinite(limit)]
+        usual = {"at least 0": "zero or positive", "above 0": "positive"}
+        return " and ".join(usual.get(word, word) for word in words) or "finite"
+
+
+class OneOf(NamedTuple):
+    """A rule: one of these names."""
+
+    names: Collection[Any]
+
+    def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
+        """The value, or `InputError`."""
+        # Only of what compares as a whole: NumPy's arrays compare number by number.
+        if not (isinstance(value, str | int | float) and value in self.names):
+            raise InputError(f"{what} is {shown(value)}{nearest(str(value), [str(name) for name in self.names])}")
+        return value
+
+
+def _passing(test: Callable[[Any], bool], wanted: str) -> Check:
+    """The check that a value passes a test; ``wanted`` says what would."""
+
+    def check(value: Any, what: str, sizes: Any = None) -> Any:
+        if not test(value):
+            raise InputError(f"{what} is {shown(value)}; give {wanted}.")
+        return value
+
+    return check
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, jax.Array | np.ndarray) and not isinstance(value, np.ma.MaskedArray):
+        number = value.ndim == 0 and value.dtype.kind in "iuf"
+    else:
+        number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    return number and not (is_concrete(value) and math.isnan(float(value)))
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_)
+
+
+def _is_line(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and value.splitlines() == [value]
+
+
+# A name for each, so that a value can also be checked by hand: ``whole_number(value, "what it is")``.
+truth_value = _passing(lambda value: isinstance(value, bool | np.bool_), "True or False")
+whole_number = _passing(_is_whole, "a whole number")
+real_number = _passing(_is_number, "a number")  # not NaN; traced values pass
+text = _passing(lambda value: isinstance(value, str), "text")
+_SCALARS = {bool: truth_value, int: whole_number, float: real_number, str: text}
+
+ONE_LINE = _passing(_is_line, "text of one line")  # a rule, and so are these
+NOT_EMPTY = _passing(lambda value: 0 not in np.shape(value), "at least one")
+ANY_NUMBER = _passing(lambda value: True, "any number")  # NaN and infinite ones in an array, which do not pass else
+
+Positive = Annotated[float, Range(above=0)]
+NotNegative = Annotated[float, Range(least=0)]
+Count = Annotated[int, Range(least=1)]
+Name = Annotated[str, ONE_LINE]
+
+
+@overload
+def checked_arguments(function: Function) -> Function: ...
+@overload
+def checked_arguments(*, where: str) -> Callable[[Function], Function]: ...
+def checked_arguments(function: Any = None, *, where: str = "") -> Any:
+    """Decorator: each argument as its annotation says (see above), or `InputError`.
+
+    ``where`` says what an argument is of, with names of other arguments in braces.
     """
+    if function is None:
+        return lambda function: checked_arguments(function, where=where)  # pyright: ignore[reportCallIssue]
     signature = inspect.signature(function)
-    kinds = {name: _kinds(parameter.annotation) for name, parameter in signature.parameters.items()}
+    checks = {name: _check_of(parameter.annotation) for name, parameter in signature.parameters.items()}
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        for name, value in signature.bind(*args, **kwargs).arguments.items():
-            if kinds[name]:
-                _check(name, value, kinds[name])
-        return function(*args, **kwargs)
+        bound, sizes = signature.bind(*args, **kwargs), {}
+        ending = f" of {' '.join(where.format_map(bound.arguments).split())}" if where else ""
+        for name, value in bound.arguments.items():
+            check = checks[name]
+            if check is not None:
+                bound.arguments[name] = check(value, f"{name}{ending}", sizes)
+        return function(*bound.args, **bound.kwargs)
 
-    return call  # pyright: ignore[reportReturnType]
+    return call
 
 
 def with_options(options: type[tuple]) -> Callable[[Function], Function]:
@@ -48,63 +175,207 @@ def with_options(options: type[tuple]) -> Callable[[Function], Function]:
 
     def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
-        own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
-        shared = [one.replace(kind=one.KEYWORD_ONLY) for one in inspect.signature(options).parameters.values()]
-        setattr(function, "__signature__", signature.replace(parameters=[*own, *shared]))  # noqa: B010
+        parameters = [given for given in signature.parameters.values() if given.kind is not given.VAR_KEYWORD]
+        shared = [field.replace(kind=field.KEYWORD_ONLY) for field in inspect.signature(options).parameters.values()]
+        setattr(function, "__signature__", signature.replace(parameters=[*parameters, *shared]))  # noqa: B010
         return function
 
     return decorate
 
 
-def _kinds(annotation: Any) -> tuple[type, ...]:
-    """The classes that an annotation allows; none where it allows what is not looked at."""
-    kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
-    known = [isinstance(kind, type) and (kind in (int, float, bool, NoneType) or _is_own(kind)) for kind in kinds]
-    return kinds if all(known) else ()
+def checked(value: Any, annotation: Any, what: str, sizes: Sizes | None = None) -> Any:
+    """A value as an annotation says (see above), or `InputError` that calls it ``what``.
+
+    ``sizes`` holds the sizes of dimensions by name; those that this value determines are added.
+    """
+    check = _check_of(annotation)
+    return value if check is None else check(value, what, {} if sizes is None else sizes)
 
 
-def _is_own(kind: type) -> bool:
-    return issubclass(kind, eqx.Module) or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
+def checked_fields(thing: Any, where: str = "") -> Any:
+    """A NamedTuple or dataclass with each field as its annotation says, or `InputError`.
+
+    A dataclass (`equinox.Module`: in ``__check_init__``) is changed itself. ``where`` says what a field is of.
+    """
+    sizes: Sizes = {}
+    for name, check in _field_checks(type(thing)).items():
+        value = getattr(thing, name)
+        result = check(value, f"{name} of {where}" if where else name, sizes)
+        if result is not value and isinstance(thing, tuple):
+            thing = thing._replace(**{name: result})  # pyright: ignore[reportAttributeAccessIssue]
+        elif result is not value:
+            object.__setattr__(thing, name, result)
+    return thing
 
 
-def _check(name: str, value: Any, kinds: tuple[type, ...]) -> None:
-    if (value is None and NoneType in kinds) or isinstance(value, tuple(kind for kind in kinds if _is_own(kind))):
-        return
-    if bool in kinds:
-        truth_value(value, name)
-    elif int in kinds:
-        whole_number(value, name)
-    elif float in kinds:
-        real_number(value, name)
+@cache
+def _field_checks(kind: type) -> dict[str, Check]:
+    if dataclasses.is_dataclass(kind):
+        annotations = {field.name: field.type for field in dataclasses.fields(kind)}
     else:
-        wanted = " or ".join(f"{_article(kind.__name__)} {kind.__name__}" for kind in kinds if kind is not NoneType)
-        given = type(value).__name__
-        raise InputError(f"{name} is {_article(given)} {given}; give {wanted}.")
+        annotations = kind.__annotations__
+    checks = {name: _check_of(annotation) for name, annotation in annotations.items()}
+    return {name: check for name, check in checks.items() if check is not None}
 
 
-def truth_value(value: Any, what: str) -> None:
-    """Raise `InputError` for what is neither true nor false, such as 1, "yes" or NaN."""
-    if not isinstance(value, bool | np.bool_):
-        raise InputError(f"{what} is {shown(value)}; give True or False.")
+def _check_of(annotation: Any) -> Check | None:
+    """The check that an annotation states, None where it states none."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _with_rules(_check_of(arguments[0]), [rule for rule in arguments[1:] if callable(rule)])
+    if origin is Literal:
+        return OneOf(arguments)
+    if origin in (Union, UnionType):
+        return _of_alternatives(arguments)
+    if origin in (Sequence, Iterable, Collection, list) or (origin is tuple and arguments[1:] == (...,)):
+        return _of_items(_check_of(arguments[0]))
+    if origin in (Mapping, dict):
+        return _of_values(_check_of(arguments[1]))
+    if _is_array(annotation) or _is_class(annotation):
+        return _of_alternatives((annotation,))
+    return _SCALARS.get(annotation) if isinstance(annotation, type) else None
 
 
-def whole_number(value: Any, what: str) -> None:
-    """Raise `InputError` for what is no whole number, such as 2.5, "2" or True."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise InputError(f"{what} is {shown(value)}; give a whole number.")
+def _is_array(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, AbstractArray)
 
 
-def real_number(value: Any, what: str) -> None:
-    """Raise `InputError` for what is no real number, such as "2", True or NaN; traced values pass."""
-    number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if isinstance(value, jax.Array | np.ndarray) and not isinstance(value, np.ma.MaskedArray):
-        number = value.ndim == 0 and value.dtype.kind in "iuf"
-    if not number or (is_concrete(value) and math.isnan(float(value))):
-        raise InputError(f"{what} is {shown(value)}; give a number.")
+def _is_class(annotation: Any) -> bool:
+    """Whether it is a class of this package."""
+    return isinstance(annotation, type) and annotation.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+def _with_rules(check: Check | None, rules: list[Check]) -> Check:
+    if isinstance(check, _ArrayCheck) and ANY_NUMBER in rules:
+        check = check._replace(finite=False)
+
+    def call(value: Any, what: str, sizes: Sizes) -> Any:
+        for step in rules if check is None else (check, *rules):
+            value = step(value, what, sizes)
+        return value
+
+    return call
+
+
+def _of_alternatives(annotations: Sequence[Any]) -> Check | None:
+    """What passes one of several annotations; arrays of several shapes count as one, and so do several classes."""
+    arrays, classes = [x for x in annotations if _is_array(x)], tuple(x for x in annotations if _is_class(x))
+    checks: list[Any] = [
+        _check_of(x)
+        for x in annotations
+        if x not in (*arrays, *classes, NoneType, np.generic)  # part of `AnyArray`
+    ]
+    if arrays:
+        shapes = tuple(dict.fromkeys(array.dim_str for array in arrays))
+        checks.append(_ArrayCheck(shapes, all(array.array_type is np.ndarray for array in arrays)))
+    if classes:
+        wanted = " or ".join(_with_article(kind.__name__) for kind in classes)
+        checks.append(_passing(lambda value: isinstance(value, classes), wanted))
+
+    def call(value: Any, what: str, sizes: Sizes) -> Any:
+        if value is None and NoneType in annotations:
+            return None
+        sentences = []
+        for check in checks:
+            try:
+                return check(value, what, sizes)
+            except InputError as error:
+                sentences.append(str(error))
+        others = [f", or {sentence.rpartition('; ')[2].removeprefix('give ')}" for sentence in sentences[1:]]
+        raise InputError("".join([text.removesuffix(".") for text in (sentences[0], *others)]) + ".")
+
+    if None in checks:
+        return None
+    return checks[0] if len(checks) == 1 and NoneType not in annotations else call
+
+
+def _of_items(check: Check | None) -> Check:
+    def call(value: Any, what: str, sizes: Sizes) -> Any:
+        if isinstance(value, str):  # whose items are characters
+            raise InputError(f"{what} is {shown(value)}; give a list.")
+        items = items_of(value, what)
+        return tuple(items if check is None else (check(x, _item(what, i), sizes) for i, x in enumerate(items)))
+
+    return call
+
+
+def _of_values(check: Check | None) -> Check:
+    def call(value: Any, what: str, sizes: Sizes) -> Any:
+        if not isinstance(value, Mapping):
+            raise InputError(f"{what} is {_with_article(type(value).__name__)}; give a dictionary.")
+        return value if check is None else {k: check(x, _item(what, k), sizes) for k, x in value.items()}
+
+    return call
+
+
+class _ArrayCheck(NamedTuple):
+    """Real numbers of one of some shapes, each as jaxtyping writes it: names, sizes, ``*name`` and ``...``."""
+
+    shapes: tuple[str, ...]
+    always_numpy: bool
+    finite: bool = True
+
+    def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
+        array = as_array(value, what, like=np.zeros(0))
+        for shape in self.shapes:
+            named = _sizes_by_name(shape.split(), array.shape, sizes)
+            if named is not None:
+                sizes.update(named)
+                break
+        else:
+            wanted = ", or ".join(_shape_in_words(shape.split(), sizes) for shape in self.shapes)
+            raise InputError(f"{what} has shape {array.shape}; give {wanted}.")
+        if not is_concrete(array):
+            return array
+        numbers = np.asarray(array)
+        if self.finite:
+            _check_each(numbers, np.isfinite(numbers), what, "give finite numbers", dimensions=shape.split())
+        return numbers if self.always_numpy else array
+
+
+def _item(what: str, *index: Any) -> str:
+    name, _, rest = what.partition(" of ")
+    return f"{name}[{', '.join(map(repr, index))}]{' of ' * bool(rest)}{rest}"
+
+
+def _sizes_by_name(names: Sequence[str], shape: tuple[int, ...], sizes: Sizes) -> Sizes | None:
+    """The sizes of the dimensions that an annotation names; None where this shape does not fit it."""
+    several = next((i for i, name in enumerate(names) if name[0] in "*."), None)
+    if several is not None:  # any number of dimensions, which are not compared
+        names = [*names[:several], *["_"] * (len(shape) - len(names) + 1), *names[several + 1 :]]
+    if len(names) != len(shape):
+        return None
+    named: Sizes = {}
+    for name, size in zip(names, shape, strict=True):
+        if name != "_" and size != (int(name) if name.isdigit() else (sizes | named).get(name, size)):
+            return None
+        if name.isidentifier() and name != "_":
+            named[name] = size
+    return named
+
+
+def _shape_in_words(names: Sequence[str], sizes: Sizes) -> str:
+    values = [str(sizes.get(name, name)) for name in names]
+    return f"({', '.join(values)}{',' if len(values) == 1 else ''})" if values else "one number"
+
+
+def _check_each(
+    numbers: Any, right: Any, what: str, asked: str, unit: str = "", dimensions: Sequence[str] = ()
+) -> None:
+    """Raise `InputError` that shows the first number that is not right, and says which it is."""
+    if np.all(right):
+        return
+    index = tuple(int(i) for i in np.argwhere(~right)[0]) if np.ndim(numbers) else ()
+    if index and len(dimensions) == len(index) and all(name.endswith("s") for name in dimensions):
+        places = " ".join(f"{name[:-1]} {i + 1}" for name, i in zip(dimensions, index, strict=True))
+        what = f"{what} {places}"  # such as "pose 2 joint 3"
+    elif index:
+        what = _item(what, *index)
+    raise InputError(f"{what} is {numbers[index]:g}{unit}; {asked}.")
 
 
 def items_of(values: Any, what: str) -> list[Any]:
-    """The items of an iterable, or `InputError` for what is none."""
+    """The items of an iterable, or `InputError`."""
     try:
         return list(values)
     except TypeError:
@@ -112,19 +383,18 @@ def items_of(values: Any, what: str) -> list[Any]:
 
 
 def check_finite(**trees: Any) -> None:
-    """Raise `InputError` where a known array in a tree holds a value that is not finite."""
+    """Raise `InputError` where an array in a tree holds a value that is not finite; traced ones pass."""
     for what, tree in trees.items():
-        for leaf in jax.tree.leaves(tree):
-            known = isinstance(leaf, jax.Array | np.ndarray | np.generic) and is_concrete(leaf)
-            if known and not np.all(np.isfinite(np.asarray(leaf))):
-                raise InputError(f"the {what} holds a value that is not finite; make it anew from finite numbers.")
+        arrays = [leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray | np.generic)]
+        if not all(np.all(np.isfinite(np.asarray(array))) for array in arrays if is_concrete(array)):
+            raise InputError(f"the {what} holds a value that is not finite; make it anew from finite numbers.")
 
 
 def shown(value: Any) -> str:
     """A value as a message shows it: in one line, and of a long one its type only."""
     text = " ".join(repr(value).split())
-    return text if len(text) < 60 else f"{_article(type(value).__name__)} {type(value).__name__}"
+    return text if len(text) < 60 else _with_article(type(value).__name__)
 
 
-def _article(noun: str) -> str:
-    return "an" if noun[:1].lower() in "aeiou" else "a"
+def _with_article(noun: str) -> str:
+    return f"{'an' if noun[:1].lower() in 'aeiou' else 'a'} {noun}"

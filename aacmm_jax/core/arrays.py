@@ -1,6 +1,6 @@
 """Conversion of arguments to float64 arrays, with messages that name what is wrong."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,7 +16,6 @@ from .x64 import check_x64
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]
 
-_CHUNK = 256  # rows of a block
 _KINDS = {"U": "text", "S": "text", "b": "true or false", "c": "complex numbers"}
 
 
@@ -31,7 +30,7 @@ def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
     It is NumPy's where ``value`` and ``like``, an array or a tree with at least one, are NumPy's; else JAX's.
     """
     if _is_masked(value):
-        raise InputError(f"{what} holds masked values, which would count as if they were not; remove them.")
+        raise InputError(f"{what} contains masked values; the mask would be ignored. Remove them.")
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and jax.tree.leaves(like) and namespace(like) is np:
         return np.asarray(value)
     check_x64()
@@ -47,7 +46,6 @@ def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
 
 
 def _is_masked(value: Any) -> bool:
-    """Whether an array, or a list of arrays, hides values behind a mask, which NumPy and JAX drop without a word."""
     if isinstance(value, list | tuple):
         return any(_is_masked(item) for item in value if isinstance(item, list | tuple | np.ma.MaskedArray))
     return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
@@ -71,9 +69,3 @@ def as_floats(value: Numbers, what: str) -> AnyArray:
     if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
         raise InputError(f"{what} holds a value that is not finite; give finite numbers.")
     return array
-
-
-def in_chunks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, size: int = _CHUNK) -> np.ndarray:
-    """``work`` on blocks of rows that the processor's cache can hold; an empty array is one block."""
-    starts = range(0, max(len(rows), 1), size)
-    return np.concatenate([work(rows[first : first + size]) for first in starts])

@@ -161,3 +161,9 @@ def broadcast_after_first(values: AnyArray, batch: tuple[int, ...]) -> AnyArray:
 def stop_gradient(tree: Tree) -> Tree:
     """The tree as a constant of differentiation."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, tree)
+
+
+def in_chunks(work: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, size: int = 256) -> np.ndarray:
+    """``work`` on blocks of rows that the processor's cache can hold; an empty array is one block."""
+    starts = range(0, max(len(rows), 1), size)
+    return np.concatenate([work(rows[first : first + size]) for first in starts])

@@ -11,8 +11,8 @@ from ..calibration.results import Calibration, Identification
 from ..core.errors import InputError
 from ..data.capture import Capture, part_of
 from ..data.observations.socket import Socket
-from ..uncertainty.group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of
-from .group_equations import PROBE, Equations, Rows, equations_of
+from .equations import PROBE, Equations, Rows, equations_of
+from .group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of
 
 # Mean square that a group adds over that of the others: errors outside the D-H model make it 7 on real arms, and it
 # is 1 where there are none.
@@ -88,7 +88,7 @@ def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
 def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
     """The groups that contradict the others; nearly always none.
 
-    Every group is tested by the poses of the others (`uncertainty.group_test`), which takes milliseconds. Of all kinds
+    Every group is tested by the poses of the others (`diagnostics.group_test`), which takes milliseconds. Of all kinds
     of groups the one that shows the contradiction best is reported: an error of a whole placement shows less in one of
     its sockets, and that of one socket less in its placement.
 

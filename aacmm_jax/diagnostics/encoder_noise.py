@@ -30,10 +30,10 @@ from ..data.capture import Capture
 from ..data.noise import Noise, one_arcsec
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
-from ..uncertainty.group_test import Block
-from ..uncertainty.residual_tests import LEVEL, Residuals, chance_above_zero
-from .group_equations import EXACT, Rows, equations_in_chunks, residual_rms
+from .equations import EXACT, Rows, equations_in_chunks, residual_rms
+from .group_test import Block
 from .missing_terms import found_terms
+from .residual_tests import LEVEL, Residuals, chance_above_zero
 
 _ROUNDS = 50  # of Fisher scoring; usually 4 to 8
 _TOLERANCE = 1e-3  # of a log variance: a hundredth of its standard uncertainty

@@ -12,9 +12,9 @@ from ..calibration.scale_fix import ends_between, positions_at_ends
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..model.observed import Observed
-from ..uncertainty.group_test import Block
-from ..uncertainty.residual_tests import consistency
-from .group_equations import LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
+from .equations import LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
+from .group_test import Block
+from .residual_tests import consistency
 
 _EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
 # A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.

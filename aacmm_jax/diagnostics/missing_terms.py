@@ -18,9 +18,9 @@ from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
 from ..kinematics.corrections.kinds import all_sought, model_with, terms_of
-from ..uncertainty.group_test import Block
-from ..uncertainty.residual_tests import LEVEL, Residuals, ScoreTest, score_tests
-from .group_equations import Rows, wider
+from .equations import Rows, wider
+from .group_test import Block
+from .residual_tests import LEVEL, Residuals, ScoreTest, score_tests
 
 MOST_TERMS = 6  # that are looked for one after the other
 _AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below which another term explains as much

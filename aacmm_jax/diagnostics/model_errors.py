@@ -20,7 +20,11 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
-from ..uncertainty.residual_tests import (
+from .encoder_noise import NoisyJoint, noisy_joint
+from .equations import EXACT, Rows, equations_in_chunks, residual_rms
+from .length_consistency import Lengths, length_test
+from .missing_terms import MOST_TERMS, FoundTerm, found_terms, with_terms
+from .residual_tests import (
     LEVEL,
     FormTest,
     Residuals,
@@ -29,10 +33,6 @@ from ..uncertainty.residual_tests import (
     form_test,
     pose_form_test,
 )
-from .encoder_noise import NoisyJoint, noisy_joint
-from .group_equations import EXACT, Rows, equations_in_chunks, residual_rms
-from .length_consistency import Lengths, length_test
-from .missing_terms import MOST_TERMS, FoundTerm, found_terms, with_terms
 
 # Of the noise of a class: its members differ by a quarter or so, which is what 8 degrees of freedom say (JCGM 100,
 # G.4.2), so that only an arm whose residuals are over twice as large is outside its class.

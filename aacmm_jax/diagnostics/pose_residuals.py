@@ -11,7 +11,7 @@ from ..calibration.record import CalibrationRecord
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
 from ..uncertainty.linearisation import ObservationRows
-from .group_equations import equations_of, linearisation_of
+from .equations import equations_of, linearisation_of
 
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 _LEAST_LEVER = 1e-6  # mm per rad: a joint whose axis the tip is on explains nothing

@@ -8,10 +8,10 @@ from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.sensitivities import Sensitivities
-from ..uncertainty.group_test import Block
-from ..uncertainty.residual_tests import Residuals
-from .group_equations import LEAST_U, PRIOR, Rows, lengths_in_solve
+from .equations import LEAST_U, PRIOR, Rows, lengths_in_solve
+from .group_test import Block
 from .length_consistency import lengths_of_sockets
+from .residual_tests import Residuals
 
 _EXPLAINED = 1e-3  # part of a column that the model leaves, below which it counts as the model's own
 

@@ -33,19 +33,11 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.prior_scales import default_prior
 from ..uncertainty.covariance import DISAGREEMENT
 from ..uncertainty.degrees_of_freedom import Law
-from ..uncertainty.residual_tests import block_diagonal, form_of_poses, form_test, score_tests
-from ..uncertainty.shared_errors import (
-    NULL,
-    Effects,
-    Moments,
-    OneVariance,
-    SharedErrors,
-    group_deviations,
-    one_variance,
-    second_moments,
-)
+from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .group_equations import EXACT, PRIOR, Rows, equations_in_chunks, lengths_in_solve, residual_rms
+from .equations import EXACT, PRIOR, Rows, equations_in_chunks, lengths_in_solve, residual_rms
+from .random_effects import NULL, Effects, Moments, OneVariance, group_deviations, one_variance, second_moments
+from .residual_tests import block_diagonal, form_of_poses, form_test, score_tests
 from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at

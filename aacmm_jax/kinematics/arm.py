@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arguments import items_of, shown
-from ..core.arrays import Numbers, as_array, as_floats, in_chunks
+from ..core.arrays import Numbers, as_array, as_floats
 from ..core.errors import InputError, nearest
-from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.text import pluralise
 from .chain import Corrections, Geometry, JointKinds, tip_pose
 from .jacobian import tip_jacobian, tip_position

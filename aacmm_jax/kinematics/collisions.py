@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, to_numpy
 from ..core.rotations import rotation_matrix
 from .arm import Arm
 from .body import Body, capsule_ends, frames_at

@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import in_chunks, to_numpy
 from .arm import Arm
 from .chain import ForwardPass, forward_pass, joint_motion, reading_units
 from .inverse_kinematics import damped_inverse

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arrays import in_chunks
+from ..core.numpy_or_jax import in_chunks
 from .arm import (
     LENGTHS,
     Arm,

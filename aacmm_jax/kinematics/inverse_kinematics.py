@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core.arrays import in_chunks
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, in_chunks, namespace, to_numpy
 from ..core.random_keys import random_numbers
 from .arm import Arm
 from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale

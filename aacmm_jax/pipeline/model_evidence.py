@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..calibration.results import PriorMetrics
-from ..diagnostics.group_equations import PRIOR, Equations, Rows
+from ..diagnostics.equations import PRIOR, Equations, Rows
 
 _EXPECTED_VARIANCE = 9.0  # of a log variance that is expected
 _SMALL = 1e-9  # singular value, relative to the largest

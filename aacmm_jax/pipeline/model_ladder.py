@@ -26,7 +26,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..diagnostics.group_equations import equations_of
+from ..diagnostics.equations import equations_of
 from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds

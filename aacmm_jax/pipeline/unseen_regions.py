@@ -17,7 +17,7 @@ from ..core.errors import InputError
 from ..core.linear_algebra import inverse_cholesky
 from ..core.text import common_labels
 from ..data.capture import Capture, names_in
-from ..diagnostics.group_equations import PRIOR, Equations, equations_of
+from ..diagnostics.equations import PRIOR, Equations, equations_of
 from .cross_validation import groups_of
 
 _GROUPS = 3  # of placements or stations, fewer of which say nothing of the scatter between them

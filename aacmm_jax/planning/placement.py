@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from ..core.arrays import in_chunks
 from ..core.errors import InputError
 from ..core.linear_algebra import inverse_cholesky
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import in_chunks, to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at
 from ..kinematics.chain import Geometry, joint_motion

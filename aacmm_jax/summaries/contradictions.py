@@ -3,7 +3,7 @@
 from ..calibration.record import CalibrationRecord, Removed
 from ..core.units import DEG
 from ..diagnostics.contradictions import Cause, Contradiction, Suspect, contradictions_of
-from ..diagnostics.group_equations import PROBE
+from ..diagnostics.equations import PROBE
 
 _NAMED_ALIKE = ("socket", "observation")  # kinds whose groups are chosen by their own names
 

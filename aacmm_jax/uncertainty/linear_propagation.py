@@ -1,9 +1,13 @@
-"""Covariance of a problem's unknowns, by the law of propagation (JCGM 100).
+"""How the unknowns follow the rows, and their covariance by the law of propagation (JCGM 100).
 
 Rows are whitened residuals w = R e of the errors e: of the readings and of the seat, which reach them through the arm,
-and of what was measured. The head of the unknowns (parameters and shared geometry) follows them as dx = -G A W w, with
-A the eliminated derivatives, W the weights of a robust loss and 1/G the information; a component of private geometry as
--D^-1 (B W w + C dx).
+and of what was measured. With A the eliminated derivatives by the head (parameters and shared geometry), B those by the
+private geometry of a component, W the weights of a robust loss, G the inverse information of the head, D^-1 that of a
+component, and C what couples both (`model.elimination`), the unknowns answer to errors of the rows as
+
+    dx = -G A W w,    dy = -D^-1 (B W w + C dx),
+
+so that their covariance is that of these linear functions, with Cov(w) as the noise has it.
 """
 
 from collections.abc import Sequence
@@ -19,7 +23,7 @@ from ..data.observations.observation import Rows
 from ..model.elimination import arrow_of, followed, pseudo_inverse, sums_by_component, weighted
 from ..model.rows import PriorRows, RowBlock, Whitening
 from .covariance import inverse_information
-from .tip_errors import ArmErrors, products
+from .tip_errors import ArmErrors, matrix_products, products
 
 _LEAST_REDUNDANCY = 0.05  # determinant of a pose's part of the residuals' projector
 
@@ -39,7 +43,8 @@ class Influence(NamedTuple):
     fixed: Bool[AnyArray, " h"]  # numbers of the head that follow nothing
     rows: list[Float[AnyArray, "h _ _"]]  # A of every block
     parts: list[Float[AnyArray, "_ _"]]  # steps of the components' numbers, class by class
-    information: Float[AnyArray, "h h"]  # 1/G, with that of a prior
+    prior: Float[AnyArray, "h h"]  # information of the prior
+    information: Float[AnyArray, "h h"]  # 1/G, with that of the prior
     inverse: Float[AnyArray, "h h"]  # G
     lost: Float[AnyArray, "h h"]  # projector onto what the data leave open
     determined: Bool[AnyArray, " h"]  # numbers of the head that are determined one by one
@@ -58,36 +63,43 @@ class Influence(NamedTuple):
         fixed: Bool[AnyArray, " h"],
     ) -> "Influence":
         """At a point; ``fixed`` numbers of the head do not follow anything."""
-        xp = namespace([block.white for block in blocks], steps)
+        xp, height = namespace([block.white for block in blocks], steps), fixed.shape[0]
         counted = [weighted(block, weight) for block, weight in zip(blocks, weights, strict=True)]
-        arrow, _ = arrow_of(counted, classes, fixed.shape[0], prior)
-        arrow = arrow.scaled(steps)
+        arrow = arrow_of(counted, classes, height, prior)[0].scaled(steps)
         head, parts = arrow.split(steps)
         own = [pseudo_inverse(matrix) for matrix in arrow.own]
         follow = [inverse @ crossed for inverse, crossed in zip(own, arrow.crossed, strict=True)]
         rows = []
         for block in blocks:
-            mine: Any = 0.0 if block.by_head is None else block.by_head * head[:, None, None]
+            eliminated: Any = 0.0 if block.by_head is None else block.by_head * head[:, None, None]
             if block.of >= 0:
                 assert block.by_own is not None
-                mine = mine - followed(block.by_own, parts[block.of][..., None] * follow[block.of], block.sizes)
-            rows.append(mine)
-        information: Any = 0.0
-        for mine, weight in zip(rows, weights, strict=True):
-            flat = _flat(mine if weight is None else mine * xp.sqrt(weight)[None, None])
-            information = information + flat @ flat.T
+                by_component = parts[block.of][..., None] * follow[block.of]
+                eliminated = eliminated - followed(block.by_own, by_component, block.sizes)
+            rows.append(eliminated)
+        of_prior = xp.zeros((height, height))
         if prior is not None:
             index = np.arange(prior.weight.shape[0])
-            information = added_to(information, (index, index), (prior.weight * head[index]) ** 2)
+            of_prior = added_to(of_prior, (index, index), (prior.weight * head[index]) ** 2)
+        # Summed anew from the eliminated rows: the Schur complement of the arrow would lose digits by cancellation.
+        information = of_prior
+        for eliminated, weight in zip(rows, weights, strict=True):
+            flat = _flat(eliminated if weight is None else eliminated * xp.sqrt(weight)[None, None])
+            information = information + flat @ flat.T
         inverse, lost, determined = inverse_information(information, fixed)
-        left = [_left_open(matrix, inverse_) for matrix, inverse_ in zip(arrow.own, own, strict=True)]
-        return cls(blocks, weights, fixed, rows, parts, information, inverse, lost, determined, own, follow, left)
+        # D D^-1 has ones on the diagonal where a number is determined.
+        seen = [
+            xp.diagonal(matrix @ inverted, axis1=-2, axis2=-1) for matrix, inverted in zip(arrow.own, own, strict=True)
+        ]
+        left = [values < 1 - 1e-6 for values in seen]
+        return cls(
+            blocks, weights, fixed, rows, parts, of_prior, information, inverse, lost, determined, own, follow, left
+        )
 
     def covariance(self) -> UnknownsCovariance:
         """Of the unknowns, where every row has the variance 1 that its weight says."""
-        transposed = [namespace(one).swapaxes(one, -1, -2) for one in self.follow]
-        each = zip(self.own, self.follow, transposed, strict=True)
-        return UnknownsCovariance(self.inverse, [own + one @ self.inverse @ other for own, one, other in each])
+        pairs = zip(self.own, self.follow, strict=True)
+        return UnknownsCovariance(self.inverse, [own + _conjugated(self.inverse, follow) for own, follow in pairs])
 
     def weighted(self, number: int, rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k r m"]:
         """Rows of a block as a robust loss counts them: the influence of its poses."""
@@ -108,6 +120,42 @@ class Influence(NamedTuple):
         owner = np.repeat(np.arange(len(block.sizes)), block.sizes)
         return block.by_own * (steps[0][:, None, None] if len(block.sizes) == 1 else steps.T[:, None, owner])
 
+    def sums(
+        self, rows: Sequence[Float[AnyArray, "q _ _"]]
+    ) -> tuple[Float[AnyArray, "h q"], list[Float[AnyArray, "_ _ q"]]]:
+        """A W r^T and, of each component, B W r^T, summed over all rows r, of which every block has q."""
+        xp, count = namespace(self.inverse, rows), rows[0].shape[0]
+        head = xp.zeros((self.inverse.shape[0], count))
+        components = [xp.zeros((*inverse.shape[:2], count)) for inverse in self.own]
+        for number, (block, values) in enumerate(zip(self.blocks, rows, strict=True)):
+            head = head + _flat(self.weighted_rows(number)) @ _flat(values).T
+            private = self.own_rows(number)
+            if private is not None:
+                of_block = sums_by_component(self.weighted(number, private), values, block.sizes)
+                components[block.of] = components[block.of] + of_block
+        return head, components
+
+    def response(
+        self, rows: Sequence[Float[AnyArray, "q _ _"]]
+    ) -> tuple[Float[AnyArray, "h q"], list[Float[AnyArray, "_ _ q"]]]:
+        """How the head and the components answer to q sets of errors of all rows: dx and dy of the module's equations.
+
+        Where ``rows`` are the residuals, this is the step of Gauss and Newton; where they are functions of the rows
+        times Cov(w), it is the unknowns' covariance with these functions.
+        """
+        sums, of_components = self.sums(rows)
+        head, triples = -self.inverse @ sums, zip(self.own, self.follow, of_components, strict=True)
+        return head, [-(own @ part) - follow @ head for own, follow, part in triples]
+
+    def eliminated(
+        self, head: Float[AnyArray, "q h"], components: Sequence[Float[AnyArray, "q _ _"]]
+    ) -> Float[AnyArray, "q h"]:
+        """Derivatives by the head of functions of all unknowns, with the components where the head has them."""
+        xp = namespace(self.inverse, head)
+        for part, follow in zip(components, self.follow, strict=True):
+            head = head - xp.einsum("qKk,Kkh->qh", part, follow)
+        return head
+
 
 def rows_of_functions(
     influence: Influence,
@@ -117,17 +165,15 @@ def rows_of_functions(
     """How linear functions of the unknowns follow the whitened rows of every block; ``head`` and ``components`` are
     their derivatives by the unknowns, natural steps."""
     xp = namespace(influence.inverse, head)
-    for part, follow in zip(components, influence.follow, strict=True):
-        head = head - xp.einsum("qKk,Kkh->qh", part, follow)
-    gain, found = -head @ influence.inverse, []
+    gain, rows = -influence.eliminated(head, components) @ influence.inverse, []
     for number, block in enumerate(influence.blocks):
-        a, own = influence.weighted_rows(number), influence.own_rows(number)
-        rows = (gain @ _flat(a)).reshape(-1, *a.shape[1:])
-        if own is not None:
-            each = xp.einsum("qKk,Kkl->Klq", components[block.of], influence.own[block.of])
-            rows = rows - followed(influence.weighted(number, own), each, block.sizes)
-        found.append(rows)
-    return found
+        a, private = influence.weighted_rows(number), influence.own_rows(number)
+        of_block = (gain @ _flat(a)).reshape(-1, *a.shape[1:])
+        if private is not None:
+            by_component = xp.einsum("qKk,Kkl->Klq", components[block.of], influence.own[block.of])
+            of_block = of_block - followed(influence.weighted(number, private), by_component, block.sizes)
+        rows.append(of_block)
+    return rows
 
 
 def variances_of_functions(
@@ -135,99 +181,115 @@ def variances_of_functions(
 ) -> Float[AnyArray, " q"]:
     """Of linear functions of the unknowns, where every row has the variance 1 that its weight says; ``head`` and
     ``components`` are their derivatives, natural steps."""
-    xp = namespace(influence.inverse, head)
-    alone = xp.zeros(head.shape[0])
-    for part, own, follow in zip(components, influence.own, influence.follow, strict=True):
-        head = head - xp.einsum("qKk,Kkh->qh", part, follow)
-        alone = alone + xp.einsum("qKk,Kkl,qKl->q", part, own, part)
-    return alone + xp.einsum("qh,hg,qg->q", head, influence.inverse, head)
+    xp, by_head = namespace(influence.inverse, head), influence.eliminated(head, components)
+    variances = xp.einsum("qh,hg,qg->q", by_head, influence.inverse, by_head)
+    for part, inverse in zip(components, influence.own, strict=True):
+        variances = variances + xp.einsum("qKk,Kkl,qKl->q", part, inverse, part)
+    return variances
+
+
+def by_covariances(
+    rows: Sequence[Float[AnyArray, "q _ _"]], covariances: Sequence[Float[AnyArray, "_ _ _"]]
+) -> list[Float[AnyArray, "q _ _"]]:
+    """Rows times the covariance of every pose's; relations, which come after the poses, have variance 1."""
+    count = len(covariances)
+    of_poses = [products(part, covariance) for part, covariance in zip(rows[:count], covariances, strict=True)]
+    return [*of_poses, *rows[count:]]
 
 
 def covariance_of_rows(
     rows: list[Float[AnyArray, "q _ _"]], covariances: list[Float[AnyArray, "_ _ _"]]
 ) -> Float[AnyArray, "q q"]:
-    """Covariance of functions that follow rows so; relations, which come after the poses, have variance 1."""
-    total: Any = 0.0
-    for number, one in enumerate(rows):
-        by = products(one, covariances[number]) if number < len(covariances) else one
-        total = total + _flat(by) @ _flat(one).T
-    return total
+    """Covariance of functions that follow rows so."""
+    pairs = zip(by_covariances(rows, covariances), rows, strict=True)
+    return sum(
+        (_flat(moved) @ _flat(plain).T for moved, plain in pairs), namespace(rows).zeros((rows[0].shape[0],) * 2)
+    )
 
 
 def covariance_with(
     influence: Influence, rows: list[Float[AnyArray, "1 _ _"]], covariances: list[Float[AnyArray, "_ _ _"]]
 ) -> tuple[Float[AnyArray, " h"], list[Float[AnyArray, "_ _"]]]:
     """Covariance of the unknowns with a function that follows the rows so; natural steps."""
-    xp = namespace(influence.inverse, rows)
-    of_head, of_own = xp.zeros(influence.inverse.shape[0]), [xp.zeros(one.shape[:2]) for one in influence.own]
-    for number, (block, one) in enumerate(zip(influence.blocks, rows, strict=True)):
-        by = products(one, covariances[number]) if number < len(covariances) else one
-        of_head = of_head + _flat(influence.weighted_rows(number)) @ by.reshape(-1)
-        own = influence.own_rows(number)
-        if own is not None:
-            sums = sums_by_component(influence.weighted(number, own), by, block.sizes)
-            of_own[block.of] = of_own[block.of] + sums[..., 0]
-    head = -influence.inverse @ of_head
-    each = zip(influence.own, influence.follow, of_own, strict=True)
-    return head, [-(own @ part[..., None])[..., 0] - follow @ head for own, follow, part in each]
-
-
-def _left_open(matrix: Float[AnyArray, "K k k"], inverse: Float[AnyArray, "K k k"]) -> Bool[AnyArray, "K k"]:
-    """Numbers of components that are not determined."""
-    xp = namespace(matrix, inverse)
-    seen = xp.diagonal(matrix @ inverse, axis1=-2, axis2=-1)
-    return seen < 1 - 1e-6
+    head, components = influence.response(by_covariances(rows, covariances))
+    return head[:, 0], [part[..., 0] for part in components]
 
 
 def _flat(rows: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h _"]:
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
+def _conjugated(matrix: Float[AnyArray, "h h"], by: Float[AnyArray, "*K k h"]) -> Float[AnyArray, "*K k k"]:
+    """B M B^T."""
+    return by @ matrix @ namespace(by).swapaxes(by, -1, -2)
+
+
+class RowErrors(NamedTuple):
+    """How what errs reaches the whitened rows of a group."""
+
+    readings: Float[AnyArray, "r n m"]  # by the readings, each over its stated standard deviation
+    seat: Float[AnyArray, "r c m"]  # by the seat, mm
+    measured: Float[AnyArray, "r r m"]  # covariance of what was measured
+
+
+def row_errors(
+    rows: Rows, errors: ArmErrors, root: Float[AnyArray, "m r r"] | None, spread: Float[AnyArray, "*n"]
+) -> RowErrors:
+    """Of a group whose rows ``root`` whitens; ``spread`` is the standard deviation of the readings."""
+    assert root is not None  # only rows of a stage without covariances have none
+    xp = namespace(root, errors.by_seat, spread)
+    whitening = xp.moveaxis(root, 0, -1)
+    readings = errors.by_readings * xp.broadcast_to(spread, (errors.by_readings.shape[1],))[None, :, None]
+    return RowErrors(
+        readings=matrix_products(whitening, readings),
+        seat=matrix_products(whitening, errors.by_seat),
+        measured=products(products(whitening, xp.moveaxis(rows.measured, 0, -1)), whitening),
+    )
+
+
 def row_covariances(
     rows: list[Rows], errors: list[ArmErrors], whitening: Whitening, noise: Noise
 ) -> list[Float[AnyArray, "_ _ _"]]:
     """Covariance of the whitened rows of every pose, by the noise and by what was measured."""
-    found = []
+    covariances = []
     for part, error, root in zip(rows, errors, whitening.roots, strict=True):
-        xp = namespace(root, error.by_seat, noise)
-        each = xp.moveaxis(root, 0, -1)
-        spread = xp.broadcast_to(noise.of_readings(error.kinds), (error.by_readings.shape[1],))
-        seat = products(each, xp.swapaxes(error.by_seat, 0, 1)) * noise.seating
-        readings = products(each, xp.swapaxes(error.by_readings * spread[None, :, None], 0, 1))
-        measured = products(products(each, xp.moveaxis(part.measured, 0, -1)), each)
-        found.append(measured + products(seat, seat) + products(readings, readings))
-    return found
+        readings, seat, measured = row_errors(part, error, root, noise.of_readings(error.kinds))
+        covariances.append(measured + noise.seating**2 * products(seat, seat) + products(readings, readings))
+    return covariances
 
 
 def alone(influence: Influence, groups: int) -> list[Float[AnyArray, "_ _ _"]]:
-    """Covariance of every pose's whitened rows from its own residual, as it were without the pose in the fit."""
-    found = []
+    """Covariance of every pose's whitened rows from its own residual, as it were without the pose in the fit.
+
+    With H the leverage of a pose (its part of the projector onto what the unknowns explain), a residual has the
+    variance 1 - H of its error, so the error is estimated as (1 - H)^-1 w (the jackknife; MacKinnon and White 1985).
+    """
+    covariances = []
     for number, block in enumerate(influence.blocks[:groups]):
         xp, a = namespace(influence.inverse, block.white), influence.weighted_rows(number)
         moved = (influence.inverse @ _flat(a)).reshape(a.shape)
         leverage = xp.einsum("zam,zbm->mab", a, moved)
-        own = influence.own_rows(number)
-        if own is not None:
-            own = influence.weighted(number, own)
+        private = influence.own_rows(number)
+        if private is not None:
+            private = influence.weighted(number, private)
             per_pose = influence.own[block.of][np.repeat(np.arange(len(block.sizes)), block.sizes)]
-            leverage = leverage + xp.einsum("kam,mkl,lbm->mab", own, per_pose, own)
+            leverage = leverage + xp.einsum("kam,mkl,lbm->mab", private, per_pose, private)
         identity = xp.asarray(np.eye(a.shape[1]))
         # Where a pose determines its own geometry nearly alone, its residual says nothing: it has the common variance.
         whitening = inverse_cholesky(identity[None] - leverage)
         determinant = 1 / xp.prod(xp.diagonal(whitening, axis1=1, axis2=2), axis=1) ** 2
-        enough = determinant > _LEAST_REDUNDANCY
-        whitening = xp.where(enough[:, None, None], whitening, identity)
-        left = xp.einsum("mba,mbc,cm->ma", whitening, whitening, block.white)
-        own = xp.where(enough[:, None, None], left[:, :, None] * left[:, None, :], identity)
-        found.append(xp.moveaxis(own, 0, -1))
-    return found
+        enough = (determinant > _LEAST_REDUNDANCY)[:, None, None]
+        whitening = xp.where(enough, whitening, identity)
+        error = xp.einsum("mba,mbc,cm->ma", whitening, whitening, block.white)
+        squares = xp.where(enough, error[:, :, None] * error[:, None, :], identity)
+        covariances.append(xp.moveaxis(squares, 0, -1))
+    return covariances
 
 
 def propagated(
     influence: Influence,
     covariances: list[Float[AnyArray, "_ _ _"]],
     shared_readings: Float[AnyArray, "h h"] | None,
-    prior: PriorRows | None,
     added: Float[AnyArray, "h h"] | None,
 ) -> UnknownsCovariance:
     """Covariance of the unknowns, from that of every pose's whitened rows; relations have variance 1.
@@ -236,55 +298,35 @@ def propagated(
     ``added`` is added to the head's.
     """
     xp, inverse = namespace(influence.inverse, covariances), influence.inverse
-    total = xp.zeros_like(inverse) if shared_readings is None else shared_readings
-    if prior is not None:
-        total = total + _of_prior(influence)
-    own_total = [xp.zeros_like(matrix) for matrix in influence.own]
-    crossed = [xp.zeros_like(matrix) for matrix in influence.follow]
+    moved = by_covariances([influence.weighted_rows(number) for number in range(len(influence.blocks))], covariances)
+    total, crossed = influence.sums(moved)
+    total = total + influence.prior + (0.0 if shared_readings is None else shared_readings)
+    head = inverse @ total @ inverse + (0.0 if added is None else added)
+    middle = [xp.zeros_like(matrix) for matrix in influence.own]
     for number, block in enumerate(influence.blocks):
-        a, b = influence.weighted_rows(number), influence.own_rows(number)
-        poses = number < len(covariances)
-        by = products(a, covariances[number]) if poses else a
-        total = total + _flat(by) @ _flat(a).T
-        if b is not None:
-            b = influence.weighted(number, b)
-            own_by = products(b, covariances[number]) if poses else b
-            own_total[block.of] = own_total[block.of] + sums_by_component(own_by, b, block.sizes)
-            crossed[block.of] = crossed[block.of] + sums_by_component(own_by, a, block.sizes)
-    head = inverse @ total @ inverse
-    head = head if added is None else head + added
+        private = influence.own_rows(number)
+        if private is not None:
+            private = influence.weighted(number, private)
+            times = products(private, covariances[number]) if number < len(covariances) else private
+            middle[block.of] = middle[block.of] + sums_by_component(times, private, block.sizes)
+    # Of dy = -D^-1 (B W w + C dx): both parts, and twice what they have in common.
     components = []
-    for own, follow, middle, both in zip(influence.own, influence.follow, own_total, crossed, strict=True):
-        turned = xp.swapaxes(follow, -1, -2)
-        mixed = own @ both @ inverse @ turned
-        components.append(own @ middle @ own - mixed - xp.swapaxes(mixed, -1, -2) + follow @ head @ turned)
+    for own, follow, square, both in zip(influence.own, influence.follow, middle, crossed, strict=True):
+        mixed = own @ both @ inverse @ xp.swapaxes(follow, -1, -2)
+        components.append(_conjugated(head, follow) + own @ square @ own - mixed - xp.swapaxes(mixed, -1, -2))
     return UnknownsCovariance(head, components)
 
 
-def of_stated(
-    influence: Influence, rows: list[Rows], whitening: Whitening, prior: PriorRows | None
-) -> Float[AnyArray, "h h"]:
+def of_stated(influence: Influence, rows: list[Rows], whitening: Whitening) -> Float[AnyArray, "h h"]:
     """The part of the head's covariance that rests on what is stated: of relations, a prior, and measured values."""
-    xp, inverse = namespace(influence.inverse), influence.inverse
-    total = xp.zeros_like(inverse) if prior is None else _of_prior(influence)
-    for number in range(len(influence.blocks)):
-        by = a = influence.weighted_rows(number)
-        if number < len(rows):
-            each = xp.moveaxis(whitening.roots[number], 0, -1)
-            by = products(a, products(products(each, xp.moveaxis(rows[number].measured, 0, -1)), each))
-        total = total + _flat(by) @ _flat(a).T
-    return inverse @ total @ inverse
-
-
-def _of_prior(influence: Influence) -> Float[AnyArray, "h h"]:
-    """The information of the prior, whose errors have variance 1 in its own rows."""
-    of_rows = (_information(influence, number) for number in range(len(influence.blocks)))
-    return influence.information - sum(of_rows, namespace(influence.inverse).zeros_like(influence.inverse))
-
-
-def _information(influence: Influence, number: int) -> Float[AnyArray, "h h"]:
-    flat = _flat(influence.rows[number])
-    return flat @ _flat(influence.weighted_rows(number)).T
+    measured = []
+    for part, root in zip(rows, whitening.roots, strict=True):
+        xp = namespace(root, part.measured)
+        turned = xp.moveaxis(root, 0, -1)
+        measured.append(products(products(turned, xp.moveaxis(part.measured, 0, -1)), turned))
+    weighted_rows = [influence.weighted_rows(number) for number in range(len(influence.blocks))]
+    total = covariance_of_rows(weighted_rows, measured) + influence.prior
+    return influence.inverse @ total @ influence.inverse
 
 
 def of_shared_readings(
@@ -296,22 +338,23 @@ def of_shared_readings(
 ) -> Float[AnyArray, "q q"] | None:
     """What poses with one reading add to a sum over poses of what follows their rows, since they share its errors.
 
-    ``reading`` is the number of the reading of each pose of each group; None where all are different.
+    With s_i what pose i of a reading adds, it is (sum s_i)(sum s_i)^T - sum s_i s_i^T. ``reading`` is the number of the
+    reading of each pose of each group; None where all are different.
     """
     counts = np.bincount(np.concatenate(reading))
     if counts.max() < 2:
         return None
     moved, owners = [], []
-    for one, error, root, mine in zip(rows, errors, whitening.roots, reading, strict=False):
-        poses = np.flatnonzero(counts[mine] > 1)
+    for part, error, root, numbers in zip(rows, errors, whitening.roots, reading, strict=False):
+        poses = np.flatnonzero(counts[numbers] > 1)
         if root is None or not len(poses):
             continue
         xp = namespace(root, error.by_readings)
         spread = xp.broadcast_to(noise.of_readings(error.kinds), (error.by_readings.shape[1],))
         readings = xp.einsum("mab,bnm->anm", root[poses], error.by_readings[..., poses] * spread[None, :, None])
-        moved.append(xp.einsum("ham,anm->hnm", one[..., poses], readings))
-        owners.append(mine[poses])
+        moved.append(xp.einsum("ham,anm->hnm", part[..., poses], readings))
+        owners.append(numbers[poses])
     xp = namespace(moved)
-    each, owner = xp.concatenate(moved, axis=2), np.unique(np.concatenate(owners), return_inverse=True)[1]
-    sums = each @ xp.asarray((owner[:, None] == np.arange(owner.max() + 1)[None, :]).astype(float))
-    return _flat(sums) @ _flat(sums).T - _flat(each) @ _flat(each).T
+    of_poses, owner = xp.concatenate(moved, axis=2), np.unique(np.concatenate(owners), return_inverse=True)[1]
+    sums = of_poses @ xp.asarray((owner[:, None] == np.arange(owner.max() + 1)[None, :]).astype(float))
+    return _flat(sums) @ _flat(sums).T - _flat(of_poses) @ _flat(of_poses).T

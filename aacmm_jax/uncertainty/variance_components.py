@@ -1,9 +1,13 @@
 """Variances of readings and seat, estimated from the residuals by two moments.
 
-The whitened residuals of poses follow their errors e as w = M e with M = I - (B^T D^-1 B + A^T G A) W: A and B are the
-derivatives by the head and by the private geometry, of which A has the latter eliminated (`model.elimination`), D and
-1/G the information of both, and W the weights of a robust loss. So the expectation of w.Qw, for a block-diagonal Q, is
-a trace that is linear in the variances.
+The whitened residuals of poses follow their errors e as w = M e with M = I - U, U = (B^T D^-1 B + A^T G A) W: A and B
+are the derivatives by the head and by the private geometry, of which A has the latter eliminated (`model.elimination`),
+D and 1/G the information of both, and W the weights of a robust loss. So for a block-diagonal Q and errors of the
+covariance C, the expectation of w.Qw is a trace that is linear in the variances,
+
+    tr(Q M C M^T) = tr(QC) - 2 tr(QUC) + tr(QUCU^T),
+
+each a sum over small matrices.
 """
 
 from typing import Any, NamedTuple
@@ -19,8 +23,8 @@ from ..data.observations.observation import Rows
 from ..model.elimination import sums_by_component
 from ..model.robust import bounded_square
 from ..model.rows import Whitening
-from .linear_propagation import Influence
-from .tip_errors import ArmErrors, products
+from .linear_propagation import Influence, row_errors
+from .tip_errors import ArmErrors, matrix_products, products, root_of_sum
 
 _ROUNDS = 10
 
@@ -60,50 +64,54 @@ def moments(
     S by the variances so far, and a pose with w.C^-1 w above the 95 % point of chi-square counts as one at that point,
     over the expectation of this for normal errors (Huber's proposal 2 of 1964, here for two variances).
     """
-    xp = namespace(influence.inverse, sigma)
-    inverse = influence.inverse
-    known = None if prior is None else inverse @ prior @ inverse
+    xp, inverse = namespace(influence.inverse, sigma), influence.inverse
+    of_prior = None if prior is None else inverse @ prior @ inverse
     parts = []
     for part, error, root in zip(rows, errors, whitening.roots, strict=True):
-        each = xp.moveaxis(root, 0, -1)
-        of_unit = xp.asarray(np.reshape(one_arcsec(error.kinds), (1, -1, 1)))
-        readings = _by(each, error.by_readings * of_unit)
-        seat = _by(each, error.by_seat)
-        measured = _by(_by(each, xp.moveaxis(part.measured, 0, -1)), each, transposed=True)
+        readings, seat, measured = row_errors(part, error, root, xp.asarray(one_arcsec(error.kinds)))
         parts.append(_Covariances(products(readings, readings), products(seat, seat), measured))
     white = [block.white for block in influence.blocks[: len(rows)]]
-    columns = [_Column.of(influence, [getattr(part, name) for part in parts]) for name in _Covariances._fields]
-    if not robust:
-        counts = [xp.ones(values.shape[1]) for values in white]
-        plain = [part.readings for part in parts], [part.seat for part in parts]
-        return _solved(influence, white, columns, *plain, counts, sigma, known)
+    columns = [
+        _Sums.of(influence, [getattr(part, name) for part in parts], weighted=True) for name in _Covariances._fields
+    ]
 
-    def again(found: Moments, _: Any) -> tuple[Moments, Any]:
-        forms_d, forms_t, counts = [], [], []
+    def solved(forms: list[list[Any]], counts: list[Any]) -> Moments:
+        """The variances that explain both sums of quadratic forms of the residuals."""
+        seen = []
+        for of_form in forms:
+            poses = zip(white, of_form, counts, strict=True)
+            seen.append(sum(xp.einsum("am,abm,bm,m->", values, form, values, count) for values, form, count in poses))
+        sums = [_Sums.of(influence, form, weighted=False) for form in forms]
+        table = [[_expectation(influence, form, column) for column in columns] for form in sums]
+        if of_prior is not None:
+            for row, form in zip(table, sums, strict=True):
+                row[-1] = row[-1] + xp.sum(of_prior * form.head)
+        return _two_variances(table, seen, sigma)
+
+    if not robust:
+        plain = [[part.readings for part in parts], [part.seat for part in parts]]
+        return solved(plain, [xp.ones(values.shape[1]) for values in white])
+
+    def again(last: Moments, _: Any) -> tuple[Moments, Any]:
+        forms: list[list[Any]] = [[], []]
+        counts = []
         for values, part in zip(white, parts, strict=True):
-            by_covariance, count = _bounded(values, part, stop_gradient(found))
-            forms_d.append(_by(_by(by_covariance, part.readings), by_covariance))
-            forms_t.append(_by(_by(by_covariance, part.seat), by_covariance))
+            by_covariance, count = _bounded(values, part, stop_gradient(last))
             counts.append(count)
-        return _solved(influence, white, columns, forms_d, forms_t, counts, sigma, known), xp.zeros(())
+            for form, covariance in zip(forms, part[:2], strict=True):
+                form.append(matrix_products(matrix_products(by_covariance, covariance), by_covariance))
+        return solved(forms, counts), xp.zeros(())
 
     return scan(again, Moments(xp.zeros(()), sigma**2), length=_ROUNDS)[0]
 
 
-def _by(
-    one: Float[AnyArray, "r s m"], other: Float[AnyArray, "s c m"], transposed: bool = False
-) -> Float[AnyArray, "r c m"]:
-    """The product of two matrices a pose, or of one with the transpose of the other."""
-    return products(one, other if transposed else namespace(other).swapaxes(other, 0, 1))
-
-
 def _bounded(
-    white: Float[AnyArray, "r m"], part: _Covariances, found: Moments
+    white: Float[AnyArray, "r m"], part: _Covariances, variances: Moments
 ) -> tuple[Float[AnyArray, "r r m"], Float[AnyArray, " m"]]:
     """C^-1 of every pose, and how much its square counts."""
-    xp, r = namespace(white, found), white.shape[0]
+    xp, r = namespace(white, variances), white.shape[0]
     # A little of the first weights besides, since C has no inverse where two joints are all that errs.
-    covariance = found.encoder * part.readings + found.seat * part.seat + part.measured
+    covariance = variances.encoder * part.readings + variances.seat * part.seat + part.measured
     covariance = covariance + 0.01 * xp.asarray(np.eye(r))[:, :, None]
     inverse = xp.moveaxis(inverse_positive_definite(xp.moveaxis(covariance, -1, 0)), 0, -1)
     square = xp.einsum("am,abm,bm->m", white, inverse, white)
@@ -111,124 +119,75 @@ def _bounded(
     return inverse, xp.minimum(1.0, most / xp.maximum(square, 1e-300)) / expected
 
 
-def _solved(
-    influence: Influence,
-    white: list[Float[AnyArray, "_ _"]],
-    columns: list["_Column"],
-    forms_d: list[Float[AnyArray, "_ _ _"]],
-    forms_t: list[Float[AnyArray, "_ _ _"]],
-    counts: list[Float[AnyArray, " _"]],
-    sigma: Float[AnyArray, ""],
-    known: Float[AnyArray, "h h"] | None,
-) -> Moments:
-    """The variances that explain both sums of quadratic forms of the residuals, of which ``known`` is the part of the
-    unknowns' covariance that follows from a prior."""
-    xp = namespace(influence.inverse, sigma)
-
-    def seen(forms: list[Any]) -> Any:
-        each = zip(white, forms, counts, strict=True)
-        return sum(xp.einsum("am,abm,bm,m->", values, form, values, count) for values, form, count in each)
-
-    table = [_expected(influence, forms, columns, known) for forms in (forms_d, forms_t)]
+def _two_variances(table: list[list[Any]], seen: list[Any], sigma: Float[AnyArray, ""]) -> Moments:
+    """Solution of the two equations: expectations for 1 arcsec, for 1 mm and of what was measured, by form."""
+    xp = namespace(table, sigma)
     (dd, dt, ds), (td, tt, ts) = table
-    right_d, right_t = seen(forms_d) - ds, seen(forms_t) - ts
+    right_d, right_t = seen[0] - ds, seen[1] - ts
     determinant = dd * tt - dt * td
     apart = determinant > 1e-9 * dd * tt
     safe = xp.where(apart, determinant, 1.0)
     encoder, seat = (tt * right_d - dt * right_t) / safe, (dd * right_t - td * right_d) / safe
-    alone = xp.maximum(right_d / xp.where(dd > 0, dd, 1.0), 0.0)
+    without_seat = xp.maximum(right_d / xp.where(dd > 0, dd, 1.0), 0.0)
     positive = apart & (encoder > 0)
     return Moments(
-        xp.where(positive, xp.where(seat > 0, encoder, alone), 0.0),
+        xp.where(positive, xp.where(seat > 0, encoder, without_seat), 0.0),
         xp.where(positive, xp.maximum(seat, 0.0), sigma**2),
     )
 
 
-class _Column(NamedTuple):
-    """What the expectations of all forms need of one list of covariances, a form for each pose."""
+class _Sums(NamedTuple):
+    """Sums over poses of A N A^T, B N B^T and B N A^T, with a matrix N for each pose; A and B ``weighted`` by W or not.
 
-    covariances: list[Any]
-    by_rows: list[Any]  # of each group, its weighted rows times them; by those of the components besides
-    own_by_rows: list[Any]
-    of_head: Any  # sums over the rows
-    of_own: list[Any]  # of each class, None without rows of poses
-    of_both: list[Any]
+    N is a form Q, of rows that are not weighted, or a covariance C, of weighted ones.
+    """
+
+    matrices: list[Any]  # N
+    by_head: list[Any]  # A N of each group
+    by_private: list[Any]  # B N of each group; None without private geometry
+    head: Any
+    private: list[Any]  # of each class
+    crossed: list[Any]
 
     @classmethod
-    def of(cls, influence: Influence, covariances: list[Any]) -> "_Column":
-        """Of covariances of the rows of every group."""
-        classes = len(influence.own)
-        by_rows, own_by_rows, of_head = [], [], 0.0
-        of_own: list[Any] = [0.0] * classes
-        of_both: list[Any] = [0.0] * classes
-        for number, covariance in enumerate(covariances):
-            block, weighted, b = influence.blocks[number], influence.weighted_rows(number), influence.own_rows(number)
-            by = products(weighted, covariance)
-            by_rows.append(by)
-            of_head = of_head + _outer(by, weighted)
-            own_by_rows.append(None)
+    def of(cls, influence: Influence, matrices: list[Any], weighted: bool) -> "_Sums":
+        xp = namespace(influence.inverse, matrices)
+        private, crossed = ([xp.zeros_like(zero) for zero in zeros] for zeros in (influence.own, influence.follow))
+        head, by_head, by_private = xp.zeros_like(influence.inverse), [], []
+        for number, matrix in enumerate(matrices):
+            block, a, b = influence.blocks[number], influence.rows[number], influence.own_rows(number)
+            if weighted:
+                a, b = influence.weighted(number, a), None if b is None else influence.weighted(number, b)
+            by_head.append(products(a, matrix))
+            by_private.append(None if b is None else products(b, matrix))
+            head = head + _outer(by_head[-1], a)
             if b is not None:
-                own = influence.weighted(number, b)
-                own_by_rows[-1] = own_by = products(own, covariance)
-                of_own[block.of] = of_own[block.of] + sums_by_component(own_by, own, block.sizes)
-                of_both[block.of] = of_both[block.of] + sums_by_component(own_by, weighted, block.sizes)
-        return cls(covariances, by_rows, own_by_rows, of_head, of_own, of_both)
+                private[block.of] = private[block.of] + sums_by_component(by_private[-1], b, block.sizes)
+                crossed[block.of] = crossed[block.of] + sums_by_component(by_private[-1], a, block.sizes)
+        return cls(matrices, by_head, by_private, head, private, crossed)
 
 
-def _expected(
-    influence: Influence, forms: list[Any], columns: list[_Column], known: Float[AnyArray, "h h"] | None
-) -> list[Any]:
-    """tr(Q M C M^T), the expectation of w.Qw, for each list of covariances C; that of the last with ``known``.
-
-    With U = I - M and its two parts, of the head and of the components, this is
-    tr(QC) - 2 tr(QUC) + tr(QUCU^T), each a sum over small matrices.
-    """
-    xp, inverse, classes = namespace(influence.inverse), influence.inverse, len(influence.own)
-    of_form: Any = 0.0
-    own_form: list[Any] = [None] * classes
-    form_by_head: list[Any] = [None] * classes
-    found: list[Any] = [0.0] * len(columns)
-    for number, form in enumerate(forms):
-        block, a, b = influence.blocks[number], influence.rows[number], influence.own_rows(number)
-        by_form = products(a, form)
-        of_form = of_form + _outer(by_form, a)
-        for i, column in enumerate(columns):
-            both = xp.sum(form * column.covariances[number])
-            found[i] = found[i] + both - 2 * xp.sum(inverse * _outer(by_form, column.by_rows[number]))
-        if b is not None:
-            of, own_by_form = block.of, products(b, form)
-            sums = sums_by_component(own_by_form, b, block.sizes), sums_by_component(own_by_form, a, block.sizes)
-            own_form[of], form_by_head[of] = (
-                one if before is None else before + one
-                for before, one in zip((own_form[of], form_by_head[of]), sums, strict=True)
-            )
-            for i, column in enumerate(columns):
-                crossed = sums_by_component(own_by_form, column.own_by_rows[number], block.sizes)
-                found[i] = found[i] - 2 * xp.sum(influence.own[of] * crossed)
-    for i, column in enumerate(columns):
-        found[i] = found[i] + xp.sum((inverse @ of_form) * (inverse @ column.of_head).T)
-        for d, own, by_head, of_own, of_both in zip(
-            influence.own, own_form, form_by_head, column.of_own, column.of_both, strict=True
-        ):
-            if own is None:
-                continue  # a class of relations alone
-            found[i] = found[i] + xp.sum((d @ own) * xp.swapaxes(d @ of_own, -1, -2))
-            found[i] = found[i] + 2 * xp.sum((d @ of_both @ inverse) * by_head)
-    if known is not None:
-        found[-1] = found[-1] + xp.sum(known * of_form)
-    return found
+def _expectation(influence: Influence, form: _Sums, column: _Sums) -> Any:
+    """tr(Q M C M^T), by the module's equation: U has a part of the head, and one of the components."""
+    xp, inverse = namespace(influence.inverse), influence.inverse
+    total: Any = xp.sum((inverse @ form.head) * (inverse @ column.head).T)
+    for number, block in enumerate(influence.blocks[: len(form.matrices)]):
+        total = total + xp.sum(form.matrices[number] * column.matrices[number])
+        total = total - 2 * xp.sum(inverse * _outer(form.by_head[number], column.by_head[number]))
+        if block.of >= 0:
+            both = sums_by_component(form.by_private[number], column.by_private[number], block.sizes)
+            total = total - 2 * xp.sum(influence.own[block.of] * both)
+    classes = zip(influence.own, form.private, form.crossed, column.private, column.crossed, strict=True)
+    for own, form_private, form_crossed, private, crossed in classes:
+        total = total + xp.sum((own @ form_private) * xp.swapaxes(own @ private, -1, -2))
+        total = total + 2 * xp.sum((own @ crossed @ inverse) * form_crossed)
+    return total
 
 
-def _outer(one: Float[AnyArray, "h r m"], other: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h h"]:
-    return one.reshape(one.shape[0], -1) @ other.reshape(other.shape[0], -1).T
+def _outer(left: Float[AnyArray, "h r m"], right: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h h"]:
+    return left.reshape(left.shape[0], -1) @ right.reshape(right.shape[0], -1).T
 
 
-def noise_from(found: Moments) -> Noise:
+def noise_from(variances: Moments) -> Noise:
     """The noise of both variances, one encoder for all."""
-    return noise_of(ARCSEC * _root(found.encoder), _root(found.seat))
-
-
-def _root(value: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
-    # The square root has no derivative at 0, the value of a variance whose estimate is negative.
-    xp = namespace(value)
-    return xp.where(value > 0, xp.sqrt(xp.where(value > 0, value, 1.0)), 0.0)
+    return noise_of(ARCSEC * root_of_sum(variances.encoder), root_of_sum(variances.seat))

@@ -8,7 +8,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.diagnostics import group_equations, model_errors, model_tests
+from aacmm_jax.diagnostics import equations, model_errors, model_tests
 from aacmm_jax.summaries.model_errors import sentences_of_tests, summary_of_tests
 
 ARCSEC = aj.units.ARCSEC
@@ -186,12 +186,12 @@ def test_observations_and_their_division_into_chunks(paper_arm, monkeypatch):
     found = checked(paper_arm, wrong, True)
     assert [one.name for one in found.noisy_observations][:1] == ["camera"]
     assert any("camera (" in text and "their u" in text for text in sentences_of_tests(found))
-    monkeypatch.setattr(group_equations, "_CHUNK", 25)
+    monkeypatch.setattr(equations, "_CHUNK", 25)
     divided = checked(paper_arm, wrong, True)
     assert divided.misfit.ratio == pytest.approx(found.misfit.ratio)
     assert [term[:2] for term in divided.terms] == [term[:2] for term in found.terms]
     assert divided.noisy_joint.ratio == pytest.approx(found.noisy_joint.ratio)
-    monkeypatch.setattr(group_equations, "_MOST_POSES", 45)
+    monkeypatch.setattr(equations, "_MOST_POSES", 45)
     assert checked(paper_arm, wrong, True).misfit.degrees_of_freedom < found.misfit.degrees_of_freedom / 1.5
 
 

@@ -12,15 +12,15 @@ from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
 from aacmm_jax.core.distributions import student_quantile
 from aacmm_jax.data.arm_classes import ArmNoise
+from aacmm_jax.diagnostics.group_test import Block
+from aacmm_jax.diagnostics.random_effects import Effects, one_variance
+from aacmm_jax.diagnostics.residual_tests import LEVEL, Residuals
 from aacmm_jax.diagnostics.shared_errors import _USUAL, missing_functions, with_shared_errors
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.prior_scales import default_prior
 from aacmm_jax.summaries.calibration import shared_rows
 from aacmm_jax.summaries.uncertainty_sentences import shared_sentence
 from aacmm_jax.uncertainty.degrees_of_freedom import Law, coverage_factor
-from aacmm_jax.uncertainty.group_test import Block
-from aacmm_jax.uncertainty.residual_tests import LEVEL, Residuals
-from aacmm_jax.uncertainty.shared_errors import Effects, one_variance
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 PLACES = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300), "D": (500, 300, 100)}

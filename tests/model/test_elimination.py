@@ -114,7 +114,7 @@ def test_covariances_of_eliminated_geometry_are_the_dense_ones(paper_arm, parts,
     influence = linear.influence()
     unit = [np.moveaxis(np.tile(np.eye(rows.shape[0]), (rows.shape[1], 1, 1)), 0, -1) for rows in
             (block.white for block in linear.blocks[: len(linear.observed.layout.groups)])]  # fmt: skip
-    for found in (influence.covariance(), propagated(influence, unit, None, linear.whitening.prior, None)):
+    for found in (influence.covariance(), propagated(influence, unit, None, None)):
         u = np.sqrt(np.diag(inverse)[: linear.height])
         np.testing.assert_allclose(
             found.head / np.outer(u, u), inverse[: linear.height, : linear.height] / np.outer(u, u), atol=1e-4

@@ -11,7 +11,7 @@ from aacmm_jax.calibration.prediction import unseen_errors
 from aacmm_jax.calibration.record import record_of
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.recording import Recording
-from aacmm_jax.diagnostics.group_equations import equations_of
+from aacmm_jax.diagnostics.equations import equations_of
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.parameters import ArmSpecification
 from aacmm_jax.pipeline.model_evidence import log_evidence

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aacmm_jax.uncertainty.group_test import Block
-from aacmm_jax.uncertainty.residual_tests import Form, Residuals, consistency, form_test, pose_form_test, score_tests
+from aacmm_jax.diagnostics.group_test import Block
+from aacmm_jax.diagnostics.residual_tests import Form, Residuals, consistency, form_test, pose_form_test, score_tests
 
 SIZES, PARAMETERS = (12, 9, 15), 4
 

@@ -13,8 +13,8 @@ from ..data.noise import Noise
 from ..kinematics.arm import by_joint, is_length, value_of
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
-from ..uncertainty.group_test import Block
 from ..uncertainty.linearisation import Linearisation
+from .group_test import Block
 
 PRIOR = "prior"  # name of its rows
 PROBE = ("probe_x", "probe_y", "probe_z")
