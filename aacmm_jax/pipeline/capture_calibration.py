@@ -133,7 +133,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         if chosen.monte_carlo:
             result = solved(record.recording.capture) if record.removed else result
             if not isinstance(result, Calibration) or chosen.robust is not None:
-                raise InputError("--monte-carlo is for calibrations without --robust and --scale nominal; leave it out.")
+                raise InputError(
+                    "--monte-carlo is for calibrations without --robust and --scale nominal; leave it out."
+                )
             sampled = chosen.stage("Drawing trials", lambda: monte_carlo(result, record.recording.capture))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     return record
