@@ -23,7 +23,7 @@ from .app import (
     with_spinner,
 )
 from .calibration_views import View
-from .plan_commands import assumed_noise
+from .plan_assumptions import assumed_noise
 
 
 @app.command(
