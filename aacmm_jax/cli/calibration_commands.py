@@ -161,7 +161,7 @@ def calibrate(
         for file in capture:
             reading(file)
         if figure is not None:
-            from ..plot.style import check_format
+            from ..plot.figures import check_format
 
             check_format(figure)
         recording = _recording(capture, same_probe)
