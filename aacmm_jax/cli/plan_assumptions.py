@@ -1,4 +1,4 @@
-"""What is assumed of an arm that has not been calibrated: noise, cones of approach and its body, by options or class."""
+"""What is assumed of an arm that was not calibrated: its noise, cones of approach and body, by options or class."""
 
 import math
 from collections.abc import Mapping, Sequence
