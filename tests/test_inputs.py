@@ -337,9 +337,7 @@ def test_simulation(paper_arm, arguments, parts):
 
 
 def test_deviation_and_batch(given):
-    assert_refused(
-        lambda: aj.perturbed_arm(given.space, length=-1.0, angle=0.0), "length is -1", "zero or positive"
-    )
+    assert_refused(lambda: aj.perturbed_arm(given.space, length=-1.0, angle=0.0), "length is -1", "zero or positive")
     batch = changed_arm(given.arm, a=np.zeros((2, 6)))
     assert_refused(lambda: aj.simulate(batch, {"A": (400, 200, 300)}), "one arm, not a batch")
 
