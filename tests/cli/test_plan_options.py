@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.cli.plan_commands import _arm_for
+from aacmm_jax.cli.plan_commands import arm_for
 
 PLAN = (
     *("plan", "panda", "-o", "plan.csv", "--poses", 16, "--candidates", 120),
@@ -105,11 +105,11 @@ def test_a_manifest_names_the_arm_relative_to_itself_where_it_can(tmp_path, monk
     arm = tmp_path / "arms" / "arm.toml"
     arm.parent.mkdir()
     arm.write_text("")
-    assert _arm_for(tmp_path / "manifests" / "plan.toml", str(arm)) == "../arms/arm.toml"
-    assert _arm_for(tmp_path / "plan.toml", "panda") == "panda"
+    assert arm_for(tmp_path / "manifests" / "plan.toml", str(arm)) == "../arms/arm.toml"
+    assert arm_for(tmp_path / "plan.toml", "panda") == "panda"
 
     def other_drive(*_):
         raise ValueError("path is on mount 'D:', start on mount 'C:'")
 
     monkeypatch.setattr(os.path, "relpath", other_drive)  # as Windows does
-    assert _arm_for(tmp_path / "plan.toml", str(arm)) == arm.as_posix()
+    assert arm_for(tmp_path / "plan.toml", str(arm)) == arm.as_posix()
