@@ -16,10 +16,9 @@ from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat
 
 from ..core.errors import InputError
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
-from ..kinematics.body import Body, body_along_links
+from ..kinematics.body import Body, body_along_links, segment_distance
 from ..kinematics.collisions import Box, Cell, HalfSpace, Obstacle, Post, check_obstacle
 from ..kinematics.parameters import ArmSpecification
-from ..kinematics.segment_distances import segment_distance
 from ..kinematics.workspace import total_link_length
 from .arms import load_specification, urdf_folder
 from .inputs import InputFile
