@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..calibration.observed_evaluation import fit_geometry
+from ..calibration.evaluation import fit_geometry
 from ..core.arguments import with_options
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
