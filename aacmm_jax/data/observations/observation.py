@@ -288,15 +288,22 @@ def offset_of(target: str) -> str:
     return f"offset of {target}"
 
 
+OTHER_KINDS: list[type[Declared]] = []  # observations and what simulates them, from elsewhere than this folder
+
+
 def kinds() -> dict[str, type[AbstractObservation]]:
-    """Every kind of observations by its name: those of the files of this folder."""
+    """Every kind of observations by its name: those of the files of this folder, and others."""
     found = {one.__name__: one for one in classes() if issubclass(one, AbstractObservation)}
     return {found[name].kind: found[name] for name in sorted(found)}
 
 
-@functools.cache
 def classes() -> list[type[Declared]]:
-    """The classes of the files of this folder that are not abstract, observations and what simulates them."""
+    """The classes of observations, and of what simulates them, that are not abstract."""
+    return [*_classes_of_files(), *OTHER_KINDS]
+
+
+@functools.cache
+def _classes_of_files() -> list[type[Declared]]:
     names = [f"{__package__}.{module.name}" for module in pkgutil.iter_modules([str(Path(__file__).parent)])]
     members = [one for name in names for one in vars(importlib.import_module(name)).values() if isinstance(one, type)]
     return [one for one in dict.fromkeys(members) if issubclass(one, Declared) and not inspect.isabstract(one)]
