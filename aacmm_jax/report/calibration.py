@@ -19,7 +19,7 @@ from ..summaries.uncertainty_sentences import shared_sentence
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
-from .elements import Block, Report, Section, with_table
+from .elements import Block, Report, Section
 from .observations import agreement_tables, observation_tables, other_poses_table, removed_tables
 from .tables import DRAWN, length_table, metrics_table, validation_tables
 
@@ -222,7 +222,7 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
     if not single:
         between = [(row["from"], row["to"]) for row in rows]
         expanded = np.array([row["expanded_mm"] or np.nan for row in rows])
-        block = with_table(length_chart(between, stage1 | {"calibrated": errors["calibrated"]}, expanded), block)
+        block = length_chart(between, stage1 | {"calibrated": errors["calibrated"]}, expanded)._replace(table=block)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 

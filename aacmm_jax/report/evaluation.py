@@ -15,15 +15,15 @@ from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..plot.acceptance import metrics_chart
 from ..plot.lengths import reading_errors_chart
-from ..plot.residuals import distances_in
+from ..plot.residuals import arms_chart, distances_in
 from ..summaries.cells import Cell, Table, format_number, number, table
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for
 from ..summaries.verdicts import overall_decision
 from .arm_view import view_of_arm
-from .elements import Block, Report, Section, with_table
-from .tables import length_table, metrics_table, residual_chart, socket_table, stages_chart, with_u_digits
+from .elements import Block, Report, Section
+from .tables import DRAWN, length_table, metrics_table, residual_chart, socket_table, with_u_digits
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
@@ -200,7 +200,7 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
             "standard": lambda row: row[2].standard,
         },
     )
-    return [*blocks, with_table(metrics_chart(tests), every, printed=limited)]
+    return [*blocks, metrics_chart(tests)._replace(table=every, printed=limited)]
 
 
 def _expanded(value: float) -> Cell:
@@ -243,7 +243,9 @@ def _nominal_and_calibrated(
         for group, title in _GROUPS
         if (rows := summary[group]) is not None
     ]
-    blocks.append(stages_chart(record.recording.capture, evaluations))
+    capture = record.recording.capture
+    distances = {stage: distances_in(capture, evaluations[stage]) for stage in _STAGES}
+    blocks.append(arms_chart(capture, distances, most=DRAWN))
     if record.used:
         used = ", ".join(sorted(record.used))
         blocks.append(f"The calibration was identified from: {used}. All other data were held out.")

@@ -10,8 +10,8 @@ from ..data.capture import Capture
 from ..diagnostics.pose_residuals import distances_of
 from ..model.metrics import pose_outliers
 from ..plot.charts import Chart
-from ..plot.residuals import Groups, Marked, arms_chart, distances_in, pose_chart
-from ..summaries.cells import Cell, Table, number, table
+from ..plot.residuals import Groups, Marked, distances_in, pose_chart
+from ..summaries.cells import Cell, Table, by_columns, number, numbers, table
 from ..summaries.tables import METRICS, decimals_for
 
 DRAWN, _LISTED = 1000, 400  # most poses in a chart, and in its table
@@ -40,18 +40,15 @@ def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
     scatter = evaluation.repeatability
     outliers, _ = pose_outliers(np.asarray(evaluation.distances), capture.sizes)
     far = np.bincount(capture.owner[outliers], minlength=len(capture.names)).tolist()
+    scattered = np.asarray(capture.sizes) > 1
     metrics = {"DE": scatter.socket_de, "Deltam": scatter.socket_deltam, "RMS": scatter.socket_rms}
     columns = {
-        name: lambda i, values=values: float(values[i]) if capture.sizes[i] > 1 else None
-        for name, values in metrics.items()
+        "socket": capture.names,
+        "poses": capture.sizes,
+        **{name: numbers(np.where(scattered, values, np.nan)) for name, values in metrics.items()},
+        "marked poses": [number(count, 0, mark="outlier" if count else "") for count in far],
     }
-    return table(
-        "Repeatability by socket [mm]",
-        range(len(capture.names)),
-        {"socket": lambda i: capture.names[i], "poses": lambda i: capture.sizes[i]}
-        | columns
-        | {"marked poses": lambda i: number(far[i], 0, mark="outlier" if far[i] else "")},
-    )
+    return by_columns("Repeatability by socket [mm]", columns)
 
 
 def residual_chart(capture: Capture, evaluation: Evaluation) -> Chart:
@@ -62,12 +59,6 @@ def residual_chart(capture: Capture, evaluation: Evaluation) -> Chart:
     title = "Residuals of the calibrated arm"
     chart = pose_chart("residuals", title, groups, {"calibrated": distances}, far=(says, far), most=DRAWN)
     return chart._replace(table=pose_table(groups, distances, "mm", (says, far)))
-
-
-def stages_chart(capture: Capture, evaluations: Mapping[str, Evaluation]) -> Chart:
-    """Distances of all poses by the nominal and the calibrated arm."""
-    distances = {arm: distances_in(capture, evaluations[arm]) for arm in ("nominal", "calibrated")}
-    return arms_chart(capture, distances, most=DRAWN)
 
 
 def pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked | None = None) -> Table:

@@ -63,6 +63,17 @@ def table(
     return Table(caption, tuple(read), [[_cell(value(row)) for value in read.values()] for row in rows], folded)
 
 
+def by_columns(caption: str, columns: Mapping[str, Iterable[Any]]) -> Table:
+    """A table of columns that are known as a whole: heading -> the values from above."""
+    rows = zip(*columns.values(), strict=True)
+    return Table(caption, tuple(columns), [[_cell(value) for value in row] for row in rows])
+
+
+def numbers(values: Any, decimals: int = 4) -> list[Cell]:
+    """A cell for each of the numbers of an array."""
+    return [number(float(value), decimals) for value in values]
+
+
 def _cell(value: Any) -> Cell:
     if isinstance(value, Cell):
         return value
