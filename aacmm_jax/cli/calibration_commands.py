@@ -240,7 +240,7 @@ def _bounded(
 def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
     """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
     if text is None and nominal.prior is None and model is not None and nominal.arm.corrections is not None:
-        from ..kinematics.prior_scales import default_prior
+        from ..kinematics.priors import default_prior
 
         return default_prior(nominal.arm)
     if text is None:
