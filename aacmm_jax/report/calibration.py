@@ -12,9 +12,8 @@ from ..core.units import DEG, people_read
 from ..plot.lengths import length_chart
 from ..plot.residuals import arms_chart, distances_by_arm
 from ..summaries.calibration import calibration_summary
-from ..summaries.cells import Cell, Table, format_number, number, table
 from ..summaries.observations import capture_words
-from ..summaries.tables import decimals_for, lengths_sentence, two_digits
+from ..summaries.tables import Cell, Table, decimals_for, format_number, lengths_sentence, listed, number, two_digits
 from ..summaries.uncertainty_sentences import shared_sentence
 from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
@@ -118,7 +117,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     if capture.names or not capture.observations:
         sockets = zip(capture.names, capture.sizes, strict=True)
         columns = {"socket": lambda row: row[0], "poses": lambda row: row[1]}
-        blocks.append(table("Sockets in which the tip was seated", sockets, columns))
+        blocks.append(listed("Sockets in which the tip was seated", sockets, columns))
     blocks += observation_tables(record)
     if capture.lengths or not capture.observations:
 
@@ -130,7 +129,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
             "calibrated value [mm]": lambda length: to_u(length.value, length.u),
             "u [mm]": lambda length: to_u(length.u, length.u),
         }
-        blocks.append(table("Reference lengths", capture.lengths, columns))
+        blocks.append(listed("Reference lengths", capture.lengths, columns))
     blocks += [*removed_tables(record), _traceability(summary["scale_from"])]
     return Section("data", "What was calibrated, and from which data", blocks)
 
@@ -185,7 +184,7 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
             words: lambda row, stage=stage: row[2] * summary["truth"][stage][row[0]] for stage, words in stages.items()
         }
         caption = "Against the true arm of the simulation"
-        blocks.append(table(caption, errors, {"": lambda row: row[1]} | columns))
+        blocks.append(listed(caption, errors, {"": lambda row: row[1]} | columns))
     return Section("stages", "Nominal and calibrated arm", blocks)
 
 
@@ -203,7 +202,7 @@ def _prior_table(prior: list[dict[str, Any]]) -> Table:
         "parameters": "parameters",
         "of these determined by the data": lambda row: number(row["effective_parameters"], 1),
     }
-    return table("Priors of the parameters, and effective parameters", prior, columns)
+    return listed("Priors of the parameters, and effective parameters", prior, columns)
 
 
 def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> Section:

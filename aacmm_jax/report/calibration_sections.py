@@ -18,9 +18,21 @@ from ..plot.parameters import bounds_chart, change_chart
 from ..plot.patterns import pattern_charts
 from ..plot.residuals import Groups, distances_in, kinds_chart
 from ..plot.uncertainty import correlation_chart, singular_chart, tried_chart, volume_chart
-from ..summaries.cells import Cell, Table, by_columns, number, numbers, table
 from ..summaries.harmonics import harmonics_by_joint, listed_apart
-from ..summaries.tables import decimals_for, encoders_in_words, factor_words, seat_in_words, two_digits, volume_rows
+from ..summaries.tables import (
+    Cell,
+    Table,
+    by_columns,
+    decimals_for,
+    encoders_in_words,
+    factor_words,
+    listed,
+    number,
+    numbers,
+    seat_in_words,
+    two_digits,
+    volume_rows,
+)
 from ..summaries.uncertainty_sentences import tried_sentence
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
@@ -43,17 +55,17 @@ _FULL_TURN = 360.0
 
 def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     """Every parameter with its expanded uncertainty; hundreds of coefficients joint by joint, and on demand."""
-    listed, harmonics = listed_apart(summary["parameters"])
+    others, harmonics = listed_apart(summary["parameters"])
     introduction = (
         "U is the expanded uncertainty (95 %), with the coverage factor of each parameter's own degrees of freedom. A "
         "parameter on a bound, or one that the data determine only together with others, has none of its own."
     )
-    by_unit = {unit: [row for row in listed if row["unit"] == unit] for unit in ("mm", "rad")}
+    by_unit = {unit: [row for row in others if row["unit"] == unit] for unit in ("mm", "rad")}
     functions = functions_chart(record)
     blocks: list[Block] = [
         introduction,
         *(change_chart(unit, rows) for unit, rows in by_unit.items() if rows),
-        _parameter_table("Parameters", listed),
+        _parameter_table("Parameters", others),
         *([] if functions is None else [functions]),
     ]
     if harmonics:
@@ -98,7 +110,7 @@ def _parameter_table(caption: str, rows: list[Any]) -> Table:
         "nominal": nominal,
         "": state,
     }
-    return table(caption, rows, columns)
+    return listed(caption, rows, columns)
 
 
 def _by_joint(harmonics: list[Any]) -> Table:
@@ -112,7 +124,7 @@ def _by_joint(harmonics: list[Any]) -> Table:
         "its U": lambda row: _expanded(row, row["largest"]["expanded"]),
         "unit": lambda row: people_read(row["unit"])[1],
     }
-    return table("Harmonics of the joints", harmonics_by_joint(harmonics), columns)
+    return listed("Harmonics of the joints", harmonics_by_joint(harmonics), columns)
 
 
 def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
@@ -301,7 +313,7 @@ def correlations(uncertainty: Uncertainty) -> Section:
         "with": lambda pair: pair[1],
         "correlation": lambda pair: number(pair[2], 3, signed=True),
     }
-    pairs = table("Pairs correlated by 0.5 or more", uncertainty.correlated(0.5), columns)
+    pairs = listed("Pairs correlated by 0.5 or more", uncertainty.correlated(0.5), columns)
     return Section("correlations", "Correlations", [correlation_chart(uncertainty)._replace(table=pairs)])
 
 
@@ -331,8 +343,8 @@ def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     vector, lower, upper = record.vectors()["calibrated"], np.asarray(record.lower), np.asarray(record.upper)
     active, stage1 = summary["active"], summary["active_stage1"]
     on_bound = sorted({*active, *stage1})
-    listed, harmonics = listed_apart(summary["parameters"])
-    shown = [*(row["parameter"] for row in listed), *(r["parameter"] for r in harmonics if r["parameter"] in on_bound)]
+    others, harmonics = listed_apart(summary["parameters"])
+    shown = [*(row["parameter"] for row in others), *(r["parameter"] for r in harmonics if r["parameter"] in on_bound)]
     index = [record.names.index(name) for name in shown]
 
     def in_unit(values: np.ndarray) -> Any:
@@ -361,4 +373,4 @@ def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         within = np.where(np.isfinite(width) & (width > 0), 2 * (vector - lower) / width - 1, math.nan)[index]
     on = np.array([name in on_bound for name in shown])
     chart = bounds_chart(shown, within, on, len(record.names) - len(shown))
-    return Section("bounds", "Bounds", [introduction, chart._replace(table=table("Bounds", index, columns))])
+    return Section("bounds", "Bounds", [introduction, chart._replace(table=listed("Bounds", index, columns))])

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ..plot.charts import Chart
-from ..summaries.cells import Table
+from ..summaries.tables import Table
 
 
 class ArmView(NamedTuple):

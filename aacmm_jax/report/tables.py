@@ -11,8 +11,7 @@ from ..diagnostics.pose_residuals import distances_of
 from ..model.metrics import pose_outliers
 from ..plot.charts import Chart
 from ..plot.residuals import Groups, Marked, distances_in, pose_chart
-from ..summaries.cells import Cell, Table, by_columns, number, numbers, table
-from ..summaries.tables import METRICS, decimals_for
+from ..summaries.tables import METRICS, Cell, Table, by_columns, decimals_for, listed, number, numbers
 
 DRAWN, _LISTED = 1000, 400  # most poses in a chart, and in its table
 
@@ -32,7 +31,7 @@ def metrics_table(
 
     rows = [(key, title) for key, title in METRICS if key in summary[next(iter(stages))]]
     columns = {words: lambda row, stage=stage: value(stage, row[0]) for stage, words in stages.items()}
-    return table(caption, rows, {"": lambda row: row[1]} | columns)
+    return listed(caption, rows, {"": lambda row: row[1]} | columns)
 
 
 def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
@@ -69,7 +68,7 @@ def pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked | N
         caption = f"The {_LISTED} farthest of {len(residuals)} poses"
     owner, numbers = groups.owner, groups.numbers
     says, marked = ("", set()) if far is None else (far[0], set(np.asarray(far[1]).tolist()))
-    return table(
+    return listed(
         caption,
         chosen.tolist(),
         {
@@ -95,7 +94,7 @@ def length_table(
     def error(i: int, value: float) -> Cell:
         return number(value, decimals_for(rows[i]["expanded_mm"]), signed=True)
 
-    return table(
+    return listed(
         caption,
         range(len(rows)),
         {
@@ -136,4 +135,4 @@ def validation_tables(summary: Mapping[str, Any]) -> list[Table]:
         "": lambda row: "disagrees" if row["disagrees"] else "",
     }
     rows = summary.get("left_out")
-    return [table(caption, pooled, columns), *([table("Groups held out [mm]", rows, groups)] if rows else [])]
+    return [listed(caption, pooled, columns), *([listed("Groups held out [mm]", rows, groups)] if rows else [])]
