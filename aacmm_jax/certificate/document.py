@@ -8,10 +8,10 @@ from xml.etree.ElementTree import Element
 from ..acceptance.record import EvaluationRecord, same_arm
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
+from ..diagnostics.contradictions import LEFT_OUT
+from ..diagnostics.findings import findings_of
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
-from ..summaries.contradictions import removals
 from ..summaries.observations import scale_sources
-from ..summaries.warnings import of_calibration
 from .acceptance_results import add_acceptance, overall
 from .measurement_results import add_results, uncertainty_statement
 from .observation_results import texts_of
@@ -219,12 +219,12 @@ def _add_statements(
     _add_statement(parent, "Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         _add_statement(parent, "Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
-    for sentence, removed in zip(removals(record), record.removed, strict=True):
-        all_of_it = f"{sentence} Sockets and observations left out: {', '.join(removed.members)}."
-        _add_statement(parent, "Data left out", all_of_it)
-    for sentence in of_calibration(record):
-        if sentence not in removals(record):
-            _add_statement(parent, "Warning", sentence)
+    for finding in findings_of(record):
+        if finding.code == LEFT_OUT:
+            members = f"Sockets and observations left out: {', '.join(finding.concerns)}."
+            _add_statement(parent, "Data left out", f"{finding.sentence} {members}")
+        else:
+            _add_statement(parent, "Warning", finding.sentence)
     if sources:
         _add_statement(parent, "Files", ", ".join(sources))
     if given.conformity is not None:

@@ -273,7 +273,7 @@ def calibrate(
 
 def _failed(record: Any) -> bool:
     """Whether the result is not one to use."""
-    from ..summaries.warnings import does_not_fit
+    from ..diagnostics.usability import does_not_fit
 
     return not record.converged or not record.plausible_scale or record.implausible_residual or does_not_fit(record)
 

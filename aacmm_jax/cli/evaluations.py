@@ -66,9 +66,9 @@ def _warnings_of(file: InputFile, record: Any) -> list[str]:
     """What the calibration warned of, from the summary in its file."""
     summary = read_summary(file, ("calibration",))[1]
     if summary is None:
-        from ..summaries.warnings import of_calibration
+        from ..diagnostics.findings import findings_of, sentences
 
-        return of_calibration(record)
+        return sentences(findings_of(record))
     return summary["warnings"]
 
 

@@ -9,12 +9,13 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read
+from ..diagnostics.determined import determined
+from ..diagnostics.findings import case_of
 from ..diagnostics.pose_residuals import distances_of, observation_residuals
 from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for, lengths_sentence, two_digits
 from ..summaries.uncertainty_sentences import shared_sentence
-from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from .arm_view import view_of_arm
 from .elements import (
@@ -59,9 +60,9 @@ _OBSERVED = "Joint least squares of everything observed"
 
 def calibration_report(record: CalibrationRecord) -> tuple[Report, dict[str, Any]]:
     """The report, except for the origin of its file; and the summary that it was made from."""
-    uncertainty, observability = uncertainty_of(record), observed(record)
+    uncertainty, observability = uncertainty_of(record), case_of(record).once(determined)
     volume = volumetric_uncertainty(uncertainty)
-    summary = calibration_summary(record, observability, volume)
+    summary = calibration_summary(record, volume)
     evaluations = record.evaluations()
     capture = record.recording.capture
     sections = [
