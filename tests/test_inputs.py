@@ -67,7 +67,7 @@ def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
         (lambda q: {"": q}, ["a socket has the name ''", "of one line"]),
         (lambda q: {"A\n": q}, ["a socket has the name 'A\\n'"]),
         (lambda q: {"A": q, "B": q[:, :5]}, ["socket 'B' has 5 columns", "socket 'A' has 6", "one column a joint"]),
-        (lambda q: {"A": q[0]}, ["socket 'A' has shape (6,)", "one row a pose and one column a joint"]),
+        (lambda q: {"A": q[0]}, ["socket 'A' has shape (6,)", "expected (poses, joints)"]),
         (lambda q: {"A": q[:0]}, ["socket 'A' has shape (0, 6)", "at least one"]),
         (lambda q: {}, ["at least one socket"]),
         (lambda q: {"A": q, "B": q}, ["sockets 'A' and 'B' have exactly the same poses", "given twice?"]),

@@ -18,9 +18,9 @@ from ..data.sphere import checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
 from . import asme_b89_4_22, iso_10360_12, jjf_1408
-from .decision import LEAST_DIVISOR, MOST, Limit, Rule, checked_rule, decide, without_test
+from .decision import MOST, Limit, Rule, checked_limit, checked_rule, decide, without_test
+from .geometry import postures_of
 from .influences import Influences, checked_influences
-from .postures import postures_of
 from .requirements import StandardTest
 from .requirements import requirements_table as table_of
 from .results import METRICS, AcceptanceTest, Measured, Metric
@@ -109,7 +109,7 @@ def run(
     influences = checked_influences(influences)
     influences = influences._replace(u=math.hypot(influences.u, u_test))
     given = checked_limits(limits or {})
-    tests = [found for test in TESTS if (found := test.run(measured, influences)) is not None]
+    tests = [result for test in TESTS if (result := test.run(measured, influences)) is not None]
     rules = DEFAULT_RULES if rule is None else dict.fromkeys(DEFAULT_RULES, checked_rule(rule))
     tests = [test._replace(rule=rules[test.standard]) for test in tests]
     if measured.none_held_out:
@@ -146,17 +146,14 @@ def without_stated_uncertainty(tests: Sequence[AcceptanceTest]) -> list[str]:
 
 def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:
     """Limits by the name of a metric, numbers made into `Limit`; `InputError` for an unknown metric or a bad limit."""
-    found = {}
+    checked = {}
     for name, limit in limits.items():
         if name not in METRICS:
             raise InputError(f"there is no metric '{name}'{without_test(name, list(METRICS))}")
         fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
-        if not divisor >= LEAST_DIVISOR:
-            raise InputError(
-                f"the limit of {name} grows with L / {divisor:g}; give a divisor of {LEAST_DIVISOR:g} or more."
-            )
-        found[name] = Limit(_number(fixed, f"the limit of {name}"), divisor)
-    return found
+        what = f"the limit of {name}"
+        checked[name] = checked_limit(Limit(_number(fixed, what), divisor), what)
+    return checked
 
 
 def _checked(measured: Measured) -> Measured:
@@ -191,11 +188,11 @@ def _decided(metric: Metric, limits: Mapping[str, Limit], rule: Rule) -> Metric:
     if metric.name not in limits:
         return metric
     values = []
-    for found in metric.values:
-        if found.length is None and math.isfinite(limits[metric.name].divisor):
+    for value in metric.values:
+        if value.length is None and math.isfinite(limits[metric.name].divisor):
             raise InputError(
                 f"the limit of {metric.name} grows with a length, but the metric is not of one; give only a number."
             )
-        limit = limits[metric.name].at(found.length or 0.0)
-        values.append(found._replace(limit=limit, decision=decide(found.value, limit, found.expanded, rule)))
+        limit = limits[metric.name].at(value.length or 0.0)
+        values.append(value._replace(limit=limit, decision=decide(value.value, limit, value.expanded, rule)))
     return metric._replace(values=tuple(values))

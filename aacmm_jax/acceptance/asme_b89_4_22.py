@@ -10,11 +10,11 @@ import numpy as np
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError
+from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
-from .geometry import LEAST_SPREAD, least_turn
+from .geometry import LEAST_SPREAD, LEFT_OR_RIGHT, elbow_sides, least_turn
 from .influences import Influences
 from .lengths import deviation_metrics, distinct_lengths, length_readings, values_by_artefact
-from .postures import LEFT_OR_RIGHT, elbow_sides
 from .procedure_items import (
     OutOfReach,
     PlannedItems,
@@ -30,11 +30,14 @@ from .requirements import (
     CALIBRATED,
     CONDITIONS,
     RANGE_STATED,
+    Origin,
     Requirement,
     StandardTest,
     all_directions,
     different_positions,
     groups_of_touches,
+    groups_where,
+    of_spheres,
     sphere_size,
     spheres_for,
     spread_places,
@@ -49,7 +52,8 @@ ZONES = {"near": (0.0, 0.2), "middle": (0.2, 0.8), "far": (0.8, 1.0)}  # fractio
 BARS = ((0.5, 0.75), (1.2, 1.5))  # fractions of the reach
 _SPAT_POSES, _POSITIONS, _DIAMETER_POINTS, _DIAMETER_REPEATS = 10, 20, 9, 3
 _LEAST_TURN, _LEAST_ELBOW = math.radians(15), 3  # of rings of touches; poses with the elbow on either side
-_BACKGROUND = "background knowledge of ASME B89.4.22"
+_BACKGROUND: Origin = ("background knowledge of ASME B89.4.22", "background")
+_READING: Origin = (_BACKGROUND[0], "own reading")
 _DIAMETER, _SPAT, _VOLUMETRIC = "effective diameter", "single-point articulation", "volumetric"
 
 
@@ -112,16 +116,10 @@ def _articulated(measured: Measured) -> dict[str, np.ndarray]:
     return {name: points for name, points in measured.tested.items() if len(points) >= _SPAT_POSES}
 
 
-def _rings_lacking(measured: Measured) -> str:
-    straight = [
-        f"'{sphere.name}', repeat {number}"
-        for sphere in spheres_for(measured, "effective-diameter")
-        for number, group in enumerate(sphere.groups, start=1)
-        if len(group) >= _DIAMETER_POINTS and least_turn(group) < _LEAST_TURN
-    ]
-    if not straight:
-        return ""
-    return f"The rings of touches must be turned by 22.5 deg or more against each other ({', '.join(straight)})."
+def _straight_rings(sphere: ProbedSphere) -> list[str]:
+    return groups_where(
+        sphere, lambda group: len(group) >= _DIAMETER_POINTS and least_turn(group) < _LEAST_TURN, "repeat"
+    )
 
 
 def _zones_lacking(measured: Measured) -> str:
@@ -173,15 +171,16 @@ TESTS = (
         _DIAMETER,
         _diameter_metrics,
         (
-            sphere_size("effective-diameter", 10, 50, _BACKGROUND, "background"),
-            touches("effective-diameter", _DIAMETER_POINTS, _BACKGROUND, "background"),
-            groups_of_touches("effective-diameter", _DIAMETER_REPEATS, "repeats", _BACKGROUND, "background"),
-            spread_touches("effective-diameter", _DIAMETER_POINTS, _BACKGROUND, "own reading"),
-            Requirement(
+            sphere_size("effective-diameter", 10, 50, _BACKGROUND),
+            touches("effective-diameter", _DIAMETER_POINTS, _BACKGROUND),
+            groups_of_touches("effective-diameter", _DIAMETER_REPEATS, "repeats", _BACKGROUND),
+            spread_touches("effective-diameter", _DIAMETER_POINTS, _READING),
+            of_spheres(
                 "rings of touches turned against each other, by 22.5 deg or more (15 as touched by hand)",
+                "effective-diameter",
+                _straight_rings,
+                "The rings of touches must be turned by 22.5 deg or more against each other ({}).",
                 _BACKGROUND,
-                "background",
-                _rings_lacking,
             ),
             CALIBRATED,
             CONDITIONS,
@@ -194,8 +193,7 @@ TESTS = (
         (
             Requirement(
                 "a socket with 10 articulations in each of three zones: 0 to 20, 20 to 80, 80 to 100 % of the reach",
-                _BACKGROUND,
-                "background",
+                *_BACKGROUND,
                 _zones_lacking,
             ),
             Requirement(
@@ -213,13 +211,11 @@ TESTS = (
         _VOLUMETRIC,
         _volumetric_metrics,
         (
-            Requirement("two bars, each in 5 positions or more", _BACKGROUND, "background", _two_bars_lacking),
-            Requirement(
-                "bars of 50 to 75 % and of 120 to 150 % of the reach", _BACKGROUND, "background", _bar_lengths_lacking
-            ),
-            different_positions(_POSITIONS, False, _BACKGROUND, "own reading"),
-            all_directions(False, _BACKGROUND, "own reading"),
-            spread_places(False, LEAST_SPREAD, _BACKGROUND, "own reading"),
+            Requirement("two bars, each in 5 positions or more", *_BACKGROUND, _two_bars_lacking),
+            Requirement("bars of 50 to 75 % and of 120 to 150 % of the reach", *_BACKGROUND, _bar_lengths_lacking),
+            different_positions(_POSITIONS, False, _READING),
+            all_directions(False, _READING),
+            spread_places(False, LEAST_SPREAD, _READING),
             RANGE_STATED,
             CALIBRATED,
             CONDITIONS,

@@ -125,45 +125,39 @@ def without_test(name: str, known: Collection[str]) -> str:
     return nearest(name, known, len(known))
 
 
-def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
-    """Limits by the name of a metric, from texts ``NAME=A`` or ``NAME=A+L/K`` in mm; ``known`` has the names."""
-    found: dict[str, Limit] = {}
-    names = {name.lower(): name for name in known}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        match = _LIMIT.fullmatch(value)
-        if not equals or match is None:
-            raise InputError(
-                f"--mpe '{text}' is not of the form NAME=A or NAME=A+L/K, in mm; for example E_Uni=0.025+L/40000."
-            )
-        if name.strip().lower() not in names:
-            raise InputError(f"--mpe '{text}' names the unknown metric '{name}'{without_test(name, known)}")
-        name = names[name.strip().lower()]
-        if name in found:
-            raise InputError(f"--mpe gives {name} two limits; give it one.")
-        try:
-            limit = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
-        except ValueError as error:
-            raise InputError(f"--mpe '{text}': '{value}' is not A or A+L/K with numbers in mm.") from error
-        if not (0 <= limit.fixed <= MOST and limit.divisor >= LEAST_DIVISOR):
-            raise InputError(
-                f"--mpe '{text}': a limit must be zero or positive and finite, and K at least {LEAST_DIVISOR:g}."
-            )
-        found[name] = limit
-    return found
+def checked_limit(limit: Limit, what: str) -> Limit:
+    """The same limit, or `InputError` where it is impossible."""
+    if not (0 <= limit.fixed <= MOST and limit.divisor >= LEAST_DIVISOR):
+        raise InputError(
+            f"{what} is {limit} mm; A must be zero or positive and finite, and K at least {LEAST_DIVISOR:g}."
+        )
+    return limit
 
 
-def read_uncertainty(text: str) -> Limit:
-    """A standard uncertainty of the test, from a text ``A`` or ``A+L/K`` in mm."""
+def limit_of_text(text: str, given: str) -> Limit:
+    """A limit, or an uncertainty, from a text ``A`` or ``A+L/K`` in mm; ``given`` is what messages begin with."""
     match = _LIMIT.fullmatch(text)
     try:
         if match is None:
-            raise ValueError
-        found = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
+            raise ValueError(text)
+        limit = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
     except ValueError as error:
-        raise InputError(f"--test-u-mm '{text}' is not A or A+L/K with numbers in mm; give 0.002+L/500000.") from error
-    if not (0 <= found.fixed <= MOST and found.divisor >= LEAST_DIVISOR):
-        raise InputError(
-            f"--test-u-mm '{text}' must be zero or positive and finite, with K at least {LEAST_DIVISOR:g}."
-        )
-    return found
+        raise InputError(f"{given} is not A or A+L/K with numbers in mm; give one such as 0.002+L/500000.") from error
+    return checked_limit(limit, given)
+
+
+def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
+    """Limits by the name of a metric, from texts ``NAME=A`` or ``NAME=A+L/K`` in mm; ``known`` has the names."""
+    limits: dict[str, Limit] = {}
+    names = {name.lower(): name for name in known}
+    for text in texts:
+        given, equals, value = text.partition("=")
+        name = names.get(given.strip().lower())
+        if not equals:
+            raise InputError(f"--mpe '{text}' is not NAME=A or NAME=A+L/K, in mm; for example E_Uni=0.025+L/40000.")
+        if name is None:
+            raise InputError(f"--mpe '{text}' names the unknown metric '{given}'{without_test(given, known)}")
+        if name in limits:
+            raise InputError(f"--mpe gives {name} two limits; give it one.")
+        limits[name] = limit_of_text(value, f"--mpe {name}={value}")
+    return limits

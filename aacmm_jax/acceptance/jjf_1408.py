@@ -65,7 +65,7 @@ TESTS = (
                 "own reading",
                 _socket_lacking,
             ),
-            different_positions(_LENGTH_POSITIONS, False, f"{_PAPER}: a length measured 30 times", "own reading"),
+            different_positions(_LENGTH_POSITIONS, False, (f"{_PAPER}: a length measured 30 times", "own reading")),
             CALIBRATED,
             CONDITIONS,
         ),

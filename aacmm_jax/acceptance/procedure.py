@@ -122,8 +122,8 @@ def plan_procedure(
         )
     unsuitable = [] if bars is None else rules.unsuitable_bars(size, lengths)
     items = rules.procedure_items(ProcedureRegion(search, reach._replace(radius=size / 2)), diameter, stylus, lengths)
-    found = items._replace(left_out=[*unsuitable, *items.left_out])
-    return Procedure(arm, standard, reach, size, measuring_range is not None, *(tuple(part) for part in found))
+    items = items._replace(left_out=[*unsuitable, *items.left_out])
+    return Procedure(arm, standard, reach, size, measuring_range is not None, *map(tuple, items))
 
 
 def simulate_procedure(
@@ -131,9 +131,7 @@ def simulate_procedure(
     nominal: ArmSpecification,
     true: ArmSpecification,
     *,
-    encoder_arcsec: float = 0.0,
-    seating: float = 0.0,
-    linear_encoder: float | None = None,
+    noise: Noise | None = None,
     u_length: float = 0.0,
     u_diameter: float = 0.0,
     seed: int = 0,
@@ -144,9 +142,7 @@ def simulate_procedure(
         procedure: The planned test.
         nominal: The arm that the recording states.
         true: The arm that takes the poses; they are projected to the artefacts by this arm.
-        encoder_arcsec: Standard deviation of a joint reading, arcsec.
-        seating: Standard deviation of each coordinate of the tip in its socket, mm.
-        linear_encoder: Standard deviation of the reading of a prismatic joint, mm; by default as of `Noise`.
+        noise: Errors of the readings, and of the tip in its socket; by default none.
         u_length: Standard uncertainty stated for the bars, and standard deviation of their true error, mm.
         u_diameter: The same of the sphere's diameter, mm.
         seed: Seed of the noise.
@@ -155,21 +151,20 @@ def simulate_procedure(
         The recording, with the true arm.
 
     Raises:
-        InputError: Noise is negative, or the true arm does not reach an artefact.
+        InputError: An uncertainty is negative, or the true arm does not reach an artefact.
 
     Example:
         >>> procedure = aj.acceptance.plan_procedure(arm, "asme", measuring_range=2000.0)
         >>> built = nominal._replace(arm=true)
-        >>> recorded = aj.acceptance.simulate_procedure(procedure, nominal, built, encoder_arcsec=2.0)
+        >>> recorded = aj.acceptance.simulate_procedure(procedure, nominal, built, noise=aj.Noise(encoder_arcsec=2.0))
         >>> print(len(recorded.capture.q), len(recorded.spheres))
         70 1
     """
-    noise = {"encoder_arcsec": encoder_arcsec, "seating": seating, "u_length": u_length, "u_diameter": u_diameter}
-    for what, value in noise.items():
+    for what, value in (("u_length", u_length), ("u_diameter", u_diameter)):
         if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
-    encoders = Noise(encoder_arcsec=encoder_arcsec, linear_encoder=linear_encoder)
-    read = np.asarray(encoders.of_readings(true.arm.geometry.kinds))
+            raise InputError(f"{what} is {value:g} mm; it must be zero or positive.")
+    noise = Noise() if noise is None else noise
+    scatter = np.asarray(noise.of_readings(true.arm.geometry.kinds))
     random = np.random.default_rng(seed)
 
     def readings(item: ProcedureItem, seating: float) -> Float[np.ndarray, "m n"]:
@@ -179,9 +174,9 @@ def simulate_procedure(
             raise InputError(
                 f"{item.test} '{item.name}': the true arm does not reach it; let it differ less from the nominal one."
             )
-        return q + read * random.normal(size=q.shape)
+        return q + scatter * random.normal(size=q.shape)
 
-    sockets = {item.name: readings(item, seating) for item in procedure.sockets}
+    sockets = {item.name: readings(item, float(noise.seating)) for item in procedure.sockets}
     bars: dict[float, float] = {}  # every position of a bar has the same error
     for *_, value in procedure.lengths:
         bars.setdefault(value, value + u_length * random.normal())

@@ -236,7 +236,7 @@ def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
         seen = np.array([row.tobytes() in known for row in np.asarray(observation.q)])
         parts = [observation]
         if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
-            unseen = observation.select(np.flatnonzero(~seen)).renamed(f"{observation.name}, unseen")
+            unseen = observation.select(np.flatnonzero(~seen)).changed(name=f"{observation.name}, unseen")
             try:
                 check_geometry(arm, Capture({}, [], [unseen]))
                 parts = [observation.select(np.flatnonzero(seen)), unseen]

@@ -19,7 +19,6 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.shifted import ShiftedObservation
 from ..kinematics.arm import Arm
 from ..kinematics.chain import JointKinds, reading_units
 from ..kinematics.inverse_kinematics import project_to_centroids
@@ -193,8 +192,7 @@ class ObservedTruth(NamedTuple):
             rows = _rows_with_replacement(observation, count, random)
             batch = _selected(observation, rows)
             own = {name: values[name] for name in observation.certified}
-            none = np.zeros((count, *part.values.shape))
-            found.append(ShiftedObservation(batch, batch.q, none, own))
+            found.append(batch.with_errors(batch.q, np.zeros((count, *part.values.shape)), own))
         nominal, u = np.asarray(self.observed.nominal), np.asarray(self.observed.u)
         drawn = nominal + u * random.normal(size=(count, len(u)))
         return batch_of_observations(found, self.ends, DrawnLengths(drawn, np.broadcast_to(u, drawn.shape)))
@@ -221,10 +219,10 @@ def shifted(
     q: Float[np.ndarray, "t m n"],
     shift: Float[np.ndarray, "t r m"],
     values: Mapping[str, Float[np.ndarray, "t k"]],
-) -> ShiftedObservation:
+) -> AbstractObservation:
     """A batch of one observation, whose own data are the same in all trials."""
     own = {name: values[name] for name in observation.certified}
-    return ShiftedObservation(_repeated(observation, len(q)), q, shift, own)
+    return _repeated(observation, len(q)).with_errors(q, shift, own)
 
 
 def _repeated(observation: AbstractObservation, count: int) -> AbstractObservation:
@@ -232,7 +230,7 @@ def _repeated(observation: AbstractObservation, count: int) -> AbstractObservati
 
 
 def batch_of_observations(
-    observations: list[ShiftedObservation], ends: list[tuple[str, str]], lengths: DrawnLengths
+    observations: list[AbstractObservation], ends: list[tuple[str, str]], lengths: DrawnLengths
 ) -> Capture:
     """A batch of captures, as `identify_many` takes it; ``ends`` are names of the positions at the lengths' ends."""
     count, _, joints = observations[0].q.shape

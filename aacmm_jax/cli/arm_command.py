@@ -120,7 +120,7 @@ def arm(
 
 
 def _template(path: Path, joints: int, as_json: bool) -> None:
-    from ..files.arm_template import arm_template
+    from ..files.arm_tables import arm_template
     from ..files.atomic_write import write_text
 
     with together(path):

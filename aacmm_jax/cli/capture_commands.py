@@ -133,19 +133,22 @@ def simulate(
             space = true.space()
             drawn = perturbed_arm(space, length=deviate_length_mm, angle=deviate_angle_deg * DEG, seed=seed)
             true = true._replace(arm=drawn, name=f"{true.name}, deviated")
+        noise = Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
         if acceptance is not None:
             if socket or poses or length or resolution_arcsec or linear_resolution_mm or temperature_c:
                 raise InputError(
                     "--acceptance brings its own sockets, poses and lengths, at 20 C; leave out --socket, --poses, "
                     "--length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
                 )
-            noise = {"encoder_arcsec": encoder_arcsec, "seating": seating_mm, "linear_encoder": linear_encoder_mm}
-            noise |= {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
 
             def taken() -> Recording:
                 from ..acceptance.procedure import plan_procedure, simulate_procedure
 
-                return simulate_procedure(plan_procedure(nominal.arm, acceptance), nominal, true, **noise, seed=seed)
+                procedure, u = (
+                    plan_procedure(nominal.arm, acceptance),
+                    {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT},
+                )
+                return simulate_procedure(procedure, nominal, true, noise=noise, **u, seed=seed)
 
             recording = with_spinner("Simulating", taken)
         else:
@@ -159,7 +162,7 @@ def simulate(
                     points,
                     poses=_poses_option(poses or ["70"], points),
                     lengths=[length_option(text) for text in length or ()],
-                    noise=Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm),
+                    noise=noise,
                     resolution_arcsec=resolution_arcsec,
                     linear_resolution=linear_resolution_mm,
                     temperature=None if temperature_c is None else _temperature_option(temperature_c),

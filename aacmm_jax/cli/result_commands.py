@@ -125,12 +125,12 @@ def evaluate(
     Errors on data that the calibration has not used are printed next to those that its uncertainty predicts. A manifest
     of points is tested without a calibration.
     """
-    from ..acceptance.decision import read_limits, read_uncertainty
+    from ..acceptance.decision import limit_of_text, read_limits
     from ..acceptance.influences import Influences, read_expansions
     from ..acceptance.results import METRICS
     from . import acceptance_display
 
-    u_test, bodies = read_uncertainty(test_u_mm), read_expansions(expansion or [])
+    u_test, bodies = limit_of_text(test_u_mm, f"--test-u-mm {test_u_mm}"), read_expansions(expansion or [])
     of_test = {
         "limits": read_limits(mpe or [], METRICS),
         "u_test": u_test.fixed,

@@ -26,18 +26,24 @@ def pytree(cls: Class) -> Class:
     static_names = tuple(field.name for field in fields if field.metadata.get("static"))
     names = tuple(field.name for field in fields if field.name not in static_names)
 
-    def flatten_with_keys(one: Any) -> tuple[Any, Any]:
-        keyed = tuple((jax.tree_util.GetAttrKey(name), getattr(one, name)) for name in names)
-        return keyed, tuple(getattr(one, name) for name in static_names)
+    register(made, names, static_names)
+    return made
 
-    def flatten(one: Any) -> tuple[Any, Any]:
-        return tuple(getattr(one, name) for name in names), tuple(getattr(one, name) for name in static_names)
 
-    def unflatten(known: Any, leaves: Any) -> Any:
-        one = object.__new__(made)
-        for name, value in zip((*static_names, *names), (*known, *leaves), strict=True):
-            object.__setattr__(one, name, value)
-        return one
+def register(made: Any, names: tuple[str, ...], static_names: tuple[str, ...]) -> None:
+    """Make a PyTree of a class whose objects have these fields alone: ``names`` are its leaves."""
+
+    def flatten_with_keys(tree: Any) -> tuple[Any, Any]:
+        keyed = tuple((jax.tree_util.GetAttrKey(name), getattr(tree, name)) for name in names)
+        return keyed, tuple(getattr(tree, name) for name in static_names)
+
+    def flatten(tree: Any) -> tuple[Any, Any]:
+        return tuple(getattr(tree, name) for name in names), tuple(getattr(tree, name) for name in static_names)
+
+    def unflatten(others: Any, leaves: Any) -> Any:
+        tree = object.__new__(made)
+        for name, value in zip((*static_names, *names), (*others, *leaves), strict=True):
+            object.__setattr__(tree, name, value)
+        return tree
 
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
-    return made

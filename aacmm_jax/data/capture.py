@@ -17,7 +17,8 @@ from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.text import shorten
 from ..kinematics.arm import Arm, by_joint
 from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
-from .observations.observation import AbstractObservation, checked_name, checked_readings
+from .observations.declared import checked_name, checked_readings
+from .observations.observation import AbstractObservation
 from .observations.socket import Socket
 from .reference_length import ReferenceLength, check_temperatures
 from .visits import checked_visits, visits_of

@@ -62,7 +62,8 @@ def observation_without_copies(observation: AbstractObservation) -> AbstractObse
 def first_of_each(*values: Any) -> list[int]:
     """Numbers of the rows of arrays, or of tuples, that differ from all rows before them."""
     first: dict[tuple[bytes, ...], int] = {}
-    arrays = [np.asarray(value) + 0.0 for value in values]  # which has no negative zero
+    arrays = [np.asarray(value) for value in values]
+    arrays = [array + 0.0 if array.dtype.kind == "f" else array for array in arrays]  # which has no negative zero
     for i, rows in enumerate(zip(*arrays, strict=True)):
         first.setdefault(tuple(row.tobytes() for row in rows), i)
     return list(first.values())

@@ -20,7 +20,8 @@ from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
-from .observations.observation import MOST_POSES, AbstractObservation, AbstractSimulated
+from .observations.observation import AbstractObservation
+from .observations.simulated import MOST_POSES, AbstractSimulated
 from .reference_length import check_temperatures
 
 

@@ -1,6 +1,7 @@
 """What a robot's controller or a program takes of a calibrated arm: tables, zero offsets alone, a Python program."""
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -194,7 +195,8 @@ def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> st
     constants = [f"{name} = [{_row(row, ', ')}]" for name, row in values.items()]
     constants.append(f"PRISMATIC = {by_joint(arm, False, True)}")
     rows = ",\n".join(f"    [{_row(row, ', ')}]" for row in base)
-    return _PROGRAM.format(title=repr(title), base=rows, constants="\n".join(constants))
+    template = Path(__file__).with_name("templates") / "program.txt"
+    return template.read_text("utf-8").format(title=repr(title), base=rows, constants="\n".join(constants))
 
 
 def _row(values: Iterable[float], separator: str = ",") -> str:
@@ -205,37 +207,3 @@ def _row(values: Iterable[float], separator: str = ",") -> str:
 def _placed(transform: Transform, length: float, angle: float, length_unit: str, angle_unit: str) -> str:
     xyz, rpy = length * transform[:3, 3], angle * roll_pitch_yaw(transform[:3, :3])
     return f"x y z = {_row(xyz, ' ')} {length_unit}, roll pitch yaw = {_row(rpy, ' ')} {angle_unit}"
-
-
-_PROGRAM = '''# Written by aacmm_jax. Lengths in mm, angles in rad; readings in rad, or mm of prismatic joints.
-# T_i = Rz(q_i + THETA) Tz(D) Tx(A) Rx(ALPHA) Ry(BETA), or Rz(THETA) Tz(q_i + D) Tx(A) Rx(ALPHA) Ry(BETA) of a prismatic
-# joint; the tip is PROBE in the last frame.
-import numpy as np
-
-TITLE = {title}
-BASE = np.array([
-{base},
-])
-{constants}
-
-
-def pose(q):
-    """The transform (4, 4) of the last frame, with the tip as its origin, at the joint readings q."""
-    transform = BASE.copy()
-    for reading, prismatic, theta, d, a, alpha, beta in zip(q, PRISMATIC, THETA, D, A, ALPHA, BETA):
-        angle, d = (theta, reading + d) if prismatic else (reading + theta, d)
-        (cz, sz), (cx, sx), (cy, sy) = [(np.cos(x), np.sin(x)) for x in (angle, alpha, beta)]
-        turn = np.array([[cz, -sz * cx, sz * sx], [sz, cz * cx, -cz * sx], [0.0, sx, cx]])
-        turn = turn @ np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-        link = np.eye(4)
-        link[:3, :3] = turn
-        link[:3, 3] = a * cz, a * sz, d
-        transform = transform @ link
-    transform[:3, 3] += transform[:3, :3] @ PROBE
-    return transform
-
-
-def position(q):
-    """The tip (3,) at the joint readings q."""
-    return pose(q)[:3, 3]
-'''

@@ -79,7 +79,7 @@ def correction_variables(arm: Arm) -> dict[str, Variable]:
         return {}
     values = np.asarray(arm.coefficients)
     names = list(correction_names(arm)[: len(values)])
-    units = [function.unit for function in arm.corrections.functions.each]
+    units = [function.unit for function in arm.corrections.functions.terms]
     variables = columns(
         "coefficient",
         coefficient=(names, "", "name of the coefficient"),

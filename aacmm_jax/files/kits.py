@@ -1,21 +1,18 @@
-"""Kits of artefacts and instruments as TOML: a table for each thing, made of what its simulation needs.
+"""Kits of artefacts and instruments as TOML: a table for each thing, made of what its simulation declares.
 
-Nothing here depends on a kind: the fields of `data.observations.Simulated...` say what may be stated, in mm and rad.
+Nothing here depends on a kind: the entries of `data.observations.Simulated...` say what may be stated, in mm and rad.
 """
 
-import dataclasses
 import math
 import os
-import typing
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat, NonNegativeInt, PositiveInt, create_model
 
-from .. import data
 from ..core.errors import InputError
-from ..data.observations.observation import AbstractSimulated
+from ..data.observations.declared import Entry
+from ..data.observations.simulated import AbstractSimulated, simulated_kinds
 from ..planning.kit_placement import KitItem
 from .toml import Strict, read_toml
 
@@ -24,41 +21,27 @@ _Numbers = list[FiniteFloat] | list[list[FiniteFloat]]
 _Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 
 
-def simulated_kinds() -> dict[str, type[AbstractSimulated]]:
-    """Everything that can be simulated, by the name of its tables."""
-    found = (getattr(data.observations, name) for name in dir(data.observations))
-    return {one.table: one for one in found if isinstance(one, type) and issubclass(one, AbstractSimulated)}
-
-
-def _stated(annotation: Any) -> Any:
-    """The type of a field in TOML, or None for one that is not stated."""
-    parts = typing.get_args(annotation)
-    if type(None) in parts:
-        (inner,) = (part for part in parts if part is not type(None))
-        found = None if inner is np.ndarray else _stated(inner)
-        return None if found is None else found | None
-    if annotation is np.ndarray:
-        return _Numbers
-    if typing.get_origin(annotation) is dict:
-        return Annotated[dict[str, _Point], Field(min_length=1)]
-    if typing.get_origin(annotation) is tuple:
-        return list[FiniteFloat]
-    return FiniteFloat if annotation is float else annotation
+def _stated(entry: Entry) -> Any:
+    """The type of an entry in TOML, or None for one that is not stated."""
+    if entry.content == "number" and entry.dimensions:
+        return None if "names" in entry.dimensions else _Numbers
+    points = Annotated[dict[str, _Point], Field(min_length=1)]
+    return {"number": FiniteFloat, "count": PositiveInt, "text": str, "truth": bool, "points": points}[entry.content]
 
 
 def _model(kind: type[AbstractSimulated]) -> type[Strict]:
     fields: dict[str, Any] = {
-        "poses": (PositiveInt, _POSES),
+        "name": (str, ...),
         "places": (NonNegativeInt, 0),
         "turned": (Literal["any", "vertical", "not"], "any"),
         "half_angle_deg": (Annotated[float, Field(gt=0, le=180)], 180.0),
         "normal": (_Point, [0.0, 0.0, 1.0]),
     }
-    for field in dataclasses.fields(kind):
-        stated = _stated(field.type)
-        if field.name not in fields and stated is not None:
-            missing = field.default is dataclasses.MISSING
-            fields[field.name] = (stated, ...) if missing else (stated | None, None)
+    for entry in kind.entries:
+        stated = _stated(entry)
+        if stated is not None:
+            fields[entry.name] = (stated, ...) if entry.required else (stated | None, None)
+    fields["poses"] = (PositiveInt, _POSES)
     return create_model(f"{kind.__name__}Table", __base__=Strict, **fields)
 
 
@@ -121,9 +104,8 @@ def _checked(
 ) -> AbstractSimulated:
     """The simulated observation, tried once: shapes that do not fit are an `InputError`."""
     where = f"{path}: [[{table}]] '{stated['name']}'"
-    constructor: Any = kind
     try:
-        simulated = constructor(**{name: _hashable(value) for name, value in stated.items()})
+        simulated = kind(**stated)
         random = np.random.default_rng(0)
         tips = simulated.tips(random)
         if tips.ndim != 2 or tips.shape[1] != 3 or not np.all(np.isfinite(tips)):
@@ -139,14 +121,3 @@ def _checked(
             f"numbers (see aj.data.observations.{kind.__name__})."
         ) from error
     return simulated
-
-
-def _hashable(value: Any) -> Any:
-    """Points of an artefact as the constructor keeps them."""
-    if isinstance(value, dict):
-        return {name: tuple(point) for name, point in value.items()}
-    return value if not isinstance(value, Sequence) or isinstance(value, str) else _tuples(value)
-
-
-def _tuples(value: Sequence[Any]) -> tuple[Any, ...]:
-    return tuple(_tuples(one) if isinstance(one, Sequence) else one for one in value)

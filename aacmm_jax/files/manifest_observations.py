@@ -13,7 +13,8 @@ import numpy as np
 from ..core.errors import InputError, nearest
 from ..core.text import quoted, shorten
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
-from ..data.observations.observation import AbstractObservation, Entry
+from ..data.observations.declared import Entry
+from ..data.observations.observation import AbstractObservation
 from .header_lines import Column
 from .inputs import InputFile
 from .manifest_sessions import session_name

@@ -15,10 +15,10 @@ from pydantic import (
     model_validator,
 )
 
-from ..data.observations.observation import AbstractObservation, Entry
+from ..data.observations.declared import Entry
+from ..data.observations.observation import AbstractObservation, kinds
 from ..data.observations.socket import Socket
 from .header_lines import Column
-from .observation_kinds import kinds
 from .toml import Strict, each_once
 
 NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}

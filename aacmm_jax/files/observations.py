@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..data.observations.observation import READINGS, AbstractObservation
+from ..data.observations.observation import AbstractObservation, kinds
 from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering
-from .observation_kinds import kinds
 from .temperatures import reading_variables, readings_of
 
 _PREFIX = "observation_"
@@ -35,7 +34,7 @@ def _table(observation: AbstractObservation, joints: int, unit: str) -> Table:
         if not entry.dimensions:
             attributes[_attribute(entry.name, entry.unit)] = value.item()
             continue
-        if entry is READINGS:
+        if entry.name == "q":
             variables |= reading_variables(entry.name, value, joints, unit)
             continue
         variables[entry.name] = Variable(entry.dimensions, value, entry.unit, entry.says)
@@ -76,7 +75,7 @@ def _observation(
         )
     values: dict[str, Any] = {}
     for entry in kind.entries:
-        if entry is READINGS and entry.name in table:
+        if entry.name == "q" and entry.name in table:
             values[entry.name] = readings_of(table, entry.name)
             continue
         found = table.get(entry.name) if entry.dimensions else attributes.get(_attribute(entry.name, entry.unit))

@@ -2,8 +2,11 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
+from functools import reduce
+from pathlib import Path
 from typing import NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +14,7 @@ from jaxtyping import Float
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw
-from ..core.text import quoted
+from ..core.text import quoted, shorten
 from ..kinematics.arm import Arm, arm_of
 from ..kinematics.axes_to_dh import (
     Axes,
@@ -29,10 +32,11 @@ from ..kinematics.parameters import ArmSpecification, UrdfSource, single, with_t
 from .atomic_write import write_text
 from .inputs import InputFile
 from .urdf_text import Robot, UrdfJoint, edited, parse_urdf
-from .urdf_tree import base_and_tip, check_moving, joints_between
 
 _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readings of -pi to pi and of 0 to 2 pi
 _LONGEST = 50_000.0  # mm; no serial chain is as long
+_LARGEST, _IN_DEGREES = 15.0, 720.0  # rad: limits of joints end below; those in degrees are mostly between
+_LISTED = 12  # links that a message names
 
 
 class UrdfChain(NamedTuple):
@@ -60,6 +64,20 @@ class UrdfChain(NamedTuple):
     def tip(self) -> Transform:
         """The tip link in the frame of the last joint, mm."""
         return self.tip_before if self.tip_joint is None else self.tip_before @ self.tip_joint.origin
+
+    def carried_links(self, base: str) -> Iterator[tuple[int, str, Transform]]:
+        """The links that the base link (0) and each joint carry up to the next joint, side branches included: number of
+        the joint, name of the link, and its frame in the base link at reading 0."""
+        stops, frame = {joint.name for joint in self.joints}, np.eye(4)
+        starts = [base, *(joint.child for joint in self.joints)]
+        for number, (start, origin) in enumerate(zip(starts, [np.eye(4), *self.origins], strict=True)):
+            frame = frame @ origin
+            waiting = [(start, frame)]
+            while waiting:
+                link, link_frame = waiting.pop()
+                yield number, link, link_frame
+                after = (joint for joint in self.robot.joints.values() if joint.parent == link)
+                waiting += [(joint.child, link_frame @ joint.origin) for joint in after if joint.name not in stops]
 
 
 class LinkMasses(NamedTuple):
@@ -103,12 +121,10 @@ def read_urdf(
         except UnicodeDecodeError as error:
             raise InputError("it is not text in UTF-8; save it as UTF-8.") from error
         robot = parse_urdf(text)
-        base, tip = base_and_tip(robot, base, tip)
-        source = UrdfSource(text, base, tip)
+        base = _base(robot, base, tip)
+        source = UrdfSource(text, base, _tip(robot, base, tip))
         arm = urdf_chain(source).arm
-        if probe is not None:
-            arm = with_tool(arm, probe)
-        return ArmSpecification(arm, _name(file), urdf=source)
+        return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -130,16 +146,18 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
         [750.   0. 300.] mm
     """
     robot = parse_urdf(source.text)
-    joints, before, waiting = [], [], np.eye(4)
-    path = joints_between(robot, source.base, source.tip)
+    path = _joints_between(robot, source.base, source.tip)
+    joints, before, frames, frame, fixed = [], [], [], np.eye(4), np.eye(4)
     for joint in path:
         if joint.kind == "fixed":
-            waiting = waiting @ joint.origin
+            fixed = fixed @ joint.origin
             continue
-        check_moving(joint)
+        _check_moving(joint)
+        frame = frame @ fixed @ joint.origin
         joints.append(joint)
-        before.append(waiting)
-        waiting = np.eye(4)
+        before.append(fixed)
+        frames.append(frame)
+        fixed = np.eye(4)
     if not joints:
         raise InputError(f"no joint moves between {quoted(source.base)} and {quoted(source.tip)}; name other links.")
     length = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in path)
@@ -148,19 +166,16 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
             f"the chain from {quoted(source.base)} to {quoted(source.tip)} is {length / 1000:,.0f} m long, as if its "
             "lengths were in mm; a URDF is in m, so divide them by 1000."
         )
-    last = path[-1] if path[-1].kind == "fixed" else None
-    tip_before = _product([joint.origin for joint in path[path.index(joints[-1]) + 1 : len(path) - (last is not None)]])
-    frames, frame = [], np.eye(4)
-    for fixed, joint in zip(before, joints, strict=True):
-        frame = frame @ fixed @ joint.origin
-        frames.append(frame)
-    tip = frame @ tip_before if last is None else frame @ tip_before @ last.origin
+    *after, last = path[path.index(joints[-1]) :]
+    tip_joint = last if last.kind == "fixed" else None
+    tip_before = reduce(np.matmul, [joint.origin for joint in after[1:]], np.eye(4))
+    tip = frame @ tip_before if tip_joint is None else frame @ tip_before @ tip_joint.origin
     directions = np.array([frame[:3, :3] @ joint.axis for frame, joint in zip(frames, joints, strict=True)])
     base, geometry = dh_of_axes(Axes(directions, np.array([frame[:3, 3] for frame in frames]), tip))
     limits = [_REVOLUTION if joint.kind == "continuous" else joint.limits or _REVOLUTION for joint in joints]
     prismatic = tuple(joint.kind == "prismatic" for joint in joints)
     arm = arm_of(geometry._replace(kinds=JointKinds(prismatic) if any(prismatic) else None), limits)
-    return UrdfChain(arm, base, robot, tuple(joints), tuple(before), tip_before, last)
+    return UrdfChain(arm, base, robot, tuple(joints), tuple(before), tip_before, tip_joint)
 
 
 def link_masses(chain: UrdfChain) -> LinkMasses:
@@ -177,26 +192,16 @@ def link_masses(chain: UrdfChain) -> LinkMasses:
         >>> print(aj.files.link_masses(chain).mass, "kg")
         [4.  3.  1.5] kg
     """
-    frames, frame = dh_frames(geometry_of(chain.arm), chain.base)[1:], np.eye(4)
-    mass, centre = np.zeros(len(chain.joints)), np.zeros((len(chain.joints), 3))
-    stops = {joint.name for joint in chain.joints}
-    for i, (origin, joint) in enumerate(zip(chain.origins, chain.joints, strict=True)):
-        frame = frame @ origin
-        waiting = [(joint.child, frame)]
-        moment = np.zeros(3)
-        while waiting:
-            name, at = waiting.pop()
-            link = chain.robot.links[name]
-            if link.mass and link.centre is not None:
-                mass[i] += link.mass
-                moment += link.mass * (at[:3, :3] @ link.centre + at[:3, 3])
-            waiting += [
-                (other.child, at @ other.origin)
-                for other in chain.robot.joints.values()
-                if other.parent == name and other.name not in stops
-            ]
+    mass, moment = np.zeros(len(chain.joints)), np.zeros((len(chain.joints), 3))
+    for number, name, frame in chain.carried_links(chain.joints[0].parent):
+        link = chain.robot.links[name]
+        if number and link.mass and link.centre is not None:
+            mass[number - 1] += link.mass
+            moment[number - 1] += link.mass * (frame[:3, :3] @ link.centre + frame[:3, 3])
+    centre = np.zeros_like(moment)
+    for i, frame in enumerate(dh_frames(geometry_of(chain.arm), chain.base)[1:]):
         if mass[i]:
-            centre[i] = frames[i][:3, :3].T @ (moment / mass[i] - frames[i][:3, 3])
+            centre[i] = frame[:3, :3].T @ (moment[i] / mass[i] - frame[:3, 3])
     return LinkMasses(mass, centre)
 
 
@@ -222,7 +227,9 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
         ('bend',) flange
     """
     if nominal.urdf is None:
-        raise InputError("the nominal arm was not read from a URDF, so there is none to write; choose --format toml.")
+        raise InputError(
+            "the nominal arm was not read from a URDF, so a URDF cannot be exported; choose --format toml."
+        )
     chain = urdf_chain(nominal.urdf)
     if single(arm).joints != len(chain.joints):
         raise InputError(
@@ -235,15 +242,15 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     for joint, fixed, old, new in zip(chain.joints, chain.before, nominal_origins, frames, strict=True):
         frame = frame @ new
         if new is not old:
-            origins[joint.name] = _written(inverse(fixed) @ new, joint.origin)
+            origins[joint.name] = _changed_attributes(inverse(fixed) @ new, joint.origin)
     tip = tip_frame(after, chain.base)
     tool = np.asarray(nominal.arm.probe) - np.asarray(chain.arm.probe)
     has_tool = bool(np.linalg.norm(tool) > 1e-9)
     # A tool is no part of the file: the tip link then follows the last D-H frame alone.
     link = tip_frame(after._replace(probe=before.probe), chain.base) if has_tool else tip
     if chain.tip_joint is not None and not same_transform(frame @ chain.tip, link):
-        moved = inverse(frame @ chain.tip_before) @ link
-        origins[chain.tip_joint.name] = _written(moved, chain.tip_joint.origin)
+        new = inverse(frame @ chain.tip_before) @ link
+        origins[chain.tip_joint.name] = _changed_attributes(new, chain.tip_joint.origin)
     elif chain.tip_joint is None:
         link = frame @ chain.tip
     name, added, notes = nominal.urdf.tip, "", ()
@@ -276,45 +283,129 @@ def save_urdf(arm: Arm, path: str | os.PathLike, *, nominal: ArmSpecification) -
     return exported
 
 
-def _product(transforms: Sequence[Transform]) -> Transform:
-    result = np.eye(4)
-    for transform in transforms:
-        result = result @ transform
-    return result
-
-
-def _name(file: InputFile) -> str:
-    return os.path.splitext(os.path.basename(os.fspath(file)))[0]
-
-
-def _written(new: Transform, old: Transform) -> tuple[str | None, str | None]:
+def _changed_attributes(new: Transform, old: Transform) -> tuple[str | None, str | None]:
     """xyz in m and rpy in rad with all digits; None where the file's own text says the same."""
-    middle = old.copy()
-    middle[:3, 3] = new[:3, 3]
-    xyz = None if same_transform(middle, old) else _digits(new[:3, 3] / 1000)
-    rpy = None if same_transform(middle, new) else _digits(roll_pitch_yaw(new[:3, :3]))
+    shifted = old.copy()
+    shifted[:3, 3] = new[:3, 3]
+    xyz, rpy = _attributes(new)
+    return None if same_transform(shifted, old) else xyz, None if same_transform(shifted, new) else rpy
+
+
+def _attributes(transform: Transform) -> tuple[str, str]:
+    values = transform[:3, 3] / 1000, roll_pitch_yaw(transform[:3, :3])
+    xyz, rpy = (" ".join(repr(float(value) + 0.0) for value in three) for three in values)  # -0.0 becomes 0.0
     return xyz, rpy
 
 
-def _digits(values: Float[np.ndarray, " 3"]) -> str:
-    return " ".join(repr(float(value) + 0.0) for value in values)  # -0.0 becomes 0.0
-
-
 def _added_link(robot: Robot, tip: str, transform: Transform) -> tuple[str, str]:
-    from xml.sax.saxutils import quoteattr
-
-    name = next(
-        name
-        for name in (f"{tip}_probe{suffix}" for suffix in ("", *range(2, 1000)))
-        if name not in robot.links and f"{name}_joint" not in robot.joints
+    names = (f"{tip}_probe{suffix}" for suffix in ("", *range(2, 1000)))
+    name = next(name for name in names if name not in robot.links and f"{name}_joint" not in robot.joints)
+    xyz, rpy = _attributes(transform)
+    return name, (
+        f"  <link name={quoteattr(name)}/>\n"
+        f'  <joint name={quoteattr(name + "_joint")} type="fixed">\n'
+        f"    <parent link={quoteattr(tip)}/>\n"
+        f"    <child link={quoteattr(name)}/>\n"
+        f'    <origin xyz="{xyz}" rpy="{rpy}"/>\n'
+        "  </joint>\n"
     )
-    xyz, rpy = _digits(transform[:3, 3] / 1000), _digits(roll_pitch_yaw(transform[:3, :3]))
-    lines = [
-        f"  <link name={quoteattr(name)}/>",
-        f'  <joint name={quoteattr(name + "_joint")} type="fixed">',
-        f"    <parent link={quoteattr(tip)}/>",
-        f"    <child link={quoteattr(name)}/>",
-        f'    <origin xyz="{xyz}" rpy="{rpy}"/>',
-        "  </joint>",
-    ]
-    return name, "".join(f"{line}\n" for line in lines)
+
+
+def _check_moving(joint: UrdfJoint) -> None:
+    """Refuse a joint that an arm does not have."""
+    what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
+    if joint.kind not in ("revolute", "continuous", "prismatic"):
+        known = joint.kind in ("floating", "planar")
+        kind = f"is {joint.kind}" if known else f"has the unknown type {quoted(joint.kind)}"
+        raise InputError(f"{what} {kind}, which is no joint of an arm; name links without it between them.")
+    if joint.mimics is not None:
+        raise InputError(
+            f"{what} mimics {quoted(joint.mimics)}, so it has no reading; name links without it between them."
+        )
+    if joint.axis is None:
+        raise InputError(f"{what} has an axis of length 0; correct its <axis xyz=...>.")
+    if joint.kind == "continuous":
+        return
+    unit, factor, other = ("m", 1e-3, "") if slides else ("rad", 1.0, ', or type="continuous"')
+    limits = [f"{factor * limit:g}" for limit in joint.limits or ()]
+    if joint.limits is None or not joint.limits[0] < joint.limits[1]:
+        state = f"has the limits {' and '.join(limits)} {unit}" if limits else "has no limits"
+        raise InputError(
+            f"{what} is {joint.kind} and {state}; give it <limit lower=... upper=...> in {unit}, the lower below the "
+            f"upper{other}."
+        )
+    if not slides and _LARGEST < max(map(abs, joint.limits)) <= _IN_DEGREES:
+        raise InputError(
+            f"{what} has the limits {' and '.join(limits)} rad, as if in degrees; a URDF is in rad, so convert them."
+        )
+
+
+def _joints_before(robot: Robot, link: str) -> list[UrdfJoint]:
+    """The joints from a link back to the root."""
+    joints: list[UrdfJoint] = []
+    while link in robot.joint_before:
+        if len(joints) > len(robot.joint_before):
+            raise InputError(f"the joints before link {quoted(link)} form a circle; a URDF is a tree, so correct it.")
+        joints.append(robot.joint_before[link])
+        link = joints[-1].parent
+    return joints
+
+
+def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
+    """The joints from base to tip."""
+    back = _joints_before(robot, tip)
+    parents = [joint.parent for joint in back]
+    if base in parents:
+        return back[: parents.index(base) + 1][::-1]
+    if base == tip:
+        raise InputError(f"base and tip are the same link, {quoted(base)}; name two.")
+    other = [joint.parent for joint in _joints_before(robot, base)]
+    if tip in other:
+        raise InputError(f"{quoted(base)} comes after {quoted(tip)}, not before it; exchange base and tip.")
+    common = next((link for link in other if link in parents), None)
+    if common is None:
+        raise InputError(f"there is no chain of joints from {quoted(base)} to {quoted(tip)}; name links of one arm.")
+    raise InputError(
+        f"{quoted(base)} and {quoted(tip)} are on two branches that part at {quoted(common)}; name that as the base, "
+        "or a tip on the branch of the base."
+    )
+
+
+def _base(robot: Robot, base: str | None, tip: str | None) -> str:
+    """The base link that is named, else the root."""
+    for what, link in (("base", base), ("tip", tip)):
+        if link is not None and link not in robot.links:
+            raise InputError(f"there is no link {quoted(link)} for the {what}; its links are {_listed(robot.links)}.")
+    if base is not None:
+        return base
+    if tip is not None and (back := _joints_before(robot, tip)):
+        return back[-1].parent
+    roots = [link for link in robot.links if link not in robot.joint_before]
+    if not robot.links:
+        raise InputError("it has no <link>; name the URDF of a robot.")
+    if not roots:
+        raise InputError("every link has a joint before it, in a circle; a URDF is a tree, so correct it.")
+    if len(roots) > 1:
+        raise InputError(f"it has {len(roots)} roots, {_listed(roots)}; name the base (base= or --base).")
+    return roots[0]
+
+
+def _tip(robot: Robot, base: str, tip: str | None) -> str:
+    """The tip link that is named, else the only end of a chain that moves."""
+    if tip is not None:
+        return tip
+    tips, inner = [], {joint.parent for joint in robot.joints.values()}
+    for link in (link for link in robot.links if link not in inner):
+        back = _joints_before(robot, link)
+        parents = [joint.parent for joint in back]
+        if base in parents and any(joint.kind != "fixed" for joint in back[: parents.index(base) + 1]):
+            tips.append(link)
+    if not tips:
+        raise InputError(f"no joint after {quoted(base)} moves; name another base (base= or --base).")
+    if len(tips) > 1:
+        raise InputError(f"its chains end at {_listed(tips)}; name the tip (tip= or --tip).")
+    return tips[0]
+
+
+def _listed(links: Iterable[str]) -> str:
+    return shorten([quoted(link) for link in links], _LISTED)

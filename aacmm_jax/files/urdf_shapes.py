@@ -1,24 +1,26 @@
-"""The body of an arm from the collision shapes of its URDF, each within one capsule."""
+"""The body of an arm from the collision shapes of its URDF, each within one capsule; of meshes, the vertices count."""
 
 import math
-from collections.abc import Iterator
-from itertools import product
+import os
+import re
+from itertools import combinations, product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.errors import InputError
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
 from ..kinematics.body import Body, body_along_links
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.segment_distances import segment_distance
-from .mesh_vertices import mesh_path, mesh_vertices
-from .urdf import UrdfChain, urdf_chain
+from .inputs import InputFile
+from .urdf import urdf_chain
 from .urdf_text import UrdfShape, collision_shapes
 
 _CENTRING = 60  # steps to the middle of the smallest circle
+_HEADER, _TRIANGLE = 84, 50  # bytes of a binary STL: before the triangles, and of each
 
 
 class UrdfBody(NamedTuple):
@@ -59,8 +61,8 @@ def urdf_body(specification: ArmSpecification, folder: Path, radius: float) -> U
     Example:
         >>> from pathlib import Path
         >>> robot = aj.files.load_specification("robot.urdf")
-        >>> found = aj.files.urdf_body(robot, Path("."), 40.0)
-        >>> print(found.body.names, found.body.radius.round(1), "mm")
+        >>> body = aj.files.urdf_body(robot, Path("."), 40.0).body
+        >>> print(body.names, body.radius.round(1), "mm")
         ('shoulder', 'upper_arm', 'forearm') [60.  56.6 42.4] mm
     """
     if specification.urdf is None:
@@ -69,78 +71,54 @@ def urdf_body(specification: ArmSpecification, folder: Path, radius: float) -> U
     frames = dh_frames(geometry_of(chain.arm), chain.base)
     rows: list[_Row] = []
     missing: dict[int, str] = {}
-    for frame, link, at in _links(chain, specification.urdf.base):
-        for number, shape in enumerate(shapes.get(link, ())):
-            capsule = _capsule(shape, inverse(frames[frame]) @ at @ shape.origin, folder)
+    for number, link, link_frame in chain.carried_links(specification.urdf.base):
+        for count, shape in enumerate(shapes.get(link, ()), start=1):
+            capsule = _capsule(shape, inverse(frames[number]) @ link_frame @ shape.origin, folder)
             if capsule is None:
-                missing[frame] = link
+                missing[number] = link
                 continue
             start, end, width = capsule
-            name = f"{link}/{number + 1}" if len(shapes[link]) > 1 else link
-            rows.append(_Row(name, frame, start, frame, end, width))
+            name = f"{link}/{count}" if len(shapes[link]) > 1 else link
+            rows.append(_Row(name, number, start, number, end, width))
     if not rows and not missing:
         return None
-    simple, known = body_along_links(specification.arm, radius), {row.end_frame for row in rows}
+    simple, with_shape = body_along_links(specification.arm, radius), {row.end_frame for row in rows}
     tool = np.linalg.norm(np.asarray(specification.arm.probe) - np.asarray(chain.arm.probe)) > 0
     rows = [row for row in rows if not any(_holds(other, row) for other in rows)]
     for row in map(_Row._make, zip(*simple[:-1], strict=True)):
-        if (row.name == "probe" and tool) or (row.end_frame in missing and row.end_frame not in known):
+        if (row.name == "probe" and tool) or (row.end_frame in missing and row.end_frame not in with_shape):
             rows.append(row)
-    notes = tuple(
-        f"meshes of {', '.join(links)} are not at hand as STL or OBJ; {instead}."
-        for links, instead in (
-            ([link for frame, link in missing.items() if frame not in known], "capsules about their D-H rows are used"),
-            ([link for frame, link in missing.items() if frame in known], "their joints' other shapes are used alone"),
-        )
-        if links
-    )
     rows.sort(key=lambda row: row.end_frame)
-    start_frame, start, end_frame, end, width = (np.array(column) for column in list(zip(*rows, strict=True))[1:])
-    # Links that follow each other touch at their joint; what carries no shape is left out of the count.
-    rank = np.unique(end_frame, return_inverse=True)[1]
-    names = tuple(row.name for row in rows)
+    notes = []
+    for partly, instead in (
+        (False, "capsules about their D-H rows are used"),
+        (True, "their joints' other shapes are used alone"),
+    ):
+        if links := [link for frame, link in missing.items() if (frame in with_shape) == partly]:
+            notes.append(f"meshes of {', '.join(links)} are not at hand as STL or OBJ; {instead}.")
+    names, *columns = zip(*rows, strict=True)
+    return UrdfBody(Body(names, *map(np.array, columns), pairs=_pairs(rows, simple)), tuple(notes))
+
+
+def _pairs(rows: list[_Row], simple: Body) -> Int[np.ndarray, "m 2"]:
+    """The capsules that may not touch: not of one or successive links, of which those without a shape do not count."""
+    rank = np.unique([row.end_frame for row in rows], return_inverse=True)[1]
     checked = {frozenset((simple.names[i], simple.names[j])) for i, j in simple.pairs}
-    pairs = [
-        (i, j)
-        for i in range(len(rows))
-        for j in range(i + 1, len(rows))
-        if rank[j] - rank[i] > 1
-        and (not {names[i], names[j]} <= set(simple.names) or frozenset((names[i], names[j])) in checked)
-    ]
-    return UrdfBody(
-        Body(names, start_frame, start, end_frame, end, width, np.array(pairs, dtype=int).reshape(-1, 2)), notes
-    )
+    pairs = []
+    for i, j in combinations(range(len(rows)), 2):
+        names = {rows[i].name, rows[j].name}
+        if rank[j] - rank[i] > 1 and (not names <= set(simple.names) or names in checked):
+            pairs.append((i, j))
+    return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
-def _holds(one: _Row, other: _Row) -> bool:
+def _holds(outer: _Row, inner: _Row) -> bool:
     """Whether a capsule of a frame holds another one, as the cylinder of a capsule the balls at its ends."""
-    if one is other or one.end_frame != other.end_frame or one.radius < other.radius:
+    if outer is inner or outer.end_frame != inner.end_frame or outer.radius < inner.radius:
         return False
-    gaps = (
-        segment_distance(one.start[:, None], one.end[:, None], end[:, None], end[:, None])[0]
-        for end in (other.start, other.end)
-    )
-    return bool(max(gaps) + other.radius <= one.radius + 1e-6)
-
-
-def _links(chain: UrdfChain, base: str) -> Iterator[tuple[int, str, Transform]]:
-    """The links that each joint carries up to the next one: number of the joint, name, and frame in the base link."""
-    stops = {joint.name for joint in chain.joints}
-    frame = np.eye(4)
-    starts = [(0, base, frame)]
-    for number, (origin, joint) in enumerate(zip(chain.origins, chain.joints, strict=True), start=1):
-        frame = frame @ origin
-        starts.append((number, joint.child, frame))
-    for number, link, at in starts:
-        waiting = [(link, at)]
-        while waiting:
-            name, place = waiting.pop()
-            yield number, name, place
-            waiting += [
-                (joint.child, place @ joint.origin)
-                for joint in chain.robot.joints.values()
-                if joint.parent == name and joint.name not in stops
-            ]
+    start, end = outer.start[:, None], outer.end[:, None]
+    gaps = [segment_distance(start, end, point[:, None], point[:, None])[0] for point in (inner.start, inner.end)]
+    return bool(max(gaps) + inner.radius <= outer.radius + 1e-6)
 
 
 def _capsule(shape: UrdfShape, frame: Transform, folder: Path) -> tuple[np.ndarray, np.ndarray, float] | None:
@@ -169,8 +147,13 @@ def bounding_capsule(points: Float[np.ndarray, "m 3"]) -> tuple[np.ndarray, np.n
     """
     centred = points - points.mean(axis=0)
     axes = np.concatenate([np.linalg.eigh(centred.T @ centred)[1].T, np.eye(3)])
-    found = (_capsule_along(points, axis) for axis in axes)
-    return min(found, key=lambda one: one[2] ** 2 * (np.linalg.norm(one[1] - one[0]) + 4 / 3 * one[2]))
+    capsules = (_capsule_along(points, axis) for axis in axes)
+
+    def volume(capsule: tuple) -> float:
+        start, end, radius = capsule
+        return radius**2 * (np.linalg.norm(end - start) + 4 / 3 * radius)
+
+    return min(capsules, key=volume)
 
 
 def _capsule_along(points: Float[np.ndarray, "m 3"], axis: Float[np.ndarray, " 3"]) -> tuple:
@@ -191,3 +174,53 @@ def _capsule_along(points: Float[np.ndarray, "m 3"], axis: Float[np.ndarray, " 3
         low = high = (low + high) / 2
         radius = np.linalg.norm(points - (best + low * axis), axis=1).max()
     return best + low * axis, best + high * axis, float(radius)
+
+
+def mesh_path(file: str, folder: Path) -> Path | None:
+    """The file that a URDF in a folder names, or None where it is not at hand.
+
+    ``package://NAME/...`` is looked for beside the folder and its parents, as packages are laid out.
+    """
+    if file.startswith("package://"):
+        package, _, rest = file.removeprefix("package://").partition("/")
+        whole = folder.absolute()
+        tried = [place for parent in (whole, *whole.parents) for place in (parent / package / rest,)]
+        tried += [parent / rest for parent in (whole, *whole.parents) if parent.name == package]
+    else:
+        # In a URL, a slash stands before the letter of a drive: file:///C:/arm.stl.
+        tried = [folder / re.sub(r"^/(?=[A-Za-z]:)", "", file.removeprefix("file://"))]
+    return next((path for path in tried if path.is_file()), None)
+
+
+def mesh_vertices(path: str | os.PathLike) -> Float[np.ndarray, "m 3"]:
+    """The vertices of an STL (binary or text) or OBJ file, in the file's own unit.
+
+    Raises:
+        InputError: It is of another format, or holds no vertices.
+    """
+    content, suffix = InputFile(path).content, os.path.splitext(os.fspath(path))[1].lower()
+    try:
+        if suffix == ".obj":
+            vertices = _numbers_after(content, b"v")
+        elif suffix == ".stl":
+            vertices = _of_stl(content)
+        else:
+            raise InputError(f"{path} is neither STL nor OBJ; export the mesh as one of them.")
+    except ValueError as error:
+        raise InputError(f"{path} has a vertex that is not three numbers; export the mesh again.") from error
+    if not len(vertices) or not np.all(np.isfinite(vertices)):
+        raise InputError(f"{path} has no vertices, or some that are not finite; export the mesh again.")
+    return np.unique(vertices, axis=0)
+
+
+def _of_stl(content: bytes) -> Float[np.ndarray, "m 3"]:
+    count = int.from_bytes(content[_HEADER - 4 : _HEADER], "little")
+    if len(content) == _HEADER + count * _TRIANGLE:  # also of binary files whose header begins with "solid"
+        triangles = np.frombuffer(content, dtype=np.uint8, offset=_HEADER).reshape(count, _TRIANGLE)
+        return triangles[:, 12:48].copy().view("<f4").reshape(-1, 3).astype(float)
+    return _numbers_after(content, b"vertex")
+
+
+def _numbers_after(content: bytes, word: bytes) -> Float[np.ndarray, "m 3"]:
+    rows = (line.split() for line in content.splitlines())
+    return np.array([[float(x) for x in row[1:4]] for row in rows if row and row[0] == word]).reshape(-1, 3)

@@ -1,27 +1,122 @@
-"""The text of a URDF: its joints and links with their places in it, and edits that leave everything else as it is.
+"""The text of a URDF: joints, links and collision shapes with their places, and edits that leave all else as it is.
 
 The format's specification: wiki.ros.org/urdf/XML. Only direct children of ``<robot>`` count, since transmissions,
-controllers and simulators have elements of the same names. A document type is refused: its entities could name other
-files, or grow to any size.
+controllers and simulators have elements of the same names.
+
+A misspelt ``<origin>`` or ``xyz=`` would count as one that is missing, and the arm would silently be another one. So
+in elements that are read, names that nearly are, or elsewhere are, those of the format are refused, and in those
+without room for other tools' data every other name as well. Names with a prefix (``drake:...``) pass.
+
+The parser is expat: it says where each tag is in bytes, which edits need, and in which line, which messages need. A
+document type is refused: its entities could name other files, or grow to any size.
 """
 
+import difflib
 import re
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
+from xml.parsers import expat
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import InputError
+from ..core.errors import InputError, nearest
 from ..core.rotations import roll_pitch_yaw_matrix
 from ..core.text import is_control, number, quoted
 from ..kinematics.axes_to_dh import Transform
-from .urdf_elements import Element, Place, elements
 
+_MOST_CHARACTERS = 20_000_000  # the largest robots of public collections have a twentieth of it
+_DEEPEST = 64  # levels of elements; a URDF has six
+_ALIKE = 0.7  # of difflib: one wrong, missing, exchanged or repeated letter in four
 _LARGEST = 1e6  # m and rad, of positions, angles and directions
 _LARGEST_ANGLE = 6.3  # rad, of roll, pitch and yaw: one revolution
 _METRE = 1000.0  # mm
+_EXPAND = "so it is a xacro file; expand it with 'xacro FILE.xacro > FILE.urdf' and name that."
+
+
+class _Names(NamedTuple):
+    """The names in an element that is read, divided by blanks."""
+
+    attributes: str = ""
+    once: str = ""  # children, of each at most one
+    often: str = ""
+    others: bool = False  # whether names that are not like these pass
+
+
+_NAMES = {
+    "robot": _Names("", "", "joint link", others=True),
+    "link": _Names("name", "inertial", "collision origin", others=True),  # an origin there means nothing
+    "joint": _Names("name type", "origin parent child axis limit mimic", others=True),
+    "origin": _Names("xyz rpy"),
+    "parent": _Names("link"),
+    "child": _Names("link"),
+    "axis": _Names("xyz"),
+    "limit": _Names("lower upper", others=True),
+    "mimic": _Names("joint multiplier offset"),
+    "inertial": _Names("", "origin mass inertia"),
+    "mass": _Names("value"),
+    "collision": _Names("name", "origin geometry", others=True),
+    "geometry": _Names("", "", "box cylinder sphere mesh", others=True),
+    "box": _Names("size"),
+    "cylinder": _Names("radius length"),
+    "sphere": _Names("radius"),
+    "mesh": _Names("filename scale"),
+}
+
+
+class Place(NamedTuple):
+    """Where a start tag is in the text, as bytes of its UTF-8."""
+
+    start: int
+    end: int
+
+
+class Element(NamedTuple):
+    """An element that is read, with those inside it."""
+
+    name: str
+    attributes: dict[str, str]
+    words: str  # what messages call it
+    line: int
+    place: Place
+    children: list["Element"]
+
+    @property
+    def where(self) -> str:
+        """Its line and name, as messages begin."""
+        return f"line {self.line}: {self.words}"
+
+    def child(self, name: str) -> "Element | None":
+        """The first child of a name."""
+        return next((child for child in self.children if child.name == name), None)
+
+    def text(self, name: str) -> str:
+        """An attribute that must be there."""
+        value = self.attributes.get(name, "")
+        if not value:
+            raise InputError(f"{self.where} has no {name}; add it.")
+        if any(map(is_control, value)):
+            raise InputError(f"{self.where} has a control character in its {name}; take it out.")
+        return value
+
+    def numbers(self, name: str, default: tuple[float, ...]) -> Float[np.ndarray, " k"]:
+        """The numbers of an attribute, as many as by default."""
+        text = self.attributes.get(name)
+        if text is None:
+            return np.array(default)
+        stated = f"{self.where} has {name} = {quoted(text)}"
+        if "${" in text or "$(" in text:
+            raise InputError(f"{stated}, {_EXPAND}")
+        try:
+            values = np.array([number(part) for part in text.split()])
+        except ValueError:
+            values = np.array([])
+        if len(default) == 3 and np.any(np.abs(values) >= _LARGEST):  # limits may be as large as one likes
+            raise InputError(f"{stated}; it must be below {_LARGEST:g}.")
+        if len(values) != len(default) or not np.all(np.isfinite(values)):
+            raise InputError(f"{stated}; it must be {'a number' if len(default) == 1 else f'{len(default)} numbers'}.")
+        return values
 
 
 class UrdfJoint(NamedTuple):
@@ -61,6 +156,7 @@ class Robot(NamedTuple):
 
     joints: dict[str, UrdfJoint]
     links: dict[str, UrdfLink]
+    joint_before: dict[str, UrdfJoint]  # by link the joint that it is the child of
     end: int  # where </robot> begins, as bytes of the text in UTF-8
 
 
@@ -72,24 +168,29 @@ def parse_urdf(text: str) -> Robot:
         text: The whole file.
 
     Raises:
-        InputError: It is no XML or no URDF, a value is no number, or a name is unknown, missing or there twice.
+        InputError: It is no XML or no URDF, a value is not a number, or a name is unknown, missing or there twice.
     """
-    root, end = elements(text)
-    joints, links = {}, {}
+    root, end = _parsed(text)
+    joints, links, before = {}, {}, {}
     for element in root.children:
-        if element.name in ("joint", "link"):
-            name = _attribute(element, "name", f"a {element.name}")
-            found = joints if element.name == "joint" else links
-            if name in found:
-                raise InputError(f"line {element.line}: {element.name} {quoted(name)} is there twice; rename one.")
-            found[name] = (_joint if element.name == "joint" else _link)(element, name)
+        items, read = (joints, _joint) if element.name == "joint" else (links, _link)
+        name = element.text("name")
+        if name in items:
+            raise InputError(f"{element.where} is there twice; rename one.")
+        items[name] = read(element, name)
     for joint in joints.values():
         for link in (joint.parent, joint.child):
             if link not in links:
                 raise InputError(
                     f"joint {quoted(joint.name)} names the link {quoted(link)}, which is not there; add it."
                 )
-    return Robot(joints, links, end)
+        if joint.child in before:
+            raise InputError(
+                f"link {quoted(joint.child)} is the child of two joints, {quoted(before[joint.child].name)} and "
+                f"{quoted(joint.name)}; a URDF is a tree, so take one of them out."
+            )
+        before[joint.child] = joint
+    return Robot(joints, links, before, end)
 
 
 def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
@@ -99,41 +200,17 @@ def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
         text: The whole file, which `parse_urdf` takes.
 
     Raises:
-        InputError: A shape has no size, or a number is none.
+        InputError: A shape has no size, or a number of it is not one.
     """
-    root, _ = elements(text)
-    found: dict[str, tuple[UrdfShape, ...]] = {}
-    for link in root.children:
+    shapes: dict[str, tuple[UrdfShape, ...]] = {}
+    for link in _parsed(text)[0].children:
         if link.name == "link":
-            name = _attribute(link, "name", "a link")
-            shapes = (_shape(child, f"link {quoted(name)}") for child in link.children if child.name == "collision")
-            known = tuple(shape for shape in shapes if shape is not None)
+            collisions = [child for child in link.children if child.name == "collision"]
+            pairs = [(child.child("geometry"), _origin(child.child("origin"))) for child in collisions]
+            known = [_shape(shape.children[0], origin) for shape, origin in pairs if shape and shape.children]
             if known:
-                found[name] = known
-    return found
-
-
-def _shape(collision: Element, what: str) -> UrdfShape | None:
-    geometry = collision.child("geometry")
-    if geometry is None or not geometry.children:
-        return None
-    element, origin = geometry.children[0], _origin(collision.child("origin"), what)
-    if element.name == "mesh":
-        scale = _numbers(element, "scale", what, (1.0, 1.0, 1.0))
-        return UrdfShape(
-            "mesh", origin, tuple((_METRE * scale).tolist()), _attribute(element, "filename", f"a mesh of {what}")
-        )
-    sizes = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}.get(element.name)
-    if sizes is None:
-        return None
-    missing = (0.0,) * 3 if element.name == "box" else (0.0,)
-    size = np.concatenate([_METRE * _numbers(element, name, what, missing) for name in sizes])
-    if not np.all(size > 0):
-        raise InputError(
-            f"line {element.line}: a collision {element.name} of {what} has no size above 0; give its "
-            f"{' and '.join(sizes)}."
-        )
-    return UrdfShape(element.name, origin, tuple(size.tolist()), "")
+                shapes[link.text("name")] = tuple(known)
+    return shapes
 
 
 def edited(text: str, origins: Mapping[str, tuple[str | None, str | None]], robot: Robot, added: str = "") -> str:
@@ -146,20 +223,18 @@ def edited(text: str, origins: Mapping[str, tuple[str | None, str | None]], robo
         added: Elements to add before ``</robot>``.
     """
     content = text.encode()
-    changes: list[tuple[int, int, bytes]] = []
+    changes: list[tuple[int, int, bytes]] = [(robot.end, robot.end, added.encode())]
     for name, values in origins.items():
         joint = robot.joints[name]
         new = {key: value for key, value in zip(("xyz", "rpy"), values, strict=True) if value is not None}
-        if joint.origin_place is None:
-            written = "".join(f' {key}="{value}"' for key, value in new.items())
-            at = joint.place.end
-            blank = re.match(rb"\s*", content[at:])
-            indent = blank.group().decode() if blank else ""
-            changes.append((at, at, f"{indent}<origin{written}/>".encode()))
+        if joint.origin_place is None:  # an element after the joint's start tag, indented as what follows
+            start = end = joint.place.end
+            indent = content[end:][: len(content[end:]) - len(content[end:].lstrip())].decode()
+            tag = indent + _with_attributes("<origin/>", new)
         else:
             start, end = joint.origin_place
-            changes.append((start, end, _with_attributes(content[start:end].decode(), new).encode()))
-    changes.append((robot.end, robot.end, added.encode()))
+            tag = _with_attributes(content[start:end].decode(), new)
+        changes.append((start, end, tag.encode()))
     for start, end, new_content in sorted(changes, reverse=True):
         content = content[:start] + new_content + content[end:]
     return content.decode()
@@ -168,42 +243,40 @@ def edited(text: str, origins: Mapping[str, tuple[str | None, str | None]], robo
 def _with_attributes(tag: str, values: Mapping[str, str]) -> str:
     """A start tag with other values of some attributes; those it lacks are added at its end."""
     for name, value in values.items():
-        pattern = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
-        if pattern.search(tag):
-            tag = pattern.sub(lambda found, value=value: f"{found[1]}{found[2][0]}{value}{found[2][0]}", tag, count=1)
-        else:
-            head = re.fullmatch(r"(.*?)(\s*/?>)", tag, re.DOTALL)
-            assert head is not None
-            tag = f'{head[1]} {name}="{value}"{head[2]}'
+        tag, count = re.subn(
+            rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""",
+            lambda match, value=value: f"{match[1]}{match[2][0]}{value}{match[2][0]}",
+            tag,
+            count=1,
+        )
+        if not count:
+            tag = re.sub(r"\s*/?>$", lambda end, name=name, value=value: f' {name}="{value}"{end[0]}', tag)
     return tag
 
 
 def _joint(element: Element, name: str) -> UrdfJoint:
-    what = f"joint {quoted(name)}"
     ends = []
     for end in ("parent", "child"):
         child = element.child(end)
         if child is None:
-            raise InputError(f"line {element.line}: {what} has no <{end} link=...>; add it.")
-        ends.append(_attribute(child, "link", f"the <{end}> of {what}"))
-    kind = _attribute(element, "type", what)
+            raise InputError(f"{element.where} has no <{end} link=...>; add it.")
+        ends.append(child.text("link"))
+    kind = element.text("type")
     origin, axis, limit, mimic = (element.child(part) for part in ("origin", "axis", "limit", "mimic"))
     direction = np.array([1.0, 0.0, 0.0])  # which the format's specification says
     if axis is not None:
-        _attribute(axis, "xyz", f"<axis> of {what}")
-        direction = _numbers(axis, "xyz", what, (0.0, 0.0, 0.0))
+        axis.text("xyz")
+        direction = axis.numbers("xyz", (0.0, 0.0, 0.0))
     size = float(np.linalg.norm(direction))
-    unit = _METRE if kind == "prismatic" else 1.0
     limits = None
-    if limit is not None and ("lower" in limit.attributes or "upper" in limit.attributes):
-        low, high = (_numbers(limit, side, what, (0.0,))[0] for side in ("lower", "upper"))
-        limits = (unit * low, unit * high)
+    if limit is not None and {"lower", "upper"} & limit.attributes.keys():
+        unit = _METRE if kind == "prismatic" else 1.0
+        limits = (unit * limit.numbers("lower", (0.0,))[0], unit * limit.numbers("upper", (0.0,))[0])
     return UrdfJoint(
-        name=name,
-        kind=kind,
-        parent=ends[0],
-        child=ends[1],
-        origin=_origin(origin, what),
+        name,
+        kind,
+        *ends,
+        origin=_origin(origin),
         axis=direction / size if size > 0 else None,
         limits=limits,
         mimics=None if mimic is None else mimic.attributes.get("joint", ""),
@@ -217,53 +290,138 @@ def _link(element: Element, name: str) -> UrdfLink:
     mass = None if inertial is None else inertial.child("mass")
     if inertial is None or mass is None:
         return UrdfLink(name, None, None)
-    what = f"link {quoted(name)}"
-    _attribute(mass, "value", f"<mass> of {what}")
-    value = _numbers(mass, "value", what, (0.0,))[0]
+    mass.text("value")
+    value = float(mass.numbers("value", (0.0,))[0])
     if value < 0:
-        raise InputError(f"line {mass.line}: the mass of {what} is {value:g} kg; it cannot be negative.")
-    return UrdfLink(name, float(value), _origin(inertial.child("origin"), what)[:3, 3])
+        raise InputError(f"{mass.where} is {value:g} kg; it cannot be negative.")
+    return UrdfLink(name, value, _origin(inertial.child("origin"))[:3, 3])
 
 
-def _origin(element: Element | None, what: str) -> Transform:
+def _shape(element: Element, origin: Transform) -> UrdfShape:
+    if element.name == "mesh":
+        scale = _METRE * element.numbers("scale", (1.0, 1.0, 1.0))
+        return UrdfShape("mesh", origin, tuple(scale.tolist()), element.text("filename"))
+    names = _NAMES[element.name].attributes.split()
+    missing = (0.0,) * 3 if element.name == "box" else (0.0,)
+    size = np.concatenate([_METRE * element.numbers(name, missing) for name in names])
+    if not np.all(size > 0):
+        raise InputError(f"{element.where} has no size above 0; give its {' and '.join(names)}.")
+    return UrdfShape(element.name, origin, tuple(size.tolist()), "")
+
+
+def _origin(element: Element | None) -> Transform:
     transform = np.eye(4)
     if element is not None:
-        angles = _numbers(element, "rpy", what, (0.0, 0.0, 0.0))
+        angles = element.numbers("rpy", (0.0, 0.0, 0.0))
         if np.any(np.abs(angles) > _LARGEST_ANGLE):
             raise InputError(
-                f"line {element.line}: rpy of {what} is {quoted(element.attributes['rpy'])}, more than a "
-                "revolution, as if in degrees; a URDF is in rad, so convert it."
+                f"{element.where} has rpy = {quoted(element.attributes['rpy'])}, more than a revolution, as if in "
+                "degrees; a URDF is in rad, so convert it."
             )
         transform[:3, :3] = roll_pitch_yaw_matrix(angles)
-        transform[:3, 3] = _METRE * _numbers(element, "xyz", what, (0.0, 0.0, 0.0))
+        transform[:3, 3] = _METRE * element.numbers("xyz", (0.0, 0.0, 0.0))
     return transform
 
 
-def _numbers(element: Element, name: str, what: str, default: tuple[float, ...]) -> Float[np.ndarray, " k"]:
-    text = element.attributes.get(name)
-    if text is None:
-        return np.array(default)
-    if "${" in text or "$(" in text:
-        raise InputError(
-            f"line {element.line}: {name} of {what} is {quoted(text)}, so it is a xacro file; expand it with "
-            "'xacro FILE.xacro > FILE.urdf' and name that."
-        )
+@lru_cache(maxsize=1)
+def _parsed(text: str) -> tuple[Element, int]:
+    """The root element, and where its end tag begins."""
+    if len(text) > _MOST_CHARACTERS:
+        raise InputError(f"it has {len(text):,} characters, and {_MOST_CHARACTERS:,} are the most; name a URDF file.")
+    content = text.encode()
+    parser = expat.ParserCreate("utf-8")
+    stack: list[Element | None] = []  # None: not read
+    root: list[Element] = []
+    ends = [0]
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        line, begin = parser.CurrentLineNumber, parser.CurrentByteIndex
+        if name.startswith("xacro:"):
+            raise InputError(f"line {line} has {_tag(name)}, {_EXPAND}")
+        if len(stack) > _DEEPEST:
+            raise InputError(f"line {line} nests elements too deeply; no URDF has more than {_DEEPEST} levels.")
+        parent = stack[-1] if stack else None
+        if not stack and name != "robot":
+            raise InputError(f"its root element is {_tag(name)}, but that of a URDF is <robot>; name a URDF file.")
+        if stack and (parent is None or not _is_read(name, parent, line)):
+            stack.append(None)
+            return
+        if parent is None:
+            words = "the robot"
+        elif parent.name == "robot":
+            words = f"{name} {quoted(attributes['name'])}" if attributes.get("name") else f"a {name}"
+        else:
+            words = f"<{name}> of {parent.words.partition(' of ')[2] if parent.words[0] == '<' else parent.words}"
+        element = Element(name, attributes, words, line, Place(begin, _end_of_tag(content, begin)), [])
+        _check_attributes(element)
+        (root if parent is None else parent.children).append(element)
+        stack.append(element)
+
+    def end(_: str) -> None:
+        stack.pop()
+        ends.append(parser.CurrentByteIndex)
+
+    def text_between(data: str) -> None:
+        if data.strip() and stack[-1] is not None:
+            raise InputError(
+                f"line {parser.CurrentLineNumber}: {stack[-1].words} holds the text {quoted(data.strip())}, which "
+                "belongs to no element; correct it."
+            )
+
+    def refuse_entities(name: str, *_: object) -> None:
+        raise InputError(f"it has a document type, {quoted(name)}, as no URDF needs; leave it out.")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = text_between, refuse_entities
     try:
-        values = np.array([number(part) for part in text.split()])
-    except ValueError:
-        values = np.array([])
-    if len(default) == 3 and np.any(np.abs(values) >= _LARGEST):  # limits may be as large as one likes
-        raise InputError(f"line {element.line}: {name} of {what} is {quoted(text)}; it must be below {_LARGEST:g}.")
-    if len(values) != len(default) or not np.all(np.isfinite(values)):
-        wanted = "a number" if len(default) == 1 else f"{len(default)} numbers"
-        raise InputError(f"line {element.line}: {name} of {what} is {quoted(text)}; it must be {wanted}.")
-    return values
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise InputError(f"it is not valid XML: {error}; correct it there.") from error
+    return root[0], ends[-1]
 
 
-def _attribute(element: Element, name: str, what: str) -> str:
-    value = element.attributes.get(name, "")
-    if not value:
-        raise InputError(f"line {element.line}: {what} has no {name}; add it.")
-    if any(is_control(character) for character in value):
-        raise InputError(f"line {element.line}: the {name} of {what} holds a control character; take it out.")
-    return value
+def _is_read(name: str, parent: Element, line: int) -> bool:
+    """Whether an element is read; refuse one whose name is misspelt, repeated or at the wrong place."""
+    names = _NAMES[parent.name]
+    once, known = names.once.split(), [*names.once.split(), *names.often.split()]
+    where = f"line {line}: {parent.words}"
+    if name in known:
+        earlier = parent.child(name)
+        if name in once and earlier is not None:
+            raise InputError(
+                f"{where} has a second {_tag(name)}, after that of line {earlier.line}; take one of them out."
+            )
+        if parent.name == "geometry" and parent.children:
+            raise InputError(f"{where} has two shapes; give each a <collision> of its own.")
+        return name in _NAMES
+    if ":" in name:
+        return False
+    if name in _NAMES:
+        raise InputError(f"{where} holds {_tag(name)}, which does not belong there; move it.")
+    if not names.others or difflib.get_close_matches(name.casefold(), known, n=1, cutoff=_ALIKE):
+        meant = nearest(_tag(name.casefold()), map(_tag, known)) if known else "; take it out."
+        raise InputError(f"{where} has an unknown element {_tag(name)}{meant}")
+    return False
+
+
+def _check_attributes(element: Element) -> None:
+    names = _NAMES[element.name]
+    known = names.attributes.split()
+    for name in element.attributes:
+        if name in known or ":" in name or name == "xmlns":
+            continue
+        if name == "quat_xyzw":
+            raise InputError(f"{element.where} has a quaternion, quat_xyzw; write its angles as rpy.")
+        if not names.others or difflib.get_close_matches(name.casefold(), known, n=1, cutoff=_ALIKE):
+            meant = nearest(name.casefold(), known)
+            raise InputError(f"{element.where} has an unknown attribute {quoted(name)}{meant}")
+
+
+def _tag(name: str) -> str:
+    return f"<{quoted(name)[1:-1]}>"
+
+
+def _end_of_tag(content: bytes, start: int) -> int:
+    """Where a start tag ends; a ``>`` in a value does not end it."""
+    tag = re.compile(rb"""<(?:[^"'>]++|"[^"]*+"|'[^']*+')*+>""").match(content, start)
+    return len(content) if tag is None else tag.end()  # None of text that is no XML, which the parser refuses

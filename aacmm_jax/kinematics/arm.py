@@ -119,7 +119,7 @@ class Arm(eqx.Module):
             ) from error
         self.prismatic = _joint_numbers(prismatic, joints)
         self.limits = None if limits is None else checked_limits(limits, joints, self.prismatic)
-        expands = corrections is not None and bool(corrections.functions.of_lengths.any())
+        expands = corrections is not None and corrections.functions.expands
         self.thermometer = bool(thermometer) or expands
 
     def _correct(self, coefficients: Numbers | None, gravity: Numbers | None, corrections: Corrections | None) -> None:
@@ -130,7 +130,7 @@ class Arm(eqx.Module):
                 raise InputError("coefficients and gravity are of corrections; make the arm by with_corrections first.")
             self.coefficients = self.gravity = None
             return
-        count = len(corrections.functions.each)
+        count = len(corrections.functions.terms)
         given = np.zeros(count) if coefficients is None else coefficients
         self.coefficients = as_floats(given, "coefficients")
         self.gravity = as_floats(DOWN if gravity is None else gravity, "gravity")
@@ -402,7 +402,7 @@ def parameter_unit(arm: Arm, name: str) -> str:
     """Unit of a parameter: mm, rad, or of a correction's coefficient its own; "1" of a pure number."""
     kind, i = locate(arm, name)
     if kind == "coefficients" and arm.corrections is not None:
-        function = arm.corrections.functions.each[i]
+        function = arm.corrections.functions.terms[i]
         return function.unit.replace("rad", "mm") if function.joint in arm.prismatic else function.unit
     return "1" if kind == "gravity" else "mm" if kind in LENGTHS else "rad"
 

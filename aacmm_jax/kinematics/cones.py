@@ -10,13 +10,11 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import in_chunks, to_numpy
 from .arm import Arm
 from .chain import ForwardPass, forward_pass, joint_motion, reading_units
-from .inverse_kinematics import damped_inverse
+from .inverse_kinematics import ARRIVED, EXACT, LARGEST_STEP, ROWS, damped_inverse, repeated
 from .jacobian import reading_columns, reading_rotations
 
 TOOL_AXIS = (0.0, 0.0, 1.0)
-_ROWS = 2048  # of one call
-_LARGEST_STEP, _LARGEST_TURN = 0.5, 0.5  # rad: of a joint, of the tool
-_EXACT, _ARRIVED = 1e-7, 1e-6  # mm
+_LARGEST_TURN = 0.5  # rad, of the tool in a step
 _INSIDE = 1e-4  # rad: what is brought into a cone ends this far inside it
 _LEVER = 100.0  # mm: a rotation of the tool counts as what it moves at this distance
 
@@ -113,7 +111,6 @@ def into_cones(
     def step(
         q: np.ndarray, targets: np.ndarray, normals: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The next configurations ``(n, c)``, and which of them need more steps."""
         forward = forward_pass(geometry, joint_motion(geometry, q.T))
         gap = targets - forward.tip
         columns = units[..., None] * np.asarray(reading_columns(forward))
@@ -130,26 +127,20 @@ def into_cones(
             free = row - np.sum(inverse * np.einsum("jn,jcn->cn", row, columns)[None], axis=1)
             size = np.sum(free * row, axis=0)
             change = change + free * ((turn - np.sum(row * change, axis=0)) / (size + 1e-2 * turn**2 + 1e-6))
-        new = np.clip(q + units * np.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
-        return new, np.any(np.abs(gap) > _EXACT, axis=0) | outside
+        new = np.clip(q + units * np.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
+        return new, np.any(np.abs(gap) > EXACT, axis=0) | outside
 
     def moved(rows: np.ndarray) -> np.ndarray:
-        n = arm.joints
-        found = rows[:, :n].T.copy()
-        given = rows[:, n : n + 3].T, rows[:, n + 3 : n + 6].T, np.maximum(rows[:, n + 6] - _INSIDE, 0.0)
-        under_way = np.arange(found.shape[1])
-        for _ in range(steps):
-            found[:, under_way], more = step(found[:, under_way], *(part[..., under_way] for part in given))
-            under_way = under_way[more]
-            if not len(under_way):
-                break
+        start, targets, normals, half_angles = np.split(rows.T, [arm.joints, arm.joints + 3, arm.joints + 6])
+        wanted = np.maximum(half_angles - _INSIDE, 0.0)[0]
+        found = repeated(step, start, [targets, normals, wanted], steps)
         forward = forward_pass(geometry, joint_motion(geometry, found.T))
-        arrived = np.linalg.norm(given[0] - forward.tip, axis=0) <= _ARRIVED
-        arrived &= _angle(_directions(forward, cones.tool_axis).T, given[1].T) <= rows[:, n + 6]
-        return np.hstack([found.T, arrived[:, None]])
+        arrived = np.linalg.norm(targets - forward.tip, axis=0) <= ARRIVED
+        arrived &= _angle(_directions(forward, cones.tool_axis).T, normals.T) <= half_angles[0]
+        return np.column_stack([found.T, arrived])
 
     with np.errstate(all="ignore"):
-        found = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), _ROWS)
+        found = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), ROWS)
     return found[:, :-1], found[:, -1] > 0
 
 

@@ -10,9 +10,10 @@ from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
-from .chain import Corrections, Geometry, KnownFunction, KnownFunctions, forward_pass, joint_motion, joints_first
+from .chain import Corrections, Geometry, forward_pass, joint_motion, joints_first
 from .corrections.kind import Loads, Term
 from .corrections.kinds import term_of, terms_of
+from .joint_functions import KnownFunctions
 
 _CONFIGURATIONS = 300
 _TEMPERATURES = (10.0, 30.0)  # C
@@ -118,7 +119,7 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
 
 
 def function_values(
-    nominal: Geometry, terms: Sequence[KnownFunction], q: Float[np.ndarray, "N n"], gravity: Float[np.ndarray, " 3"]
+    nominal: Geometry, terms: Sequence[Term], q: Float[np.ndarray, "N n"], gravity: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "k N"]:
     """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
     functions = KnownFunctions(tuple(terms))
@@ -134,7 +135,7 @@ def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
     if arm.corrections is None:
         return arm.replace(corrections=Corrections(KnownFunctions(added), arm.geometry), gravity=np.array(DOWN))
     assert arm.coefficients is not None
-    each = (*arm.corrections.functions.each, *added)
+    each = (*arm.corrections.functions.terms, *added)
     coefficients = namespace(arm.coefficients).concatenate([arm.coefficients, np.zeros(len(added))])
     return arm.replace(
         corrections=Corrections(KnownFunctions(each), arm.corrections.nominal),
@@ -146,5 +147,5 @@ def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
 def loads_of(arm: Arm) -> Loads | None:
     """Masses and centres of the links, where functions of an arm's corrections know them."""
     assert arm.corrections is not None
-    loads = (getattr(term, "loads", None) for term in arm.corrections.functions.each)
+    loads = (getattr(term, "loads", None) for term in arm.corrections.functions.terms)
     return next((found for found in loads if found is not None), None)

@@ -34,7 +34,7 @@ def default_prior(arm: Arm) -> Prior:
         >>> print(prior.groups)
         ('lengths', 'angles', 'gravity', 'harmonics=1')
     """
-    terms = () if arm.corrections is None else arm.corrections.functions.each
+    terms = () if arm.corrections is None else arm.corrections.functions.terms
     kinds: dict[str, float] = {}
     slides: dict[str, float] = {}
     for kind in all_kinds():

@@ -145,7 +145,7 @@ class Observed:
             group.members for group, stack in zip(self.layout.groups, self.stacks, strict=True) if not stack.linear
         ]
         for number in sorted(itertools.chain(*others)):
-            found |= self.observations[number].certified
+            found |= self.observations[number].certified_values()
         return found
 
     def forward(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> ForwardPass:
@@ -175,8 +175,7 @@ class Observed:
         tips = [tips_of(forward, rows) for rows in self.slices]
         found: dict[str, Any] = {}
         for observation, own in zip(self.observations, tips, strict=True):
-            # Through the class: a bound method of Equinox is a module made anew.
-            new = type(observation).start(observation, own, arm.probe)
+            new = observation.start(own, arm.probe)
             if observation.target:
                 new = {offset_of(observation.target): arm.probe} | new
             found = new | found  # what another observation has found stays

@@ -84,8 +84,7 @@ def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], bat
             name: _columns_of_role(z[p:], role.first, role.size, group.counts)
             for name, role in zip(stack.unknowns, group.roles, strict=False)
         }
-        # Through the class: a bound method of Equinox is a module made anew, which takes as long as a residual.
-        found.append(type(stack).residual(stack, tips_of(forward, group.index), unknowns))
+        found.append(stack.residual_with_errors(tips_of(forward, group.index), unknowns))
     return PointRows(forward, found)
 
 

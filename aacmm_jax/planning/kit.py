@@ -18,7 +18,8 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.arm_classes import small_arm_noise
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..data.observations.observation import AbstractObservation, AbstractSimulated
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.collisions import Cell
 from ..kinematics.cones import TOOL_AXIS, Cone, cones_of

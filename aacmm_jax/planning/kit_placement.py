@@ -1,6 +1,5 @@
 """Where to put what is in a kit: random placements, ranked by the poses that they allow, then moved a little."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
@@ -12,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.rotations import rotation_vector
-from ..data.observations.observation import AbstractObservation, AbstractSimulated
+from ..data.observations.observation import AbstractObservation
+from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.workspace import SearchRegion, reached, total_link_length
 from .fedorov_exchange import Candidates, relaxed_value
@@ -289,8 +289,7 @@ def _extent(simulated: AbstractSimulated) -> Float[np.ndarray, "m 3"]:
 
 def _repeated(simulated: AbstractSimulated, poses: int) -> AbstractSimulated:
     """With another number of poses in each place."""
-    changed: Any = simulated
-    return dataclasses.replace(changed, poses=poses)
+    return simulated.changed(poses=poses)
 
 
 def _about(turn: Rotation, middle: Float[np.ndarray, " 3"], to: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 6"]:

@@ -110,7 +110,7 @@ def _functions_chart(record: CalibrationRecord) -> Chart | None:
     if not plots:
         return None
     corrections = record.calibrated.arm.corrections
-    terms = () if corrections is None else corrections.functions.each
+    terms = () if corrections is None else corrections.functions.terms
     kinds = {term.kind.description: term.kind.of_own_reading for term in terms if isinstance(term, Term)}
     drawn, others = ([each for each, own in kinds.items() if own is of] for of in (True, False))
     description = (

@@ -157,7 +157,7 @@ def _with_probe_fitted(uncertainty: Uncertainty | None, part: Capture | None) ->
     if uncertainty is None or part is None or any(observation.target for observation in part.observations):
         return None
     poses = [Socket(name, q) for name, q in part.sockets.items()]
-    capture = Capture({}, [], [one.with_target("probe") for one in (*poses, *part.observations)])
+    capture = Capture({}, [], [one.changed(target="probe") for one in (*poses, *part.observations)])
     try:
         check_geometry(uncertainty.arm, capture)
     except InputError:

@@ -119,8 +119,8 @@ class Uncertainty(eqx.Module):
             raise InputError(f"least is {least:g}; give a correlation between 0 and 1.")
         table = np.asarray(self.correlation)
         pairs = [(i, j) for i in range(len(table)) for j in range(i) if abs(table[i, j]) >= least]
-        found = [(self.names[j], self.names[i], float(table[i, j])) for i, j in pairs]
-        return sorted(found, key=lambda entry: -abs(entry[2]))
+        entries = [(self.names[j], self.names[i], float(table[i, j])) for i, j in pairs]
+        return sorted(entries, key=lambda entry: -abs(entry[2]))
 
     @property
     def scatter(self) -> Law:

@@ -53,10 +53,10 @@ def inverse_information(
     information = information + xp.diag(xp.where(fixed, 1.0 + xp.max(xp.abs(information)), 0.0))
     # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
     values, vectors = semidefinite_eigen(information)
-    known = values > _NULL * values[0]
-    seen, lost = xp.where(known[None, :], vectors, 0.0), xp.where(known[None, :], 0.0, vectors)
-    inner = seen.T @ information @ seen + xp.diag(xp.where(known, 0.0, 1.0))
+    informed = values > _NULL * values[0]
+    seen, lost = xp.where(informed[None, :], vectors, 0.0), xp.where(informed[None, :], 0.0, vectors)
+    inner = seen.T @ information @ seen + xp.diag(xp.where(informed, 0.0, 1.0))
     inverse = seen @ inverse_positive_definite(inner) @ seen.T
-    hardly = xp.where((values > _LEAST_INFORMATION)[None, :] & known[None, :], 0.0, vectors)
+    hardly = xp.where((values > _LEAST_INFORMATION)[None, :] & informed[None, :], 0.0, vectors)
     determined = fixed | (xp.sum(hardly**2, axis=1) < 1e-6)
     return xp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined

@@ -45,13 +45,13 @@ class Law(NamedTuple):
     @classmethod
     def of(cls, degrees_of_freedom: Float[AnyArray, " c"]) -> "Law":
         """Of variances that were estimated from so many degrees of freedom."""
-        one = np.ones((len(degrees_of_freedom), 1))
-        return cls(degrees_of_freedom, one, one)
+        certain = np.ones((len(degrees_of_freedom), 1))
+        return cls(degrees_of_freedom, certain, certain)
 
     @property
     def in_numpy(self) -> "Law":
         """With NumPy's arrays."""
-        return Law(*(np.asarray(each, dtype=float) for each in self))
+        return Law(*(np.asarray(values, dtype=float) for values in self))
 
     def joined(self, *others: "Law") -> "Law":
         """With further parts."""
@@ -91,7 +91,7 @@ class Components(eqx.Module):
 
     def without(self, name: str) -> "Components | None":
         """Without one of them."""
-        kept = np.array([i for i, own in enumerate(self.names) if own != name], dtype=int)
+        kept = np.array([i for i, part in enumerate(self.names) if part != name], dtype=int)
         if not len(kept):
             return None
         return Components(tuple(self.names[i] for i in kept), self.matrices[kept], Law(*(of[kept] for of in self.law)))
@@ -130,16 +130,16 @@ def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law)
     if not 0 < level < 1:
         raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
     law, variances = law.in_numpy, np.asarray(variances, dtype=float)
-    known = np.all(np.isfinite(variances), axis=-1)
-    variances = np.where(known[..., None], variances, 0.0)
+    finite = np.all(np.isfinite(variances), axis=-1)
+    variances = np.where(finite[..., None], variances, 0.0)
     freedom = effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
-    found = np.array(student_quantile(0.5 + level / 2, freedom))
+    factors = np.array(student_quantile(0.5 + level / 2, freedom))
     total = np.sum(variances, axis=-1)
     spread = np.flatnonzero(np.sum(np.asarray(law.weights) > 0, axis=1) > 1)
     mixed = np.any(variances[..., spread] > 1e-9 * total[..., None], axis=-1) & (total > 0)
     if mixed.any():
-        found[mixed] = _of_mixtures(level, variances[mixed], law, spread)
-    return found
+        factors[mixed] = _of_mixtures(level, variances[mixed], law, spread)
+    return factors
 
 
 def degrees_of_freedom(variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
@@ -162,23 +162,23 @@ def _of_mixtures(
     """Coverage factors of quantities of whose variance some parts have distributions."""
     ratios, weights = _combinations(np.asarray(law.ratios), np.asarray(law.weights), spread)
     total = np.sum(variances, axis=1)
-    each = variances[:, None, :] * ratios  # (m, draws, c)
-    possible = np.maximum(np.sum(each, axis=2), 1e-12 * total[:, None])
-    freedom = effective_degrees_of_freedom(each, np.asarray(law.degrees_of_freedom))
+    parts = variances[:, None, :] * ratios  # (m, draws, c)
+    possible = np.maximum(np.sum(parts, axis=2), 1e-12 * total[:, None])
+    freedom = effective_degrees_of_freedom(parts, np.asarray(law.degrees_of_freedom))
     root = np.sqrt(possible / total[:, None])
     both = student_quantile(0.5 + level / 2, freedom) * root
     low, high = both.min(axis=1), both.max(axis=1)
     # Newton's method: what lies outside is a convex function of the factor, so it converges from below, and from above
     # its first step ends below.
-    found = np.sum(weights * both, axis=1)
+    factors = np.sum(weights * both, axis=1)
     for _ in range(_ROUNDS):
-        scaled = found[:, None] / root
+        scaled = factors[:, None] / root
         outside = np.sum(weights * student_tail(scaled, freedom), axis=1)
         slope = -2 * np.sum(weights * student_density(scaled, freedom) / root, axis=1)
-        last, found = found, np.clip(found - (outside - (1 - level)) / slope, low, high)
-        if np.all(np.abs(found - last) <= 1e-9 * found):
+        last, factors = factors, np.clip(factors - (outside - (1 - level)) / slope, low, high)
+        if np.all(np.abs(factors - last) <= 1e-9 * factors):
             break
-    return found
+    return factors
 
 
 def _combinations(
@@ -188,13 +188,13 @@ def _combinations(
     and of several a lattice (Kronecker's sequence), which has as many of each."""
     if len(spread) == 1:
         kept = weights[spread[0]] > 0
-        found = np.ones((int(kept.sum()), len(ratios)))
-        found[:, spread[0]] = ratios[spread[0], kept]
-        return found, weights[spread[0], kept]
-    found, number = np.ones((_DRAWS, len(ratios))), np.arange(_DRAWS)
+        possible = np.ones((int(kept.sum()), len(ratios)))
+        possible[:, spread[0]] = ratios[spread[0], kept]
+        return possible, weights[spread[0], kept]
+    possible, number = np.ones((_DRAWS, len(ratios))), np.arange(_DRAWS)
     for i, part in enumerate(spread):
         at = (number + 0.5) / _DRAWS if i == 0 else (0.5 + number * _STEPS[(i - 1) % len(_STEPS)]) % 1.0
         order = np.argsort(ratios[part])
         of_order = weights[part, order]
-        found[:, part] = np.interp(at, np.cumsum(of_order) - 0.5 * of_order, ratios[part, order])
-    return found, np.full(_DRAWS, 1 / _DRAWS)
+        possible[:, part] = np.interp(at, np.cumsum(of_order) - 0.5 * of_order, ratios[part, order])
+    return possible, np.full(_DRAWS, 1 / _DRAWS)

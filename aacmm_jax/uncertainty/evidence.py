@@ -52,12 +52,12 @@ def eliminated(
     inverse = xp.zeros((0, 0))
     if len(others):
         inverse = inverse_information(gram[np.ix_(others, others)], pinned[others])[0]
-    crossed, own = gram[np.ix_(index, others)], pinned[index]
+    crossed, pinned_here = gram[np.ix_(index, others)], pinned[index]
     information = gram[np.ix_(index, index)] - crossed @ inverse @ crossed.T
     slope = gradient[index] - crossed @ (inverse @ gradient[others])
     information = 0.5 * (information + information.T)
-    free = xp.where(own, 0.0, deviation)
-    return PriorModel(information, xp.where(own, 0.0, information @ free - slope), deviation, own)
+    free = xp.where(pinned_here, 0.0, deviation)
+    return PriorModel(information, xp.where(pinned_here, 0.0, information @ free - slope), deviation, pinned_here)
 
 
 class _Posterior(NamedTuple):
@@ -85,8 +85,8 @@ def _given_pinned(covariance: Float[AnyArray, "k k"], pinned: Bool[AnyArray, " k
     """The covariance of the others where pinned parameters are known; 0 for these."""
     xp = namespace(covariance, pinned)
     both, unit = pinned[:, None] & pinned[None, :], xp.asarray(np.eye(len(pinned)))
-    known = xp.where(both, inverse_positive_definite(xp.where(both, covariance, unit)), 0.0)
-    return xp.where(pinned[:, None] | pinned[None, :], 0.0, covariance - covariance @ known @ covariance)
+    inverse = xp.where(both, inverse_positive_definite(xp.where(both, covariance, unit)), 0.0)
+    return xp.where(pinned[:, None] | pinned[None, :], 0.0, covariance - covariance @ inverse @ covariance)
 
 
 class Groups(NamedTuple):
@@ -152,9 +152,9 @@ def covariance_of_log_variances(
     to a factor of e; an expected one as it is expected.
     """
     xp = namespace(model, at)
-    known = xp.asarray(np.diag(np.where(groups.expected, 0.0, 0.25)))
+    beforehand = xp.asarray(np.diag(np.where(groups.expected, 0.0, 0.25)))
     unit, both = xp.asarray(np.eye(len(groups.members))), moving[:, None] & moving[None, :]
-    curvature = xp.where(both, known - 0.5 * _evidence(model, groups, at).second, unit)
+    curvature = xp.where(both, beforehand - 0.5 * _evidence(model, groups, at).second, unit)
     return xp.where(both, inverse_positive_definite(curvature), 0.0)
 
 

@@ -67,8 +67,8 @@ class Linearisation(NamedTuple):
         errors = arm_errors(point, observed)
         xp = namespace(z, sigma)
         of_arm = [
-            covariance_of_sigma(one, xp.asarray(sigma)) if noise is None else covariance_of_noise(one, noise)
-            for one in errors
+            covariance_of_sigma(error, xp.asarray(sigma)) if noise is None else covariance_of_noise(error, noise)
+            for error in errors
         ]
         whitening = whitening_of(point.rows, observed, of_arm, xp.asarray(least))._replace(prior=prior)
         return cls.of(observed, space, z, point, errors, whitening, loss)
@@ -121,30 +121,26 @@ class Linearisation(NamedTuple):
 
     def parts(self) -> list[ObservationRows]:
         """The rows, observation by observation."""
-        xp, observed = namespace(self.z), self.observed
-
-        def each(arrays: list[AnyArray]) -> list[AnyArray]:
-            return observed.by_observation(arrays)
-
-        rows = self.point.rows
+        xp, observed, rows = namespace(self.z), self.observed, self.point.rows
         weights = [
             xp.ones(block.white.shape[1]) if weight is None else weight
-            for block, weight in zip(self.blocks, self.weights, strict=True)
+            for block, weight in zip(self.blocks[: len(rows)], self.weights, strict=False)
         ]
-        columns = (
-            each([part.values for part in rows]),
-            each([part.by_tip for part in rows]),
-            each([error.by_readings for error in self.errors]),
-            each([error.by_seat for error in self.errors]),
-            each([xp.moveaxis(part.measured, 0, -1) for part in rows]),
-            each([xp.moveaxis(root, 0, -1) for root in self.whitening.roots]),
-            each(weights[: len(rows)]),
+        by_group = (
+            [part.values for part in rows],
+            [part.by_tip for part in rows],
+            [error.by_readings for error in self.errors],
+            [error.by_seat for error in self.errors],
+            [xp.moveaxis(part.measured, 0, -1) for part in rows],
+            [xp.moveaxis(root, 0, -1) for root in self.whitening.roots],
+            weights,
         )
-        found = []
-        for one, poses, *values in zip(observed.observations, observed.slices, *columns, strict=True):
-            values[4], values[5] = (xp.moveaxis(matrices, -1, 0) for matrices in values[4:6])
-            found.append(ObservationRows(one, poses, *values))
-        return found
+        columns = [observed.by_observation(arrays) for arrays in by_group]
+        for index in (4, 5):  # matrices, of which the pose is the first axis again
+            columns[index] = [xp.moveaxis(matrices, -1, 0) for matrices in columns[index]]
+        return [
+            ObservationRows(*values) for values in zip(observed.observations, observed.slices, *columns, strict=True)
+        ]
 
     def white(self) -> list[Float[AnyArray, "_ _"]]:
         """Whitened residuals of each observation."""
@@ -158,36 +154,36 @@ class Linearisation(NamedTuple):
 
     def by_private(self) -> list[Float[AnyArray, "_ _ _"]]:
         """Whitened derivatives of each observation by the private geometry that it alone uses."""
-        found: list[AnyArray] = [np.zeros((0, 0, 0))] * len(self.observed.observations)
+        derivatives: list[AnyArray] = [np.zeros((0, 0, 0))] * len(self.observed.observations)
         for group, block in zip(self.observed.layout.groups, self.blocks, strict=False):
             size = sum(role.size for role in group.roles if role.private)
             first = 0
             for i, (number, count) in enumerate(zip(group.members, group.counts, strict=True)):
-                mine = slice(first, first + count)
+                poses = slice(first, first + count)
                 if block.by_own is None:
-                    found[number] = namespace(block.white).zeros((0, *block.white[:, mine].shape))
+                    derivatives[number] = namespace(block.white).zeros((0, *block.white[:, poses].shape))
                 else:
-                    found[number] = block.by_own[group.start[i] : group.start[i] + size, :, mine]
+                    derivatives[number] = block.by_own[group.start[i] : group.start[i] + size, :, poses]
                 first += count
-        return found
+        return derivatives
 
     def private(self) -> list[np.ndarray]:
         """Indices of the private geometry of each observation, in the order of `by_private`."""
-        found: list[np.ndarray] = [np.zeros(0, dtype=int)] * len(self.observed.observations)
+        indices: list[np.ndarray] = [np.zeros(0, dtype=int)] * len(self.observed.observations)
         for group in self.observed.layout.groups:
             for i, number in enumerate(group.members):
                 parts = [np.arange(role.size) + role.first[i] for role in group.roles if role.private]
-                found[number] = np.concatenate(parts) if parts else found[number]
-        return found
+                indices[number] = np.concatenate(parts) if parts else indices[number]
+        return indices
 
     def dense(self) -> list[Float[AnyArray, "z _ _"]]:
         """Whitened derivatives of each observation by all unknowns; as large as all of them together."""
-        found = []
-        for head, own, index in zip(self.by_head(), self.by_private(), self.private(), strict=True):
+        derivatives = []
+        for head, private, index in zip(self.by_head(), self.by_private(), self.private(), strict=True):
             whole = namespace(head).zeros((self.z.shape[0], *head.shape[1:]))
             whole = set_at(whole, slice(0, self.height), head)
-            found.append(set_at(whole, len(self.space.names) + index, own) if len(index) else whole)
-        return found
+            derivatives.append(set_at(whole, len(self.space.names) + index, private) if len(index) else whole)
+        return derivatives
 
     def relations(self) -> tuple[Float[np.ndarray, "l z"], Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
         """Derivatives of reference lengths and certified values by all unknowns, their residuals (mm, rad), and their
@@ -195,16 +191,16 @@ class Linearisation(NamedTuple):
         observed, p = self.observed, len(self.space.names)
         positions, parts = observed.positions, observed.split(np.asarray(self.z)[p:])
         unit, rows, residuals, u = np.eye(len(self.z)), [np.zeros((0, len(self.z)))], [np.zeros(0)], [np.zeros(0)]
-        for (start, end), nominal, own in zip(observed.ends, observed.nominal, observed.u, strict=True):
+        for (start, end), nominal, u_of_row in zip(observed.ends, observed.nominal, observed.u, strict=True):
             between = np.asarray(parts[end] - parts[start])
             size = np.linalg.norm(between)
             rows.append(((between / size) @ (unit[p + positions[end]] - unit[p + positions[start]]))[None])
             residuals.append(np.reshape(size - nominal, 1))
-            u.append(np.reshape(own, 1))
-        for name, (value, own) in observed.certified().items():
+            u.append(np.reshape(u_of_row, 1))
+        for name, (value, u_of_row) in observed.certified().items():
             rows.append(unit[p + positions[name]])
             residuals.append(np.asarray(parts[name] - value))
-            u.append(np.asarray(own))
+            u.append(np.asarray(u_of_row))
         return np.concatenate(rows), np.concatenate(residuals), np.concatenate(u)
 
 

@@ -30,33 +30,33 @@ class SharedErrors(eqx.Module):
 
     def without_functions(self) -> "SharedErrors":
         """Those that move the tips of poses alike."""
-        own = len(self.added)
+        count = len(self.added)
         return SharedErrors(
-            kinds=self.kinds[:own],
-            units=self.units[:own],
+            kinds=self.kinds[:count],
+            units=self.units[:count],
             names=(),
-            sd=self.sd[:own],
+            sd=self.sd[:count],
             moments=np.zeros((0, 0)),
             follow=self.follow[:, :0],
             correlation_length=self.correlation_length,
             added=self.added,
             by_group=np.zeros((0, 0, 0)),
-            law=Law(*(of[:own] for of in self.law)),
+            law=Law(*(of[:count] for of in self.law)),
         )
 
     @property
     def of_tips(self) -> Components | None:
         """What errors of the tip add to the covariance of the parameters."""
-        own = len(self.added)
-        return Components(self.kinds[:own], self.added, Law(*(of[:own] for of in self.law))) if own else None
+        count = len(self.added)
+        return Components(self.kinds[:count], self.added, Law(*(of[:count] for of in self.law))) if count else None
 
     @property
     def of_functions(self) -> Components:
         """By how much the covariance of parameters and coefficients grows with the logarithm of each variance."""
-        xp, own = namespace(self), len(self.added)
+        xp, count = namespace(self), len(self.added)
         by_coefficients = xp.concatenate([self.follow, xp.asarray(np.eye(len(self.names)))])
         grown = by_coefficients @ self.by_group @ by_coefficients.T
-        return Components(self.kinds[own:], grown, Law(*(of[own:] for of in self.law)))
+        return Components(self.kinds[count:], grown, Law(*(of[count:] for of in self.law)))
 
     def sd_of(self, *kinds: str) -> Float[AnyArray, ""] | float:
         """Standard deviation of a tip coordinate by effects of some kinds, mm; 0 without."""

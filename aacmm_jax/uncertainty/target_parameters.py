@@ -61,8 +61,8 @@ def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
     """
     # NumPy compiles nothing.
     observed, space = to_numpy((Observed.of(capture, arm), Parameters(arm, ("probe_x",))))
-    found = observed.split(np.asarray(observed.start(space, np.asarray(space.vector()))))
-    places = [np.asarray(found[offset_of(observation.target)]) for observation in observed.observations]
+    geometry = observed.split(np.asarray(observed.start(space, np.asarray(space.vector()))))
+    places = [np.asarray(geometry[offset_of(observation.target)]) for observation in observed.observations]
     tip = max(places, key=lambda place: float(np.hypot(place[0], place[1])))
     if any(isinstance(observation, MeasuredTransforms) for observation in observed.observations):
         tip = tip + _AROUND

@@ -35,7 +35,7 @@ def arm_errors(point: PointRows, observed: Observed) -> list[ArmErrors]:
     readings, rotations = reading_columns(forward), reading_rotations(forward)  # (n, 3, N)
     # An arm whose tips err by s turns them by about s over its size.
     size = xp.sqrt(xp.mean(xp.sum(forward.tip**2, axis=0)))
-    found = []
+    errors = []
     for part, group in zip(point.rows, observed.layout.groups, strict=True):
         by_tip, by_rotation, poses = part.by_tip, part.by_rotation, group.index
         by_readings = products(by_tip, readings[..., poses])
@@ -43,15 +43,15 @@ def arm_errors(point: PointRows, observed: Observed) -> list[ArmErrors]:
         if by_rotation is not None:
             by_readings = by_readings + products(by_rotation, rotations[..., poses])
             by_seat = xp.concatenate([by_tip, by_rotation / size], axis=1)
-        found.append(ArmErrors(by_readings, by_seat, forward.kinds))
-    return found
+        errors.append(ArmErrors(by_readings, by_seat, forward.kinds))
+    return errors
 
 
 def covariance_of_noise(errors: ArmErrors, noise: Noise) -> Float[AnyArray, "m r r"]:
     """Of a group's rows by the noise of readings and seat."""
     xp = namespace(errors, noise)
-    each = xp.broadcast_to(noise.of_readings(errors.kinds), (errors.by_readings.shape[1],))
-    moved = errors.by_readings * each[None, :, None]
+    spread = xp.broadcast_to(noise.of_readings(errors.kinds), (errors.by_readings.shape[1],))
+    moved = errors.by_readings * spread[None, :, None]
     tip = errors.by_seat[:, :3]
     return squares(moved) + (noise.seating**2 + 1e-12) * squares(tip)
 
@@ -66,16 +66,16 @@ def squares(rows: Float[AnyArray, "r c m"]) -> Float[AnyArray, "m r r"]:
     return namespace(rows).moveaxis(products(rows, rows), -1, 0)
 
 
-def products(one: Float[AnyArray, "r c m"], other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r s m"]:
+def products(left: Float[AnyArray, "r c m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r s m"]:
     """A matrix a pose times the transpose of another, as sums: XLA computes many products of small matrices several
     times as slowly."""
-    first, *others = (one[:, None, c] * other[None, :, c] for c in range(one.shape[1]))
+    first, *others = (left[:, None, c] * right[None, :, c] for c in range(left.shape[1]))
     return sum(others, first)
 
 
-def matrix_products(one: Float[AnyArray, "r s m"], other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
+def matrix_products(left: Float[AnyArray, "r s m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
     """The product of two matrices a pose."""
-    return products(one, namespace(other).swapaxes(other, 0, 1))
+    return products(left, namespace(right).swapaxes(right, 0, 1))
 
 
 def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -> Float[AnyArray, "r m"]:
@@ -104,18 +104,18 @@ def scatter_of(
             slope = slope - 2 * xp.sum(solved * _each(of_arm, solved))
         return total, xp.where(slope < 0, slope, -1.0)
 
-    known = stop_gradient((rows, errors, degrees_of_freedom))
+    constant = stop_gradient((rows, errors, degrees_of_freedom))
 
     def refine(state: tuple[Any, Any]) -> tuple[Any, Any]:
         count, log_sigma = state
-        total, slope = excess(log_sigma, *known)
+        total, slope = excess(log_sigma, *constant)
         # Newton's step in the logarithm; far above the root, where the sum falls as a power of sigma, a longer one.
-        longer = xp.where(total > 0, (total + known[2]) / known[2], 1.0)
+        longer = xp.where(total > 0, (total + constant[2]) / constant[2], 1.0)
         step = xp.clip(-total / slope * longer, -2.0, 2.0)
         done = xp.abs(step) < 1e-12
         return xp.where(done, _ROUNDS, count + 1), xp.maximum(log_sigma + step, np.log(_LEAST_SIGMA))
 
-    values = xp.concatenate([xp.reshape(part.values, (-1,)) for part in known[0]])
+    values = xp.concatenate([xp.reshape(part.values, (-1,)) for part in constant[0]])
     first = xp.log(xp.sqrt(xp.mean(values**2)) + _LEAST_SIGMA)
     _, root = while_loop(lambda state: state[0] < _ROUNDS, refine, (xp.asarray(0), first))
     # One more step, which is nothing, but carries the derivatives of the implicit equation.
@@ -136,12 +136,12 @@ def robust_scatter_of(
     """The same from the median of the poses' squared residuals, each over its median for normal errors: a few bad poses
     do not change it much."""
     xp = namespace([part.values for part in rows], errors)
-    known, expected = stop_gradient((rows, errors)), stop_gradient(degrees_of_freedom)
+    constant, expected = stop_gradient((rows, errors)), stop_gradient(degrees_of_freedom)
     count = sum(part.values.size for part in rows)
 
     def rescale(log_sigma: Any, _: Any) -> tuple[Any, Any]:
         squares = []
-        for part, error in zip(*known, strict=True):
+        for part, error in zip(*constant, strict=True):
             inverse = inverse_positive_definite(part.measured + covariance_of_sigma(error, xp.exp(log_sigma)))
             square = xp.einsum("rm,mrs,sm->m", part.values, inverse, part.values)
             squares.append(square / median_square(part.values.shape[0]))

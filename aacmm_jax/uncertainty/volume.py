@@ -45,23 +45,23 @@ class VolumetricUncertainty(NamedTuple):
     def summary(self) -> dict[str, float]:
         """Median, 95th percentile and largest uncertainty, standard and expanded to 95 %, mm; the smallest and the
         largest coverage factor."""
-        found = {"length_mm": self.length}
+        numbers = {"length_mm": self.length}
         pairs = [np.stack([u, expanded]) for u, expanded in zip(self[5:8], self[8:], strict=True)]
         u, expanded = np.concatenate(pairs, axis=1)
-        known = np.isfinite(u) & (u > 0)
-        factors = expanded[known] / u[known]
-        found |= {"coverage_factor_least": float(factors.min(initial=np.inf))}
-        found |= {"coverage_factor_largest": float(factors.max(initial=-np.inf))}
+        usable = np.isfinite(u) & (u > 0)
+        factors = expanded[usable] / u[usable]
+        numbers |= {"coverage_factor_least": float(factors.min(initial=np.inf))}
+        numbers |= {"coverage_factor_largest": float(factors.max(initial=-np.inf))}
         for name in self._fields[5:]:
             values = getattr(self, name)
-            found |= {
+            numbers |= {
                 f"{name}_median_mm": float(np.median(values)),
                 f"{name}_95_mm": float(
                     np.quantile(values, 0.95, method="higher")
                 ),  # no sum, so infinite ones are allowed
                 f"{name}_largest_mm": float(np.max(values)),
             }
-        return found
+        return numbers
 
 
 @checked_arguments
@@ -146,7 +146,7 @@ def sample_lengths(
     draw = lambda m: random.uniform(allowed[:, 0], allowed[:, 1], (m, arm.joints))  # noqa: E731
     if length is None:
         return draw(count), draw(count)
-    starts, ends, found = [], [], 0
+    starts, ends, count_reached = [], [], 0
     for _ in range(60):
         q = draw(2 * count)
         direction = random.normal(size=(2 * count, 3))
@@ -156,8 +156,8 @@ def sample_lengths(
         other, arrived = project_to_targets(arm, draw(2 * count)[near], targets[near], allowed)
         starts.append(q[near][arrived])
         ends.append(other[arrived])
-        found += int(arrived.sum())
-        if found >= count:
+        count_reached += int(arrived.sum())
+        if count_reached >= count:
             return np.concatenate(starts)[:count], np.concatenate(ends)[:count]
     raise InputError(
         f"lengths of {length:g} mm cannot be reached by this arm within its joint limits; give a shorter one."

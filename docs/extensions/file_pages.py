@@ -18,7 +18,7 @@ from key_descriptions import DESCRIPTIONS
 from pydantic import BaseModel
 
 import aacmm_jax as aj
-from aacmm_jax.files import administrative_data, arms, cells, kits, manifest, manifest_tables
+from aacmm_jax.files import administrative_data, arm_tables, cells, kits, manifest, manifest_tables
 from aacmm_jax.study import specification
 
 FOLDER = DOCS / "reference" / "files"
@@ -26,7 +26,7 @@ FOLDER = DOCS / "reference" / "files"
 FORMATS: dict[str, tuple[str, str, type[BaseModel]]] = {
     "manifest": ("Manifest of a capture", "`aacmm import FILE`, `aj.files.read_manifest`", manifest.manifest_model()),
     "points": ("Manifest of points", "`aacmm evaluate FILE`, `aj.files.read_points`", manifest.PointsManifest),
-    "arm": ("Arm", "an arm of every command, `aj.load_arm`", arms._ArmModel),
+    "arm": ("Arm", "an arm of every command, `aj.load_arm`", arm_tables.ArmFile),
     "study": ("Study", "`aacmm study FILE`, `aj.study.read_study`", specification.Specification),
     "kit": ("Kit of artefacts and instruments", "`aacmm plan --kit FILE`, `aj.files.read_kit`", kits._Kit),
     "cell": ("Cell of a robot", "`aacmm plan --cell FILE`, `aj.files.load_cell`", cells._CellFile),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import aacmm_jax as aj
 from aacmm_jax.acceptance import geometry, measured_by, run
 from aacmm_jax.acceptance.all_tests import TESTS, requirements_table
-from aacmm_jax.acceptance.postures import elbow_sides
+from aacmm_jax.acceptance.geometry import elbow_sides
 from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
 from aacmm_jax.acceptance.requirements import CONFIDENCES
 from aacmm_jax.acceptance.results import Measured

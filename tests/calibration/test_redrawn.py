@@ -1,7 +1,5 @@
 """Captures drawn anew: every kind of observation scatters as it should, by one piece of code."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -54,7 +52,7 @@ def test_certified_values_are_drawn_once_for_all_that_share_them(paper_arm, boun
     capture, result = calibrated(paper_arm, bounds, SIMULATED["bars"])
     batch = truth_of(result, capture).drawn(300, NOISE, np.random.default_rng(0))
     name = "coordinates of bar"
-    values = [observation.values[name] for observation in batch.observations]
+    values = [observation.drawn[name] for observation in batch.observations]
     assert len(values) == 3
     for other in values[1:]:
         np.testing.assert_array_equal(values[0], other)
@@ -65,9 +63,7 @@ def test_certified_values_are_drawn_once_for_all_that_share_them(paper_arm, boun
 @pytest.fixture(scope="module")
 def mixed(paper_arm, bounds):
     """Two sockets at a known distance, a tracker that saw the same arm, and a plate that all share."""
-    few = [dataclasses.replace(one, poses=12) for one in SIMULATED["points"]] + [
-        dataclasses.replace(one, poses=3) for one in SIMULATED["bars"]
-    ]
+    few = [one.changed(poses=12) for one in SIMULATED["points"]] + [one.changed(poses=3) for one in SIMULATED["bars"]]
     sockets = {"A": (400, 100, 300), "B": (400, 100, 500)}
     return calibrated(paper_arm, bounds, few, sockets, [("A", "B", 0.002)])
 
@@ -115,7 +111,7 @@ def test_monte_carlo_of_observations(mixed):
 
 def test_what_cannot_be_drawn(paper_arm, bounds, mixed):
     capture, result = mixed
-    plate = [dataclasses.replace(SIMULATED["plate"][0], poses=1)]
+    plate = [SIMULATED["plate"][0].changed(poses=1)]
     singles, of_singles = calibrated(paper_arm, bounds, plate)
     with pytest.raises(aj.InputError, match="one pose in each point"):
         aj.bootstrap(of_singles, singles)

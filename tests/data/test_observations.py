@@ -11,12 +11,11 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.data.observations.cylinder import distances, fitted_cylinder
+from aacmm_jax.data.observations.fits import distances_from_axis, fitted_cylinder
 from aacmm_jax.data.observations.frames import placed
 from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
+from aacmm_jax.data.observations.observation import kinds as known_kinds
 from aacmm_jax.data.observations.platform import platform_frames
-from aacmm_jax.data.observations.shifted import ShiftedObservation
-from aacmm_jax.files.observation_kinds import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
 POSES = 12
@@ -166,7 +165,7 @@ def test_platform_frames_are_exact_for_exact_data(seed):
         position = placed(indices[index], on_platform)[0]
         q = {point: np.zeros((1, 6)) for point in points}
         artefact = kinds.Artefact(f"{placement} at {index}", points, q, placement=placement, index=index)
-        observations.append(ShiftedObservation(artefact, artefact.q, np.zeros((3, len(q))), {}))
+        observations.append(artefact.with_errors(artefact.q, np.zeros((3, len(q))), {}))
         tips.append(Tips(position, (position, position, position)))
     found = platform_frames(observations, tips)
     assert set(found) == {f"placement {name}" for name in placements} | {"index 1", "index 2"}
@@ -290,7 +289,7 @@ def test_cylinders_are_found_in_any_direction(shape, known):
         tips, radius = touches(cylinder, *shape), np.array(20.0) if known else None
         axis, found = fitted_cylinder(tips, radius)
         assert abs(found - 20) < (1e-12 if known else 1.0)
-        assert np.abs(distances(tips, axis)[0] - found).max() < 0.12
+        assert np.abs(distances_from_axis(tips, axis)[0] - found).max() < 0.12
 
 
 def test_a_cylinder_is_fitted_under_jit_too():

@@ -103,7 +103,7 @@ def test_copies_within_observations_count_once(paper_arm, tmp_path):
     np.testing.assert_array_equal(kept["T"].points, one.points)
     np.testing.assert_array_equal(kept["T"].covariance, one.covariance)
     assert kept["measured again"].q.shape == (2, 6)
-    assert kept["bar"].owner == (0, 0, 1, 1)
+    assert kept["bar"].point == ("a", "a", "b", "b")
     assert capture.repeated.poses == (("A", 1), ("T", 2), ("bar", 1))
     specification = aj.kinematics.ArmSpecification(paper_arm, "test")
     aj.files.save_capture(tmp_path / "c.h5", aj.Recording(capture, specification))

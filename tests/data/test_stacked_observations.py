@@ -8,7 +8,6 @@ import pytest
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.observations.observation import Tips
-from aacmm_jax.data.observations.shifted import ShiftedObservation
 
 from .test_observations import ALL, POSES, TIPS, unknowns_of
 
@@ -46,7 +45,7 @@ def cylinder(i, name, q):
 
 def shifted(i, name, q):
     sphere = kinds.Sphere(name, q, diameter=50 + i)
-    return ShiftedObservation(sphere, q, RANDOM.normal(size=(1, len(q))), {})
+    return sphere.with_errors(q, RANDOM.normal(size=(1, len(q))), {})
 
 
 STACKS = {
@@ -103,9 +102,13 @@ def test_a_stack_is_what_its_observations_are(name, library):
     columns = [np.concatenate(values, axis=1) for values in zip(*repeated, strict=True)]
     columns = dict(zip(stack.unknowns, columns, strict=True))
     tips = tips_of(slice(0, ENDS[-1]))
-    residual = type(stack).residual if library is np else jax.jit(type(stack).residual)
+    evaluate = type(stack).residual_with_errors
+    residual = evaluate if library is np else jax.jit(evaluate)
     rows = residual(*jax.tree.map(library.asarray, (stack, tips, columns)))
-    parts = [one.residual(tips_of(poses), own) for one, poses, own in zip(observations, SLICES, unknowns, strict=True)]
+    parts = [
+        one.residual_with_errors(tips_of(poses), own)
+        for one, poses, own in zip(observations, SLICES, unknowns, strict=True)
+    ]
     for field in ("values", "by_tip", "by_rotation"):
         if getattr(parts[0], field) is not None:
             expected = np.concatenate([getattr(part, field) for part in parts], axis=-1)
@@ -119,18 +122,20 @@ def test_a_stack_is_what_its_observations_are(name, library):
 @pytest.mark.parametrize("name", [*ALL, "shifted"])
 def test_derivatives_are_those_of_jax(name):
     """By unknowns that all poses share and by those of each pose, which are equal here; also under vmap."""
-    known = to_numpy(ALL[name] if name in ALL else ShiftedObservation(ALL["plane"], ALL["plane"].q, SHIFT, {}))
+    known = to_numpy(ALL[name] if name in ALL else ALL["plane"].with_errors(ALL["plane"].q, SHIFT, {}))
     observation, tips = jax.tree.map(jnp.asarray, (known, TIPS))
     shared = {part: unknowns_of(known)[part] for part in known.unknowns}
-    rows = known.residual(TIPS, shared)
+    rows = known.residual_with_errors(TIPS, shared)
 
     def values(unknowns):
-        return observation.residual(tips, unknowns).values
+        return observation.residual_with_errors(tips, unknowns).values
 
     of_each = {part: np.repeat(value, POSES, axis=1) for part, value in shared.items()}
     alone = jax.jit(jax.jacfwd(values))(jax.tree.map(jnp.asarray, shared))
     own = jax.jit(jax.jacfwd(values))(jax.tree.map(jnp.asarray, of_each))
-    one = jax.jit(jax.vmap(observation.residual, (None, 0)))(tips, jax.tree.map(lambda v: jnp.stack([v, v]), of_each))
+    one = jax.jit(jax.vmap(observation.residual_with_errors, (None, 0)))(
+        tips, jax.tree.map(lambda v: jnp.stack([v, v]), of_each)
+    )
     for part, expected in rows.by_unknowns.items():
         tolerance = 1e-9 * np.abs(expected).max()
         np.testing.assert_allclose(np.moveaxis(alone[part][..., 0], -1, 0), expected, atol=tolerance)
@@ -147,10 +152,10 @@ def test_what_is_linear_has_derivatives_that_depend_on_nothing(name):
     first = {part: unknowns_of(observation)[part] for part in observation.unknowns}
     moved = {part: value + 0.1 for part, value in first.items()}
     tips = TIPS._replace(position=1.1 * TIPS.position)
-    both = observation.residual(TIPS, first), observation.residual(tips, moved)
+    both = observation.residual_with_errors(TIPS, first), observation.residual_with_errors(tips, moved)
     constant = all(np.array_equal(both[0].by_unknowns[part], both[1].by_unknowns[part]) for part in first)
     assert observation.linear == constant == (name in ("socket", "point"))
-    assert ShiftedObservation(observation, observation.q, 0 * both[0].values, {}).linear == constant
+    assert observation.with_errors(observation.q, 0 * both[0].values, {}).linear == constant
 
 
 def test_only_those_are_alike_that_have_the_same_rows():
@@ -159,9 +164,6 @@ def test_only_those_are_alike_that_have_the_same_rows():
         "planes", "exact planes", "artefact", "indexed artefact"
     }  # fmt: skip
     assert len({one.alike for one in SPHERES}) == len(SPHERES)
-    shifted = [ShiftedObservation(one, one.q, SHIFT, {}) for one in (ALL["plane"], ALL["socket"], ALL["planes"])]
-    assert shifted[0].alike != shifted[1].alike
-    assert shifted[2].alike is None
     inside = [kinds.Cylinder("c", ALL["plane"].q, diameter=50, inside=inside).alike for inside in (False, True)]
     assert inside[0] != inside[1]
 

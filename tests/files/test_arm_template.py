@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.arm_noise import NoiseTable
-from aacmm_jax.files.arm_template import arm_template
-from aacmm_jax.files.arms import _ArmModel, _Identification, _Joint
+from aacmm_jax.files.arm_tables import ArmFile, Identification, JointTable, NoiseTable, arm_template
 from aacmm_jax.files.corrections import CorrectionsTable
 from aacmm_jax.files.priors import PriorTable
 
@@ -24,13 +22,13 @@ def test_the_template_loads(tmp_path, joints):
 
 def test_every_key_is_in_it_and_valid(tmp_path):
     text = arm_template(6)
-    for model in (_ArmModel, _Joint, _Identification, NoiseTable, PriorTable, CorrectionsTable):
+    for model in (ArmFile, JointTable, Identification, NoiseTable, PriorTable, CorrectionsTable):
         for name, field in model.model_fields.items():
             key = field.alias or name
             assert re.search(rf"\b{key}\b", text), key
     # Keys that are commented out can be used as they are written.
     uncommented = re.sub(r"^# (\[identification\]|(?:held|free|length|angle|override) = )", r"\1", text, flags=re.M)
-    assert tomllib.loads(uncommented)["identification"].keys() == _Identification.model_fields.keys()
+    assert tomllib.loads(uncommented)["identification"].keys() == Identification.model_fields.keys()
     (tmp_path / "my.toml").write_text(uncommented)
     specification = aj.files.load_specification(tmp_path / "my.toml")
     assert specification.override == {"probe_z": 60.0}

@@ -11,8 +11,7 @@ from hypothesis.extra import numpy as arrays
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.files import load_cell
-from aacmm_jax.files.mesh_vertices import mesh_path
-from aacmm_jax.files.urdf_shapes import bounding_capsule
+from aacmm_jax.files.urdf_shapes import bounding_capsule, mesh_path
 from aacmm_jax.kinematics import Box, HalfSpace, Post, clearances
 from aacmm_jax.kinematics.body import capsule_ends, frames_at
 from tests.example_counts import example_count
@@ -178,9 +177,9 @@ def test_refused(tmp_path, change, text):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (('size="0.4 0.06 0.08"', 'size="0.4 0 0.08"'), "collision box of link 'one' has no size above 0"),
+        (('size="0.4 0.06 0.08"', 'size="0.4 0 0.08"'), "<box> of link 'one' has no size above 0"),
         (('radius="0.05" length="0.2"', 'radius="0.05"'), "give its radius and length"),
-        (('<sphere radius="0.03"/>', '<sphere radius="x"/>'), "radius of link 'two' is 'x'"),
+        (('<sphere radius="0.03"/>', '<sphere radius="x"/>'), "<sphere> of link 'two' has radius = 'x'"),
     ],
 )
 def test_refused_shapes(tmp_path, change, text):

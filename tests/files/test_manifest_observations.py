@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
+from aacmm_jax.data.observations.observation import kinds as known_kinds
 from aacmm_jax.files.manifest_tables import TABLES
-from aacmm_jax.files.observation_kinds import kinds as known_kinds
 from tests.refusals import assert_refused
 
 HEAD = 'arm = "cheng2018-simulation"\n[angles]\nunit = "rad"\n'
@@ -205,7 +205,7 @@ def test_groups_and_names_of_points(tmp_path):
     )
     assert (left.name, right.name, left.artefact) == ("bar/left", "bar/right", "bar 1")
     assert np.array_equal(left.q, Q[[0, 2, 1]])
-    assert (left.owner, right.owner) == ((0, 0, 1), (1, 1))
+    assert (left.point, right.point) == (("a", "a", "b"), ("b", "b"))
     assert np.array_equal(left.coordinates[1], [300.5, 0, 0])
     assert float(left.u) == 0.001
     (distances,) = read(
@@ -231,7 +231,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         ),
         key=lambda one: ["parallel planes", "sphere", "cylinder", "plane", "socket"].index(one.kind),
     )
-    assert (planes.name, planes.first, float(planes.between)) == ("block a", 3, 94.0)
+    assert (planes.name, planes.side.count("one"), float(planes.between)) == ("block a", 3, 94.0)
     assert float(sphere.radius) == 12.7
     assert (float(cylinder.radius), float(cylinder.form)) == (7.0, 0.002)
     assert (plane.name, socket.target) == ("wall", "T")

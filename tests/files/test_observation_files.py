@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.data.observations.observation import kinds as known_kinds
 from aacmm_jax.files.hdf5 import SEALED_SINCE
-from aacmm_jax.files.observation_kinds import kinds as known_kinds
 from tests.example_counts import example_count
 
 JOINTS = 3

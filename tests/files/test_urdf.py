@@ -173,7 +173,7 @@ def test_manifest_and_arm_file_name_a_urdf(tmp_path, nominal):
     stated = aj.files.load_specification(arm)
     assert (stated.held, stated.urdf.tip, stated.name) == (("d_1",), "tool0", "arm")
     np.testing.assert_array_equal(stated.arm.probe, found.arm.probe)
-    assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is no URDF", "leave out base and tip")
+    assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is not a URDF", "leave out base and tip")
     assert_refused(lambda: aj.load_arm("panda", probe=(0, 0, 1)), "states the probe itself")
     both = written(tmp_path, head + "joint = [{alpha = 0, a = 1, d = 0}]\n", "both.toml")
     assert_refused(lambda: aj.load_arm(both), "either joint", "or urdf")
@@ -210,7 +210,7 @@ REFUSED = {
     "no limits": (joint("joint_5", limit=""), {}, ["'joint_5' is revolute and has no limits", "continuous"]),
     "reversed limits": (joint("joint_5", limit='<limit lower="1" upper="-1"/>'), {}, ["limits 1 and -1 rad"]),
     "limits in degrees": (joint("joint_5", limit='<limit lower="-90" upper="120"/>'), {}, ["-90 and 120 rad"]),
-    "angles in degrees": (('rpy="0 -1.5708 0"', 'rpy="0 -90 0"'), {}, ["rpy of joint", "'0 -90 0'", "in degrees"]),
+    "angles in degrees": (('rpy="0 -1.5708 0"', 'rpy="0 -90 0"'), {}, ["of joint", "rpy = '0 -90 0'", "in degrees"]),
     "no root": (('<child link="base_link"/>', BACK), {"tip": None}, ["every link has a joint before it", "a tree"]),
     "not finite": (('xyz="0.35 0 0.03"', 'xyz="nan 0 0"'), {}, ["'nan 0 0'", "3 numbers"]),
     "millimetres": (('xyz="0.35 0 0.03"', 'xyz="350 0 30"'), {}, ["352 m long", "divide them by 1000"]),
@@ -224,13 +224,13 @@ REFUSED = {
     "no number": (('xyz="0.35 0 0.03"', 'xyz="a 0 0"'), {}, ["'a 0 0'"]),
     "huge": (('rpy="0 -1.5708 0"', 'rpy="1e300 0 0"'), {}, ["'1e300 0 0'", "below 1e+06"]),
     "infinite": (('xyz="0.35 0 0.03"', 'xyz="inf 0 0"'), {}, ["'inf 0 0'"]),
-    "mass": (('<mass value="3"/>', '<mass value="-3"/>'), {}, ["the mass of link 'upper' is -3 kg"]),
+    "mass": (('<mass value="3"/>', '<mass value="-3"/>'), {}, ["<mass> of link 'upper' is -3 kg"]),
     "no parent": (('<parent link="wrist_1"/>', ""), {}, ["joint 'joint_5' has no <parent"]),
     "no name": (('<link name="wrist_2"/>', "<link/>"), {}, ["a link has no name"]),
     "xacro": (('<link name="wrist_2"/>', '<xacro:arm name="x"/>'), {}, ["xacro FILE.xacro > FILE.urdf"]),
     "xacro value": (('xyz="0.35 0 0.03"', 'xyz="${length} 0 0"'), {}, ["xacro FILE.xacro > FILE.urdf"]),
     "no XML": (("</robot>", ""), {}, ["not valid XML", "correct it there"]),
-    "another format": (("<robot", "<model"), {}, ["not valid XML"]),
+    "another format": (("<robot", "<model"), {}, ["root element is <model>"]),
     "misspelt origin": (
         ('<origin xyz="0.35', '<orign xyz="0.35'), {}, ["line 50: joint 'joint_4'", "<orign>; did you mean '<origin>'?"]
     ),
@@ -247,16 +247,18 @@ REFUSED = {
     "misspelt link": (('<link name="wrist_2"/>', '<Link name="wrist_2"/>'), {}, ["the robot", "<Link>; did you mean"]),
     "misspelt mass": (('<mass value="3"/>', '<mas value="3"/>'), {}, ["<inertial> of link 'upper'", "<mas>"]),
     "mass outside": (
-        ('<inertial><origin xyz="0 0 0.2"/><mass value="3"/>', '<mass value="3"/><inertial>'), {}, ["'upper'", "<mass>"]
+        ('<inertial><origin xyz="0 0 0.2"/><mass value="3"/>', '<mass value="3"/><inertial>'), {},
+        ["link 'upper' holds <mass>, which does not belong there"],
     ),
     "inside an origin": (
-        ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"><axis xyz="0 0 1"/></origin>'), {}, ["<axis>, but holds"]
+        ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"><axis xyz="0 0 1"/></origin>'), {},
+        ["holds <axis>, which does not belong there; move it"],
     ),
     "text": (('<origin xyz="0.35 0 0.03"', 'origin xyz="0.35" <origin'), {}, ["holds the text 'origin xyz=\"0.35\"'"]),
     "quaternion": (('rpy="0 1.5708 0"', 'quat_xyzw="0 1 0 0"'), {}, ["quat_xyzw", "as rpy"]),
     "two shapes": (
         ('<link name="wrist_2"/>', '<link name="wrist_2"><collision><geometry><sphere radius="1"/><box size="1 1 1"/>'
-         "</geometry></collision></link>"), {}, ["<geometry> of link 'wrist_2' has 2 shapes"]
+         "</geometry></collision></link>"), {}, ["<geometry> of link 'wrist_2' has two shapes"]
     ),
 }  # fmt: skip
 
@@ -311,6 +313,9 @@ def test_other_files_are_refused(tmp_path, content, part):
 
 def test_export_needs_the_urdf(paper_arm, nominal):
     assert_refused(
-        lambda: urdf_of(paper_arm, aj.files.load_specification("panda")), "not read from a URDF", "--format toml"
+        lambda: urdf_of(paper_arm, aj.files.load_specification("panda")),
+        "not read from a URDF",
+        "a URDF cannot be exported",
+        "--format toml",
     )
     assert_refused(lambda: urdf_of(aj.load_arm("panda"), nominal), "has 7 joints, but the URDF 6")

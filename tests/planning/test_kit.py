@@ -1,7 +1,5 @@
 """Plans with artefacts and instruments: information of the model's rows, placements, and files for all kinds."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -49,7 +47,7 @@ def problem(space):
 )
 def test_information_is_that_of_a_calibration(paper_arm, space, problem, which):
     """The covariance that a plan predicts is what the calibration of its poses finds, for every kind at once."""
-    simulated = [dataclasses.replace(one, poses=8) for one in EVERYTHING[which]]
+    simulated = [one.changed(poses=8) for one in EVERYTHING[which]]
     capture = aj.simulate(paper_arm, {}, observations=simulated, noise=aj.Noise(), seed=2)
     candidates = candidates_of_kit(problem, capture.observations)
     predicted = covariance_of(candidates.information(candidates.rows), len(FEW))
@@ -102,7 +100,7 @@ def test_a_whole_plan(paper_arm, space, monkeypatch):
     assert all(100 <= z <= 600 for frame in (first, second) for z in [frame[5]])
     for simulated, one in zip(found.kit[:2], found.observations[:2], strict=True):
         tips = np.asarray(paper_arm.position(one.q))
-        points = dataclasses.replace(simulated, poses=1).tips(np.random.default_rng(0))
+        points = simulated.changed(poses=1).tips(np.random.default_rng(0))
         assert np.abs(tips - points[list(one.owner)]).max() < 1e-5
     assert found.predicted.largest < found.random.largest
     assert found.more.largest <= found.predicted.largest * 1.001

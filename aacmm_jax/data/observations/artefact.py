@@ -1,10 +1,8 @@
 """Artefacts of certified points: ball bars, plates of balls or holes, tetrahedra; in each of their placements."""
 
-import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -13,27 +11,10 @@ from ...core.errors import InputError, nearest
 from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix, rotation_vector
-from .columns import each_pose, no_covariance
-from .frames import moved, placed
-from .observation import (
-    FRAME,
-    READINGS,
-    TARGET,
-    AbstractObservation,
-    AbstractSimulated,
-    Entry,
-    Quantity,
-    Rows,
-    Tips,
-    Unknowns,
-    checked_name,
-    checked_readings,
-    checked_scalar,
-    checked_target,
-    checked_values,
-    is_exact,
-    numbers,
-)
+from .declared import NAME, checked_readings, count, derived, is_exact, number, points, text
+from .frames import each_pose, moved, no_covariance, placed
+from .observation import FRAME, AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
+from .simulated import AbstractSimulated
 
 
 class Artefact(AbstractObservation):
@@ -64,79 +45,41 @@ class Artefact(AbstractObservation):
         (12, 6) ['placement plate', 'coordinates of plate']
     """
 
-    kind: ClassVar[str] = "artefact"
-    by_pose: ClassVar[tuple[str, ...]] = ("q", "owner")
-    table: ClassVar[str] = "artefact"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        Entry("point", "point of the artefact that held the tip", dimensions=("pose",), content="text", required=True),
-        Entry("names", "point of the artefact", dimensions=("names",), content="text", required=True),
-        Entry("coordinates", "certified coordinates", "mm", ("names", "axis"), required=True, uncertainty="u"),
-        Entry("u", "standard uncertainty of a coordinate", "mm"),
-        Entry("artefact", "name of the artefact", content="text"),
-        Entry("placement", "name of its placement", content="text"),
-        Entry("index", "index of the platform that carries it", content="text"),
-        TARGET,
-    )
-    rows: ClassVar[int] = 3
-    q: Float[AnyArray, "m n"]
-    coordinates: Float[AnyArray, "c 3"]
-    u: Float[AnyArray, ""]
-    name: str = eqx.field(static=True)
-    artefact: str = eqx.field(static=True)
-    placement: str = eqx.field(static=True)
-    index: str | None = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)  # of the points, all of the artefact
-    owner: tuple[int, ...] = eqx.field(static=True)  # point of each pose
-    free: bool = eqx.field(static=True)  # whether the coordinates are unknowns with certified values
+    kind, table, noun, rows = "artefact", "artefact", "artefact", 3
+    point: tuple[str, ...] = text("point of the artefact that held the tip", "pose")
+    names: tuple[str, ...] = text("point of the artefact", "names")
+    coordinates: Float[AnyArray, "c 3"] = number("certified coordinates", "mm", "names", "axis", uncertainty="u")
+    u: Float[AnyArray, ""] = number("standard uncertainty of a coordinate", "mm", default=0.0)
+    artefact: str = text("name of the artefact", default=NAME)
+    placement: str = text("name of its placement", default=NAME, of_session=True)
+    index: str | None = text("index of the platform that carries it", default=None, of_session=True)
+    free: bool = derived()  # whether the coordinates are unknowns with certified values
 
-    def __init__(
-        self,
-        name: str,
-        points: Mapping[str, Numbers],
-        q: Mapping[str, Numbers],
-        *,
-        u: Numbers = 0.0,
-        artefact: str | None = None,
-        placement: str | None = None,
-        index: str | None = None,
-        target: str = "",
-    ):
-        self.name = checked_name(name, "an artefact")
+    def __init__(self, name: str, points: Mapping[str, Numbers], q: Mapping[str, Numbers], **options: Any):
         where = f"artefact '{name}'"
         if not isinstance(points, Mapping) or not isinstance(q, Mapping) or not points or not q:
             raise InputError(f"{where} needs two dictionaries: its points' coordinates, and the readings in them.")
-        for point in q:
-            if point not in points:
-                raise InputError(f"{where} has poses in '{point}', which has no coordinates{nearest(point, points)}")
         blocks = {point: checked_readings(f"{where} point '{point}'", readings) for point, readings in q.items()}
         widths = {block.shape[1] for block in blocks.values()}
         if len(widths) > 1:
             raise InputError(f"{where} has readings of {sorted(widths)} columns; give one column a joint.")
-        self.names = tuple(points)
-        rows = [checked_values(f"{where} point '{point}'", value, (3,)) for point, value in points.items()]
-        self.coordinates = namespace(*rows).stack(rows)
-        self.q = namespace(*blocks.values()).concatenate(list(blocks.values()))
-        self.owner = tuple(self.names.index(point) for point, block in blocks.items() for _ in range(block.shape[0]))
-        self.u = checked_scalar(f"u of {where}", u)
-        self.artefact = checked_name(name if artefact is None else artefact, "an artefact")
-        self.placement = checked_name(name if placement is None else placement, "a placement")
-        self.index = None if index is None else checked_name(index, "an index")
-        self.target = checked_target(target)
-        self.free = not is_exact(self.u)
+        readings = namespace(*blocks.values()).concatenate(list(blocks.values()))
+        held = [point for point, block in blocks.items() for _ in range(block.shape[0])]
+        super().__init__(name, readings, held, list(points), list(points.values()), **options)
 
-    def stored(self) -> dict[str, Any]:
-        point = np.array([self.names[i] for i in self.owner])
-        return super().stored() | {"point": point, "names": np.array(self.names)}
+    def completed(self, where: str) -> Mapping[str, Any]:
+        for point in dict.fromkeys(self.point):
+            if point not in self.names:
+                raise InputError(
+                    f"{where} has poses in '{point}', which has no coordinates{nearest(point, self.names)}"
+                )
+        return {"free": not is_exact(self.u)}
 
-    @classmethod
-    def rebuilt(cls, name: str, stored: Mapping[str, Any]) -> "Artefact":
-        held = np.asarray(stored["point"])
-        points = dict(zip(np.asarray(stored["names"]).tolist(), stored["coordinates"], strict=True))
-        q = {point: stored["q"][held == point] for point in dict.fromkeys(held.tolist())}
-        rest = {key: value for key, value in stored.items() if key not in ("q", "point", "names", "coordinates")}
-        return cls(name, points, q, **rest)
+    @property
+    def owner(self) -> np.ndarray:
+        """Index of the point of each pose, ``(m,)``."""
+        numbers = {name: i for i, name in enumerate(self.names)}
+        return np.array([numbers[point] for point in self.point])
 
     @property
     def frame(self) -> str:
@@ -154,17 +97,10 @@ class Artefact(AbstractObservation):
         return f"coordinates of {self.artefact}"
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        return ("name", "placement", "index")
-
-    @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        found = {self.frame: FRAME}
-        if self.index is not None:
-            found[self.platform] = FRAME
-        if self.free:
-            found[self.shape] = ("mm",) * self.coordinates.size
-        return found
+        platform = {} if self.index is None else {self.platform: FRAME}
+        shape = {self.shape: ("mm",) * self.coordinates.size} if self.free else {}
+        return {self.frame: FRAME} | platform | shape
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         if part != self.shape:
@@ -174,29 +110,28 @@ class Artefact(AbstractObservation):
 
     @property
     def fixes_scale(self) -> bool:
-        return len(set(self.owner)) > 1
+        return len(set(self.point)) > 1
 
     @property
-    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
+    def certified(self) -> Certified:
         if not self.free:
             return {}
         values = self.coordinates.reshape(-1)
         return {self.shape: (values, namespace(values, self.u).broadcast_to(self.u, values.shape))}
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
-        xp = namespace(tips, self.coordinates)
-        frame = fitted_frame(self.coordinates[np.array(self.owner)].T, tips.position)
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         # Where the platform's frames are unknown too, the placement carries all of it: `platform_frames` says more, by
         # all observations together.
-        found = {self.frame: frame}
+        frame = fitted_frame(self.coordinates[self.owner].T, tips.position)
+        parts: Parts = {self.frame: frame}
         if self.index is not None:
-            found[self.platform] = xp.zeros(6)
+            parts[self.platform] = namespace(tips, self.coordinates).zeros(6)
         if self.free:
-            found[self.shape] = self.coordinates.reshape(-1)
-        return found
+            parts[self.shape] = self.coordinates.reshape(-1)
+        return parts
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        xp, owner, m = namespace(tips, unknowns, self.coordinates), np.array(self.owner), self.q.shape[0]
+        xp, owner, m = namespace(tips, unknowns, self.coordinates), self.owner, self.q.shape[0]
         coordinates = self.coordinates.reshape(-1, 1)
         if self.free:
             coordinates = unknowns[self.shape]
@@ -244,33 +179,24 @@ class SimulatedArtefact(AbstractSimulated):
         (10, 6)
     """
 
-    table: ClassVar[str] = "artefact"
-    name: str = eqx.field(static=True)
-    points: dict[str, tuple[float, float, float]] = eqx.field(static=True)
-    poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0,) * 6)
-    errors: np.ndarray | None = None
-    u: float = 0.0
-    artefact: str | None = eqx.field(static=True, default=None)
-    placement: str | None = eqx.field(static=True, default=None)
-    index: str | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self) -> None:
-        if not isinstance(self.points, Mapping) or not self.points:
-            raise InputError(f"points of '{self.name}' are no dictionary; give each point's name and coordinates.")
-        for point, coordinates in self.points.items():
-            numbers(f"point '{checked_name(point, 'a point')}'", 3)(coordinates)
-        if self.errors is not None:
-            numbers("errors of the coordinates", len(self.points), 3)(self.errors)
+    table = "artefact"
+    points: dict[str, tuple[float, float, float]] = points("true coordinates of each point")
+    poses: int = count("number of poses")
+    frame: np.ndarray = number("frame of the artefact in the base frame", "mm", 6, default=(0.0,) * 6)
+    errors: np.ndarray | None = number("errors of the certified coordinates", "mm", "names", 3, default=None)
+    u: float = number("their standard uncertainty", "mm", default=0.0)
+    artefact: str | None = text("name of the artefact", default=None)
+    placement: str | None = text("name of the placement", default=None)
+    index: str | None = text("name of the index of a platform", default=None)
 
     @property
     def orientation(self) -> Float[np.ndarray, "3 3"]:
         return np.asarray(rotation_matrix(self.frame[:3]))
 
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedArtefact":
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
         turned = rotation_matrix(frame[:3]) @ rotation_matrix(self.frame[:3])
         whole = np.concatenate([rotation_vector(turned), moved(frame, self.frame[3:])])
-        return dataclasses.replace(self, name=name, artefact=self.artefact or self.name, frame=whole)
+        return self.changed(name=name, artefact=self.artefact or self.name, frame=whole)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         coordinates = np.repeat(np.array(list(self.points.values())), self.poses, axis=0)
@@ -281,12 +207,6 @@ class SimulatedArtefact(AbstractSimulated):
     ) -> Artefact:
         certified = np.array(list(self.points.values())) + (0.0 if self.errors is None else self.errors)
         blocks = q.reshape(len(self.points), self.poses, -1)
-        return Artefact(
-            self.name,
-            dict(zip(self.points, certified, strict=True)),
-            dict(zip(self.points, blocks, strict=True)),
-            u=self.u,
-            artefact=self.artefact,
-            placement=self.placement,
-            index=self.index,
-        )
+        names = dict(artefact=self.artefact, placement=self.placement, index=self.index)
+        points, held = (dict(zip(self.points, rows, strict=True)) for rows in (certified, blocks))
+        return Artefact(self.name, points, held, u=self.u, **names)

@@ -1,36 +1,19 @@
 """Distances of the tip from an unknown pivot: a telescoping ball bar, a draw wire."""
 
-import dataclasses
 from collections.abc import Hashable, Mapping
-from typing import ClassVar
+from typing import Any, Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers, as_floats, is_concrete
+from ...core.arrays import is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import length_and_direction, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
-from .columns import variances
-from .frames import moved
-from .observation import (
-    POINT,
-    READINGS,
-    TARGET,
-    AbstractObservation,
-    AbstractSimulated,
-    Entry,
-    Rows,
-    Tips,
-    Unknowns,
-    checked_name,
-    checked_readings,
-    checked_target,
-    checked_truth,
-    checked_values,
-    numbers,
-)
+from .declared import number, truth
+from .frames import moved, variances
+from .observation import POINT, AbstractObservation, Parts, Rows, Tips, Unknowns
+from .simulated import AbstractInBox
 
 
 class Distances(AbstractObservation):
@@ -53,43 +36,15 @@ class Distances(AbstractObservation):
         ['pivot of telescoping bar']
     """
 
-    kind: ClassVar[str] = "distances"
-    by_pose: ClassVar[tuple[str, ...]] = ("q", "values", "u")
-    table: ClassVar[str] = "distances"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        Entry("values", "measured distance from the pivot", "mm", ("pose",), required=True),
-        Entry("u", "standard uncertainty of a distance", "mm", ("pose",)),
-        Entry("constant", "whether an unknown constant is added to all distances", content="truth"),
-        TARGET,
-    )
-    rows: ClassVar[int] = 1
-    q: Float[AnyArray, "m n"]
-    values: Float[AnyArray, " m"]
-    u: Float[AnyArray, " m"]
-    name: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-    constant: bool = eqx.field(static=True)
+    kind, table, rows = "distances", "distances", 1
+    values: Float[AnyArray, " m"] = number("measured distance from the pivot", "mm", "pose")
+    u: Float[AnyArray, " m"] = number("standard uncertainty of a distance", "mm", "pose", default=0.0, spread=True)
+    constant: bool = truth("whether an unknown constant is added to all distances")
 
-    def __init__(
-        self,
-        name: str,
-        q: Numbers,
-        values: Numbers,
-        *,
-        u: Numbers = 0.0,
-        constant: bool = False,
-        target: str = "",
-    ):
-        self.name = checked_name(name, "an observation")
-        where = f"observation '{name}'"
-        self.q = checked_readings(where, q)
-        self.values = checked_values(f"distances of {where}", values, (self.q.shape[0],))
-        self.u = _checked_u(where, u, self.q.shape[0])
-        self.target = checked_target(target)
-        self.constant = checked_truth(f"constant of {where}", constant)
+    def completed(self, where: str) -> Mapping[str, Any]:
         if not self.constant and is_concrete(self.values) and np.any(np.asarray(self.values) <= 0):
             raise InputError(f"{where} has a distance that is not positive; give distances in mm, or constant=True.")
+        return {}
 
     @property
     def pivot(self) -> str:
@@ -113,7 +68,7 @@ class Distances(AbstractObservation):
     def alike(self) -> Hashable | None:
         return ()
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         xp = namespace(tips, self.values)
         middle = xp.mean(tips.position, axis=1, keepdims=True)
         size = xp.sqrt(xp.mean((tips.position - middle) ** 2)) + 1e-12
@@ -123,20 +78,19 @@ class Distances(AbstractObservation):
         design = xp.concatenate(columns)
         normal = design @ design.T + 1e-12 * centred.shape[1] * xp.asarray(np.eye(len(design)))
         solution = solve_positive_definite(normal, design @ (xp.sum(centred**2, axis=0) - values**2))
-        found = {self.pivot: middle[:, 0] + size * solution[:3]}
-        return found | ({self.zero: size * solution[4:]} if self.constant else {})
+        return {self.pivot: middle[:, 0] + size * solution[:3]} | (
+            {self.zero: size * solution[4:]} if self.constant else {}
+        )
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.values), self.q.shape[0]
-        between = tips.position - unknowns[self.pivot]
-        distance, towards = length_and_direction(between)
-        direction = towards[None]
-        by_unknowns = {self.pivot: -direction.swapaxes(0, 1)}
+        distance, towards = length_and_direction(tips.position - unknowns[self.pivot])
+        by_unknowns = {self.pivot: -towards[:, None]}
         values = self.values
         if self.constant:
             values = values + unknowns[self.zero][0]
             by_unknowns[self.zero] = -xp.ones((1, 1, m))
-        return Rows((distance - values)[None], direction, by_unknowns, variances(self.u, m))
+        return Rows((distance - values)[None], towards[None], by_unknowns, variances(self.u, m))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         needs = "pivot and constant need five" if self.constant else "pivot needs four"
@@ -144,16 +98,7 @@ class Distances(AbstractObservation):
             raise InputError(f"observation '{self.name}' has {tips.shape[1]} distances, but its {needs}; measure more.")
 
 
-def _checked_u(where: str, u: Numbers, poses: int) -> AnyArray:
-    array = as_floats(u, f"u of {where}")
-    if array.shape not in ((), (poses,)):
-        raise InputError(f"u of {where} has shape {array.shape}; give one number, or ({poses},).")
-    if is_concrete(array) and np.any(np.asarray(array) < 0):
-        raise InputError(f"u of {where} is negative; a standard uncertainty must be zero or positive.")
-    return namespace(array).broadcast_to(array, (poses,))
-
-
-class SimulatedDistances(AbstractSimulated):
+class SimulatedDistances(AbstractInBox):
     """Distances from a pivot to random places in a box.
 
     Args:
@@ -170,18 +115,12 @@ class SimulatedDistances(AbstractSimulated):
         (20,)
     """
 
-    table: ClassVar[str] = "distances"
-    name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
-    poses: int = eqx.field(static=True)
-    pivot: np.ndarray = eqx.field(converter=numbers("pivot", 3))
-    u: float = 0.0
+    table = "distances"
+    pivot: np.ndarray = number("pivot in the base frame", "mm", 3)
+    u: float = number("standard uncertainty of each distance", "mm", default=0.0)
 
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedDistances":
-        return dataclasses.replace(self, name=name, pivot=moved(frame, self.pivot))
-
-    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        return random.uniform(self.box[0], self.box[1], (self.poses, 3))
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
+        return self.changed(name=name, pivot=moved(frame, self.pivot))
 
     def recorded(
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator

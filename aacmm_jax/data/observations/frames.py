@@ -1,15 +1,35 @@
-"""Residuals of tips from points that are known in an unknown frame, which several kinds of observations share."""
+"""Arrays over the poses of an observation, and points in an unknown frame: what several kinds share."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ...core.linear_algebra import products_by_column, solve_positive_definite
+from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import cross_matrix, fitted_frame, rotation_and_derivative, rotation_matrix
-from .columns import as_columns, each_pose
-from .observation import Tips
+from ...core.rotations import cross, cross_matrix, rotation_and_derivative, rotation_matrix
+
+
+def as_columns(values: Float[AnyArray, "k ..."]) -> Float[AnyArray, "k p"]:
+    """Numbers ``(k,)`` as one column; columns as they are."""
+    return values.reshape(len(values), -1)
+
+
+def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r c m"]:
+    """The same matrix for every pose."""
+    return namespace(matrix).broadcast_to(matrix[:, :, None], (*matrix.shape, poses))
+
+
+def variances(u: Float[AnyArray, "..."], poses: int) -> Float[AnyArray, "m 1 1"]:
+    """Covariances of one residual a pose, from one standard uncertainty for all or from one each."""
+    xp = namespace(u)
+    square = xp.reshape(xp.asarray(u**2), (-1, 1, 1))
+    return square if len(square) == poses else xp.broadcast_to(square, (poses, 1, 1))
+
+
+def no_covariance(rows: int, poses: int) -> Float[np.ndarray, "m r r"]:
+    """Of observations in which nothing was measured but the poses."""
+    return np.zeros((poses, rows, rows))
 
 
 class Placed(NamedTuple):
@@ -46,43 +66,33 @@ def seen_from(frame: Float[AnyArray, " 6"], points: Float[AnyArray, "m 3"]) -> F
     return (points - frame[3:]) @ rotation_matrix(frame[:3])
 
 
-def turned_z(direction: Float[AnyArray, " 3"]) -> Float[AnyArray, " 2"]:
-    """The first two components of the rotation vector, whose third is 0, that turns z to a unit vector upwards."""
-    xp = namespace(direction)
-    sine = xp.sqrt(direction[0] ** 2 + direction[1] ** 2)
-    level = sine < 1e-12
-    factor = xp.where(level, 1.0, xp.arctan2(sine, direction[2]) / xp.where(level, 1.0, sine))
-    return xp.stack([-direction[1] * factor, direction[0] * factor])
-
-
-def frame_and_offset(
-    coordinates: Float[AnyArray, "3 m"], tips: Tips, offset: Float[AnyArray, " 3"]
-) -> tuple[Float[AnyArray, " 6"], Float[AnyArray, " 3"]]:
-    """A station's frame and the place of its target in the last frame, from points that the station measured.
-
-    The tips are o + A p, with A the axes of the last frame; in the station's frame, whose rotation in the base frame is
-    R, the points y are R y + c = o + A p. In R, c and p this is linear, so R is found as a matrix first, which then
-    becomes the nearest rotation.
-    """
-    xp = namespace(coordinates, tips, offset)
-    axes = xp.stack(tips.axes, axis=1)  # (3, 3, m): columns are axes
-    origin = tips.position - xp.einsum("cpm,p->cm", axes, offset)
-    size = xp.sqrt(xp.mean((coordinates - xp.mean(coordinates, axis=1, keepdims=True)) ** 2)) + 1e-9
-    centred = (coordinates - xp.mean(coordinates, axis=1, keepdims=True)) / size
-    m = coordinates.shape[1]
-    identity = xp.asarray(np.eye(3))
-    # Unknowns: R by rows (9, times the size), the station's centre (3), minus p (3).
-    by_matrix = (identity[:, :, None, None] * centred[None, None]).reshape(3, 9, m)
-    by_centre = xp.broadcast_to(identity[:, :, None], (3, 3, m))
-    design = xp.concatenate([by_matrix, by_centre, -axes], axis=1)
-    normal = xp.einsum("cum,cvm->uv", design, design)
-    right = xp.einsum("cum,cm->u", design, origin)
-    solution = solve_positive_definite(normal + 1e-9 * m * xp.asarray(np.eye(15)), right)
-    found = solution[12:]
-    target = origin + xp.einsum("cpm,p->cm", axes, found)
-    return fitted_frame(coordinates, target), found
-
-
 def moved(frame: Float[np.ndarray, " 6"], point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     """A point turned by a frame's rotation and moved by its origin, mm."""
     return np.asarray(rotation_matrix(frame[:3])) @ point + frame[3:]
+
+
+def rotation_logarithm(
+    matrix: Float[AnyArray, "3 3 m"],
+) -> tuple[Float[AnyArray, "3 m"], Float[AnyArray, "3 3 m"], Float[AnyArray, "3 3 m"]]:
+    """Vectors of rotations well below a right angle, and their derivatives by a small rotation before and after.
+
+    With w the vector: log(exp(e) exp(w)) = w + J^-1(w) e, J^-1(w) = I - W / 2 + c W^2, and after: J^-1(-w).
+    """
+    xp = namespace(matrix)
+    half = [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    sine_axis = xp.stack(half) / 2
+    square = xp.sum(sine_axis**2, axis=0)
+    cosine = (matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - 1) / 2
+    small = square < 1e-12
+    sine = xp.sqrt(xp.where(small, 1.0, square))
+    angle = xp.arctan2(sine, cosine)
+    w = xp.where(small, 1 + square / 6, angle / sine)[None] * sine_axis
+    t2 = xp.sum(w**2, axis=0)
+    near = t2 < 1e-6
+    t = xp.sqrt(xp.where(near, 1.0, t2))
+    c = xp.where(near, 1 / 12 + t2 / 720, 1 / t**2 - (1 + xp.cos(t)) / (2 * t * xp.sin(t)))
+    identity = xp.asarray(np.eye(3))[:, :, None]
+    columns = [cross(w, xp.broadcast_to(identity[:, i], w.shape)) for i in range(3)]
+    skew = xp.stack(columns, axis=1)
+    twice = xp.einsum("ijm,jkm->ikm", skew, skew)
+    return w, identity - skew / 2 + c[None, None] * twice, identity + skew / 2 + c[None, None] * twice

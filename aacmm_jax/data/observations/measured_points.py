@@ -2,45 +2,21 @@
 
 import abc
 from collections.abc import Hashable, Mapping
-from typing import ClassVar
+from typing import Any, Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers
+from ...core.arrays import Numbers, as_floats, is_concrete
 from ...core.errors import InputError
-from ...core.numpy_or_jax import AnyArray, namespace
+from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.rotations import fitted_frame
-from .columns import each_pose
-from .frames import frame_and_offset, placed, seen_from, turned_covariances
-from .observation import (
-    FRAME,
-    READINGS,
-    TARGET,
-    AbstractObservation,
-    AbstractSimulated,
-    Entry,
-    Rows,
-    Tips,
-    Unknowns,
-    checked_covariances,
-    checked_name,
-    checked_readings,
-    checked_target,
-    checked_values,
-    numbers,
-    offset_of,
-)
+from .declared import NAME, number, text
+from .fits import frame_and_offset
+from .frames import each_pose, placed, seen_from, turned_covariances
+from .observation import FRAME, AbstractObservation, Parts, Rows, Tips, Unknowns, offset_of
+from .simulated import AbstractInBox, AbstractOfTarget
 
-MEASURED = (
-    READINGS,
-    Entry("points", "measured point", "mm", ("pose", "axis"), required=True),
-    Entry("u", "standard uncertainty of a coordinate", "mm", ("pose", "axis")),
-    Entry("covariance", "covariance of a point", "mm^2", ("pose", "axis", "axis_2")),
-    Entry("station", "station of the instrument", content="text"),
-    TARGET,
-)
 _FLAT = 1e-6  # second singular value of points on a line, of the first
 _SAME = 1e-9  # mm
 
@@ -48,17 +24,26 @@ _SAME = 1e-9  # mm
 class AbstractMeasured(AbstractObservation):
     """What an instrument measured in a frame of its own, which all observations of one station share."""
 
-    points: eqx.AbstractVar[Float[AnyArray, "m 3"]]
-    station: eqx.AbstractVar[str]
+    points: Float[AnyArray, "m 3"] = number("measured point", "mm", "pose", "axis")
+    u: AnyArray | None = number("standard uncertainty of a coordinate", "mm", "pose", "axis", default=None, spread=True)
+    covariance: Float[AnyArray, "m 3 3"] = number(
+        "covariance of a point", "mm^2", "pose", "axis", "axis_2", default=None, raw=True
+    )
+    station: str = text("station of the instrument", default=NAME, of_session=True)
+
+    def completed(self, where: str) -> Mapping[str, Any]:
+        if self.u is not None and self.covariance is not None:
+            raise InputError(f"{where}: u and covariance are both given; give one of them.")
+        poses = self.q.shape[0]
+        if self.covariance is not None:
+            return {"covariance": _checked_covariances(where, self.covariance, poses)}
+        # Residuals are weighted by covariances, so these are kept in place of u.
+        return {"covariance": _on_diagonals(np.zeros((poses, 3)) if self.u is None else self.u), "u": None}
 
     @property
     def frame(self) -> str:
         """Name of the unknown frame of the station."""
         return f"frame of {self.station}"
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return ("name", "station")
 
     @property
     def fixes_scale(self) -> bool:
@@ -69,7 +54,7 @@ class AbstractMeasured(AbstractObservation):
         return ()
 
     @abc.abstractmethod
-    def without_errors(self, tips: Tips, unknowns: Mapping[str, Float[AnyArray, " k"]]) -> "AbstractMeasured":
+    def without_errors(self, tips: Tips, unknowns: Parts) -> Self:
         """The same observation, had the instrument measured exactly these tips."""
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -99,60 +84,50 @@ class MeasuredPoints(AbstractMeasured):
         (50, 3) ['frame of tracker']
     """
 
-    kind: ClassVar[str] = "points"
-    by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "covariance")
-    table: ClassVar[str] = "points"
-    entries: ClassVar[tuple[Entry, ...]] = MEASURED
-    rows: ClassVar[int] = 3
-    q: Float[AnyArray, "m n"]
-    points: Float[AnyArray, "m 3"]
-    covariance: Float[AnyArray, "m 3 3"]
-    name: str = eqx.field(static=True)
-    station: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-
-    def __init__(
-        self,
-        name: str,
-        q: Numbers,
-        points: Numbers,
-        *,
-        u: Numbers | None = None,
-        covariance: Numbers | None = None,
-        station: str | None = None,
-        target: str = "",
-    ):
-        self.name = checked_name(name, "an observation")
-        where = f"observation '{name}'"
-        self.q = checked_readings(where, q)
-        poses = self.q.shape[0]
-        self.points = checked_values(f"points of {where}", points, (poses, 3))
-        self.covariance = checked_covariances(where, u, covariance, poses)
-        self.station = checked_name(name if station is None else station, "a station")
-        self.target = checked_target(target)
+    kind, table, rows = "points", "points", 3
 
     @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME}
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         if not self.target:
             return {self.frame: fitted_frame(self.points.T, tips.position)}
-        frame, found = frame_and_offset(self.points.T, tips, offset)
-        return {self.frame: frame, offset_of(self.target): found}
+        frame, place = frame_and_offset(self.points.T, tips, offset)
+        return {self.frame: frame, offset_of(self.target): place}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        xp = namespace(tips, unknowns, self.points)
+        identity = namespace(tips, unknowns, self.points).asarray(np.eye(3))
         seen = placed(unknowns[self.frame], self.points.T)
         return Rows(
             values=tips.position - seen.points,
-            by_tip=each_pose(xp.asarray(np.eye(3)), self.q.shape[0]),
+            by_tip=each_pose(identity, self.q.shape[0]),
             by_unknowns={self.frame: -seen.by_frame},
             measured=turned_covariances(seen.rotation, self.covariance),
         )
 
-    def without_errors(self, tips: Tips, unknowns: Mapping[str, Float[AnyArray, " k"]]) -> "MeasuredPoints":
-        return eqx.tree_at(lambda o: o.points, self, seen_from(unknowns[self.frame], tips.position.T))
+    def without_errors(self, tips: Tips, unknowns: Parts) -> Self:
+        return self.changed(points=seen_from(unknowns[self.frame], tips.position.T))
+
+
+@numpy_if_known
+def _on_diagonals(u: Float[AnyArray, "m 3"]) -> Float[AnyArray, "m 3 3"]:
+    """Variances, mm^2."""
+    return u[:, :, None] ** 2 * np.eye(3)[None]
+
+
+def _checked_covariances(where: str, covariance: Numbers, poses: int) -> Float[AnyArray, "m 3 3"]:
+    """Covariances of all points or of each, mm^2, or `InputError`."""
+    array = as_floats(covariance, f"covariance of {where}")
+    if array.shape not in ((3, 3), (poses, 3, 3)):
+        raise InputError(f"covariance of {where} has shape {array.shape}; give (3, 3) or ({poses}, 3, 3).")
+    array = namespace(array).broadcast_to(array, (poses, 3, 3))
+    if is_concrete(array):
+        values = np.asarray(array)
+        symmetric = np.allclose(values, values.swapaxes(-1, -2), rtol=1e-6, atol=1e-15)
+        if not symmetric or np.linalg.eigvalsh(values).min() < -1e-12 * max(np.abs(values).max(), 1e-300):
+            raise InputError(f"covariance of {where} is not symmetric and positive; give variances in mm^2.")
+    return array
 
 
 def check_spread(where: str, points: Float[np.ndarray, "3 m"]) -> None:
@@ -168,7 +143,7 @@ def check_spread(where: str, points: Float[np.ndarray, "3 m"]) -> None:
         )
 
 
-class SimulatedPoints(AbstractSimulated):
+class SimulatedPoints(AbstractInBox, AbstractOfTarget):
     """Points that an instrument measures at random places in a box.
 
     Args:
@@ -188,25 +163,9 @@ class SimulatedPoints(AbstractSimulated):
         (50, 3) ['frame of tracker']
     """
 
-    table: ClassVar[str] = "points"
-    name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
-    poses: int = eqx.field(static=True)
-    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    u: float = 0.0
-    target: str = eqx.field(static=True, default="")
-    place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
-
-    @property
-    def offset(self) -> Float[np.ndarray, " 3"] | None:
-        return None if self.place is None else numbers("place of the target", 3)(self.place)
-
-    def __check_init__(self) -> None:
-        if bool(self.target) != (self.offset is not None):
-            raise InputError(f"'{self.name}' needs both, a target and its place in the last frame, or neither.")
-
-    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        return random.uniform(self.box[0], self.box[1], (self.poses, 3))
+    table = "points"
+    frame: np.ndarray = number("frame of the instrument in the base frame", "mm", 6, default=(0.0,) * 6)
+    u: float = number("standard uncertainty of each coordinate", "mm", default=0.0)
 
     def recorded(
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator

@@ -1,35 +1,22 @@
 """Transforms of a target on the last frame, positions and orientations, as an instrument saw them."""
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers, is_concrete
+from ...core.arrays import is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import cross, rotation_and_derivative, rotation_derivative, rotation_matrix, rotation_vector
-from .columns import each_pose, variances
-from .frames import frame_and_offset, placed, seen_from, turned_covariances
-from .measured_points import MEASURED, AbstractMeasured
-from .observation import (
-    FRAME,
-    AbstractSimulated,
-    Entry,
-    Rows,
-    Tips,
-    Unknowns,
-    checked_covariances,
-    checked_name,
-    checked_readings,
-    checked_scalar,
-    checked_values,
-    numbers,
-    offset_of,
-)
+from ...core.rotations import rotation_and_derivative, rotation_derivative, rotation_matrix, rotation_vector
+from .declared import NAME, number, text
+from .fits import frame_and_offset
+from .frames import each_pose, placed, rotation_logarithm, seen_from, turned_covariances, variances
+from .measured_points import AbstractMeasured
+from .observation import FRAME, Parts, Rows, Tips, Unknowns, offset_of
+from .simulated import AbstractInBox
 
 
 class MeasuredTransforms(AbstractMeasured):
@@ -60,54 +47,22 @@ class MeasuredTransforms(AbstractMeasured):
         ['frame of 6-D probe', 'orientation of 6-D probe']
     """
 
-    kind: ClassVar[str] = "transforms"
-    by_pose: ClassVar[tuple[str, ...]] = ("q", "points", "rotations", "covariance")
-    table: ClassVar[str] = "transforms"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        *MEASURED,
-        Entry("rotations", "measured axes of the target, as columns", "1", ("pose", "axis", "axis_2"), required=True),
-        Entry("u_angle", "standard uncertainty of an orientation about each axis", "rad", required=True),
+    kind, table, rows, rotates = "transforms", "transforms", 6, True
+    rotations: Float[AnyArray, "m 3 3"] = number(
+        "measured axes of the target, as columns", "1", "pose", "axis", "axis_2"
     )
-    stated: ClassVar[tuple[str, ...]] = ("u_angle",)
-    rows: ClassVar[int] = 6
-    rotates: ClassVar[bool] = True
-    q: Float[AnyArray, "m n"]
-    points: Float[AnyArray, "m 3"]
-    rotations: Float[AnyArray, "m 3 3"]
-    covariance: Float[AnyArray, "m 3 3"]
-    u_angle: Float[AnyArray, ""]
-    name: str = eqx.field(static=True)
-    station: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
+    u_angle: Float[AnyArray, ""] = number(
+        "standard uncertainty of an orientation about each axis", "rad", positive=True
+    )
+    target: str = text("target that was seen", default=NAME)
 
-    def __init__(
-        self,
-        name: str,
-        q: Numbers,
-        points: Numbers,
-        rotations: Numbers,
-        *,
-        u_angle: Numbers,
-        u: Numbers | None = None,
-        covariance: Numbers | None = None,
-        station: str | None = None,
-        target: str | None = None,
-    ):
-        self.name = checked_name(name, "an observation")
-        where = f"observation '{name}'"
-        self.q = checked_readings(where, q)
-        poses = self.q.shape[0]
-        self.points = checked_values(f"points of {where}", points, (poses, 3))
-        self.rotations = checked_values(f"rotations of {where}", rotations, (poses, 3, 3))
+    def completed(self, where: str) -> Mapping[str, Any]:
         if is_concrete(self.rotations):
-            known = np.asarray(self.rotations)
-            proper = np.allclose(known @ known.swapaxes(-1, -2), np.eye(3), atol=1e-6)
-            if not proper or np.any(np.linalg.det(known) < 0):
+            matrices = np.asarray(self.rotations)
+            orthogonal = np.allclose(matrices @ matrices.swapaxes(-1, -2), np.eye(3), atol=1e-6)
+            if not orthogonal or np.any(np.linalg.det(matrices) < 0):
                 raise InputError(f"{where} has a matrix that is no rotation; give right-handed unit axes as columns.")
-        self.covariance = checked_covariances(where, u, covariance, poses)
-        self.u_angle = checked_scalar(f"u_angle of {where}", u_angle, positive=True)
-        self.station = checked_name(name if station is None else station, "a station")
-        self.target = checked_name(name if target is None else target, "a target")
+        return super().completed(where)
 
     @property
     def orientation(self) -> str:
@@ -118,13 +73,13 @@ class MeasuredTransforms(AbstractMeasured):
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.frame: FRAME, self.orientation: ("rad",) * 3}
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         xp = namespace(tips, self.points)
-        frame, found = frame_and_offset(self.points.T, tips, offset)
+        frame, place = frame_and_offset(self.points.T, tips, offset)
         # The first pose says how the target is turned in the last frame; the fit does the rest.
         axes = xp.stack(tips.axes, axis=1)[:, :, 0]
         turned = axes.T @ rotation_matrix(frame[:3]) @ self.rotations[0]
-        return {self.frame: frame, offset_of(self.target): found, self.orientation: rotation_vector(turned)}
+        return {self.frame: frame, offset_of(self.target): place, self.orientation: rotation_vector(turned)}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.points), self.q.shape[0]
@@ -135,7 +90,7 @@ class MeasuredTransforms(AbstractMeasured):
         target, by_target = rotation_and_derivative(orientation)
         predicted = products_by_column(target.swapaxes(0, 1), axes)
         seen = products_by_column(place.rotation, xp.moveaxis(self.rotations, 0, -1))
-        angle, left, right = _logarithm(products_by_column(predicted.swapaxes(0, 1), seen.swapaxes(0, 1)))
+        angle, left, right = rotation_logarithm(products_by_column(predicted.swapaxes(0, 1), seen.swapaxes(0, 1)))
         by_station = -products_by_column(rotation_derivative(frame[:3]).swapaxes(0, 1), right.swapaxes(0, 1))
         inside = products_by_column(by_target.swapaxes(0, 1), axes)
         by_orientation = products_by_column(left, inside.swapaxes(0, 1)).swapaxes(0, 1)
@@ -156,42 +111,14 @@ class MeasuredTransforms(AbstractMeasured):
             by_rotation=xp.concatenate([none, left]),
         )
 
-    def without_errors(self, tips: Tips, unknowns: Mapping[str, Float[AnyArray, " k"]]) -> "MeasuredTransforms":
+    def without_errors(self, tips: Tips, unknowns: Parts) -> Self:
         xp, frame = namespace(tips, unknowns), unknowns[self.frame]
         station, target = rotation_matrix(frame[:3]), rotation_matrix(unknowns[self.orientation])
         axes = xp.moveaxis(xp.stack(tips.axes, axis=1), -1, 0)  # (m, 3, 3)
-        exact = (seen_from(frame, tips.position.T), station.T @ axes @ target)
-        return eqx.tree_at(lambda o: (o.points, o.rotations), self, exact)
+        return self.changed(points=seen_from(frame, tips.position.T), rotations=station.T @ axes @ target)
 
 
-def _logarithm(
-    matrix: Float[AnyArray, "3 3 m"],
-) -> tuple[Float[AnyArray, "3 m"], Float[AnyArray, "3 3 m"], Float[AnyArray, "3 3 m"]]:
-    """Vectors of rotations well below a right angle, and their derivatives by a small rotation before and after.
-
-    With w the vector: log(exp(e) exp(w)) = w + J^-1(w) e, J^-1(w) = I - W / 2 + c W^2, and after: J^-1(-w).
-    """
-    xp = namespace(matrix)
-    half = [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
-    sine_axis = xp.stack(half) / 2
-    square = xp.sum(sine_axis**2, axis=0)
-    cosine = (matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - 1) / 2
-    small = square < 1e-12
-    sine = xp.sqrt(xp.where(small, 1.0, square))
-    angle = xp.arctan2(sine, cosine)
-    w = xp.where(small, 1 + square / 6, angle / sine)[None] * sine_axis
-    t2 = xp.sum(w**2, axis=0)
-    near = t2 < 1e-6
-    t = xp.sqrt(xp.where(near, 1.0, t2))
-    c = xp.where(near, 1 / 12 + t2 / 720, 1 / t**2 - (1 + xp.cos(t)) / (2 * t * xp.sin(t)))
-    identity = xp.asarray(np.eye(3))[:, :, None]
-    columns = [cross(w, xp.broadcast_to(identity[:, i], w.shape)) for i in range(3)]
-    skew = xp.stack(columns, axis=1)
-    twice = xp.einsum("ijm,jkm->ikm", skew, skew)
-    return w, identity - skew / 2 + c[None, None] * twice, identity + skew / 2 + c[None, None] * twice
-
-
-class SimulatedTransforms(AbstractSimulated):
+class SimulatedTransforms(AbstractInBox):
     """Transforms of a target that an instrument measures at random places in a box.
 
     Args:
@@ -210,21 +137,15 @@ class SimulatedTransforms(AbstractSimulated):
         (20, 3, 3)
     """
 
-    table: ClassVar[str] = "transforms"
-    name: str = eqx.field(static=True)
-    box: np.ndarray = eqx.field(converter=numbers("box", 2, 3))
-    poses: int = eqx.field(static=True)
-    offset_and_orientation: np.ndarray = eqx.field(converter=numbers("offset and orientation", 6), default=(0.0,) * 6)
-    frame: np.ndarray = eqx.field(converter=numbers("frame", 6), default=(0.0,) * 6)
-    u: float = 0.0
-    u_angle: float = 1e-4
+    table = "transforms"
+    offset_and_orientation: np.ndarray = number("place and rotation of the target", "mm", 6, default=(0.0,) * 6)
+    frame: np.ndarray = number("frame of the instrument in the base frame", "mm", 6, default=(0.0,) * 6)
+    u: float = number("standard uncertainty of each coordinate", "mm", default=0.0)
+    u_angle: float = number("standard uncertainty about each axis", "rad", default=1e-4)
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
         return self.offset_and_orientation[:3]
-
-    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
-        return random.uniform(self.box[0], self.box[1], (self.poses, 3))
 
     def recorded(
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator

@@ -1,40 +1,24 @@
 """Planes: the tip touches one, or two parallel ones at a certified distance."""
 
-import dataclasses
 from collections.abc import Hashable, Mapping
-from typing import Any, ClassVar
+from typing import Any, Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import products_by_column, semidefinite_eigen
+from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_and_derivative, rotation_matrix
-from .columns import variances
-from .frames import moved, turned_z
-from .observation import (
-    READINGS,
-    TARGET,
-    AbstractObservation,
-    AbstractSimulated,
-    Entry,
-    Quantity,
-    Rows,
-    Tips,
-    Unknowns,
-    checked_name,
-    checked_readings,
-    checked_scalar,
-    checked_target,
-    checked_truth,
-    is_exact,
-    numbers,
-)
+from .declared import checked_readings, count, derived, is_exact, number, text, truth
+from .fits import fitted_plane
+from .frames import moved, variances
+from .observation import AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
+from .simulated import AbstractSimulated
 
 PLANE = ("rad", "rad", "mm")
+SIDES = ("one", "other")
 
 
 class Plane(AbstractObservation):
@@ -55,25 +39,8 @@ class Plane(AbstractObservation):
         ['plane table']
     """
 
-    kind: ClassVar[str] = "plane"
-    table: ClassVar[str] = "plane"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        Entry("form", "standard deviation of the surface about its plane", "mm"),
-        TARGET,
-    )
-    rows: ClassVar[int] = 1
-    stated: ClassVar[tuple[str, ...]] = ("form",)
-    q: Float[AnyArray, "m n"]
-    form: Float[AnyArray, ""]
-    name: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-
-    def __init__(self, name: str, q: Numbers, *, form: Numbers = 0.0, target: str = ""):
-        self.name = checked_name(name, "a plane")
-        self.q = checked_readings(f"plane '{name}'", q)
-        self.form = checked_scalar(f"form of plane '{name}'", form)
-        self.target = checked_target(target)
+    kind, table, noun, rows = "plane", "plane", "plane", 1
+    form: Float[AnyArray, ""] = number("standard deviation of the surface about its plane", "mm", default=0.0)
 
     @property
     def place(self) -> str:
@@ -92,13 +59,12 @@ class Plane(AbstractObservation):
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         return _normal_and_distance(values)
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         return {self.place: fitted_plane(tips.position)}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        distance, normal, by_plane = heights(tips.position, unknowns[self.place])
-        measured = variances(self.form, self.q.shape[0])
-        return Rows(distance[None], _each(normal, self.q.shape[0]), {self.place: by_plane[:, None]}, measured)
+        height, by_tip, by_plane = heights(tips.position, unknowns[self.place])
+        return Rows(height[None], by_tip, {self.place: by_plane[:, None]}, variances(self.form, self.q.shape[0]))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         check_plane(f"plane '{self.name}'", tips)
@@ -127,63 +93,38 @@ class ParallelPlanes(AbstractObservation):
         (12, 6) ['plane block', 'distance of block']
     """
 
-    kind: ClassVar[str] = "parallel planes"
-    by_pose: ClassVar[tuple[str, ...]] = ("q", "second")
-    table: ClassVar[str] = "parallel_planes"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        Entry("side", "plane that was touched: one or other", dimensions=("pose",), content="text", required=True),
-        Entry("distance", "certified distance between the planes", "mm", required=True, uncertainty="u"),
-        Entry("u", "standard uncertainty of the distance", "mm"),
-        Entry("stylus", "diameter of the tip's ball", "mm"),
-        Entry("inside", "whether the ball was between the planes", content="truth"),
-        Entry("form", "standard deviation of the surface about its plane", "mm"),
-        TARGET,
+    kind, table, noun, rows = "parallel planes", "parallel_planes", "planes", 1
+    side: tuple[str, ...] = text("plane that was touched: one or other", "pose")
+    distance: Float[AnyArray, ""] = number(
+        "certified distance between the planes", "mm", uncertainty="u", positive=True
     )
-    rows: ClassVar[int] = 1
-    q: Float[AnyArray, "m n"]
-    distance: Float[AnyArray, ""]  # mm
-    stylus: Float[AnyArray, ""]  # mm
-    u: Float[AnyArray, ""]
-    form: Float[AnyArray, ""]
-    name: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-    second: tuple[bool, ...] = eqx.field(static=True)  # whether a pose is on the second plane; these come last
-    inside: bool = eqx.field(static=True)
-    free: bool = eqx.field(static=True)  # whether the distance is an unknown with a certified value
+    u: Float[AnyArray, ""] = number("standard uncertainty of the distance", "mm", default=0.0)
+    stylus: Float[AnyArray, ""] = number("diameter of the tip's ball", "mm", default=0.0)
+    inside: bool = truth("whether the ball was between the planes")
+    form: Float[AnyArray, ""] = number("standard deviation of the surface about its plane", "mm", default=0.0)
+    free: bool = derived()  # whether the distance is an unknown with a certified value
 
-    def __init__(
-        self,
-        name: str,
-        one: Numbers,
-        other: Numbers,
-        distance: Numbers,
-        *,
-        u: Numbers = 0.0,
-        stylus: Numbers = 0.0,
-        inside: bool = False,
-        form: Numbers = 0.0,
-        target: str = "",
-    ):
-        self.name = checked_name(name, "a pair of planes")
-        where = f"planes '{name}'"
-        sides = checked_readings(f"{where}, one side,", one), checked_readings(f"{where}, other side,", other)
-        if sides[0].shape[1] != sides[1].shape[1]:
-            raise InputError(f"{where} have {sides[0].shape[1]} and {sides[1].shape[1]} columns; give one a joint.")
-        self.q = namespace(*sides).concatenate(sides)
-        self.second = (False,) * sides[0].shape[0] + (True,) * sides[1].shape[0]
-        self.stylus = checked_scalar(f"stylus of {where}", stylus)
-        self.distance = checked_scalar(f"distance of {where}", distance, positive=True)
-        self.inside = checked_truth(f"inside of {where}", inside)
+    def __init__(self, name: str, one: Numbers, other: Numbers, distance: Numbers, **options: Any):
+        readings = [
+            checked_readings(f"planes '{name}', side {side},", q) for side, q in zip(SIDES, (one, other), strict=True)
+        ]
+        widths = [q.shape[1] for q in readings]
+        if widths[0] != widths[1]:
+            raise InputError(f"planes '{name}' have {widths[0]} and {widths[1]} columns; give one a joint.")
+        sides = [side for side, q in zip(SIDES, readings, strict=True) for _ in range(q.shape[0])]
+        super().__init__(name, namespace(*readings).concatenate(readings), sides, distance, **options)
+
+    def completed(self, where: str) -> Mapping[str, Any]:
+        if unknown := sorted(set(self.side) - set(SIDES)):
+            raise InputError(f"{where} have the side '{unknown[0]}'; the sides are one and other.")
+        if missing := set(SIDES) - set(self.side):
+            raise InputError(f"{where} have no poses on the side '{missing.pop()}'; record some.")
         if is_concrete(self.between) and float(self.between) <= 0:
             raise InputError(
                 f"{where} have a stylus of {float(self.stylus):g} mm between planes at {float(self.distance):g} mm; "
                 "give the distance and the diameter of the ball that fits between them, in mm."
             )
-        self.u = checked_scalar(f"u of {where}", u)
-        self.form = checked_scalar(f"form of {where}", form)
-        self.target = checked_target(target)
-        self.free = not is_exact(self.u)
+        return {"free": not is_exact(self.u)}
 
     @property
     def place(self) -> str:
@@ -191,32 +132,19 @@ class ParallelPlanes(AbstractObservation):
         return f"plane {self.name}"
 
     @property
+    def separation(self) -> str:
+        """Name of the distance."""
+        return f"distance of {self.name}"
+
+    @property
     def between(self) -> Float[AnyArray, "*batch"]:
         """Certified distance of the tip's centres on both planes, mm."""
         return self.distance - self.stylus if self.inside else self.distance + self.stylus
 
-    def stored(self) -> dict[str, Any]:
-        sides = np.where(self.second, "other", "one")
-        return super().stored() | {"side": sides}
-
-    @classmethod
-    def rebuilt(cls, name: str, stored: Mapping[str, Any]) -> "ParallelPlanes":
-        rest = {key: value for key, value in stored.items() if key not in ("q", "side")}
-        side = np.asarray(stored["side"])
-        unknown = sorted(set(side.tolist()) - {"one", "other"})
-        if unknown:
-            raise InputError(f"planes '{name}' have the side '{unknown[0]}'; the sides are one and other.")
-        return cls(name, stored["q"][side == "one"], stored["q"][side == "other"], **rest)
-
     @property
-    def first(self) -> int:
-        """Number of poses on the first plane."""
-        return self.second.count(False)
-
-    @property
-    def separation(self) -> str:
-        """Name of the distance."""
-        return f"distance of {self.name}"
+    def second(self) -> np.ndarray:
+        """Whether each pose is on the other plane, ``(m,)``."""
+        return np.array(self.side) == SIDES[1]
 
     @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
@@ -233,34 +161,31 @@ class ParallelPlanes(AbstractObservation):
         return True
 
     @property
-    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
+    def certified(self) -> Certified:
         return {self.separation: (self.between[None], self.u[None])} if self.free else {}
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
-        xp, k = namespace(tips), self.first
-        sides = tips.position[:, :k], tips.position[:, k:]
-        centres = [xp.mean(side, axis=1, keepdims=True) for side in sides]
-        both = xp.concatenate([side - centre for side, centre in zip(sides, centres, strict=True)], axis=1)
-        start = fitted_plane(both + centres[0])
-        return {self.place: start} | ({self.separation: self.between[None]} if self.free else {})
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
+        # Both planes have one normal: that of all touches, each side about its middle.
+        xp, sides = namespace(tips), [np.flatnonzero(~self.second), np.flatnonzero(self.second)]
+        centres = [xp.mean(tips.position[:, rows], axis=1, keepdims=True) for rows in sides]
+        centred = [tips.position[:, rows] - centre for rows, centre in zip(sides, centres, strict=True)]
+        plane = fitted_plane(xp.concatenate(centred, axis=1) + centres[0])
+        return {self.place: plane} | ({self.separation: self.between[None]} if self.free else {})
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        height, normal, by_plane = heights(tips.position, unknowns[self.place])
-        m, k = self.q.shape[0], self.first
-        xp = namespace(height, self.form)
-        other = np.array(self.second)
+        height, by_tip, by_plane = heights(tips.position, unknowns[self.place])
+        xp, second = namespace(height, self.form), self.second
         # The normal may point either way; which way the other plane is follows from the tips.
-        side = xp.where(xp.mean(height[k:]) >= xp.mean(height[:k]), 1.0, -1.0) * xp.asarray(other.astype(float))
+        upwards = xp.mean(height[np.flatnonzero(second)]) >= xp.mean(height[np.flatnonzero(~second)])
+        side = xp.where(upwards, 1.0, -1.0) * xp.asarray(second.astype(float))
         distance = unknowns[self.separation][0] if self.free else self.between
         by_unknowns = {self.place: by_plane[:, None]}
         if self.free:
             by_unknowns[self.separation] = -side[None, None]
-        measured = variances(self.form, m)
-        return Rows((height - side * distance)[None], _each(normal, m), by_unknowns, measured)
+        return Rows((height - side * distance)[None], by_tip, by_unknowns, variances(self.form, len(second)))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        k = self.first
-        sides = [tips[:, :k], tips[:, k:]]
+        sides = [tips[:, ~self.second], tips[:, self.second]]
         both = np.concatenate([side - side.mean(axis=1, keepdims=True) for side in sides], axis=1)
         check_plane(f"planes '{self.name}'", both)
 
@@ -270,15 +195,11 @@ def _normal_and_distance(values: Float[np.ndarray, " 3"]) -> tuple[Quantity, ...
     return (Quantity("normal", normal, "1"), Quantity("distance from the origin", values[2:], "mm"))
 
 
-def _each(normal: Float[AnyArray, "3 p"], poses: int) -> Float[AnyArray, "1 3 m"]:
-    return namespace(normal).broadcast_to(normal[None], (1, 3, poses))
-
-
 def heights(
     tips: Float[AnyArray, "3 m"], plane: Float[AnyArray, "3 p"]
-) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 p"], Float[AnyArray, "3 m"]]:
-    """Heights of tips over a plane (or over one each), mm, its unit normal, and the derivatives of the heights by the
-    plane's numbers."""
+) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "1 3 m"], Float[AnyArray, "3 m"]]:
+    """Heights of tips over a plane (or over one each), mm, and their derivatives by the tips, which are the unit
+    normal, and by the plane's numbers."""
     xp = namespace(tips, plane)
     w = xp.concatenate([plane[:2], xp.zeros_like(plane[:1])])
     rotation, axes = rotation_and_derivative(w)
@@ -286,19 +207,8 @@ def heights(
     # The normal, and its derivatives by the two components.
     rows = xp.stack([normal, *(cross(axes[:, i], normal) for i in range(2))])
     height, *by_turn = products_by_column(rows, tips)
-    return height - plane[2], normal, xp.stack([*by_turn, -xp.ones_like(height)])
-
-
-def fitted_plane(tips: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 3"]:
-    """The plane that points are closest to: its numbers as `Plane` has them, with the normal upwards."""
-    xp = namespace(tips)
-    middle = xp.mean(tips, axis=1)
-    centred = tips - middle[:, None]
-    scatter = centred @ centred.T
-    _, vectors = semidefinite_eigen(scatter / (xp.trace(scatter) + 1e-300))
-    normal = vectors[:, 2] / xp.sqrt(xp.sum(vectors[:, 2] ** 2))
-    normal = xp.where(normal[2] < 0, -normal, normal)
-    return xp.concatenate([turned_z(normal), (normal @ middle)[None]])
+    by_tip = xp.broadcast_to(normal[None], (1, 3, tips.shape[1]))
+    return height - plane[2], by_tip, xp.stack([*by_turn, -xp.ones_like(height)])
 
 
 def check_plane(where: str, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -329,17 +239,16 @@ class SimulatedPlanes(AbstractSimulated):
         (16, 6)
     """
 
-    table: ClassVar[str] = "planes"
-    name: str = eqx.field(static=True)
-    corner: np.ndarray = eqx.field(converter=numbers("corner", 3))
-    sides: np.ndarray = eqx.field(converter=numbers("sides", 2, 3))
-    poses: int = eqx.field(static=True)
-    distance: float | None = None
-    u: float = 0.0
+    table = "planes"
+    corner: np.ndarray = number("corner of the (first) rectangle in the base frame", "mm", 3)
+    sides: np.ndarray = number("its two sides as vectors", "mm", 2, 3)
+    poses: int = count("number of poses")
+    distance: float | None = number("true distance to the second plane", "mm", default=None)
+    u: float = number("standard uncertainty of the certified distance", "mm", default=0.0)
 
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedPlanes":
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
         turned = self.sides @ rotation_matrix(frame[:3]).T
-        return dataclasses.replace(self, name=name, corner=moved(frame, self.corner), sides=turned)
+        return self.changed(name=name, corner=moved(frame, self.corner), sides=turned)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         planes = 1 if self.distance is None else 2

@@ -10,7 +10,6 @@ from ...core.rotations import fitted_frame, rotation_matrix
 from .artefact import Artefact
 from .frames import placed
 from .observation import AbstractObservation, Tips
-from .shifted import ShiftedObservation
 
 Frame = Float[AnyArray, " 6"]
 Held = list[tuple[Artefact, Float[AnyArray, "3 m"]]]  # an artefact of each observation, and the tips in its points
@@ -26,10 +25,9 @@ def platform_frames(observations: Sequence[AbstractObservation], tips: Sequence[
     # By the name of the platform's frame. What does not stand on it, "", comes first: its frame is that of the base.
     waiting: dict[str, Held] = {"": []}
     for observation, own in zip(observations, tips, strict=True):
-        artefact = observation.observation if isinstance(observation, ShiftedObservation) else observation
-        if isinstance(artefact, Artefact):
-            name = "" if artefact.index is None else artefact.platform
-            waiting.setdefault(name, []).append((artefact, own.position))
+        if isinstance(observation, Artefact):
+            name = "" if observation.index is None else observation.platform
+            waiting.setdefault(name, []).append((observation, own.position))
     if len(waiting) == 1:
         return {}
     placements: dict[str, Frame] = {}
@@ -68,4 +66,4 @@ def _new_placements(held: Held, index: Frame) -> dict[str, Frame]:
 
 
 def _coordinates(artefact: Artefact) -> Float[AnyArray, "3 m"]:
-    return artefact.coordinates[np.array(artefact.owner)].T
+    return artefact.coordinates[artefact.owner].T

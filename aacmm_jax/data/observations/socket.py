@@ -1,33 +1,16 @@
 """A socket: the tip is at one point, whose position is unknown."""
 
-import copy
-import dataclasses
 from collections.abc import Hashable, Mapping
-from typing import ClassVar
+from typing import Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers
 from ...core.numpy_or_jax import AnyArray, namespace
-from .columns import each_pose, no_covariance
-from .frames import moved
-from .observation import (
-    POINT,
-    READINGS,
-    TARGET,
-    AbstractObservation,
-    AbstractSimulated,
-    Entry,
-    Rows,
-    Tips,
-    Unknowns,
-    checked_name,
-    checked_readings,
-    checked_target,
-    numbers,
-)
+from .declared import count, number
+from .frames import each_pose, moved, no_covariance
+from .observation import POINT, AbstractObservation, Parts, Rows, Tips, Unknowns
+from .simulated import AbstractOfTarget
 
 
 class Socket(AbstractObservation):
@@ -47,21 +30,7 @@ class Socket(AbstractObservation):
         (40, 6) ['position of hole']
     """
 
-    kind: ClassVar[str] = "socket"
-    table: ClassVar[str] = "socket"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        TARGET,
-    )
-    rows: ClassVar[int] = 3
-    q: Float[AnyArray, "m n"]
-    name: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-
-    def __init__(self, name: str, q: Numbers, *, target: str = ""):
-        self.name = checked_name(name, "a socket")
-        self.q = checked_readings(f"socket '{name}'", q)
-        self.target = checked_target(target)
+    kind, table, noun, rows = "socket", "socket", "socket", 3
 
     @property
     def position(self) -> str:
@@ -80,32 +49,20 @@ class Socket(AbstractObservation):
     def alike(self) -> Hashable | None:
         return ()
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         return {self.position: namespace(tips).mean(tips.position, axis=1)}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        identity = each_pose(namespace(tips, unknowns).asarray(np.eye(3)), self.q.shape[0])
-        return Rows(
-            values=tips.position - unknowns[self.position],
-            by_tip=identity,
-            by_unknowns={self.position: -identity},
-            measured=no_covariance(3, self.q.shape[0]),
-        )
+        m, part = self.q.shape[0], self.position
+        identity = each_pose(namespace(tips, unknowns).asarray(np.eye(3)), m)
+        return Rows(tips.position - unknowns[part], identity, {part: -identity}, no_covariance(3, m))
 
 
 def sockets_of(readings: Mapping[str, Float[AnyArray, "m n"]]) -> tuple[Socket, ...]:
-    """Sockets whose names and readings a capture has checked: each as a copy of the first, since equinox takes 0.1 ms
-    to make and check one, and there may be thousands."""
-    made: list[Socket] = []
-    for name, q in readings.items():
-        if not made:
-            made.append(Socket(name, q))
-            continue
-        one = copy.copy(made[0])
-        object.__setattr__(one, "name", name)
-        object.__setattr__(one, "q", q)
-        made.append(one)
-    return tuple(made)
+    """Sockets whose names and readings a capture has checked: each as a copy of the first, since there may be
+    thousands."""
+    first = [Socket(name, q) for name, q in [*readings.items()][:1]]
+    return tuple(first[0].changed(name=name, q=q) for name, q in readings.items())
 
 
 def position_of(socket: str) -> str:
@@ -113,7 +70,7 @@ def position_of(socket: str) -> str:
     return f"position of {socket}"
 
 
-class SimulatedSocket(AbstractSimulated):
+class SimulatedSocket(AbstractOfTarget):
     """Poses with the tip in one socket.
 
     Args:
@@ -131,19 +88,12 @@ class SimulatedSocket(AbstractSimulated):
         (10, 6) ['position of cone']
     """
 
-    table: ClassVar[str] = "socket"
-    name: str = eqx.field(static=True)
-    point: np.ndarray = eqx.field(converter=numbers("point", 3))
-    poses: int = eqx.field(static=True)
-    target: str = eqx.field(static=True, default="")
-    place: tuple[float, float, float] | None = eqx.field(static=True, default=None)
+    table = "socket"
+    point: np.ndarray = number("position in the base frame", "mm", 3)
+    poses: int = count("number of poses")
 
-    @property
-    def offset(self) -> Float[np.ndarray, " 3"] | None:
-        return None if self.place is None else np.asarray(self.place, dtype=float)
-
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedSocket":
-        return dataclasses.replace(self, name=name, point=moved(frame, self.point))
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
+        return self.changed(name=name, point=moved(frame, self.point))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return np.tile(self.point, (self.poses, 1))

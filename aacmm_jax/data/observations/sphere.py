@@ -1,42 +1,66 @@
 """A sphere: the tip touches it, so it is at one distance from an unknown centre."""
 
-import dataclasses
 from collections.abc import Hashable, Mapping
-from typing import Any, ClassVar
+from typing import Any, Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arrays import Numbers, is_concrete
+from ...core.arrays import is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import length_and_direction, solve_positive_definite
+from ...core.linear_algebra import length_and_direction
 from ...core.numpy_or_jax import AnyArray, namespace
-from .columns import each_pose, no_covariance
-from .frames import moved
-from .observation import (
-    POINT,
-    READINGS,
-    TARGET,
-    AbstractObservation,
-    AbstractSimulated,
-    Entry,
-    Quantity,
-    Rows,
-    Tips,
-    Unknowns,
-    checked_name,
-    checked_readings,
-    checked_scalar,
-    checked_target,
-    is_exact,
-    numbers,
-)
+from .declared import count, derived, is_exact, number, truth
+from .fits import fitted_sphere
+from .frames import each_pose, moved, no_covariance
+from .observation import POINT, AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
+from .simulated import AbstractSimulated
 
 _SMALLEST_CAP = 20.0  # degrees from its middle: below it, centre and radius can hardly be told apart
 
 
-class Sphere(AbstractObservation):
+class AbstractRound(AbstractObservation):
+    """Touches of a surface of one diameter, which may be certified: the tip's centre is at one distance, the radius,
+    from what is in its middle."""
+
+    diameter: Float[AnyArray, ""] | None = number("certified diameter", "mm", default=None, uncertainty="u")
+    u: Float[AnyArray, ""] = number("standard uncertainty of the diameter", "mm", default=0.0)
+    stylus: Float[AnyArray, ""] = number("diameter of the tip's ball", "mm", default=0.0)
+    free: bool = derived()  # whether the radius is an unknown
+    inside = False
+
+    @property
+    def radius(self) -> Float[AnyArray, "*batch"] | None:
+        """Certified distance of the tip's centre from the middle, mm."""
+        if self.diameter is None:
+            return None
+        return (self.diameter - self.stylus if self.inside else self.diameter + self.stylus) / 2
+
+    @property
+    def size(self) -> str:
+        """Name of the unknown radius."""
+        return f"radius of {self.name}"
+
+    def radius_at(self, unknowns: Unknowns) -> Any:
+        """The radius in a residual."""
+        return unknowns[self.size][0] if self.free else self.radius
+
+    @property
+    def fixes_scale(self) -> bool:
+        return self.radius is not None
+
+    @property
+    def certified(self) -> Certified:
+        return {self.size: (self.radius[None], self.u[None] / 2)} if self.free and self.radius is not None else {}
+
+    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
+        if part != self.size or not float(self.stylus):
+            return super().quantities(part, values)
+        ball = float(self.stylus) / 2
+        return (Quantity("without the tip's ball", values + ball if self.inside else values - ball, "mm"),)
+
+
+class Sphere(AbstractRound):
     """Touches of a sphere: the tip's centre is at (diameter + stylus) / 2 from an unknown centre.
 
     Args:
@@ -57,56 +81,18 @@ class Sphere(AbstractObservation):
         15.5 ['centre of ball', 'radius of ball']
     """
 
-    kind: ClassVar[str] = "sphere"
-    table: ClassVar[str] = "touched_sphere"
-    entries: ClassVar[tuple[Entry, ...]] = (
-        READINGS,
-        Entry("diameter", "certified diameter", "mm", uncertainty="u"),
-        Entry("u", "standard uncertainty of the diameter", "mm"),
-        Entry("stylus", "diameter of the tip's ball", "mm"),
-        TARGET,
-    )
-    stated: ClassVar[tuple[str, ...]] = ("diameter", "stylus", "u")
-    q: Float[AnyArray, "m n"]
-    diameter: Float[AnyArray, ""] | None  # mm
-    stylus: Float[AnyArray, ""]  # mm
-    u: Float[AnyArray, ""]  # of the radius, mm
-    name: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
-    point: bool = eqx.field(static=True)  # whether the radius is exactly 0: a socket
-    free: bool = eqx.field(static=True)  # whether the radius is an unknown
+    kind, table, noun = "sphere", "touched_sphere", "sphere"
+    rows: int = derived()  # of a sphere of radius 0 all three coordinates, else the distance
 
-    def __init__(
-        self,
-        name: str,
-        q: Numbers,
-        *,
-        diameter: Numbers | None = None,
-        u: Numbers = 0.0,
-        stylus: Numbers = 0.0,
-        target: str = "",
-    ):
-        self.name = checked_name(name, "a sphere")
-        where = f"sphere '{name}'"
-        self.q = checked_readings(where, q)
-        self.target = checked_target(target)
-        self.u = checked_scalar(f"u of {where}", u) / 2
-        self.stylus = checked_scalar(f"stylus of {where}", stylus)
-        self.diameter = None if diameter is None else checked_scalar(f"diameter of {where}", diameter)
-        exact = is_exact(self.u)
-        known = self.radius is not None and is_concrete(self.radius)
-        self.point = known and exact and float(self.radius) == 0  # pyright: ignore[reportArgumentType]
-        self.free = self.radius is None or not exact
+    def completed(self, where: str) -> Mapping[str, Any]:
+        exact, radius = is_exact(self.u), self.radius
+        point = radius is not None and is_concrete(radius) and exact and float(radius) == 0
+        return {"free": radius is None or not exact, "rows": 3 if point else 1}
 
     @property
-    def radius(self) -> Float[AnyArray, "*batch"] | None:
-        """Certified distance of the tip's centre from the centre, mm."""
-        return None if self.diameter is None else (self.diameter + self.stylus) / 2
-
-    @property
-    def rows(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Residuals of each pose: of a sphere of radius 0 all three coordinates, else the distance."""
-        return 3 if self.point else 1
+    def is_point(self) -> bool:
+        """Whether its radius is exactly 0, as that of a socket."""
+        return self.rows == 3
 
     @property
     def centre(self) -> str:
@@ -114,65 +100,43 @@ class Sphere(AbstractObservation):
         return f"centre of {self.name}"
 
     @property
-    def size(self) -> str:
-        """Name of the unknown radius."""
-        return f"radius of {self.name}"
-
-    @property
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         return {self.centre: POINT} | ({self.size: ("mm",)} if self.free else {})
 
-    def stored(self) -> dict[str, Any]:
-        return super().stored() | {"u": 2 * self.u}  # twice and half of a number are exact
-
-    def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
-        if part != self.size or not float(self.stylus):
-            return super().quantities(part, values)
-        return (Quantity("without the tip's ball", values - float(self.stylus) / 2, "mm"),)
-
     @property
     def fixes_scale(self) -> bool:
-        return self.radius is not None and not self.point
-
-    @property
-    def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
-        return {self.size: (self.radius[None], self.u[None])} if self.free and self.radius is not None else {}
+        return super().fixes_scale and not self.is_point
 
     @property
     def linear(self) -> bool:
-        return self.point
+        return self.is_point
 
     @property
     def alike(self) -> Hashable | None:
-        return self.point, self.free, self.diameter is None
+        return self.is_point, self.free, self.diameter is None
 
-    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> dict[str, Float[AnyArray, " k"]]:
-        xp = namespace(tips)
-        if self.point:
-            return {self.centre: xp.mean(tips.position, axis=1)}
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
+        if self.is_point:
+            return {self.centre: namespace(tips).mean(tips.position, axis=1)}
         centre, radius = fitted_sphere(tips.position)
-        found = {self.centre: centre}
-        if self.free:
-            found[self.size] = (radius if self.radius is None else self.radius)[None]
-        return found
+        size = radius if self.radius is None else self.radius
+        return {self.centre: centre} | ({self.size: size[None]} if self.free else {})
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.u), self.q.shape[0]
         between = tips.position - unknowns[self.centre]
-        if self.point:
+        if self.is_point:
             identity = each_pose(xp.asarray(np.eye(3)), m)
             return Rows(between, identity, {self.centre: -identity}, no_covariance(3, m))
         distance, towards = length_and_direction(between)
-        direction = towards[None]
-        radius: Any = unknowns[self.size][0] if self.free else self.radius
-        by_unknowns = {self.centre: -direction.swapaxes(0, 1)}
+        by_unknowns = {self.centre: -towards[:, None]}
         if self.free:
             by_unknowns[self.size] = -xp.ones((1, 1, m))
-        return Rows((distance - radius)[None], direction, by_unknowns, no_covariance(1, m))
+        return Rows((distance - self.radius_at(unknowns))[None], towards[None], by_unknowns, no_covariance(1, m))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         where = f"sphere '{self.name}'"
-        if self.point:
+        if self.is_point:
             return
         needed = 4 if self.radius is None else 3
         if tips.shape[1] < needed:
@@ -190,20 +154,22 @@ class Sphere(AbstractObservation):
             )
 
 
-def fitted_sphere(tips: Float[AnyArray, "3 m"]) -> tuple[Float[AnyArray, " 3"], Float[AnyArray, ""]]:
-    """Centre and radius of the sphere through points, by linear least squares: |t|^2 = 2 c.t + r^2 - |c|^2."""
-    xp = namespace(tips)
-    middle = xp.mean(tips, axis=1, keepdims=True)
-    size = xp.sqrt(xp.mean((tips - middle) ** 2)) + 1e-12
-    centred = (tips - middle) / size
-    design = xp.concatenate([2 * centred, xp.ones_like(centred[:1])])
-    normal = design @ design.T + 1e-12 * tips.shape[1] * xp.asarray(np.eye(4))
-    solution = solve_positive_definite(normal, design @ xp.sum(centred**2, axis=0))
-    radius = xp.sqrt(xp.maximum(solution[3] + xp.sum(solution[:3] ** 2), 0.0))
-    return middle[:, 0] + size * solution[:3], size * radius
+class AbstractSimulatedRound(AbstractSimulated):
+    """Touches of a surface of one diameter, which may be certified."""
+
+    diameter: float
+    certified: bool = truth("whether the diameter is certified", default=True)
+    u: float = number("standard uncertainty of the certified diameter", "mm", default=0.0)
+    stylus: float = number("diameter of the tip's ball", "mm", default=0.0)
+
+    def certificate(self, random: np.random.Generator) -> dict[str, float]:
+        """What is recorded of the diameter."""
+        if not self.certified:
+            return {}
+        return {"diameter": self.diameter + self.u * random.normal(), "u": self.u, "stylus": self.stylus}
 
 
-class SimulatedSphere(AbstractSimulated):
+class SimulatedSphere(AbstractSimulatedRound):
     """Touches all over a sphere, or over a cap of it.
 
     Args:
@@ -222,17 +188,13 @@ class SimulatedSphere(AbstractSimulated):
         (25, 6) 28.00 mm
     """
 
-    table: ClassVar[str] = "touched_sphere"
-    name: str = eqx.field(static=True)
-    centre: np.ndarray = eqx.field(converter=numbers("centre", 3))
-    diameter: float
-    poses: int = eqx.field(static=True)
-    certified: bool = eqx.field(static=True, default=True)
-    u: float = 0.0
-    stylus: float = 0.0
+    table = "touched_sphere"
+    centre: np.ndarray = number("centre in the base frame", "mm", 3)
+    diameter: float = number("true diameter", "mm")
+    poses: int = count("number of poses")
 
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "SimulatedSphere":
-        return dataclasses.replace(self, name=name, centre=moved(frame, self.centre))
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
+        return self.changed(name=name, centre=moved(frame, self.centre))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         directions = random.normal(size=(self.poses, 3))
@@ -242,7 +204,4 @@ class SimulatedSphere(AbstractSimulated):
     def recorded(
         self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
     ) -> Sphere:
-        if not self.certified:
-            return Sphere(self.name, q)
-        diameter = self.diameter + self.u * random.normal()
-        return Sphere(self.name, q, diameter=diameter, u=self.u, stylus=self.stylus)
+        return Sphere(self.name, q, **self.certificate(random))

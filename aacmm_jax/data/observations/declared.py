@@ -1,0 +1,248 @@
+"""Classes whose constructor, checks and fields follow from what they declare: observations, and what simulates them.
+
+``diameter: Float[AnyArray, ""] | None = number("certified diameter", "mm", default=None, uncertainty="u")`` in a class
+says all that there is to say of a datum: its name, type, meaning, unit, shape and default. The constructor takes it,
+files and manifests hold it, reports print it, and nothing else names it.
+"""
+
+import abc
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import FrozenInstanceError
+from typing import Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+
+from ...core.arguments import shown, truth_value
+from ...core.arrays import Numbers, as_array, as_floats, is_concrete
+from ...core.errors import InputError
+from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
+
+REQUIRED = inspect.Parameter.empty
+NAME = object()  # as a default: the name of the observation
+
+
+class Entry(NamedTuple):
+    """One of the data of a class, as its constructor takes it, files hold it and a manifest states it."""
+
+    says: str
+    unit: str = ""  # none for text and truth values
+    dimensions: tuple[Any, ...] = ()  # of an array: names, or sizes; the first is "pose" where each pose has a row
+    content: Literal["number", "count", "text", "truth", "points"] = "number"
+    default: Any = REQUIRED
+    uncertainty: str = ""  # of a certified value: name of the entry with its standard uncertainty
+    positive: bool = False  # a single number may not be 0
+    spread: bool = False  # of an array: one number for all poses is enough
+    raw: bool = False  # checked by `completed` of the class
+    of_session: bool = False  # a name that means something else in another session
+    name: str = ""
+
+    @property
+    def required(self) -> bool:
+        """Whether it has no default."""
+        return self.default is REQUIRED
+
+
+class Derived(NamedTuple):
+    """A field that `completed` makes of the data; it fixes a compiled program."""
+
+
+def number(says: str, unit: str = "", *dimensions: str | int, **options: Any) -> Any:
+    """Declares a number that is zero or positive, or with ``dimensions`` an array; ``options`` are those of `Entry`."""
+    return Entry(says, unit, dimensions, **options)
+
+
+def text(says: str, *dimensions: str, **options: Any) -> Any:
+    """Declares a name, or names."""
+    return Entry(says, "", dimensions, "text", **options)
+
+
+def truth(says: str, default: bool = False) -> Any:
+    """Declares what is true or false."""
+    return Entry(says, content="truth", default=default)
+
+
+def count(says: str) -> Any:
+    """Declares a number of poses."""
+    return Entry(says, content="count")
+
+
+def points(says: str) -> Any:
+    """Declares a dictionary of points by name, mm."""
+    return Entry(says, "mm", ("axis",), "points")
+
+
+def derived() -> Any:
+    """Declares a field that `completed` fills in."""
+    return Derived()
+
+
+class Declared(abc.ABC):
+    """A frozen object with a name and with what its class declares.
+
+    The constructor takes what has no default first.
+    A class may have a constructor of its own, which calls this one, and whose ``**options`` are then its entries with a
+    default.
+    """
+
+    entries: ClassVar[tuple[Entry, ...]] = ()
+    derived_fields: ClassVar[tuple[str, ...]] = ()
+    noun: ClassVar[str] = "observation"  # in messages
+    keyword_only: ClassVar[bool] = True  # what has a default
+    name: str
+
+    __signature__: ClassVar[inspect.Signature]  # of the constructor, for help and completion
+    _parameters: ClassVar[inspect.Signature]  # of the entries
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        declared = {name: value for name, value in vars(cls).items() if isinstance(value, Entry | Derived)}
+        for name in declared:
+            delattr(cls, name)
+        entries = {name: entry._replace(name=name) for name, entry in declared.items() if isinstance(entry, Entry)}
+        inherited = {entry.name: entry for base in reversed(cls.__mro__[1:]) for entry in getattr(base, "entries", ())}
+        # What all kinds may have comes last.
+        cls.entries = tuple(sorted((inherited | entries).values(), key=lambda e: e.name in ("target", "place")))
+        cls.derived_fields = (*cls.derived_fields, *(declared.keys() - entries.keys()))
+        cls._parameters = _signature(cls.entries, cls.keyword_only)
+        parameters = list(cls._parameters.parameters.values())
+        if "__init__" in vars(cls):
+            _, *stated = inspect.signature(vars(cls)["__init__"]).parameters.values()
+            parameters = [one for one in parameters if one.default is not REQUIRED]
+            parameters = [*(one for one in stated if one.kind is not one.VAR_KEYWORD), *parameters]
+        cls.__signature__ = inspect.Signature(parameters)
+
+    def __init__(self, name: str, *values: Any, **options: Any):
+        given = self._parameters.bind(name, *values, **options)
+        given.apply_defaults()
+        where = f"{self.noun} '{checked_name(name, f'{_article(self.noun)} {self.noun}')}'"
+        object.__setattr__(self, "name", name)
+        sizes: dict[str | int, int] = {"axis": 3, "axis_2": 3}
+        for entry in self.entries:
+            value = given.arguments[entry.name]
+            if value is None and entry.default is NAME:
+                value = name
+            if not (entry.raw or (value is None and entry.default is None)):
+                value = self.checked(entry, value, where, sizes)
+            object.__setattr__(self, entry.name, value)
+        for field, value in self.completed(where).items():
+            object.__setattr__(self, field, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise FrozenInstanceError(f"cannot assign to field '{name}'")
+
+    def changed(self, **fields: Any) -> Self:
+        """The same object with other values of some fields, which are not checked."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self) | fields)
+        return other
+
+    @abc.abstractmethod
+    def checked(self, entry: Entry, value: Any, where: str, sizes: dict[str | int, int]) -> Any:
+        """The value of an entry of the object ``where`` as this class holds it, or `InputError`; ``sizes`` are those of
+        the dimensions so far."""
+
+    def completed(self, where: str) -> Mapping[str, Any]:
+        """Other fields, made of the checked entries; raises `InputError` for data that do not fit together."""
+        return {}
+
+    def stored(self) -> dict[str, Any]:
+        """The values of the entries, without those that have none; text of each pose as an array."""
+        values = {entry.name: getattr(self, entry.name) for entry in self.entries}
+        known = {name: value for name, value in values.items() if value is not None}
+        return {name: np.array(value) if isinstance(value, tuple) else value for name, value in known.items()}
+
+
+def _signature(entries: Sequence[Entry], keyword_only: bool) -> inspect.Signature:
+    kind = inspect.Parameter
+    types = {"number": "Numbers", "count": "int", "text": "str", "truth": "bool", "points": "dict"}
+    parameters = [kind("name", kind.POSITIONAL_OR_KEYWORD, annotation="str")]
+    for entry in sorted(entries, key=lambda entry: not entry.required):
+        by_keyword = keyword_only and not entry.required
+        default = None if entry.default is NAME else entry.default
+        annotation = types[entry.content] + (" | None" if default is None else "")
+        place = kind.KEYWORD_ONLY if by_keyword else kind.POSITIONAL_OR_KEYWORD
+        parameters.append(kind(entry.name, place, default=default, annotation=annotation))
+    return inspect.Signature(parameters)
+
+
+def checked_value(entry: Entry, value: Any, where: str, sizes: dict[str | int, int]) -> Any:
+    """A value of an observation: numbers as arrays of JAX, names of poses as a tuple; else `InputError`."""
+    what = f"{entry.name} of {where}"
+    if entry.content == "truth":
+        truth_value(value, what)
+        return bool(value)
+    if entry.content == "text" and not entry.dimensions:
+        return "" if entry.default == "" and isinstance(value, str) and not value else checked_name(value, what)
+    if entry.content == "text":
+        names = tuple(map(str, value))
+        _check_shape(entry, (len(names),), what, sizes)
+        return names
+    if entry.dimensions == ("pose", "joint"):
+        array = checked_readings(where, value)
+    elif not entry.dimensions:
+        return checked_scalar(what, value, positive=entry.positive)
+    else:
+        array = as_floats(value, what)
+    if entry.spread:
+        whole = tuple(sizes[dimension] for dimension in entry.dimensions)
+        if array.shape not in [whole[i:] for i in range(len(whole) + 1)]:
+            raise InputError(f"{what} has shape {array.shape}; give one number, or {whole}.")
+        if is_concrete(array) and np.any(np.asarray(array) < 0):
+            raise InputError(f"{what} is negative; a standard uncertainty must be zero or positive.")
+        return _spread(array, whole)
+    _check_shape(entry, array.shape, what, sizes)
+    return array
+
+
+@numpy_if_known
+def _spread(array: AnyArray, shape: tuple[int, ...]) -> AnyArray:
+    return namespace(array).broadcast_to(array, shape)
+
+
+def _check_shape(entry: Entry, shape: tuple[int, ...], what: str, sizes: dict[str | int, int]) -> None:
+    """Compare with the sizes of dimensions so far, which get those that are new."""
+    wanted = tuple(dimension if isinstance(dimension, int) else sizes.get(dimension) for dimension in entry.dimensions)
+    if len(shape) != len(wanted) or any(size not in (None, given) for size, given in zip(wanted, shape, strict=True)):
+        one_each = ", one row a pose" if entry.dimensions[0] == "pose" else ""
+        raise InputError(f"{what} has shape {shape}; give {str(wanted).replace('None', 'any')}{one_each}.")
+    sizes.update(zip(entry.dimensions, shape, strict=True))
+
+
+def checked_name(name: object, what: str) -> str:
+    """A name of one line, or `InputError`."""
+    if not isinstance(name, str) or not name.strip() or name.splitlines() != [name]:
+        raise InputError(f"{what} has the name {shown(name)}; give it a name of one line.")
+    return name
+
+
+def checked_readings(where: str, readings: Numbers) -> AnyArray:
+    """Joint readings ``(m, n)``, rad, or mm of prismatic joints, or `InputError` that says what is wrong with them."""
+    array = as_array(readings, where, like=np.zeros(0))
+    if array.ndim != 2 or 0 in array.shape:
+        raise InputError(f"{where} has shape {array.shape}; expected (poses, joints), with at least one of each.")
+    if is_concrete(array) and len(bad := np.argwhere(~np.isfinite(np.asarray(array)))):
+        row, column = bad[0] + 1
+        raise InputError(
+            f"{where} pose {row} joint {column} is {array[row - 1, column - 1]}; every reading must be finite."
+        )
+    return array
+
+
+def checked_scalar(what: str, value: Numbers, *, positive: bool = False) -> AnyArray:
+    """One number, zero or positive, or `InputError`."""
+    array = as_floats(value, what)
+    if array.ndim:
+        raise InputError(f"{what} has shape {array.shape}; give one number.")
+    if is_concrete(array) and (float(array) < 0 or (positive and float(array) == 0)):
+        raise InputError(f"{what} is {float(array):g}; it must be {'positive' if positive else 'zero or positive'}.")
+    return array
+
+
+def is_exact(u: AnyArray) -> bool:
+    """Whether a certified value is exact, and not an unknown of its own; a traced uncertainty is not known to be 0."""
+    return is_concrete(u) and float(u) == 0
+
+
+def _article(noun: str) -> str:
+    return "an" if noun[:1] in "aeiou" else "a"

@@ -1,0 +1,175 @@
+"""What an arm file (TOML) may hold, and a commented template of one."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from ..core.errors import InputError
+from ..core.units import DEG
+from ..data.arm_classes import CLASSES, SEATING, ArmNoise, class_noise, noise_of_repeatability
+from ..data.noise import Noise
+from ..kinematics.arm import Arm
+from .corrections import CorrectionsTable
+from .priors import PriorTable
+from .toml import Strict, each_once
+
+_MOST_JOINTS = 20
+# alpha, a, d, joint by joint, as often as needed: of a small measuring arm (shoulder, elbow, wrist), and of a shorter
+# chain, whose tip still reaches a volume.
+_ROWS = ((-90, 0, 300), (90, 0, 0), (-90, 0, 400), (90, 0, 0), (-90, 0, 400), (90, 0, 0))
+_FEW_ROWS = ((-90, 0, 300), (90, 300, 0), (-90, 0, 0), (90, 100, 0), (0, 0, 0))
+
+
+class JointTable(Strict):
+    """A row of D-H parameters, in the file's units."""
+
+    alpha: FiniteFloat
+    a: FiniteFloat
+    d: FiniteFloat
+    theta: FiniteFloat = 0.0
+    beta: FiniteFloat | None = None
+    limits: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "JointTable":
+        if self.limits is not None and not self.limits[0] < self.limits[1]:
+            low, high = self.limits
+            raise ValueError(f"the limits are {low:g} to {high:g}; the lower must be below the upper.")
+        return self
+
+
+class Identification(Strict):
+    """The table ``[identification]``: what a calibration may change, in the file's units."""
+
+    held: list[str] | None = None
+    free: list[str] = Field(default_factory=list)
+    length: PositiveFloat = 10.0
+    angle: PositiveFloat | None = None
+    override: dict[str, PositiveFloat] = Field(default_factory=dict)
+
+
+class NoiseTable(Strict):
+    """The table ``[noise]``: a class, a published repeatability, or standard deviations."""
+
+    arm_class: Annotated[Literal["measuring arm", "robot", "hobby arm"] | None, Field(alias="class")] = None
+    repeatability_mm: PositiveFloat | None = None  # pose repeatability of ISO 9283
+    encoder_arcsec: NonNegativeFloat | list[FiniteFloat] | None = None
+    seating_mm: NonNegativeFloat | None = None
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _one_statement(self) -> "NoiseTable":
+        if self.repeatability_mm is not None and self.encoder_arcsec is not None:
+            raise ValueError("give repeatability_mm or encoder_arcsec; both say how precise the readings are.")
+        return self
+
+    def noise(self, arm: Arm, default: str) -> ArmNoise:
+        """The noise; what the table does not state is that of its class, by default ``default``."""
+        name = self.arm_class or default
+        seating = SEATING if self.seating_mm is None else self.seating_mm
+        if self.encoder_arcsec is not None:
+            noise = Noise(encoder_arcsec=self.encoder_arcsec, seating=seating)
+        elif self.repeatability_mm is not None:
+            noise = noise_of_repeatability(arm, self.repeatability_mm, seating)
+        else:
+            noise = Noise(encoder_arcsec=np.asarray(class_noise(arm, name).encoder_arcsec), seating=seating)
+        noise.check(arm.joints)
+        return ArmNoise(name, noise, self.source or f"class {name}: {CLASSES[name].source}")
+
+
+class ArmFile(Strict):
+    """An arm file."""
+
+    name: str = ""
+    source: str = ""
+    convention: Literal["standard", "craig"] = "standard"
+    length_unit: Literal["mm", "m"]
+    angle_unit: Literal["rad", "deg"]
+    probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, default_factory=lambda: [0.0, 0.0, 0.0])]
+    joint: list[JointTable] = Field(default_factory=list)
+    prismatic: Annotated[list[PositiveInt], AfterValidator(each_once)] = Field(default_factory=list)  # joints from 1
+    urdf: str | None = None  # instead of rows of joints: a URDF beside this file
+    base: str | None = None  # its links
+    tip: str | None = None
+    thermometer: bool = False
+    identification: Identification | None = None
+    corrections: CorrectionsTable | None = None
+    noise: NoiseTable | None = None
+    priors: PriorTable | None = None
+
+    @property
+    def units(self) -> tuple[float, float]:
+        """The units of lengths and angles, in mm and rad."""
+        return {"mm": 1.0, "m": 1000.0}[self.length_unit], {"rad": 1.0, "deg": DEG}[self.angle_unit]
+
+    @model_validator(mode="after")
+    def _rows_or_urdf(self) -> "ArmFile":
+        if bool(self.joint) == (self.urdf is not None):
+            raise ValueError("give either joint, one row a joint, or urdf, the name of a URDF file.")
+        if self.urdf is None and (self.base is not None or self.tip is not None):
+            raise ValueError("base and tip are links of a URDF; leave them out, or give urdf.")
+        if self.urdf is not None and self.prismatic:
+            raise ValueError("prismatic is for rows of joints; a URDF states its prismatic joints, so leave it out.")
+        return self
+
+    @model_validator(mode="after")
+    def _unit_of_angles(self) -> "ArmFile":
+        """Refuse twists that can only be in the other unit."""
+        for number, joint in enumerate(self.joint, start=1):
+            if self.angle_unit == "rad" and abs(joint.alpha) > 2 * math.pi:
+                raise ValueError(
+                    f"joint {number} has alpha = {joint.alpha:g} rad, more than a revolution; is it in degrees? "
+                    "Correct angle_unit or alpha."
+                )
+        twists = [joint.alpha for joint in self.joint if joint.alpha]
+        quarters = [twist / (math.pi / 2) for twist in twists]
+        if self.angle_unit == "deg" and twists and all(abs(x - round(x)) < 1e-3 and 1 <= abs(x) < 3 for x in quarters):
+            raise ValueError(
+                f"every alpha is a multiple of pi/2, such as {twists[0]:g}, which is unusual in degrees; is it in rad? "
+                "Correct angle_unit or alpha."
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _consistent_rows(self) -> "ArmFile":
+        if not self.joint:
+            return self
+        first = self.joint[0]
+        if len({joint.limits is None for joint in self.joint}) > 1:
+            raise ValueError("limits are given for some joints only; give them for all or for none.")
+        if max(self.prismatic, default=0) > len(self.joint):
+            raise ValueError(f"prismatic names joint {max(self.prismatic)}, but there are {len(self.joint)} joints.")
+        if self.prismatic and first.limits is None:
+            raise ValueError(
+                f"joint {min(self.prismatic)} is prismatic, but its travel is not stated; give every joint limits (in "
+                "length_unit of prismatic joints)."
+            )
+        if self.convention == "craig" and (first.alpha or first.a):
+            raise ValueError(
+                "joint 1 has a twist or a length before its axis (alpha_0, a_0), which standard form cannot hold; "
+                "choose the base frame on the first axis, so that both are 0."
+            )
+        if self.convention == "craig" and any(joint.beta for joint in self.joint):
+            raise ValueError("beta is Hayati's angle of the standard form; leave it out of a craig table.")
+        return self
+
+
+def arm_template(joints: int = 6) -> str:
+    """The text of an arm file in which every key is explained, valid as it stands.
+
+    Raises:
+        InputError: The number is not between 1 and 20.
+    """
+    if not 1 <= joints <= _MOST_JOINTS:
+        raise InputError(f"an arm of {joints} joints cannot be written; give a number from 1 to {_MOST_JOINTS}.")
+    pattern = _FEW_ROWS if joints < len(_ROWS) else _ROWS
+    rows = [pattern[i % len(pattern)] if i + 1 < joints else (0, 0, 0) for i in range(joints)]
+    lines = [
+        f"  {{ alpha = {alpha:3d}, a = {a:3d}, d = {d:3d}, theta = 0, limits = [-170, 170] }},  # joint {number}"
+        for number, (alpha, a, d) in enumerate(rows, start=1)
+    ]
+    text = (Path(__file__).with_name("templates") / "arm.toml").read_text("utf-8")
+    return text.replace("{rows}", "\n".join(lines)).replace("{last}", str(joints))
