@@ -98,7 +98,7 @@ def _amplitude_text(term: "FoundTerm") -> str:
 
 def wider_model(terms: "Sequence[FoundTerm]", arm: Arm | None) -> str:
     """The model that the arm has, with the terms that were found besides; empty where that is no other model."""
-    functions = () if arm is None or arm.corrections is None else arm.corrections.functions.each
+    functions = () if arm is None or arm.corrections is None else arm.corrections.functions.terms
     present = [term for term in functions if isinstance(term, Term)]
     sought, added = all_sought(), []
     for kind, one in (sought[term.kind] for term in terms if term.kind in sought):

@@ -19,7 +19,8 @@ _TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the col
 def test(case: Case) -> list[Finding]:
     """A solve that did not end, residuals that no arm has, and parameters most of which ended on a bound."""
     record, findings = case.record, []
-    if not record.converged and not record.reason.startswith("Converged"):  # else the scale is what is wrong
+    # Where a solve ended whose scale is not plausible, that is what is wrong.
+    if not record.converged and (record.plausible_scale or not record.reason.startswith("Converged")):
         findings.append(Finding("not-converged", record.reason, severity="unusable"))
     if record.implausible_residual:
         findings.append(_implausible(case))
