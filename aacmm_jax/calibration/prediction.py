@@ -18,8 +18,8 @@ from jaxtyping import Float
 from ..core.distributions import chance
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
+from ..data.copies import visits_of
 from ..data.observations.socket import position_of
-from ..data.visits import visits_of
 from ..model.elimination import followed
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty

@@ -94,7 +94,7 @@ def arm(
     from ..files.arms import load_specification
 
     if figure is not None:
-        from ..plot.style import check_format
+        from ..plot.figures import check_format
 
         check_format(figure)
     with together(figure):

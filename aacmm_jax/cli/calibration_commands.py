@@ -195,7 +195,7 @@ def calibrate(
         for file in capture:
             reading(file)
         if figure is not None:
-            from ..plot.style import check_format
+            from ..plot.figures import check_format
 
             check_format(figure)
         recording = _joined(capture, same_probe)
@@ -204,7 +204,7 @@ def calibrate(
             raise InputError("--leave-out says what --cross-validate leaves out; give both.")
         others = None
         if only_poses is not None:
-            from ..data.drawing import draw_poses
+            from ..data.capture import draw_poses
 
             part, others = draw_poses(recording.capture, only_poses, seed)
             recording = recording._replace(capture=part)
@@ -280,7 +280,7 @@ def _failed(record: Any) -> bool:
 
 def _joined(files: Sequence[Path], same_probe: bool) -> Any:
     """The recording of a file, or of several as the sessions of one arm, with the digests of the files."""
-    from ..data.capture import join_sessions
+    from ..data.joined_captures import join_sessions
     from ..files.captures import load_capture
     from ..files.inputs import InputFile, fingerprint
 

@@ -65,7 +65,7 @@ def compare(
     if len(files) < 2:
         raise InputError(f"{files[0]} alone cannot be compared; name at least two calibrations.")
     if figure is not None:
-        from ..plot.style import check_format
+        from ..plot.figures import check_format
 
         check_format(figure)
     with together(figure, csv):

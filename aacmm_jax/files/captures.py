@@ -9,11 +9,10 @@ import numpy as np
 from ..core.errors import InputError
 from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
-from ..data.copies import Repeated
+from ..data.copies import UNKNOWN, Repeated
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
-from ..data.visits import UNKNOWN
 from ..kinematics.arm import Arm, readings_unit
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from .corrections import corrected_of, correction_variables

@@ -60,7 +60,7 @@ def record():
 
 @pytest.mark.slow
 def test_the_report_shows_functions_and_folds_coefficients(record):
-    report, summary = calibration_report(record)
+    report, summary = calibration_report(record), calibration_summary(record)
     blocks = {getattr(block, "caption", getattr(block, "title", block)): block for section in report.sections
               for block in section.blocks}  # fmt: skip
     names = [row[0].text for row in blocks["Parameters"].rows]
