@@ -2,8 +2,8 @@
 
 import math
 
-from ..calibration.checks import PLAUSIBLE_SCALE, plausible
 from ..calibration.record import REPEATABILITY, CalibrationRecord
+from ..calibration.results import PLAUSIBLE_SCALE, plausible
 from ..calibration.scale_anchor import scale_set_by_clause
 from ..core.text import shorten
 from ..core.units import INCH, M

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..calibration.drawn_errors import functions_of, places_of
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import Calibration
-from ..calibration.sensitivities import Sensitivities
+from ..calibration.stages import Sensitivities
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import Arm, correction_names, natural_steps

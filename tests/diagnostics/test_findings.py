@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.checks import plausible
+from aacmm_jax.calibration.results import plausible
 from aacmm_jax.diagnostics import findings_of
 from aacmm_jax.diagnostics.findings import case_of, diagnostics, finding_rows, sentences
 from aacmm_jax.diagnostics.recorded import of_recording
