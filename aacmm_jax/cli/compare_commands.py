@@ -6,9 +6,8 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import InputError
-from ..files.atomic_write import write_text
 from ..files.hdf5 import read_tables
-from ..files.outputs import together
+from ..files.outputs import together, write_text
 from .app import Json, app, examples, show_summary, with_spinner
 
 

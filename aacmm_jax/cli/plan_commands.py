@@ -332,7 +332,7 @@ def _is_urdf(arm: str) -> bool:
 
 def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Callable[[str], str], arm: str) -> str:
     """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
-    from ..files.atomic_write import write_text
+    from ..files.outputs import write_text
 
     with together(output, manifest):
         write_text(output, poses)

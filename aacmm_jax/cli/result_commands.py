@@ -9,10 +9,9 @@ import typer
 
 from ..core.errors import InputError
 from ..core.text import printable
-from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile
-from ..files.outputs import check_kept, together
+from ..files.outputs import check_kept, together, write_text
 from ..files.sense import check_shown
 from .app import (
     KEPT,

@@ -18,11 +18,10 @@ import numpy as np
 
 from ..core._compat import named_members
 from ..core.errors import InputError
-from ..files.atomic_write import write_atomically
 from ..files.captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from ..files.hdf5 import Table, Variable, check_sense, columns, opened, read_tables, undamaged, write_tables
 from ..files.inputs import InputFile
-from ..files.outputs import ELSEWHERE
+from ..files.outputs import ELSEWHERE, write_atomically
 from ..kinematics.arm import parameter_unit
 from .blocks import DIMENSIONS, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
