@@ -12,9 +12,8 @@ from jaxtyping import Float, Int
 
 from ..core.errors import InputError
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
-from ..kinematics.body import Body, body_along_links
+from ..kinematics.body import Body, body_along_links, segment_distance
 from ..kinematics.parameters import ArmSpecification
-from ..kinematics.segment_distances import segment_distance
 from .inputs import InputFile
 from .urdf import urdf_chain
 from .urdf_text import UrdfShape, collision_shapes

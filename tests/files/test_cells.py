@@ -161,10 +161,16 @@ def test_meshes_that_are_not_at_hand(tmp_path):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (("size = [400, 200, 600]", "size = [400, 0, 600]"), "cell.toml: box 'cabinet' has an edge of 0 mm"),
+        (
+            ("size = [400, 200, 600]", "size = [400, 0, 600]"),
+            "cell.toml: size.1. of obstacle 'cabinet' is 0 mm; it must be positive",
+        ),
         (("radius = 30.0", "radius = -30.0"), "cell.toml.*radius"),
         (("[[capsule]]", "[[sphere]]"), "cell.toml.*sphere"),
-        (("radius = 50.0", "radius = [1.0, 2.0]"), "cell.toml: radius has 2 values, but the arm has 7 joints"),
+        (
+            ("radius = 50.0", "radius = [1.0, 2.0]"),
+            "cell.toml: radius has shape .2,.; give one number, or .joints,. with 7 joints",
+        ),
         (("normal = [0, 0, 1]", "normal = [0, 0]"), "cell.toml.*normal"),
     ],
 )
