@@ -258,7 +258,7 @@ class Study:
             if drawn is None or (name in corrections and name not in true):
                 drawn = _NONE
             normal.append(drawn.normal is not None)
-            widths.append(unit * (drawn.uniform if drawn.normal is None else drawn.normal))
+            widths.append(unit * (drawn.normal or drawn.uniform or 0.0))
         return np.array(widths), normal
 
     def _bounds(self, cell: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
