@@ -153,7 +153,7 @@ def _evaluated(
         )
         stored = read_summary(read[0], ("calibration",))[1]
         warnings = of_calibration(record) if stored is None else stored["warnings"]
-        evaluation = evaluation_of(record, recording, **of_test, calibration_warnings=warnings)
+        evaluation = evaluation_of(record, recording, **of_test)._replace(calibration_warnings=tuple(warnings))
         summary = with_spinner("Evaluating", lambda: evaluation_summary(evaluation))
         if not summary["acceptance"]:
             _refuse_options_of_tests(of_test, measuring_range)
