@@ -22,35 +22,21 @@ from ..chain import ForwardPass
 
 
 class Loads(NamedTuple):
-    """What pulls at the arm, for functions of gravity.
+    """What pulls at the arm, for functions of gravity."""
 
-    Args:
-        mass: Of each link, kg.
-        centre: Its centre of mass in its own D-H frame, mm.
-    """
-
-    mass: tuple[float, ...]
-    centre: tuple[tuple[float, float, float], ...]
+    mass: tuple[float, ...]  # of each link, kg
+    centre: tuple[tuple[float, float, float], ...]  # of mass, in the link's own D-H frame, mm
 
 
 class Sought(NamedTuple):
-    """Functions of a kind that residuals are searched for, all those of one joint at once.
+    """Functions of a kind that residuals are searched for, all those of one joint at once."""
 
-    Args:
-        name: What results call it: "first harmonic".
-        option: That of the model with these functions: "1" of ``harmonics=1``.
-        follows: What residuals follow then, of joint {i}: "cos q_{i}".
-        cause: What usually causes it, with its article: "an eccentric encoder".
-        of_slides: Whether prismatic joints have it as well.
-        relative: Whether its size is the coefficient, a ratio, rather than what it adds over the poses.
-    """
-
-    name: str
-    option: str
-    follows: str
-    cause: str
-    of_slides: bool = False
-    relative: bool = False
+    name: str  # what results call it: "first harmonic"
+    option: str  # of the model with these functions: "1" of ``harmonics=1``
+    follows: str  # what residuals follow then, of joint {i}: "cos q_{i}"
+    cause: str  # what usually causes it, with its article: "an eccentric encoder"
+    of_slides: bool = False  # whether prismatic joints have it as well
+    relative: bool = False  # whether its size is the coefficient, a ratio, rather than what it adds over the poses
 
 
 @dataclass(frozen=True)
@@ -115,21 +101,13 @@ class AbstractCorrection(abc.ABC):
 
 
 class Term(NamedTuple):
-    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3.
-
-    Args:
-        kind: What it is one of.
-        word: Which function.
-        number: Which of them: an order, a link, another joint; 0 where there is only one.
-        joint: The joint that it moves, from 1; 0 where it scales all lengths of the arm.
-        loads: Masses of the arm, where the function needs them.
-    """
+    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3."""
 
     kind: AbstractCorrection
-    word: str
-    number: int
-    joint: int
-    loads: Loads | None = None
+    word: str  # which function
+    number: int  # which of them: an order, a link, another joint; 0 where there is only one
+    joint: int  # that it moves, from 1; 0 where it scales all lengths of the arm
+    loads: Loads | None = None  # masses of the arm, where the function needs them
 
     @property
     def name(self) -> str:

@@ -32,8 +32,7 @@ def is_kind(name: str) -> bool:
 def register(kind: AbstractCorrection) -> None:
     """Make a kind known that has no file in this folder.
 
-    Raises:
-        InputError: What a model calls it, or a word of its coefficients, is another kind's, or no lowercase letters.
+    Raises `InputError` where what a model calls it, or a word of its coefficients, is another kind's.
     """
     for name in (kind.model, *kind.words):
         taken = any(name in (other.model, *other.words) for other in all_kinds())
@@ -118,8 +117,7 @@ def model_with(kind: AbstractCorrection, option: str) -> str:
 def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     """The term that a coefficient belongs to, or None where this is no coefficient's name.
 
-    Raises:
-        InputError: It is one, but not of an arm with so many joints.
+    Raises `InputError` where it is one, but not of an arm with so many joints.
     """
     coefficient = coefficient_of(name)
     if coefficient is None:
@@ -136,14 +134,8 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
 def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term, ...]:
     """The terms of a model: kinds with their options, separated by commas, such as "dh,gravity,harmonics=1".
 
-    Args:
-        model: Names of kinds, each with an option after "=" if need be; "dh" stands for the arm itself, "functions"
-            for harmonics=1-31.
-        joints: Number of joints of the arm.
-        loads: Masses of the arm, where known.
-
-    Raises:
-        InputError: A kind is unknown or there twice, or an option means nothing.
+    Raises `InputError` where a kind is unknown or there twice, or an option means nothing. "dh" stands for the arm
+    itself, "functions" for harmonics=1-31; ``loads`` are the masses of the arm, where known.
     """
     all_terms: list[Term] = []
     seen: set[str] = set()
