@@ -264,7 +264,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + LENGTH.replace("200.0", '"long"'), ["'length 1.value' must be a valid number, not 'long'"]),
         (SMALL + LENGTH + "u = -1", ["'length 1.u' must be greater than or equal to 0, not -1"]),
         (SMALL + LENGTH.replace('"b"', '"{x}"'), ["from 'a' to '{x}'", "field that no [[socket]] has"]),
-        (SMALL + LENGTH.replace("200.0", "true"), ["length 1.value: true and false are no numbers"]),
+        (SMALL + LENGTH.replace("200.0", "true"), ["length 1.value: expected a number, but it is true or false"]),
         (SMALL + SOCKET.replace("file", 'name = "b"\nfile') + 2 * LENGTH, ["from 'a' to 'b' of 200 mm is given twice"]),
         (
             HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = ["a.csv", "a.csv"]',
