@@ -117,13 +117,10 @@ def _written(steps: Sequence[Any], content: Any) -> list[Any]:
     """The part of the path to an error that is in the file: other steps are pydantic's ("a number or a list")."""
     kept = []
     for step in steps:
-        if (
-            isinstance(content, list | tuple)
-            if isinstance(step, int)
-            else isinstance(content, Mapping) and step in content
-        ):
+        index = isinstance(step, int)
+        if isinstance(content, list | tuple) if index else isinstance(content, Mapping) and step in content:
             kept.append(step)
-            content = content[step] if not isinstance(step, int) or step < len(content) else None
+            content = None if index and step >= len(content) else content[step]
     return kept
 
 
@@ -147,12 +144,8 @@ def _explain(error: Any, model: Any, content: Any) -> str:
     shown = quoted(given) if isinstance(given, str) else repr(given)
     shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else shown
     advice = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
-    tables = {
-        "dict_type": "must be a table",
-        "model_type": "must be a table",
-        "tuple_type": "must be a list of numbers",
-    }
-    wanted = tables.get(kind) or error["msg"].replace("Input should", "must").partition(", unable")[0]
+    wanted = {"dict_type": "must be a table", "model_type": "must be a table", "tuple_type": "must be a list"}.get(kind)
+    wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]
     if context.get("class_name") == "Distribution":
         wanted = "must be a number, { uniform = ... } or { normal = ... }"
     return f"'{place}' {wanted}, not {shown}{advice}."
