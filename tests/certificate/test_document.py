@@ -97,7 +97,7 @@ HOSTILE = ("<script>alert('1')</script>", 'a]]><b>"&amp;&lt;', "tab\té Ж 測 �
 
 @pytest.fixture(scope="module")
 def record(paper_arm) -> aj.calibration.CalibrationRecord:
-    """A calibration of an arm that is off, so that the nominal and the calibrated one differ. One of its two lengths is exact."""
+    """A calibration of an arm that is off, so that nominal and calibrated differ. One of its two lengths is exact."""
     nominal = aj.kinematics.ArmSpecification(paper_arm, "small & fine")
     bounds = nominal.bounds()
     true = bounds.space.arm(np.asarray(bounds.space.vector()) + np.where(bounds.space.lengths, 0.4, 0.001))
@@ -456,7 +456,9 @@ def test_any_number_reads_back(record, value):
     parent = ElementTree.Element("x")
     parent.append(xml_elements.real(value, MM))
     again = ElementTree.fromstring(xml_elements.xml_text(parent).replace("si:", ""))[0]
-    read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["Calibrated parameters", "Scale", "k"].value
+    read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))[
+        "Calibrated parameters", "Scale", "k"
+    ].value
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
 
 
@@ -788,7 +790,9 @@ def test_a_certificate_whose_number_was_edited_is_refused(record):
     k = f"<si:value>{parse_dcc(text)['Calibrated parameters', 'Scale', 'k'].value!r}</si:value>"
     numbers = (f"<si:value>{number}</si:value>" for number in ("1_0", "\u0663", "NaN", "INF", "1e300", "9" * 5001))
     for edited in (k.replace(".", ","), "", *numbers):
-        assert_refused(lambda edited=edited: parse_dcc(text.replace(k, edited)), "'Calibrated parameters / Scale / k'", "no number")
+        assert_refused(
+            lambda edited=edited: parse_dcc(text.replace(k, edited)), "'Calibrated parameters / Scale / k'", "no number"
+        )
 
 
 @pytest.mark.parametrize("kind", kinds.all_kinds(), ids=lambda kind: kind.model)
