@@ -72,8 +72,9 @@ def main() -> None:
     texts = [path.read_text() for path in MODULES]
     written = [line for text in texts for line in text.splitlines()]
     statements = sum(isinstance(node, ast.stmt) for text in texts for node in ast.walk(ast.parse(text)))
-    print(f"{sum(lines.values()):7,} lines in {len(MODULES)} modules, of {statements / len(written):.3f} statements and")
-    print(f"        {sum(map(len, written)) / len(written):.1f} characters each")
+    print(f"{sum(lines.values()):7,} lines in {len(MODULES)} modules")
+    characters = sum(map(len, written)) / len(written)
+    print(f"{statements / len(written):7.3f} statements and {characters:.1f} characters a line")
     users = defaultdict(set)
     for path in MODULES:
         for target in imports(path):
