@@ -26,8 +26,8 @@ from .core import units as units
 from .core.errors import IdentifiabilityWarning as IdentifiabilityWarning
 from .core.errors import InputError as InputError
 from .data.capture import Capture as Capture
-from .data.capture import join_sessions as join_sessions
-from .data.capture import stack_captures as stack_captures
+from .data.joined_captures import join_sessions as join_sessions
+from .data.joined_captures import stack_captures as stack_captures
 from .data.noise import Noise as Noise
 from .data.recording import Recording as Recording
 from .data.reference_length import ReferenceLength as ReferenceLength
@@ -40,6 +40,7 @@ from .kinematics.parameters import perturbed_arm as perturbed_arm
 from .kinematics.priors import Prior as Prior
 from .model.scale import fix_scale as fix_scale
 from .model.scale import scale_from_lengths as scale_from_lengths
+from .pipeline.capture_calibration import calibrate_capture as calibrate_capture
 from .pipeline.cross_validation import cross_validate as cross_validate
 from .pipeline.model_ladder import compare_models as compare_models
 from .pipeline.single import calibrate as calibrate

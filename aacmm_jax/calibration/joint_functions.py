@@ -43,7 +43,7 @@ def function_of_joint(
     arm: Arm = to_numpy(record.calibrated.arm)
     if arm.corrections is None:
         return None
-    each = arm.corrections.functions.each
+    each = arm.corrections.functions.terms
     chosen = [
         i for i, one in enumerate(each) if one.joint == joint and isinstance(one, Term) and one.kind.of_own_reading
     ]

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..calibration.drawn_errors import functions_of, places_of
 from ..calibration.record import CalibrationRecord, record_of
 from ..calibration.results import Calibration
-from ..calibration.sensitivities import Sensitivities
+from ..calibration.stages import Sensitivities
 from ..core._compat import inside_trace
 from ..core.arrays import is_concrete
 from ..core.distributions import chi_square_tail, f_tail
@@ -30,7 +30,7 @@ from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
 from ..kinematics.corrections.kinds import coefficient_of, shared_model
 from ..kinematics.parameters import ArmSpecification
-from ..kinematics.prior_scales import default_prior
+from ..kinematics.priors import default_prior
 from ..uncertainty.covariance import DISAGREEMENT
 from ..uncertainty.degrees_of_freedom import Law
 from ..uncertainty.shared_errors import SharedErrors

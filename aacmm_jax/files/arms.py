@@ -276,12 +276,7 @@ def _arm_of_rows(model: ArmFile) -> Arm:
 
 
 def with_parameters(specification: ArmSpecification, capture: Capture | None = None) -> ArmSpecification:
-    """The same with the parameters for an arm whose file proposes none.
-
-    Args:
-        specification: As of `read_arm`.
-        capture: What was observed; by default tips in sockets.
-    """
+    """The same with the parameters for an arm whose file proposes none; by default for tips in sockets."""
     try:
         space = determined_parameters(specification.arm, capture)
     except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip

@@ -1,23 +1,30 @@
 """The Denavit-Hartenberg chain: one forward pass from base to tip. Its derivatives are in `jacobian`.
 
+From the frame before joint i to the frame after it (Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1):
+
+    T_i = Rz(q_i + theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i) [Ry(beta_i)]     revolute
+    T_i = Rz(theta_i) Tz(q_i + d_i) Tx(a_i) Rx(alpha_i) [Ry(beta_i)]     prismatic
+
+and the tip is T_1 ... T_n probe. Corrections only change what is added to theta_i (or d_i) and scale all lengths: they
+are `joint_functions`, and enter in three lines of `_forward_pass`.
+
 Layout of the arrays: joints first, then the batch, then the three components of a vector, then the N configurations:
 ``(n, ..., 3, N)``. One loop over the joints works on contiguous rows of configurations, which suits XLA on a CPU and
 on a GPU. (Measured, 70 configurations x 21 columns on one core: 30 us; unrolled joint by joint 180-580 us, because
 XLA then computes the chain again for every column. `forward_pass_by_joints` prevents that, for batches on a CPU.)
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import groupby
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from ..core.numpy_or_jax import AnyArray, broadcast_after_first, compiled, namespace, scan
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan
+from .joint_functions import JointErrors, KnownFunctions, joint_errors_of
 
 _UNIT = 1000.0  # mm: a slide of 1 mm counts as much as a rotation of 1 mrad, like the natural steps of parameters
 
@@ -40,112 +47,6 @@ class JointKinds:
     def mask(self, rank: int = 1) -> Bool[np.ndarray, "n ..."]:
         """Whether each joint is prismatic, with axes of length 1 after the first up to the given rank."""
         return np.asarray(self.prismatic).reshape(-1, *(1,) * (rank - 1))
-
-
-@runtime_checkable
-class KnownFunction(Protocol):
-    """A function of the readings that a coefficient multiplies: a term of `kinematics.corrections`; hashable."""
-
-    @property
-    def joint(self) -> int:
-        """The joint that it moves, from 1; 0 where it scales all lengths."""
-        ...
-
-    @property
-    def name(self) -> str:
-        """Name of the coefficient."""
-        ...
-
-    @property
-    def unit(self) -> str:
-        """Unit of the coefficient."""
-        ...
-
-    @property
-    def rows(self) -> int:
-        """1, or 3 where the function is the product of the direction of gravity with three rows."""
-        ...
-
-    @property
-    def kind(self) -> "KindOfFunctions":
-        """What evaluates it."""
-        ...
-
-
-@runtime_checkable
-class KindOfFunctions(Protocol):
-    """What evaluates functions of a kind all at once, of which an arm may have hundreds."""
-
-    def values(
-        self, terms: Sequence[Any], q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass"
-    ) -> Float[AnyArray, "rows ... 1 N"]:
-        """Their rows at N configurations, with the nominal arm's frames there."""
-        ...
-
-
-@jax.tree_util.register_static
-@dataclass(frozen=True)
-class KnownFunctions:
-    """The functions of a chain's corrections, static in every program."""
-
-    each: tuple[KnownFunction, ...]
-
-    def __hash__(self) -> int:
-        return hash(self.names)  # kept: every call of a compiled program asks for it
-
-    def values(self, q: Float[AnyArray, "n ... 1 N"], forward: "ForwardPass") -> Float[AnyArray, "rows ... 1 N"]:
-        """All rows at N configurations, with the nominal arm's frames there."""
-        values = [own[0].kind.values(own, q, forward) for own in self._of_one_kind]
-        # Those of frames have the batch of the nominal arms, others that of the readings alone.
-        batch = np.broadcast_shapes(*(each.shape[1:] for each in values))
-        return namespace(q, forward).concatenate([broadcast_after_first(each, batch) for each in values])
-
-    @cached_property
-    def _of_one_kind(self) -> list[tuple[KnownFunction, ...]]:
-        """Neighbours of the same kind."""
-        return [tuple(own) for _, own in groupby(self.each, key=lambda function: type(function.kind))]
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coefficients."""
-        return tuple(function.name for function in self.each)
-
-    @cached_property
-    def moved(self) -> Int[np.ndarray, " k"]:
-        """The joint, from 0, that each function moves."""
-        return np.array([function.joint - 1 for function in self.each])
-
-    @cached_property
-    def by_gravity(self) -> Bool[np.ndarray, " k"]:
-        """Whether a function is the product of the direction of gravity with three rows."""
-        return np.array([function.rows == 3 for function in self.each])
-
-    @cached_property
-    def first_row(self) -> Int[np.ndarray, " k"]:
-        """The first row of each function."""
-        rows = np.where(self.by_gravity, 3, 1)
-        return np.cumsum(rows) - rows
-
-    @cached_property
-    def term_of_row(self) -> Int[np.ndarray, " rows"]:
-        """The function, from 0, that each row belongs to."""
-        return np.repeat(np.arange(len(self.each)), np.where(self.by_gravity, 3, 1))
-
-    @property
-    def component_of_row(self) -> Int[np.ndarray, " rows"]:
-        """The component of gravity that each row is multiplied by; 3 for those of other functions."""
-        return np.where(
-            self.by_gravity[self.term_of_row], np.arange(len(self.term_of_row)) - self.first_row[self.term_of_row], 3
-        )
-
-    def of_joints(self, joints: int) -> Float[np.ndarray, "n k"]:
-        """1 where a function moves a joint, else 0."""
-        return (np.arange(joints)[:, None] == self.moved).astype(float)
-
-    @property
-    def of_lengths(self) -> Float[np.ndarray, " k"]:
-        """1 for the functions that scale all lengths, else 0."""
-        return np.array([float(function.joint == 0) for function in self.each])
 
 
 class Corrections(NamedTuple):
@@ -185,15 +86,6 @@ class JointMotion(NamedTuple):
     sin: Float[AnyArray, "n ... 1 N"]
     slide: Float[AnyArray, "n ... 1 N"] | None  # mm
     functions: Float[AnyArray, "rows ... 1 N"] | None = None  # of the corrections
-
-
-class JointErrors(NamedTuple):
-    """Derivatives of what the corrections add to each joint's theta, or d of a prismatic joint."""
-
-    by_coefficient: Float[AnyArray, "k ... 1 N"]  # of the one joint that it moves, or of the scale
-    by_gravity: Float[AnyArray, "n 3 ... 1 N"]
-    functions: KnownFunctions
-    scale: Float[AnyArray, "... 1 N"] | None  # of all lengths, by thermal expansion; None without a term of it
 
 
 class ForwardPass(NamedTuple):
@@ -266,8 +158,7 @@ def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"])
 
 @compiled
 def forward_pass(geometry: Geometry, motion: JointMotion) -> ForwardPass:
-    """All frames from the base to the tip: T_i = Rz(q + theta) Tz(d) Tx(a) Rx(alpha) [Ry(beta)] of a revolute joint,
-    Rz(theta) Tz(q + d) Tx(a) Rx(alpha) [Ry(beta)] of a prismatic one.
+    """All frames from the base to the tip.
 
     Batches of the parameters (their leading axes) and of the motion (configurations last) broadcast.
     """
@@ -302,26 +193,29 @@ def _unrolled(body: Callable, start: Any, inputs: Any) -> tuple[Any, Any]:
     return carry, jax.tree.map(lambda *leaves: leaves, *outputs)
 
 
-def _with_rank(motion: JointMotion, rank: int) -> JointMotion:
-    """The motion with as many batch axes."""
-    return jax.tree.map(lambda t: t.reshape(t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]), motion)
+def _joints_first(geometry: Geometry, motion: JointMotion) -> tuple[Geometry, JointMotion]:
+    """Parameters with the joints first, and the motion, both with as many batch axes as the larger of them."""
+    rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
+    motion = jax.tree.map(lambda t: t.reshape(t.shape[:1] + (1,) * (rank + 2 - t.ndim) + t.shape[1:]), motion)
+    return jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry), motion
 
 
 def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> ForwardPass:
     xp = namespace(geometry, motion)
-    rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
-    motion = _with_rank(motion, rank)
-    parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
+    parameters, motion = _joints_first(geometry, motion)
     theta, d, a, probe, errors = parameters.theta, parameters.d, parameters.a, parameters.probe, None
     if motion.slide is not None:
         d = d + motion.slide
     if geometry.corrections is not None:
-        added, errors = _joint_errors(parameters, motion, geometry.corrections.functions)
-        mask = np.zeros(()) if geometry.kinds is None else geometry.kinds.mask(added.ndim)
-        theta = theta + (added if geometry.kinds is None else xp.where(mask, 0.0, added))
-        d = d if geometry.kinds is None else d + xp.where(mask, added, 0.0)
+        errors = _errors_of(parameters, motion)
+        if geometry.kinds is None:
+            theta = theta + errors.added
+        else:
+            slides = geometry.kinds.mask(errors.added.ndim)
+            theta, d = theta + xp.where(slides, 0.0, errors.added), d + xp.where(slides, errors.added, 0.0)
         if errors.scale is not None:
             d, a, probe = (lengths * errors.scale[None] for lengths in (d, a, probe))
+    # The angle of a joint is a sum, whose cosine and sine follow from those of its parts: the readings' are known.
     cos_theta, sin_theta = xp.cos(theta), xp.sin(theta)
     inputs = (
         (motion.cos * cos_theta - motion.sin * sin_theta, motion.sin * cos_theta + motion.cos * sin_theta),
@@ -331,7 +225,8 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
         d,
     )
 
-    def joint(frame, row):
+    def joint(frame: Any, row: Any) -> tuple[Any, Any]:
+        # [x y z] <- [x y z] Rz Rx Ry; the origin moves by d along z, which Rz keeps, and by a along the new x.
         (x, y, z), origin = frame
         (cos_angle, sin_angle), (cos_alpha, sin_alpha), beta, a, d = row
         new_x = cos_angle * x + sin_angle * y
@@ -347,55 +242,30 @@ def _forward_pass(geometry: Geometry, motion: JointMotion, loop: Callable) -> Fo
 
     batch = np.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves((motion, parameters))))
     shape = (*batch[:-2], 3, batch[-1])
-    axes_of_base = [xp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in xp.eye(3)]
-    start = ((axes_of_base[0], axes_of_base[1], axes_of_base[2]), xp.zeros(shape))
-    (frame, origin), axes = loop(joint, start, inputs)
+    x, y, z = (xp.broadcast_to(axis.reshape((1,) * len(batch[:-2]) + (3, 1)), shape) for axis in xp.eye(3))
+    (frame, origin), axes = loop(joint, ((x, y, z), xp.zeros(shape)), inputs)
     tip = origin + probe[0] * frame[0] + probe[1] * frame[1] + probe[2] * frame[2]
     return ForwardPass(frame, tip, *axes, kinds=geometry.kinds, errors=errors)
 
 
-def _joint_errors(
-    parameters: Geometry, motion: JointMotion, functions: KnownFunctions
-) -> tuple[Float[AnyArray, "n ... 1 N"], JointErrors]:
-    """What the corrections add to each joint, and its derivatives; ``parameters`` have the joints first."""
-    xp = namespace(parameters, motion)
-    assert motion.functions is not None
-    assert parameters.coefficients is not None
-    assert parameters.gravity is not None
-    rows, gravity, joints = motion.functions, parameters.gravity, functions.of_joints(len(parameters.theta))
-    by_coefficient, by_gravity = rows, xp.zeros((len(joints), 3, *rows.shape[1:]))
-    heavy = np.flatnonzero(functions.by_gravity)
-    if len(heavy):
-        moments = [rows[functions.first_row[heavy] + i] for i in range(3)]
-        moment = gravity[:1] * moments[0] + gravity[1:2] * moments[1] + gravity[2:] * moments[2]
-        others = functions.first_row[~functions.by_gravity]
-        order = np.argsort(np.concatenate([heavy, np.flatnonzero(~functions.by_gravity)]))
-        by_coefficient = xp.concatenate([moment, xp.broadcast_to(rows[others], (len(others), *moment.shape[1:]))])[
-            order
-        ]
-        weighted = xp.stack([parameters.coefficients[heavy] * each for each in moments], axis=1)
-        by_gravity = xp.tensordot(joints[:, heavy], weighted, axes=1)
-    added = xp.tensordot(joints, parameters.coefficients * by_coefficient, axes=1)
-    of_lengths, scale = functions.of_lengths, None
-    if of_lengths.any():
-        scale = 1.0 + xp.tensordot(of_lengths, parameters.coefficients * by_coefficient, axes=1)
-    return added, JointErrors(by_coefficient, by_gravity, functions, scale)
+def _errors_of(parameters: Geometry, motion: JointMotion) -> JointErrors:
+    """The errors of the joints; parameters and motion have the joints first."""
+    assert parameters.corrections is not None
+    functions, joints = parameters.corrections.functions, len(parameters.theta)
+    return joint_errors_of(functions, motion.functions, parameters.coefficients, parameters.gravity, joints)  # pyright: ignore
 
 
 def joint_errors(
     geometry: Geometry, motion: JointMotion
 ) -> tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "... 1 N"]]:
     """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm; the scale of lengths."""
-    assert geometry.corrections is not None
-    rank = max(motion.cos.ndim - 2, *(leaf.ndim - 1 for leaf in jax.tree.leaves(geometry)))
-    parameters = jax.tree.map(lambda leaf: joints_first(leaf, rank), geometry)
-    added, errors = _joint_errors(parameters, _with_rank(motion, rank), geometry.corrections.functions)
-    return added, namespace(added).ones_like(added[0]) if errors.scale is None else errors.scale
+    errors = _errors_of(*_joints_first(geometry, motion))
+    return errors.added, errors.length_scale
 
 
 def length_scale(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, " N"]:
     """What all lengths of one arm are multiplied by at readings with a thermometer; 1 without thermal expansion."""
-    if geometry.corrections is None or not geometry.corrections.functions.of_lengths.any():
+    if geometry.corrections is None or not geometry.corrections.functions.expands:
         return namespace(q).ones_like(q[:, 0])
     return joint_errors(geometry, joint_motion(geometry, q))[1][0]
 

@@ -1,22 +1,21 @@
 """Cones of approach: from which directions a tool may come to a socket, and configurations that keep to them."""
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import in_chunks, to_numpy
 from .arm import Arm
 from .chain import ForwardPass, forward_pass, joint_motion, reading_units
-from .inverse_kinematics import damped_inverse
+from .inverse_kinematics import ARRIVED, EXACT, LARGEST_STEP, ROWS, damped_inverse, repeated
 from .jacobian import reading_columns, reading_rotations
 
 TOOL_AXIS = (0.0, 0.0, 1.0)
-_ROWS = 2048  # of one call
-_LARGEST_STEP, _LARGEST_TURN = 0.5, 0.5  # rad: of a joint, of the tool
-_EXACT, _ARRIVED = 1e-7, 1e-6  # mm
+_LARGEST_TURN = 0.5  # rad, of the tool in a step
 _INSIDE = 1e-4  # rad: what is brought into a cone ends this far inside it
 _LEVER = 100.0  # mm: a rotation of the tool counts as what it moves at this distance
 
@@ -59,16 +58,13 @@ def cones_of(cones: list[Cone], tool_axis: tuple[float, float, float] = TOOL_AXI
     Raises:
         InputError: A direction has the length 0, or a half angle is not above 0.
     """
-    vectors = np.array([*(cone.normal for cone in cones), tool_axis], dtype=float)
+    directions = {f"normal of cone {i + 1}": cone.normal for i, cone in enumerate(cones)} | {"tool_axis": tool_axis}
+    vectors = np.array([checked(value, Float[np.ndarray, "3"], what) for what, value in directions.items()])
     sizes = np.linalg.norm(vectors, axis=1, keepdims=True)
-    if vectors.shape[1:] != (3,) or not np.all(np.isfinite(vectors)) or np.any(sizes == 0):
-        raise InputError("a normal or the tool's axis is no direction; give three numbers that are not all 0.")
-    for cone in cones:
-        if not 0 < cone.half_angle <= math.pi:
-            raise InputError(
-                f"a cone of approach has a half angle of {math.degrees(cone.half_angle):g} deg; give one above 0 and "
-                "at most 180."
-            )
+    if np.any(sizes == 0):
+        raise InputError("a normal or the tool's axis has the length 0; give three numbers that are not all 0.")
+    half_angles = np.degrees([cone.half_angle for cone in cones])
+    checked(half_angles, Annotated[Float[np.ndarray, " cones"], Range(above=0, most=180, unit="deg")], "half_angle")
     unit = vectors / sizes
     return Cones(unit[:-1], np.array([cone.half_angle for cone in cones], dtype=float), unit[-1])
 
@@ -113,7 +109,6 @@ def into_cones(
     def step(
         q: np.ndarray, targets: np.ndarray, normals: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The next configurations ``(n, c)``, and which of them need more steps."""
         forward = forward_pass(geometry, joint_motion(geometry, q.T))
         gap = targets - forward.tip
         columns = units[..., None] * np.asarray(reading_columns(forward))
@@ -130,26 +125,20 @@ def into_cones(
             free = row - np.sum(inverse * np.einsum("jn,jcn->cn", row, columns)[None], axis=1)
             size = np.sum(free * row, axis=0)
             change = change + free * ((turn - np.sum(row * change, axis=0)) / (size + 1e-2 * turn**2 + 1e-6))
-        new = np.clip(q + units * np.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
-        return new, np.any(np.abs(gap) > _EXACT, axis=0) | outside
+        new = np.clip(q + units * np.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
+        return new, np.any(np.abs(gap) > EXACT, axis=0) | outside
 
     def moved(rows: np.ndarray) -> np.ndarray:
-        n = arm.joints
-        found = rows[:, :n].T.copy()
-        given = rows[:, n : n + 3].T, rows[:, n + 3 : n + 6].T, np.maximum(rows[:, n + 6] - _INSIDE, 0.0)
-        under_way = np.arange(found.shape[1])
-        for _ in range(steps):
-            found[:, under_way], more = step(found[:, under_way], *(part[..., under_way] for part in given))
-            under_way = under_way[more]
-            if not len(under_way):
-                break
+        start, targets, normals, half_angles = np.split(rows.T, [arm.joints, arm.joints + 3, arm.joints + 6])
+        wanted = np.maximum(half_angles - _INSIDE, 0.0)[0]
+        found = repeated(step, start, [targets, normals, wanted], steps)
         forward = forward_pass(geometry, joint_motion(geometry, found.T))
-        arrived = np.linalg.norm(given[0] - forward.tip, axis=0) <= _ARRIVED
-        arrived &= _angle(_directions(forward, cones.tool_axis).T, given[1].T) <= rows[:, n + 6]
-        return np.hstack([found.T, arrived[:, None]])
+        arrived = np.linalg.norm(targets - forward.tip, axis=0) <= ARRIVED
+        arrived &= _angle(_directions(forward, cones.tool_axis).T, normals.T) <= half_angles[0]
+        return np.column_stack([found.T, arrived])
 
     with np.errstate(all="ignore"):
-        found = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), _ROWS)
+        found = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), ROWS)
     return found[:, :-1], found[:, -1] > 0
 
 

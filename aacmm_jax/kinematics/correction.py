@@ -12,20 +12,17 @@ from jaxtyping import Bool, Float
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError
 from ..core.linear_algebra import solve_positive_definite
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, numpy_if_known, to_numpy
+from ..core.numpy_or_jax import AnyArray, compiled, in_chunks, namespace, numpy_if_known, set_at, to_numpy
 from ..core.rotations import cross
 from .arm import Arm, checked_limits, is_single
 from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale, reading_units
+from .inverse_kinematics import ARRIVED, EXACT, LARGEST_STEP, ROWS, repeated
 from .jacobian import reading_columns, reading_rotations
 
 FULL_POSE = 6  # joints from which on the orientation can be reached as well
-_STEPS = 60
 _LEVER = 500.0  # mm: a rotation counts as what it moves at this distance
-_LARGEST_STEP = 0.5  # rad, or m of a prismatic joint
-_CLOSED = 1e-7  # mm: one more step closes a gap of this size to rounding
 _STILL = 1e-13  # rad, or m of a prismatic joint: a step of this size changes nothing
-_ARRIVED, _ALIGNED = 1e-6, 1e-9  # mm, rad
-_ROWS = 2048  # of one call: fewer leave much of the time to Python, more do not fit into the processor's cache
+_ALIGNED = 1e-9  # rad
 
 
 class ReadingsAtPoses(NamedTuple):
@@ -110,23 +107,24 @@ def readings_at_poses(
         allowed = np.asarray(checked_limits(limits, arm.joints, arm.prismatic))
     count = math.prod(q.shape[:-1])
     rows, wanted = q.reshape(count, q.shape[-1]), poses.reshape(count, 4, 4)
+    # An arm that has expanded reaches a position where the arm at 20 C reaches it divided by the scale of lengths.
     scale = length_scale(arm.geometry, rows)
-    rows, wanted = rows[:, : arm.joints], _at_20_degrees(wanted, scale)
-    if namespace(arm.geometry, rows, wanted) is np:
-        starts = range(0, max(count, 1), _ROWS)
-        parts = [
-            solve_to_poses(arm.geometry, rows[first : first + _ROWS], wanted[first : first + _ROWS], allowed)
-            for first in starts
-        ]
-        found, distance, angle = (np.concatenate(part) for part in zip(*parts, strict=True))
-    else:
-        found, distance, angle = solve_to_poses(arm.geometry, rows, wanted, allowed)
-    reached = distance <= _ARRIVED
-    if arm.joints >= FULL_POSE:
-        reached = reached & (angle <= _ALIGNED)
+    wanted = set_at(wanted, (slice(None), slice(3), 3), wanted[:, :3, 3] / scale[:, None])
+
+    xp = namespace(arm.geometry, rows, wanted)
+
+    def solved(rows: Any) -> Any:
+        q, poses = rows[:, : arm.joints], rows[:, arm.joints :].reshape(-1, 4, 4)
+        return xp.column_stack(solve_to_poses(arm.geometry, q, poses, allowed))
+
+    both = xp.concatenate([rows[:, : arm.joints], wanted.reshape(count, 16)], axis=1)
+    solution = in_chunks(solved, both, ROWS) if xp is np else solved(both)
+    readings, distance, angle = solution[:, :-2], scale * solution[:, -2], solution[:, -1]
+    reached = (distance <= ARRIVED) & ((angle <= _ALIGNED) | (arm.joints < FULL_POSE))
     shape = q.shape[:-1]
-    found = found.reshape(*shape, arm.joints)
-    return ReadingsAtPoses(found, *(x.reshape(shape) for x in (scale * distance, angle, reached)))
+    return ReadingsAtPoses(
+        readings.reshape(*shape, arm.joints), *(x.reshape(shape) for x in (distance, angle, reached))
+    )
 
 
 def least_motion(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " N"]:
@@ -149,24 +147,16 @@ def least_motion(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " N
     return np.linalg.svd(columns.transpose(2, 1, 0), compute_uv=False)[:, -1]
 
 
-def _at_20_degrees(poses: Float[AnyArray, "c 4 4"], scale: Float[AnyArray, " c"]) -> Float[AnyArray, "c 4 4"]:
-    """The poses that the arm has at 20 C where, with its lengths multiplied by ``scale``, it has those given."""
-    xp = namespace(poses, scale)
-    factor = xp.broadcast_to(scale[:, None, None], poses.shape)
-    return poses / xp.where(np.array([[False] * 3 + [True]] * 3 + [[False] * 4])[None], factor, 1.0)
-
-
 @compiled(jit=partial(jax.jit, static_argnames=("steps",)))
 def solve_to_poses(
     geometry: Geometry,
     q: Float[AnyArray, "c n"],
     poses: Float[AnyArray, "c 4 4"],
     limits: Float[AnyArray, "n 2"],
-    steps: int = _STEPS,
+    steps: int = 60,
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"], Float[AnyArray, " c"]]:
-    """Damped least-norm steps to the poses, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
-
-    The result of a row does not depend on the other rows.
+    """Damped least-norm steps to the poses, within the limits; for any jit, vmap or loop. A row does not depend on the
+    other rows.
 
     Args:
         geometry: The arm's ``geometry``.
@@ -183,42 +173,26 @@ def solve_to_poses(
     units = reading_units(geometry)[:, None]
 
     def step(q: Any, wanted: Any) -> tuple[Any, Any]:
-        """The next readings ``(n, c)``, and which rows need more steps."""
         forward = forward_pass(geometry, joint_motion_of_rows(geometry, q[:, None]))
-        gap, columns = _gap_and_columns(forward, wanted, whole)
+        gap, rotation = _remaining(forward, wanted)
+        columns = reading_columns(forward)
+        if whole:
+            gap = xp.concatenate([gap, _LEVER * rotation])
+            columns = xp.concatenate([columns, _LEVER * reading_rotations(forward)], axis=1)
         columns = columns * units[:, None]
         change = _least_norm(columns, gap)
         # A joint at its limit that a step would take beyond stays there, and the others do what they can.
         stays = ((q <= low) & (change < 0)) | ((q >= high) & (change > 0))
         if xp is not np or stays.any():
             change = _least_norm(xp.where(stays[:, None], 0.0, columns), gap)
-        new = xp.clip(q + units * xp.clip(change, -_LARGEST_STEP, _LARGEST_STEP), low, high)
-        open_gap, moves = xp.any(xp.abs(gap) > _CLOSED, axis=0), xp.any(xp.abs(new - q) > _STILL * units, axis=0)
-        return new, open_gap & moves
+        new = xp.clip(q + units * xp.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
+        is_open, moves = xp.any(xp.abs(gap) > EXACT, axis=0), xp.any(xp.abs(new - q) > _STILL * units, axis=0)
+        return new, is_open & moves
 
-    # A step after the gap was seen to be closed takes what Newton's method leaves to rounding.
-    q, wanted = xp.clip(q.T, low, high), xp.moveaxis(poses[:, :3], 0, -1)
-    if xp is np:
-        under_way = np.arange(q.shape[-1])
-        for _ in range(steps):
-            q[:, under_way], more = step(q[:, under_way], wanted[..., under_way])
-            under_way = under_way[more]
-            if not len(under_way):
-                break
-    else:
-        # A row that has arrived stays as it is, so that it does not depend on how many steps the others take.
-        def body(state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-            count, q, under_way = state
-            new, more = step(q, wanted)
-            return count + 1, xp.where(under_way[None], new, q), under_way & more
-
-        _, q, _ = jax.lax.while_loop(
-            lambda state: (state[0] < steps) & xp.any(state[2]),
-            body,
-            (xp.zeros((), dtype=np.int32), q, xp.ones(q.shape[1:], dtype=bool)),
-        )
-    forward = forward_pass(geometry, joint_motion(geometry, q.T))
-    shift, rotation = _remaining(forward, wanted)
+    # The step after the gap was seen to be closed takes what Newton's method leaves to rounding.
+    wanted = xp.moveaxis(poses[:, :3], 0, -1)
+    q = repeated(step, xp.clip(q.T, low, high), [wanted], steps)
+    shift, rotation = _remaining(forward_pass(geometry, joint_motion(geometry, q.T)), wanted)
     return q.T, xp.linalg.norm(shift, axis=0), xp.linalg.norm(rotation, axis=0)
 
 
@@ -239,19 +213,6 @@ def _remaining(
     size = xp.sqrt(xp.where(small, 1.0, square + 1e-300))
     rotation = sine * xp.where(small, 1.0, xp.arctan2(size, cosine) / size)[None]
     return wanted[:, 3] - forward.tip, rotation
-
-
-def _gap_and_columns(
-    forward: ForwardPass, wanted: Float[AnyArray, "3 4 N"], whole: bool
-) -> tuple[Float[AnyArray, "m N"], Float[AnyArray, "n m N"]]:
-    """What is left to the poses wanted, in mm, and its derivatives by the readings; of positions alone, or of all."""
-    xp = namespace(forward, wanted)
-    shift, rotation = _remaining(forward, wanted)
-    moved = reading_columns(forward)
-    if not whole:
-        return shift, moved
-    columns = xp.concatenate([moved, _LEVER * reading_rotations(forward)], axis=1)
-    return xp.concatenate([shift, _LEVER * rotation]), columns
 
 
 def _least_norm(columns: Float[AnyArray, "n m N"], gap: Float[AnyArray, "m N"]) -> Float[AnyArray, "n N"]:

@@ -21,7 +21,7 @@ from .arm import (
     neighbouring_arm,
     with_arrays,
 )
-from .inverse_kinematics import ObservedPoses, SocketPoses, project_to_centroids, project_to_targets
+from .inverse_kinematics import SocketPoses, project_to_centroids, project_to_targets
 from .near_degeneracy import trade_offs
 
 _OFF_AXIS = 5.0  # mm
@@ -80,7 +80,7 @@ def determined_at(
 
 
 def _of_positions(
-    arm: Arm, observed: ObservedPoses, names: Sequence[str], q: Float[np.ndarray, "m n"] | None = None
+    arm: Arm, observed: Any, names: Sequence[str], q: Float[np.ndarray, "m n"] | None = None
 ) -> Float[np.ndarray, "m 3 p"]:
     """Derivatives of tips that were measured in an unknown frame, less what that frame, an unknown place of a target
     and, where nothing fixes it, the scale imitate; at other readings, where they are given."""
@@ -161,7 +161,7 @@ class PosesInSockets:
 
     q: Float[np.ndarray, "N n"]
     sizes: tuple[int, ...]
-    observations: tuple[ObservedPoses, ...] = ()
+    observations: tuple[Any, ...] = ()
 
     @property
     def columns(self) -> int:

@@ -1,88 +1,64 @@
-"""Inverse kinematics: configurations that put the tip at targets. The only implementation; all others call it.
+"""Inverse kinematics: configurations that put the tip at targets, by damped least-norm steps.
 
-* `random_configurations`: one at each target, from random starts; for simulation.
-* `project_to_targets`: given ones moved to their targets by least-norm steps within limits, and which of them arrived.
-* `project_to_centroids`: those of a capture moved until each socket's tips coincide.
-* `solve_to_targets`, `least_norm_inverse`, `damped_inverse`: their parts, for callers with a jit of their own.
+With the Jacobian J of the tip by the readings and the gap g to the target, the smallest change of the readings that
+closes the gap to first order is J^T (J J^T)^-1 g. It is damped by what vanishes with the gap, so that the last steps
+are Newton's: dq = J^T (J J^T + 0.01 |g|^2)^-1 g (Levenberg's method; Chan and Lawrence 1988), at most 0.5 rad a joint,
+within the limits. `readings_at_poses` and `cones` add the orientation to it; all use `repeated`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, compiled, in_chunks, namespace, to_numpy
 from ..core.random_keys import random_numbers
 from .arm import Arm
-from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale
+from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale, reading_units
 from .jacobian import reading_columns
 
 _BATCH = 256  # candidates per call: one compiled shape for every number of targets
-_ROWS = 2048  # of one call: fewer leave much of the time to Python, more do not fit into the processor's cache
+ROWS = 2048  # of one call: fewer leave much of the time to Python, more do not fit into the processor's cache
 _ROUNDS = 12
 _STEPS = 60  # of one attempt; five of six random starts converge
-_TOLERANCE, _ARRIVED = 1e-9, 1e-6  # mm
-_LARGEST_STEP = 0.5  # rad, or m of a prismatic joint
-_EXACT = 1e-7  # mm: one more step closes a gap of this size to rounding
+_TOLERANCE, ARRIVED = 1e-9, 1e-6  # mm
+LARGEST_STEP = 0.5  # rad, or m of a prismatic joint
+EXACT = 1e-7  # mm: one more step closes a gap of this size to rounding
 
 
-@runtime_checkable
-class ObservedPoses(Protocol):
-    """The part of an observation that kinematics needs."""
-
-    @property
-    def q(self) -> Float[AnyArray, "m n"]:
-        """Joint readings, rad, or mm of prismatic joints."""
-        ...
-
-    @property
-    def target(self) -> str:
-        """Name of a tip at an unknown place in the last frame; empty for the arm's own probe."""
-        ...
-
-    @property
-    def fixes_scale(self) -> bool:
-        """Whether the observation determines the scale of the arm."""
-        ...
+# The part of a capture that kinematics needs: readings ``q`` of the poses, socket after socket, with their number of
+# ``columns``; the ``sizes`` of the sockets, the ``owner`` of each pose and the ``ends()`` of lengths, as indices of
+# sockets; and other ``observations``, each with its ``q``, its ``target`` and whether it ``fixes_scale``.
+SocketPoses = Any
 
 
-@runtime_checkable
-class SocketPoses(Protocol):
-    """The part of a capture that kinematics needs: poses, socket after socket, lengths, and the rest."""
+def repeated(step: Callable[..., tuple[Any, Any]], q: Any, rows: Sequence[Any], steps: int) -> Any:
+    """``q, more = step(q, *rows)`` at most so many times, each configuration (last axis) until it needs no more.
 
-    @property
-    def q(self) -> Float[AnyArray, "N n"]:
-        """Joint readings, rad, or mm of prismatic joints."""
-        ...
+    NumPy leaves out those that are done, most of them after a dozen steps; in JAX they stay as they are. So the result
+    of one does not depend on the others.
+    """
+    if namespace(q, rows) is np:
+        q, under_way = q.copy(), np.arange(q.shape[-1])
+        for _ in range(steps):
+            q[..., under_way], more = step(q[..., under_way], *(row[..., under_way] for row in rows))
+            under_way = under_way[more]
+            if not len(under_way):
+                break
+        return q
 
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Number of poses of each socket."""
-        ...
+    def body(state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        count, q, under_way = state
+        new, more = step(q, *rows)
+        return count + 1, jnp.where(under_way, new, q), under_way & more
 
-    @property
-    def columns(self) -> int:
-        """Number of columns of the readings."""
-        ...
-
-    @property
-    def owner(self) -> Int[np.ndarray, " N"]:
-        """Index of the socket that each pose belongs to."""
-        ...
-
-    @property
-    def observations(self) -> tuple[ObservedPoses, ...]:
-        """What else was observed."""
-        ...
-
-    def ends(self) -> Int[np.ndarray, "l 2"]:
-        """Socket indices of every length's two ends."""
-        ...
+    start = (jnp.zeros((), dtype=np.int32), q, jnp.ones(q.shape[-1:], dtype=bool))
+    return jax.lax.while_loop(lambda state: (state[0] < steps) & jnp.any(state[2]), body, start)[1]
 
 
 @compiled(jit=partial(jax.jit, static_argnames=("steps",)))
@@ -95,8 +71,7 @@ def solve_to_targets(
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
     """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
-    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). The result of a row does not depend on the
-    other rows. NumPy leaves out rows that have arrived, most of them after a dozen steps.
+    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). A row does not depend on the other rows.
 
     Args:
         geometry: The arm's ``geometry``.
@@ -116,36 +91,19 @@ def solve_to_targets(
         [[ 100.  150. -100.]] True
     """
     xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
-    largest = (
-        _LARGEST_STEP if geometry.kinds is None else _LARGEST_STEP * xp.asarray(geometry.kinds.units)[:, None, None]
-    )
+    largest = LARGEST_STEP * xp.asarray(reading_units(geometry))[:, None, None]
 
     def step(q: Any, wanted: Any) -> tuple[Any, Any]:
         forward = forward_pass(geometry, joint_motion_of_rows(geometry, q))
         gap = wanted - forward.tip
-        # The damping vanishes with the distance, so that the last steps are Newton's.
-        damping = 1e-2 * xp.sum(gap**2, axis=0) + 1e-12
-        inverse = weighted_inverse(forward, damping)
+        inverse = weighted_inverse(forward, 1e-2 * xp.sum(gap**2, axis=0) + 1e-12)
         change = xp.sum(inverse * gap[None], axis=1, keepdims=True)
-        return xp.clip(q + xp.clip(change, -largest, largest), low, high), gap
+        return xp.clip(q + xp.clip(change, -largest, largest), low, high), xp.any(xp.abs(gap) > EXACT, axis=0)
 
-    # A step after the gap was seen to be closed takes what Newton's method leaves to rounding.
-    q, wanted = q.T[:, None, :], targets.T
-    if xp is np:
-        q, under_way = q.copy(), np.arange(q.shape[-1])
-        for _ in range(steps):
-            q[..., under_way], gap = step(q[..., under_way], wanted[:, under_way])
-            under_way = under_way[np.any(np.abs(gap) > _EXACT, axis=0)]
-            if not len(under_way):
-                break
-    else:
-        _, q, _ = jax.lax.while_loop(
-            lambda state: (state[0] < steps) & jnp.any(jnp.abs(state[2]) > _EXACT),
-            lambda state: (state[0] + 1, *step(state[1], wanted)),
-            (jnp.zeros((), dtype=np.int32), q, jnp.ones_like(wanted)),
-        )
+    # The step after the gap was seen to be closed takes what Newton's method leaves to rounding.
+    q = repeated(step, q.T[:, None, :], [targets.T], steps)
     tip = forward_pass(geometry, joint_motion_of_rows(geometry, q)).tip
-    return q[:, 0].T, xp.linalg.norm(wanted - tip, axis=0)
+    return q[:, 0].T, xp.linalg.norm(targets.T - tip, axis=0)
 
 
 def least_norm_inverse(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, "n 3 N"]:
@@ -197,22 +155,21 @@ def random_configurations(
     Raises `InputError`, with the target's label, if none is found.
     """
     arm, targets, limits = to_numpy((arm, targets, limits))
-    wanted = targets.shape[0]
-    angles = np.zeros((wanted, arm.joints))
-    missing = np.arange(wanted)
-    for round_number in range(_ROUNDS * (1 + wanted // _BATCH) if wanted else 0):
+    count = targets.shape[0]
+    q, missing = np.zeros((count, arm.joints)), np.arange(count)
+    for round_number in range(_ROUNDS * (1 + count // _BATCH)):
+        if not len(missing):
+            return q
         # Every missing target is tried, several times at once if they are few; the first success counts.
         tried = np.resize(missing, _BATCH)
         key_of_round = jax.random.fold_in(key, round_number)
         start = limits[:, 0] + random_numbers("uniform", key_of_round, (_BATCH, arm.joints)) * np.ptp(limits, axis=1)
         solved, distance = solve_to_targets(*to_numpy((arm.geometry, start, targets[tried], limits)))
         successes = np.flatnonzero(distance <= _TOLERANCE)[::-1]
-        angles[tried[successes]] = solved[successes]
+        q[tried[successes]] = solved[successes]
         missing = np.setdiff1d(missing, tried[successes])
-        if not len(missing):
-            return angles
-    if not wanted:
-        return angles
+    if not len(missing):
+        return q
     links = float(np.abs(arm.a).sum() + np.abs(arm.d).sum() + np.linalg.norm(arm.probe))
     point = ", ".join(f"{round(float(x)):.6g}" for x in np.asarray(targets[missing[0]]))
     what = labels[missing[0]] if labels else "the target"
@@ -250,13 +207,12 @@ def project_to_targets(
     geometry = to_numpy(arm.geometry)
 
     def moved(rows: np.ndarray) -> np.ndarray:
-        found, distance = solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed, steps)
-        return np.hstack([found, distance[:, None]])
+        return np.column_stack(solve_to_targets(geometry, rows[:, :-3], rows[:, -3:], allowed, steps))
 
     # An arm that has expanded is at the target where the arm at 20 C is at the target divided by the scale of lengths.
     joints, temperature = q[:, : arm.joints], q[:, arm.joints :]
-    found = in_chunks(moved, np.hstack([joints, targets / length_scale(geometry, q)[:, None]]), _ROWS)
-    return np.hstack([found[:, :-1], temperature]), found[:, -1] <= _ARRIVED
+    solved = in_chunks(moved, np.hstack([joints, targets / length_scale(geometry, q)[:, None]]), ROWS)
+    return np.hstack([solved[:, :-1], temperature]), solved[:, -1] <= ARRIVED
 
 
 def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:
@@ -266,11 +222,9 @@ def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None 
     wrong the tips scatter, and scattered tips make directions look determined that are not, such as a rotation about
     the base.
     """
-    q = np.asarray(capture.q)
-    owner = capture.owner
+    q, owner, sizes = np.asarray(capture.q), capture.owner, np.asarray(capture.sizes)
     source = arm if targets_of is None else targets_of
     tips = in_chunks(lambda rows: np.asarray(source.position(rows)), q)
-    sizes = np.asarray(capture.sizes)
     sums = np.stack([np.bincount(owner, weights=tips[:, axis]) for axis in range(3)], axis=1)
     targets = (sums / sizes[:, None])[owner]
     moved, reached = project_to_targets(arm, q, targets)

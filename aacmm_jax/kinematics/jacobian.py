@@ -1,7 +1,15 @@
 """The Jacobian: exact derivatives of the tip by every parameter and joint reading, from the axes of the chain.
 
-Rotating the chain by a small angle about a unit axis ``u`` through a point ``o`` moves the tip by ``u x (tip - o)``;
-sliding it along ``u`` moves the tip by ``u``. So each Jacobian column follows from one axis of the forward pass.
+Rotating the chain beyond a point o by a small angle about a unit axis u moves the tip by u x (tip - o) and the last
+frame by the rotation vector u; sliding it along u moves the tip by u. So each column follows from one axis of the
+forward pass:
+
+    theta_i, q_i   z before the joint, through the origin before it          d_i      z before the joint
+    alpha_i        x after it, through the origin after it                   a_i      x after it
+    beta_i         y after it, through the origin after it                   probe    axes of the last frame
+
+A coefficient c_b moves one joint by phi_b, so that its column is phi_b times that of the joint's reading; the scale of
+all lengths moves the tip by itself, tip / scale, since the tip is linear in them.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +28,6 @@ from .chain import (
     Geometry,
     JointKinds,
     JointMotion,
-    KnownFunctions,
     components_last,
     forward_pass,
     forward_pass_by_joints,
@@ -29,6 +36,7 @@ from .chain import (
     joints_first,
     of_joints,
 )
+from .joint_functions import KnownFunctions
 
 
 def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Float[AnyArray, "... 3 N"]:
@@ -36,26 +44,45 @@ def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Floa
     return namespace(u, v).stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=-2)
 
 
+_ROTATIONS = {"alpha": ("x", "origin"), "theta": ("z_before", "origin_before"), "beta": ("y", "origin")}
+_SLIDES = {"a": "x", "d": "z_before", "probe": "frame"}
+
+
 def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3 N"]]:
     """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis)."""
-    kinds = ("alpha", "a", "d", "theta") if forward.y is None else ("alpha", "a", "d", "theta", "beta")
-    kinds = (*kinds, "probe") if forward.errors is None else (*kinds, "probe", "coefficients", "gravity")
-    return {kind: _columns_of_kind(forward, kind) for kind in kinds}
+    kinds = ("alpha", "a", "d", "theta", *(() if forward.y is None else ("beta",)), "probe")
+    kinds = kinds if forward.errors is None else (*kinds, "coefficients", "gravity")
+    return {kind: _columns(forward, kind) for kind in kinds}
 
 
-def _columns_of_kind(forward: ForwardPass, kind: str) -> Float[AnyArray, "k ... 3 N"]:
-    xp = namespace(forward.tip)
+def _columns(forward: ForwardPass, kind: str) -> Float[AnyArray, "k ... 3 N"]:
+    """Derivative of the tip by all parameters of a kind."""
+    if kind in ("coefficients", "gravity"):
+        return _by_errors(forward, kind, reading_columns(forward), _tip_by_scale(forward))
     if kind == "probe":
-        return _of_length(forward, xp.stack(forward.frame))
+        return _of_length(forward, namespace(forward.tip).stack(forward.frame))
+    return _at(forward, kind, slice(None))
+
+
+def _at(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyArray, "... 3 N"]:
+    """Derivative of the tip by a parameter of one joint, or of several."""
+    if kind in _ROTATIONS:
+        axis, origin = (getattr(forward, name)[at] for name in _ROTATIONS[kind])
+        return _cross(axis, (forward.tip if isinstance(at, int) else forward.tip[None]) - origin)
+    return _of_length(forward, getattr(forward, _SLIDES[kind])[at])
+
+
+def _by_errors(
+    forward: ForwardPass, kind: str, by_reading: Float[AnyArray, "n ... 3 N"], by_scale: Float[AnyArray, "... 3 N"]
+) -> Float[AnyArray, "k ... 3 N"]:
+    """Columns of coefficients or of gravity, from those of the joints' readings and of the scale of all lengths."""
+    assert forward.errors is not None
     if kind == "gravity":
-        return xp.stack([_correction_column(forward, kind, i) for i in range(3)])
-    if kind == "coefficients":  # all at once: there may be hundreds
-        assert forward.errors is not None
-        functions, by_each = forward.errors.functions, reading_columns(forward)
-        if functions.of_lengths.any():  # the last column, -1, is that of the scale of lengths
-            by_each = xp.concatenate([by_each, _tip_by_scale(forward)[None]])
-        return forward.errors.by_coefficient * by_each[functions.moved]
-    return _columns_of(forward, kind, slice(None))
+        return namespace(by_reading).sum(forward.errors.by_gravity * by_reading[:, None], axis=0)
+    functions = forward.errors.functions
+    if functions.expands:  # the last, -1, is that of the scale
+        by_reading = namespace(by_reading).concatenate([by_reading, by_scale[None]])
+    return forward.errors.by_coefficient * by_reading[functions.moved]
 
 
 def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
@@ -64,10 +91,10 @@ def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
     A reading enters only in its sum with ``theta``, or with ``d`` of a prismatic joint. That corrections change with
     the readings, by as little as a gear ratio errs, is left out here; `tip_jacobian` has it.
     """
-    rotations = _columns_of(forward, "theta", slice(None))
+    rotations = _at(forward, "theta", slice(None))
     if forward.kinds is None:
         return rotations
-    slides = _columns_of(forward, "d", slice(None))
+    slides = _at(forward, "d", slice(None))
     return namespace(forward).where(forward.kinds.mask(rotations.ndim), slides, rotations)
 
 
@@ -97,43 +124,13 @@ def _parameter_of(kinds: JointKinds | None, kind: str, i: int) -> str:
     return "theta" if kinds is None or not kinds.prismatic[i] else "d"
 
 
-def _columns_of(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyArray, "... 3 N"]:
-    """Derivative of the tip by a parameter of one joint, or of several."""
-    rotations = {
-        "alpha": (forward.x, forward.origin),
-        "theta": (forward.z_before, forward.origin_before),
-        "beta": (forward.y, forward.origin),
-    }
-    if kind in rotations:
-        axis, origin = rotations[kind]
-        return _cross(axis[at], (forward.tip if isinstance(at, int) else forward.tip[None]) - origin[at])
-    if kind in ("coefficients", "gravity"):
-        assert isinstance(at, int)
-        return _correction_column(forward, kind, at)
-    return _of_length(forward, {"a": forward.x, "d": forward.z_before, "probe": forward.frame}[kind][at])
-
-
 def moved_by_correction(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, Float[AnyArray, "... 1 N"]]]:
     """The joints that a coefficient, or a component of gravity, moves, and by how much; none of thermal expansion."""
     assert forward.errors is not None
     functions = forward.errors.functions
     if kind == "coefficients":
         return [(int(functions.moved[i]), forward.errors.by_coefficient[i])] if functions.moved[i] >= 0 else []
-    return [
-        (joint, forward.errors.by_gravity[joint, i])
-        for joint in sorted(set(functions.moved[functions.by_gravity].tolist()))
-    ]
-
-
-def _correction_column(forward: ForwardPass, kind: str, i: int) -> Float[AnyArray, "... 3 N"]:
-    """Derivative of the tip by a coefficient, or by a component of the direction of gravity."""
-    assert forward.errors is not None
-    if kind == "coefficients" and forward.errors.functions.of_lengths[i]:
-        return forward.errors.by_coefficient[i] * _tip_by_scale(forward)
-    column = namespace(forward.tip).zeros_like(forward.tip)
-    for joint, by in moved_by_correction(forward, kind, i):
-        column = column + by * _columns_of(forward, _parameter_of(forward.kinds, "q", joint), joint)
-    return column
+    return [(joint, forward.errors.by_gravity[joint, i]) for joint in np.unique(functions.moved[functions.by_gravity])]
 
 
 def readings_gradient(
@@ -170,13 +167,28 @@ def stacked_jacobian_columns(
     forward: ForwardPass, indices: tuple[tuple[str, int], ...]
 ) -> Float[AnyArray, "... p 3 N"]:
     """The Jacobian columns of some parameters, each a kind (or ``q``, a reading) and a 0-based index."""
-    xp, wanted = namespace(forward), [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
+    wanted = [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
     if isinstance(forward.x, tuple):
-        chosen = [_columns_of(forward, kind, i) for kind, i in wanted]
+        chosen = [_at(forward, kind, i) for kind, i in wanted]
     else:
-        columns = {kind: _columns_of_kind(forward, kind) for kind in dict.fromkeys(kind for kind, _ in wanted)}
+        columns = {kind: _columns(forward, kind) for kind in dict.fromkeys(kind for kind, _ in wanted)}
         chosen = [columns[kind][i] for kind, i in wanted]
-    return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*forward.tip.shape[:-2], 0, *forward.tip.shape[-2:]))
+    return _stacked(chosen, forward)
+
+
+def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:
+    """Derivative of the last frame's orientation, as a rotation vector, by some parameters; 0 for lengths."""
+    still = namespace(forward).zeros_like(forward.tip)
+    wanted = [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
+    axes: dict[str, Any] = {kind: getattr(forward, axis) for kind, (axis, _) in _ROTATIONS.items()}
+    for kind in {kind for kind, _ in wanted} & {"coefficients", "gravity"}:
+        axes[kind] = _by_errors(forward, kind, reading_rotations(forward), still)
+    return _stacked([still if axes.get(kind) is None else axes[kind][i] for kind, i in wanted], forward)
+
+
+def _stacked(columns: list[Float[AnyArray, "... 3 N"]], forward: ForwardPass) -> Float[AnyArray, "... p 3 N"]:
+    xp, shape = namespace(forward), forward.tip.shape
+    return xp.stack(columns, axis=-3) if columns else xp.zeros((*shape[:-2], 0, *shape[-2:]))
 
 
 class SharedColumns(NamedTuple):
@@ -188,17 +200,17 @@ class SharedColumns(NamedTuple):
     few: tuple[tuple[str, int], ...]  # parameters whose columns are needed
     source: Int[np.ndarray, " p"]  # of which of them each parameter's column is a multiple
     functions: Int[np.ndarray, " k"]  # of the parameters that are coefficients
-    own: Int[np.ndarray, " c"]  # the parameters that are none
-    order: Int[np.ndarray, " p"] | None  # of these and the coefficients among all; None where they are in order
+    others: Int[np.ndarray, " c"]  # the other parameters
+    order: Int[np.ndarray, " p"] | None  # of others and coefficients among all; None where they are in order
 
     def multiplied(self, columns: Float[AnyArray, "b r m"], forward: Any, rows: Any) -> Float[AnyArray, "p r m"]:
         """Columns of all parameters at some of the configurations, from the few."""
         if not len(self.functions):
             return columns
         assert forward.errors is not None
-        of_functions = np.delete(self.source, self.own)
+        of_functions = np.delete(self.source, self.others)
         products = columns[of_functions] * forward.errors.by_coefficient[self.functions][..., rows]
-        both = namespace(columns, forward).concatenate([columns[self.source[self.own]], products])
+        both = namespace(columns, forward).concatenate([columns[self.source[self.others]], products])
         return both if self.order is None else both[self.order]
 
 
@@ -208,37 +220,17 @@ def shared_columns(functions: KnownFunctions | None, indices: tuple[tuple[str, i
     # Thermal expansion moves no joint (-1): its column is its own.
     moved = [-1 if functions is None or kind != "coefficients" else int(functions.moved[i]) for kind, i in indices]
     of_functions = np.array(moved, dtype=int) >= 0
-    wanted = [("q", joint) if joint >= 0 else one for joint, one in zip(moved, indices, strict=True)]
-    few = {one: place for place, one in enumerate(dict.fromkeys(wanted))}
-    own, coefficients = np.flatnonzero(~of_functions), np.flatnonzero(of_functions)
-    order = np.argsort(np.concatenate([own, coefficients]))
+    wanted = [("q", joint) if joint >= 0 else index for joint, index in zip(moved, indices, strict=True)]
+    few = {index: place for place, index in enumerate(dict.fromkeys(wanted))}
+    others, coefficients = np.flatnonzero(~of_functions), np.flatnonzero(of_functions)
+    order = np.argsort(np.concatenate([others, coefficients]))
     return SharedColumns(
         few=tuple(few),
-        source=np.array([few[one] for one in wanted], dtype=int),
+        source=np.array([few[index] for index in wanted], dtype=int),
         functions=np.array([indices[i][1] for i in coefficients], dtype=int),
-        own=own,
+        others=others,
         order=None if np.array_equal(order, np.arange(len(order))) else order,
     )
-
-
-def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:
-    """Derivative of the last frame's orientation, as a rotation vector, by some parameters; 0 for lengths."""
-    axes, xp = {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before}, namespace(forward)
-    still = xp.zeros_like(forward.tip)
-
-    def rotation(kind: str, i: int) -> Float[AnyArray, "... 3 N"]:
-        if kind in ("coefficients", "gravity"):
-            moved = [
-                by * forward.z_before[joint]
-                for joint, by in moved_by_correction(forward, kind, i)
-                if _parameter_of(forward.kinds, "q", joint) == "theta"
-            ]
-            return sum(moved, still)
-        kind = _parameter_of(forward.kinds, kind, i)
-        return still if axes.get(kind) is None else axes[kind][i]
-
-    chosen = [rotation(kind, i) for kind, i in indices]
-    return xp.stack(chosen, axis=-3) if chosen else xp.zeros((*still.shape[:-2], 0, *still.shape[-2:]))
 
 
 class PoseColumns(NamedTuple):
@@ -277,13 +269,9 @@ def pose_columns(
         geometry = jax.tree.map(chain, geometry, batched[0])
         # Joints first, then the batch, configurations last.
         motion = jax.tree.map(lambda leaf, many: jnp.moveaxis(leaf, 0, 1) if many else leaf, motion, batched[1])
-        found = jax.lax.platform_dependent(
-            geometry,
-            motion,
-            cpu=partial(computed, forward_pass_by_joints),
-            default=partial(computed, forward_pass),
-        )
-        return found, jax.tree.map(lambda _: True, found)
+        on_cpu, elsewhere = partial(computed, forward_pass_by_joints), partial(computed, forward_pass)
+        result = jax.lax.platform_dependent(geometry, motion, cpu=on_cpu, default=elsewhere)
+        return result, jax.tree.map(lambda _: True, result)
 
     of_one.def_vmap(of_many)
     return of_one(geometry, motion)

@@ -199,7 +199,7 @@ def _by_functions(
     found = np.zeros((len(functions.term_of_row), cotangent.shape[1]))
     coefficients, gravity = np.asarray(problem.arm.coefficients), [*np.asarray(problem.arm.gravity), 1.0]
     for row, (term, component) in enumerate(zip(functions.term_of_row, functions.component_of_row, strict=True)):
-        joint = functions.each[term].joint - 1
+        joint = functions.terms[term].joint - 1
         if kind == "coefficients" and term == i:
             found[row] = gravity[component] * of_joints[joint]
         if kind == "gravity" and component == i:

@@ -11,8 +11,10 @@ from ..core.errors import InputError
 from ..kinematics.arm import Arm, checked_readings, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import dh_frames, geometry_of
 from ..kinematics.workspace import arm_reach, skeleton
-from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes, new_figure, save_figure
+from .charts import Marks, Plot, linear
+from .figures import TONES, draw, new_figure, save_figure
 
+_DARK, _ACCENT, _LIGHT = TONES["main"], TONES["accent"], TONES["soft"]
 _TIPS = 4000  # of the picture of the reach
 _ZOOM = 0.88  # so that labels in space stay within the figure
 _NUMBERS = 5  # along the longest axis in space
@@ -38,12 +40,12 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
     """
     axes = _axes_in_space(axes)
     configurations = np.atleast_2d(np.asarray(checked_readings(arm, q)))
-    first = {"color": DARK, "linewidth": 3, "marker": "o", "markersize": 4}
-    others = {"color": LIGHT, "linewidth": 0.8}
+    first = {"color": _DARK, "linewidth": 3, "marker": "o", "markersize": 4}
+    others = {"color": _LIGHT, "linewidth": 0.8}
     for index, line in reversed(list(enumerate(skeleton(arm, configurations)))):
         axes.plot(*line.T, **(others if index else first))
     tips = np.asarray(arm.position(configurations))
-    axes.plot(*tips.T, linestyle="none", marker="+", color=ACCENT, markersize=8)
+    axes.plot(*tips.T, linestyle="none", marker="+", color=_ACCENT, markersize=8)
     _label_space(axes)
     return axes
 
@@ -68,13 +70,13 @@ def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | 
     axes = _axes_in_space(axes)
     base = np.eye(4) if base is None else base
     line = skeleton(arm, np.zeros((1, arm.joints)))[0] @ base[:3, :3].T + base[:3, 3]
-    axes.plot(*line.T, color=DARK, linewidth=3, marker="o", markersize=3)
-    axes.plot(*line[-1:].T, linestyle="none", marker="+", color=ACCENT, markersize=10)
+    axes.plot(*line.T, color=_DARK, linewidth=3, marker="o", markersize=3)
+    axes.plot(*line[-1:].T, linestyle="none", marker="+", color=_ACCENT, markersize=10)
     size = 0.12 * max(np.ptp(line, axis=0).max(), 1e-9)
     for number, frame in enumerate(dh_frames(geometry_of(without_corrections(arm)), base)[:-1], start=1):
         origin, end = frame[:3, 3], frame[:3, 3] + size * frame[:3, 2]
-        axes.quiver(*origin, *(end - origin), color=ACCENT, linewidth=1.2, arrow_length_ratio=0.25)
-        axes.text(*(end + 0.4 * size * frame[:3, 2]), f"  {number}", color=ACCENT, fontsize=9, va="center")
+        axes.quiver(*origin, *(end - origin), color=_ACCENT, linewidth=1.2, arrow_length_ratio=0.25)
+        axes.text(*(end + 0.4 * size * frame[:3, 2]), f"  {number}", color=_ACCENT, fontsize=9, va="center")
     # A flat arm in a box of its own size would be a line.
     low, high = line.min(axis=0), line.max(axis=0)
     half = 0.6 * np.maximum(high - low, 0.6 * np.ptp(line, axis=0).max())[:, None] * [-1, 1]
@@ -99,18 +101,19 @@ def arm_workspace(arm: Arm, axes: Any = None) -> Any:
         >>> print(axes.get_ylabel())
         height [mm]
     """
-    axes = axes_or_new(axes, (4.6, 5.4))
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TIPS, arm.joints))
     tips, reach = np.asarray(arm.position(q)), arm_reach(arm)
-    axes.plot(np.hypot(tips[:, 0], tips[:, 1]), tips[:, 2], linestyle="none", marker=".", markersize=2, color=LIGHT)
+    radius, shoulder = np.hypot(tips[:, 0], tips[:, 1]), float(reach.shoulder[2])
     angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
-    height = reach.shoulder[2]
-    axes.plot(reach.radius * np.cos(angles), height + reach.radius * np.sin(angles), color=DARK, linewidth=1)
-    axes.plot([0.0], [height], linestyle="none", marker="o", markersize=4, color=DARK)
-    label_axes(axes, "distance from the first axis [mm]", "height [mm]")
-    axes.set_aspect("equal")
-    return axes
+    across, up = reach.radius * np.cos(angles), shoulder + reach.radius * np.sin(angles)
+    marks = (
+        Marks("", radius, tips[:, 2], "dot", "soft", size=1.5),
+        Marks("", across, up, "line"),
+        Marks("", [0.0], [shoulder], "dot", size=5),
+    )
+    plot = Plot(linear("distance from the first axis [mm]", across), linear("height [mm]", up), marks, square=True)
+    return draw(plot, axes, (4.6, 5.4))
 
 
 def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.ndarray, "4 4"] | None = None) -> None:
@@ -143,10 +146,10 @@ def _label_space(axes: Any) -> None:
     axes.set(xlabel="x [mm]", ylabel="y [mm]")
     axes.set_zlabel("z [mm]", labelpad=8)
     axes.set_aspect("equal")
-    each = (axes.xaxis, axes.yaxis, axes.zaxis)
-    lengths = [abs(np.subtract(*axis.get_view_interval())) for axis in each]
+    all_axes = (axes.xaxis, axes.yaxis, axes.zaxis)
+    lengths = [abs(np.subtract(*axis.get_view_interval())) for axis in all_axes]
     axes.set_box_aspect(lengths, zoom=_ZOOM)
-    for axis, length in zip(each, lengths, strict=True):
+    for axis, length in zip(all_axes, lengths, strict=True):
         axis.get_major_locator().set_params(nbins=max(2, round(_NUMBERS * length / max(lengths))))
 
 

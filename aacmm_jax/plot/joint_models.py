@@ -1,5 +1,6 @@
-"""Figures of models of the joints: how they compare, and what each joint does besides its reading."""
+"""Models of the joints: how they compare, and what each joint does besides its reading."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,38 @@ from jaxtyping import Float
 from ..calibration.joint_functions import function_of_joint
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
 from ..core.units import DEG
 from ..diagnostics.pose_residuals import observation_residuals
-from ..kinematics.arm import Arm
+from ..kinematics.corrections.kind import Term
 from ..pipeline.model_ladder import ComparedModels
-from .style import ACCENT, DARK, LIGHT, axes_or_new, label_axes
+from ..summaries.cells import format_number
+from .charts import Chart, Marks, Plot, borders, level, linear, names
+from .figures import TONES, draw
 
 _IN_A_BIN, _MOST_BINS = 8, 80  # poses, and bins of a joint's travel
 _MRAD = 1e-3
+_WIDTH = 0.38  # of a bar
+
+
+def models_chart(
+    labels: Sequence[str], recommended: int, inside: np.ndarray, outside: np.ndarray, u_outside: np.ndarray
+) -> Chart:
+    """RMS errors of models inside and outside what they were fitted to, with the standard error outside; mm."""
+    x = np.arange(len(labels))
+    words = [
+        f"{label}: inside {format_number(a)} mm, outside {format_number(b)} ± {format_number(c)} mm"
+        for label, a, b, c in zip(labels, inside.tolist(), outside.tolist(), u_outside.tolist(), strict=True)
+    ]
+    low, high = outside - u_outside, outside + u_outside
+    left, right, box = x - _WIDTH / 2, x + _WIDTH / 2, (_WIDTH, 0.0)
+    marks = (
+        Marks("poses that were fitted", left, inside, "boxes", "soft", words, box=box),
+        Marks("regions left out, ± one standard error", right, outside, "boxes", "main", words, low, high, box=box),
+    )
+    named = [f"{label} (recommended)" if i == recommended else label for i, label in enumerate(labels)]
+    y = linear("RMS distance from the geometry [mm]", inside, outside, high, [0.0], zero=True)
+    description = "The RMS distance of poses from their geometry, from the simplest model to the richest."
+    return Chart("models", "Errors by model", description, (Plot(names("", named), y, marks, height=260),))
 
 
 def model_comparison(found: ComparedModels, axes: Any = None) -> Any:
@@ -37,31 +61,45 @@ def model_comparison(found: ComparedModels, axes: Any = None) -> Any:
         >>> print(len(axes.patches), "bars")
         4 bars
     """
-    axes = axes_or_new(axes)
-    x, width = np.arange(len(found.models)), 0.38
-    inside = [model.rms_inside for model in found.models]
-    outside = [model.rms_outside for model in found.models]
-    errors = [model.u_outside for model in found.models]
-    axes.bar(x - width / 2, inside, width, color=LIGHT, label="poses that were fitted")
-    axes.bar(x + width / 2, outside, width, yerr=errors, capsize=3, color=DARK, label="regions that were left out")
-    names = [f"{model.model}\n(recommended)" if model is found.recommended else model.model for model in found.models]
-    axes.set_xticks(x, [name.replace(",", ",\n") for name in names])
-    label_axes(axes, "", "RMS distance from the geometry [mm]")
-    axes.set_axisbelow(True)
-    axes.legend(frameon=False, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    return axes
+    models = found.models
+    columns = (
+        np.array([getattr(model, key) for model in models]) for key in ("rms_inside", "rms_outside", "u_outside")
+    )
+    chart = models_chart([model.model for model in models], models.index(found.recommended), *columns)
+    return draw(chart.plots[0], axes)
+
+
+def functions_chart(record: CalibrationRecord) -> Chart | None:
+    """What each joint does besides its reading; None for an arm whose joints do what they read."""
+    corrections = record.calibrated.arm.corrections
+    plots = [plot for joint in range(1, record.calibrated.arm.joints + 1) if (plot := joint_plot(record, joint, True))]
+    if not plots or corrections is None:
+        return None
+    kinds = {
+        term.kind.description: term.kind.of_own_reading
+        for term in corrections.functions.terms
+        if isinstance(term, Term)
+    }
+    drawn, others = ([words for words, own_reading in kinds.items() if own_reading is by] for by in (True, False))
+    description = (
+        f"The curve: corrections of each joint by its own reading ({', '.join(drawn)}), less their mean"
+        + (f"; without {', '.join(others)}" if others else "")
+        + ". Marks: the curve and what the residuals of neighbouring poses ask besides, with twice its standard error. "
+        "Dashed lines are the ends of the travel that was measured."
+    )
+    return Chart("functions", "What the joints do besides their readings", description, tuple(plots))
 
 
 def joint_function(
-    record: CalibrationRecord, joint: int, axes: Any = None, *, label: str | None = None, color: str = DARK
+    record: CalibrationRecord, joint: int, axes: Any = None, *, label: str | None = None, color: str = TONES["main"]
 ) -> Any:
     """Plot what a joint does besides its reading, against its reading; mrad, or mm of a prismatic joint.
 
     Marks are means over neighbouring poses, with twice their standard error: the change of this joint that alone would
     explain most of their residuals, added to the calibrated function. That function is the curve, with its expanded
     uncertainty (95 %): harmonics and gear ratio of the arm, less their mean over the poses, which a zero offset takes
-    up. It goes a little beyond the travel of the poses (dotted), within the limits of the joint. Marks off the curve,
-    or a pattern of marks without a curve, are errors that the model lacks.
+    up. It goes a little beyond the travel of the poses (between the dashed lines), within the limits of the joint.
+    Marks off the curve, or a pattern of marks without a curve, are errors that the model lacks.
 
     Args:
         record: A calibration from observations or with a prior, the residuals of which are known pose by pose.
@@ -81,36 +119,46 @@ def joint_function(
         >>> by_pose = aj.calibration.record_of(robust, aj.Recording(two_bars, nominal), robust="huber")
         >>> axes = aj.plot.joint_function(by_pose, 2)
         >>> print(axes.get_xlabel())
-        q_2 [deg]
+        reading of joint 2 [deg]
     """
-    arm: Arm = to_numpy(record.calibrated.arm)
-    if not 1 <= joint <= arm.joints:
-        raise InputError(f"joint is {joint}; the arm has joints 1 to {arm.joints}.")
+    joints = record.calibrated.arm.joints
+    if not 1 <= joint <= joints:
+        raise InputError(f"joint is {joint}; the arm has joints 1 to {joints}.")
+    plot = joint_plot(record, joint)
+    assert plot is not None
+    marks = [part._replace(tone=color) if part.tone == "main" else part for part in plot.marks]
+    points = next(i for i, part in enumerate(marks) if part.symbol == "dot")
+    marks[points] = marks[points]._replace(name=label or "")
+    return draw(plot._replace(marks=tuple(marks)), axes, legend=False)
+
+
+def joint_plot(record: CalibrationRecord, joint: int, only_corrected: bool = False) -> Plot | None:
+    """The function of one joint, and what residuals ask of it; ``only_corrected``: None where it has no function."""
     residuals = observation_residuals(record)
-    axes = axes_or_new(axes)
-    q = np.concatenate([np.asarray(one.observation.q) for one in residuals])
-    asked = np.concatenate([one.by_joint[joint - 1] for one in residuals])
-    lever = np.concatenate([one.lever[joint - 1] for one in residuals])
-    slides = joint in arm.prismatic
-    unit, reading = (1.0, 1.0) if slides else (_MRAD, DEG)
+    q = np.concatenate([np.asarray(part.observation.q) for part in residuals])
     curve = function_of_joint(record, joint, q)
+    if curve is None and only_corrected:
+        return None
+    asked = np.concatenate([part.by_joint[joint - 1] for part in residuals])
+    lever = np.concatenate([part.lever[joint - 1] for part in residuals])
+    slides, travel = joint in record.calibrated.arm.prismatic, q[:, joint - 1]
+    unit, reading = (1.0, 1.0) if slides else (_MRAD, DEG)
+    marks: list[Marks] = []
     if curve is not None:
-        at, value, expanded = curve.reading, curve.value, curve.expanded
+        x, value, expanded = curve.reading / reading, curve.value / unit, curve.expanded / unit
+        low, high = value - expanded, value + expanded
+        marks = [Marks("", x, value, "band", low=low, high=high), Marks("", x, value, "line"),
+                 borders([travel.min() / reading, travel.max() / reading])]  # fmt: skip
         asked = asked + curve.at_poses
-        low, high = q[:, joint - 1].min(), q[:, joint - 1].max()
-        axes.fill_between(
-            at / reading, (value - expanded) / unit, (value + expanded) / unit, color=color, alpha=0.2, linewidth=0
-        )
-        seen = (at >= low) & (at <= high)
-        axes.plot(at[seen] / reading, value[seen] / unit, color=color, linewidth=1.2)
-        for side in (at <= low, at >= high):
-            axes.plot(at[side] / reading, value[side] / unit, color=color, linewidth=1.0, linestyle=":")
-    means, values, u = _binned(q[:, joint - 1], asked, lever)
-    style = {"fmt": "o", "markersize": 3, "elinewidth": 0.7, "color": color if curve is None else ACCENT}
-    axes.errorbar(means / reading, values / unit, yerr=2 * u / unit, label=label, **style)
-    axes.axhline(0, color="0.4", linewidth=0.8)
-    label_axes(axes, f"q_{joint} [{'mm' if slides else 'deg'}]", f"joint {joint} [{'mm' if slides else 'mrad'}]")
-    return axes
+    means, values, u = _binned(travel, asked, lever)
+    y, u, tone = values / unit, u / unit, "main" if curve is None else "accent"
+    marks.append(Marks("", means / reading, y, "dot", tone, low=y - 2 * u, high=y + 2 * u, size=4))
+    axes = (
+        linear(f"reading of joint {joint} [{'mm' if slides else 'deg'}]", *(mark.x for mark in marks), margin=0.02),
+        linear(f"joint {joint} [{'mm' if slides else 'mrad'}]", *(end for mark in marks for end in (mark.low, mark.high)
+               if end is not None), [0.0]),
+    )  # fmt: skip
+    return Plot(*axes, (*marks, level(0.0)), height=150)
 
 
 def _binned(
@@ -118,11 +166,10 @@ def _binned(
 ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
     """Means over poses with neighbouring readings, weighted by how far the joint moves the tip, and their standard
     errors by the scatter."""
-    bins = np.array_split(np.argsort(reading), np.clip(len(reading) // _IN_A_BIN, 1, _MOST_BINS))
     means, values, u = [], [], []
-    for own in bins:
-        weight = lever[own] ** 2 / max(np.sum(lever[own] ** 2), 1e-300)
-        means.append(reading[own].mean())
-        values.append(weight @ asked[own])
-        u.append(np.sqrt(np.sum((weight * (asked[own] - values[-1])) ** 2)))
+    for members in np.array_split(np.argsort(reading), np.clip(len(reading) // _IN_A_BIN, 1, _MOST_BINS)):
+        weight = lever[members] ** 2 / max(np.sum(lever[members] ** 2), 1e-300)
+        means.append(reading[members].mean())
+        values.append(weight @ asked[members])
+        u.append(np.sqrt(np.sum((weight * (asked[members] - values[-1])) ** 2)))
     return np.array(means), np.array(values), np.array(u)

@@ -1,6 +1,6 @@
 """Figures of a Monte Carlo study; each takes its results."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -9,20 +9,16 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..study.results import Results
-from ..study.statistics import (
-    METRICS,
-    correlation,
-    factor_title,
-    level_text,
-    level_title,
-    metric_title,
-    shown_unit,
-)
-from .style import ACCENT, COLORS, DARK, LINES, MARKERS, axes_or_new, label_axes, logarithmic, new_figure, save_figure
+from ..study.statistics import METRICS, correlation, factor_title, level_text, level_title, shown_unit
+from ..summaries.cells import format_number
+from .charts import SERIES, Marks, Plot, level, linear, logarithmic, names, ordinates
+from .figures import draw, draw_all, save_figure
+from .uncertainty import correlation_plot
 
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
-_WIDE = 10  # characters of a level: longer ones do not fit beside each other
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
+_ENDS = (5, 50, 95)  # percentiles
+_WIDE = 20  # times: positive values over a wider range need a logarithmic axis
 
 
 def study_metric(results: Results, metric: str = "length_error", axes: Any = None) -> Any:
@@ -47,28 +43,55 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
     """
     if metric not in METRICS:
         raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")
-    axes = axes_or_new(axes)
+    along, runs = runs_of_metric(results, most=len(SERIES))
+    of_cells = lambda cells: _percentiles(results, metric, cells)  # noqa: E731
+    return draw(metric_plots(results, metric, along, [runs], of_cells)[0], axes)
+
+
+def runs_of_metric(results: Results, most: int) -> tuple[str | None, dict[str, list[int]]]:
+    """The factor with the most levels, and runs of cells along it by the levels of the others in words."""
     factors = results.study.factors
     along = max(factors, key=lambda name: len(factors[name])) if factors else None
-    runs = {"": [0]} if along is None else _runs(results, along, most=len(MARKERS))
-    positive, values = True, []
-    for i, (words, cells) in enumerate(runs.items()):
-        low, middle, high = _percentiles(results, metric, cells)
-        x = np.array([0 if along is None else _index(results, cell)[along] for cell in cells])
-        x = x + 0.6 * ((i + 0.5) / len(runs) - 0.5)  # side by side at each level
-        style = {"fmt": MARKERS[i], "color": COLORS[i], "capsize": 3, "markersize": 5, "label": words or None}
-        axes.errorbar(x, middle, yerr=[middle - low, high - middle], **style)
-        positive &= bool(np.all(low[np.isfinite(low)] > 0))
-        values.append(middle[np.isfinite(middle)])
-    if positive and _spans_decades(list(np.concatenate(values)[:, None])):
-        logarithmic(axes)
-    axes.set_xticks(
-        *([[0], ["all trials"]] if along is None else [range(len(factors[along])), _levels(results, along)])
-    )
-    label_axes(axes, "" if along is None else factor_title(along), metric_title(metric))
-    if len(runs) > 1:
-        axes.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    return axes
+    return along, {"": [0]} if along is None else _runs(results, along, most)
+
+
+def metric_plots(
+    results: Results,
+    metric: str,
+    along: str | None,
+    groups: Sequence[dict[str, list[int]]],
+    percentiles: Callable[[Sequence[int]], np.ndarray],
+) -> tuple[Plot, ...]:
+    """A metric of runs of cells, a plot for each group of runs: medians, with bars from the 5th to the 95th percentile
+    of the converged trials, which ``percentiles`` gives of each cell."""
+    unit, _ = metric_unit(metric)
+    values = [[percentiles(cells) for cells in runs.values()] for runs in groups]
+    every = np.concatenate([part.ravel() for parts in values for part in parts])
+    every = every[np.isfinite(every)]
+    wide = bool(len(every)) and every.min() > 0 and every.max() > _WIDE * every.min()
+    y = (logarithmic if wide else linear)(METRICS[metric] + (f" [{unit}]" if unit else ""), every)
+    x_axis = names("", ["all trials"]) if along is None else names(factor_title(along), _levels(results, along))
+    plots = []
+    for runs, parts in zip(groups, values, strict=True):
+        marks = []
+        for i, ((words, cells), ends) in enumerate(zip(runs.items(), parts, strict=True)):
+            at = np.array([0 if along is None else _index(results, cell)[along] for cell in cells])
+            x = at + 0.6 * ((i + 0.5) / len(runs) - 0.5)  # side by side at each level
+            said = [
+                f"cell {cell + 1}: median {format_number(b)} {unit}, 5 % {format_number(a)}, 95 % {format_number(c)}"
+                for cell, (a, b, c) in zip(cells, ends.T.tolist(), strict=True)
+            ]
+            name = words if len(runs) > 1 else ""
+            marks.append(Marks(name, x, ends[1], **SERIES[i], words=said, low=ends[0], high=ends[2]))
+        title = "" if len(runs) > 1 else next(iter(runs))
+        height = 280 if len(groups) == 1 else 200
+        plots.append(Plot(x_axis, y, tuple(marks), title=title[:1].upper() + title[1:], height=height))
+    return tuple(plots)
+
+
+def metric_unit(metric: str) -> tuple[str, float]:
+    """The unit in which a metric is drawn, and the factor to it."""
+    return ("parts in a million", 1e6) if metric == "scale_error" else shown_unit(metric)
 
 
 def save_study_figures(results: Results, folder: Path) -> list[Path]:
@@ -95,35 +118,30 @@ def save_study_figures(results: Results, folder: Path) -> list[Path]:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{folder} cannot be made: {reason}; choose another folder.") from error
-    written = []
-    for name, figure in _possible_figures(results).items():
-        written.append(folder / f"{name}.png")
-        save_figure(figure(), written[-1])
-    return written
-
-
-def _possible_figures(results: Results) -> dict[str, Any]:
-    """Functions that make the figures, by file name."""
-    figures: dict[str, Any] = {"convergence": lambda: study_convergence(results)}
-    if not any(np.any(results.column("converged", cell) == 1) for cell in range(len(results.study.cells))):
-        return figures
-    for names, prefix, plot in (
-        (tuple(results.study.factors), "distributions", study_distributions),
-        (_WIDTHS, "error_against", study_errors),
-        (_SHIFTS, "k_against", study_scale),
-    ):
-        for factor in names:
-            if factor in results.study.factors:
-                name = f"{prefix}_{factor.replace('.', '_')}"
-                figures[name] = lambda factor=factor, plot=plot: plot(results, factor)
-    figures["correlation"] = lambda: study_correlation(results, 1)
-    return figures
+    figures: dict[str, Callable[[], Any]] = {"convergence": lambda: study_convergence(results)}
+    factors = results.study.factors
+    if any(np.any(results.column("converged", cell) == 1) for cell in range(len(results.study.cells))):
+        for chosen, prefix, plot in (
+            (tuple(factors), "distributions", study_distributions),
+            (_WIDTHS, "error_against", study_errors),
+            (_SHIFTS, "k_against", study_scale),
+        ):
+            figures |= {
+                f"{prefix}_{factor.replace('.', '_')}": lambda factor=factor, plot=plot: plot(results, factor)
+                for factor in chosen
+                if factor in factors
+            }
+        figures["correlation"] = lambda: study_correlation(results, 1)
+    for name, figure in figures.items():
+        save_figure(figure(), folder / f"{name}.png")
+    return [folder / f"{name}.png" for name in figures]
 
 
 def study_distributions(
     results: Results, factor: str, metrics: Sequence[str] = ("de", "length_error", "angle_error")
 ) -> Any:
-    """Plot how metrics are distributed at each level of a factor, over all other factors, as box plots.
+    """Plot how metrics are distributed at each level of a factor, over all other factors: quartiles as boxes, medians
+    as marks, and whiskers from the 5th to the 95th percentile.
 
     Args:
         results: The study.
@@ -136,21 +154,20 @@ def study_distributions(
     Example:
         >>> aj.plot.study_distributions(results, "bounds.length_mm").savefig("distributions.svg")
     """
-    names = [name for name in (_available(results, metric) for metric in metrics) if name]
-    figure, axes = _panels(1, len(names), (4.3 * len(names), 3.8))
-    for panel, name in zip(axes[0], names, strict=True):
-        values = [_values(results, name, cells) for cells in _cells_by_level(results, factor)]
-        panel.boxplot(
-            [v if len(v) else [np.nan] for v in values], whis=(5, 95), showfliers=False,
-            tick_labels=_levels(results, factor), medianprops={"color": DARK, "linewidth": 1.8},
-        )  # fmt: skip
-        if max(len(label.get_text()) for label in panel.get_xticklabels()) > _WIDE:
-            panel.tick_params(axis="x", labelrotation=20)
-            for label in panel.get_xticklabels():
-                label.set(ha="right", rotation_mode="anchor")
-        _finish(panel, factor_title(factor), _title(name))
-        if all(np.nanmin(v, initial=np.inf) > 0 for v in values) and _spans_decades(values):
-            panel.set_yscale("log")
+    index = [_index(results, cell)[factor] for cell in range(len(results.study.cells))]
+    cells = [[cell for cell, at in enumerate(index) if at == i] for i in range(len(results.study.factors[factor]))]
+    x, axis = np.arange(len(cells)), names(factor_title(factor), _levels(results, factor))
+    plots = []
+    for name in filter(None, (_available(results, metric) for metric in metrics)):
+        low, q25, median, q75, high = np.array([_quantiles(_values(results, name, of), (5, 25, 50, 75, 95))
+                                                for of in cells]).T  # fmt: skip
+        marks = (
+            Marks("", x, median, "bars", low=q25, high=q75, size=16),
+            Marks("", x, median, "square", low=low, high=high, size=5),
+        )
+        wide = np.nanmin(low, initial=np.inf) > 0 and np.nanmax(median) > _WIDE / 2 * np.nanmin(median)
+        plots.append(Plot(axis, (logarithmic if wide else linear)(_title(name), low, high), marks))
+    figure = draw_all(plots, len(plots), (4.3, 3.8))
     others = [factor_title(name) for name in results.study.factors if name != factor]
     pooled = f"\ntrials pooled over all levels of: {', '.join(others)}" if others else ""
     figure.suptitle(f"boxes: quartiles and median; whiskers: 5 % and 95 %{pooled}", fontsize=9)
@@ -172,25 +189,31 @@ def study_errors(results: Results, factor: str) -> Any:
     """
     kind = "length_error" if "length" in factor else "angle_error"
     runs = _runs(results, factor, most=4)
-    figure, axes = _panels(1, len(runs), (5 * len(runs), 3.9), sharey=True)
-    for panel, (words, cells) in zip(axes[0], runs.items(), strict=True):
-        x = [float(results.study.factors[factor][_index(results, cell)[factor]]) for cell in cells]
-        # Angles are the same after the fix: the line before it is wide enough to be seen below the other.
-        for name, color, label, marker, size in (
-            (f"{kind}_stage1", ACCENT, "before the scale fix", "^", 12),
-            (kind, DARK, "after", "s", 5),
-        ):
-            low, middle, high = _percentiles(results, name, cells)
-            if np.any(np.isfinite(middle)):
-                panel.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
-                panel.plot(x, middle, color=color, marker=marker, label=label, markersize=size, linewidth=size / 3)
-        panel.set_xscale("log")
-        panel.set_xticks(x, [f"{value:g}" for value in x])
-        panel.minorticks_off()
-        logarithmic(panel)
-        _finish(panel, factor_title(factor), _title(kind) if panel is axes[0, 0] else "", fill(words, 60))
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", frameon=False, ncols=2)
-    return figure
+    x = _values_of_factor(results, factor, next(iter(runs.values())))
+    # Angles are the same after the fix: the line before it is wide enough to be seen below the other.
+    stages: dict[str, dict[str, Any]] = {
+        f"{kind}_stage1": {"name": "before the scale fix", "tone": "accent", "symbol": "triangle", "size": 15},
+        kind: {"name": "after", "tone": "main", "symbol": "square", "size": 6},
+    }
+    panels = {
+        fill(words, 60): [
+            part for name, style in stages.items() for part in _curve(x, _percentiles(results, name, cells), **style)
+        ]
+        for words, cells in runs.items()
+    }
+    y = logarithmic(_title(kind), *(ends for marks in panels.values() for ends in ordinates(marks)))
+    x_axis = logarithmic(factor_title(factor), x)._replace(ticks=tuple((float(at), f"{at:g}") for at in x))
+    plots = [Plot(x_axis, y, tuple(marks), title=words) for words, marks in panels.items()]
+    return draw_all(plots, len(plots), (5, 3.9))
+
+
+def _curve(x: np.ndarray, ends: np.ndarray, *, band: bool = True, **style: Any) -> list[Marks]:
+    """Medians as joined points, with a band from the 5th to the 95th percentile; nothing where no trial converged."""
+    low, middle, high = ends
+    if not np.any(np.isfinite(middle)):
+        return []
+    curve = Marks(x=x, y=middle, joined=True, **style)
+    return [Marks("", x, middle, "band", style["tone"], low=low, high=high), curve] if band else [curve]
 
 
 def study_scale(results: Results, factor: str) -> Any:
@@ -206,25 +229,20 @@ def study_scale(results: Results, factor: str) -> Any:
     Example:
         >>> aj.plot.study_scale(results, "bounds.length_shift_mm").savefig("scale.svg")
     """
-    runs = _runs(results, factor, most=len(MARKERS))
-    figure, axes = _panels(1, 1, (6.4, 4.2 + 0.16 * len(runs)))
-    panel = axes[0, 0]
-    for i, (words, cells) in enumerate(runs.items()):
-        x = [float(results.study.factors[factor][_index(results, cell)[factor]]) for cell in cells]
-        low, middle, high = (1e6 * (part - 1) for part in _percentiles(results, "scale", cells))
-        if len(runs) <= 4:
-            panel.fill_between(x, low, high, color=COLORS[i], alpha=0.12, linewidth=0)
-        style = {"color": COLORS[i], "linestyle": LINES[i], "marker": MARKERS[i], "label": words or None}
-        panel.plot(x, middle, **style)
-    panel.axhline(0.0, color="0.4", linewidth=0.9, linestyle="--")
-    _finish(panel, factor_title(factor), "error of the scale of stage 1 [parts in a million]")
-    if len(runs) > 1:
-        figure.legend(loc="outside upper center", frameon=False, fontsize=8)
-    return figure
+    runs = _runs(results, factor, most=len(SERIES))
+    marks = [level(0.0)]
+    for style, (words, cells) in zip(SERIES, runs.items(), strict=False):
+        ends, name = 1e6 * (_percentiles(results, "scale", cells) - 1), words if len(runs) > 1 else ""
+        x = _values_of_factor(results, factor, cells)
+        marks += _curve(x, ends, band=len(runs) <= 4, name=name, **style)
+    x_axis = linear(factor_title(factor), *(part.x for part in marks))
+    y = linear("error of the scale of stage 1 [parts in a million]", *ordinates(marks))
+    return draw_all([Plot(x_axis, y, tuple(marks))], 1, (6.4, 4.2 + 0.16 * len(runs)))
 
 
 def study_correlation(results: Results, cell: int) -> Any:
-    """Plot the correlations of the parameters' errors in one cell.
+    """Plot the correlations of the parameters' errors in one cell: darker is stronger, with the sign written where it
+    is at least 0.5.
 
     Args:
         results: The study.
@@ -242,17 +260,10 @@ def study_correlation(results: Results, cell: int) -> Any:
     count = len(results.study.cells)
     if not 1 <= cell <= count:
         raise InputError(f"cell is {cell}; the study has cells 1 to {count}.")
-    names = results.study.space.names
-    figure, axes = _panels(1, 1, (6.8, 5.8))
-    panel = axes[0, 0]
-    image = panel.imshow(correlation(results, cell - 1), vmin=-1, vmax=1, cmap="RdBu_r")
-    panel.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-    panel.set_yticks(range(len(names)), names, fontsize=8)
     words = _cell_label(results, cell - 1)
-    title = f"correlation of parameter errors, cell {cell}{': ' if words else ''}{words}"
-    panel.set_title(fill(title, 70), fontsize=10)
-    figure.colorbar(image, ax=panel, shrink=0.85)
-    return figure
+    title = fill(f"correlation of parameter errors, cell {cell}{': ' if words else ''}{words}", 70)
+    plot = correlation_plot(list(results.study.space.names), correlation(results, cell - 1), title)
+    return draw_all([plot], 1, (6.8, 6.8))
 
 
 def study_convergence(results: Results) -> Any:
@@ -276,28 +287,26 @@ def study_convergence(results: Results) -> Any:
         converged = results.column("converged", cell)
         total[at] += np.sum(converged >= 0)
         good[at] += np.sum(converged == 1)
-    percentage = np.divide(100 * good, total, out=np.full_like(good, np.nan), where=total > 0)
-    least = min(float(np.nanmin(percentage, initial=100.0)), 99.0)
-    darkest = 100 - 2.5 * (100 - least)  # so that the least that was found is a middle grey
-    figure, axes = _panels(1, 1, (1.9 + 0.75 * max(len(levels[0]), 4), 1.9 + 0.5 * len(levels[1])))
-    panel = axes[0, 0]
-    panel.imshow(percentage, vmin=darkest, vmax=100, cmap="Greys_r", aspect="auto")
-    for (row, column), value in np.ndenumerate(percentage):
-        text = "-" if np.isnan(value) else f"{value:.0f}" if value in (0, 100) else f"{value:.1f}"
-        color = "white" if value < (darkest + 100) / 2 else "black"
-        panel.text(column, row, text, ha="center", va="center", fontsize=8, color=color)
-    panel.set_xticks(range(len(levels[0])), levels[0])
-    panel.set_yticks(range(len(levels[1])), levels[1])
-    panel.set_xlabel(factor_title(factors[0]) if factors else "")
-    panel.set_ylabel(fill(factor_title(factors[1]), 14 + 8 * len(levels[1])) if len(factors) > 1 else "")
-    panel.set_title("trials that converged [%]", fontsize=10)
-    return figure
-
-
-def _panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
-    """A new figure, and its axes as an array."""
-    figure = new_figure(size)
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+    percentage = np.divide(100 * good, total, out=np.full_like(good, np.nan), where=total > 0).ravel()
+    y, x = (part.ravel() for part in np.indices(total.shape))
+    # The least is a middle shade, on which its number can be read.
+    failed = 100 - np.nan_to_num(percentage, nan=100.0)
+    shade = np.rint(2 * failed / max(failed.max(), 1.0)).astype(int)
+    words = ["-" if np.isnan(p) else f"{p:.0f}" if p in (0, 100) else f"{p:.1f}" for p in percentage]
+    marks = (
+        Marks("", x, y, "boxes", shade=shade, box=(1.0, 1.0)),
+        Marks("", x, y, "text", "ink", words, size=8),
+    )
+    titles = (
+        factor_title(factors[0]) if factors else "",
+        fill(factor_title(factors[1]), 14 + 8 * len(levels[1])) if len(factors) > 1 else "",
+    )
+    x_axis, y_axis = (
+        names(title, labels)._replace(low=-0.5, high=len(labels) - 0.5)
+        for title, labels in zip(titles, levels, strict=True)
+    )
+    size = 1.9 + 0.75 * max(len(levels[0]), 4), 1.9 + 0.5 * len(levels[1])
+    return draw_all([Plot(x_axis, y_axis, marks, title="trials that converged [%]")], 1, size)
 
 
 def _available(results: Results, metric: str) -> str | None:
@@ -310,16 +319,19 @@ def _available(results: Results, metric: str) -> str | None:
 
 
 def _values(results: Results, metric: str, cells: Sequence[int]) -> np.ndarray:
-    """A metric of the converged trials of some cells; angles in arcseconds."""
+    """A metric of the converged trials of some cells, in the unit in which it is drawn."""
     rows = [results.column(metric, cell)[results.column("converged", cell) == 1] for cell in cells]
-    values = shown_unit(metric)[1] * np.concatenate(rows)
+    values = metric_unit(metric)[1] * np.concatenate(rows)
     return values[np.isfinite(values)]
+
+
+def _quantiles(values: np.ndarray, percentiles: Sequence[int]) -> np.ndarray:
+    return np.percentile(values, percentiles) if len(values) else np.full(len(percentiles), np.nan)
 
 
 def _percentiles(results: Results, metric: str, cells: Sequence[int]) -> np.ndarray:
     """5th, 50th and 95th percentile in each cell; NaN where no trial converged."""
-    rows = [_values(results, metric, [cell]) for cell in cells]
-    return np.array([np.percentile(row, (5, 50, 95)) if len(row) else [np.nan] * 3 for row in rows]).T
+    return np.array([_quantiles(_values(results, metric, [cell]), _ENDS) for cell in cells]).T
 
 
 def _index(results: Results, cell: int) -> dict[str, int]:
@@ -329,10 +341,9 @@ def _index(results: Results, cell: int) -> dict[str, int]:
     return {name: int(i) for name, i in zip(results.study.factors, chosen, strict=True)}
 
 
-def _cells_by_level(results: Results, factor: str) -> list[list[int]]:
-    cells = range(len(results.study.cells))
-    index = [_index(results, cell)[factor] for cell in cells]
-    return [[cell for cell in cells if index[cell] == i] for i in range(len(results.study.factors[factor]))]
+def _values_of_factor(results: Results, factor: str, cells: Sequence[int]) -> np.ndarray:
+    levels = results.study.factors[factor]
+    return np.array([float(levels[_index(results, cell)[factor]]) for cell in cells])
 
 
 def _runs(results: Results, factor: str, most: int) -> dict[str, list[int]]:
@@ -359,16 +370,4 @@ def _levels(results: Results, factor: str) -> list[str]:
 
 
 def _title(metric: str) -> str:
-    return f"{METRICS[metric].removesuffix(' after the scale fix')} [{shown_unit(metric)[0] or '1'}]"
-
-
-def _spans_decades(values: list[np.ndarray]) -> bool:
-    """Whether medians differ more than tenfold."""
-    medians = [np.median(v) for v in values if len(v)]
-    return bool(medians and max(medians) > 10 * min(medians))
-
-
-def _finish(panel: Any, x: str, y: str, title: str = "") -> None:
-    panel.set(xlabel=x, ylabel=y)
-    panel.set_title(title, fontsize=9)
-    panel.grid(True, which="major", axis="y", alpha=0.3)
+    return f"{METRICS[metric].removesuffix(' after the scale fix')} [{metric_unit(metric)[0] or '1'}]"

@@ -11,8 +11,8 @@ from ..data.capture import Capture
 from ..data.observations.observation import POINT, offset_of
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach, skeleton
+from ..plot.residuals import Groups
 from .elements import ArmView
-from .residuals import Groups
 
 _MOST = 150  # poses in a page
 _NO_GEOMETRY: Mapping[str, Any] = {}

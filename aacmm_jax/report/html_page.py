@@ -3,7 +3,6 @@
 import base64
 import hashlib
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,17 @@ from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
+from ..plot.charts import Chart
+from ..plot.svg import drawn, key, points
+from ..summaries.cells import Table
 from .administrative_data import administrative_groups
-from .chart_svg import drawn, key, points, shade_key
-from .elements import ArmView, Chart, Report, ReportTable
+from .elements import ArmView, Report
 
 KINDS = ("calibration", "evaluation", "study", "model comparison")
 _FOLDER = Path(__file__).parent
+_MOST_STACKED = 30  # cells: more would be a list without end
+_NARROW, _CHARACTER, _GAP = 370.0, 7.6, 8.0  # pixels: a telephone's page, a character, between columns
+_LONGEST = 14  # characters: longer texts are wrapped
 
 
 def write_report(
@@ -53,17 +57,17 @@ def write_report(
 def _written(source: Path, target: Path, administrative_data: AdministrativeData | None) -> dict[str, Any]:
     kind = read_summary(source, KINDS)[0]["kind"]
     read = source if kind == "study" else InputFile(source)  # a study is read in parts
-    stored = read_tables(read, (kind,), without=("trials",))
-    report, simulated, decision = _REPORTS[kind](read, stored.attributes)
-    if simulated:
+    attributes = read_tables(read, (kind,), without=("trials",)).attributes
+    report = _report_of(kind, read, attributes)
+    if report.simulated:
         warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
-        mark = "unsure" if decision == "conforms" else report.verdict_mark  # no real arm conforms
+        mark = "unsure" if report.decision == "conforms" else report.verdict_mark  # no real arm conforms
         report = report._replace(warnings=warnings, verdict_mark=mark)
     if administrative_data is not None:
         tested = kind == "evaluation"
-        check_conformity(administrative_data, simulated=simulated, decision=decision, tested=tested)
+        check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, tested=tested)
         report = report._replace(administrative=administrative_groups(administrative_data, tested))
-    page = _render(report, _origin(read, stored.attributes))
+    page = _render(report, _origin(read, attributes))
     write_text(target, page)
     return {
         "kind": "report",
@@ -76,51 +80,29 @@ def _written(source: Path, target: Path, administrative_data: AdministrativeData
     }
 
 
-def _calibration(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from ..files.calibrations import load_calibration
-    from .calibration import calibration_report
+def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any]) -> Report:
+    """The report of a file; what it takes is imported for its kind alone."""
+    if kind == "calibration":
+        from ..files.calibrations import load_calibration
+        from .calibration import calibration_report
 
-    record = load_calibration(source)
-    return calibration_report(record)[0], record.recording.true is not None, None
+        return calibration_report(load_calibration(source))
+    if kind == "evaluation":
+        from ..files.evaluations import load_evaluation, load_points
+        from .evaluation import evaluation_report, points_report
 
+        if attributes.get("of") == "points":
+            return points_report(load_points(source))
+        return evaluation_report(load_evaluation(source))
+    if kind == "study":
+        from ..study.results import Results
+        from .study import study_report
 
-def _evaluation(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from ..summaries.verdicts import overall_decision
-    from .evaluation import evaluation_report, points_report
-
-    if attributes.get("of") == "points":
-        from ..files.evaluations import load_points
-
-        report, summary = points_report(load_points(source))
-        return report, False, overall_decision(summary)
-    from ..files.evaluations import load_evaluation
-
-    record = load_evaluation(source)
-    report, summary = evaluation_report(record)
-    return report, record.recording.true is not None, overall_decision(summary)
-
-
-def _models(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
+        return study_report(Results.of(source))
     from ..files.compared_models import load_compared_models
     from .models import models_report
 
-    return models_report(load_compared_models(source)), False, None
-
-
-def _study(source: str | os.PathLike, attributes: dict[str, Any]) -> tuple[Report, bool, str | None]:
-    from ..study.results import Results
-    from .study import study_report
-
-    return study_report(Results.of(source))[0], False, None
-
-
-# By the kind of file: the report, whether it is of a simulation, and the overall decision of its acceptance tests.
-_REPORTS: dict[str, Callable[[str | os.PathLike, dict[str, Any]], tuple[Report, bool, str | None]]] = {
-    "calibration": _calibration,
-    "evaluation": _evaluation,
-    "study": _study,
-    "model comparison": _models,
-}
+    return models_report(load_compared_models(source))
 
 
 def _origin(source: str | os.PathLike, attributes: dict[str, Any]) -> list[tuple[str, list[str]]]:
@@ -154,10 +136,11 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         report=report,
         origin=origin,
         is_chart=lambda block: isinstance(block, Chart),
-        is_table=lambda block: isinstance(block, ReportTable),
+        is_table=lambda block: isinstance(block, Table),
         is_arm_view=lambda block: isinstance(block, ArmView),
         plots=lambda chart: [drawn(plot, f"chart-{chart.id}") for plot in chart.plots],
-        keys=_key,
+        stacked_table=_stacked,
+        keys=lambda chart: key(chart.plots),
         points={block.id: [points(plot) for plot in block.plots] for block in blocks if isinstance(block, Chart)},
         scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},
         style=read("page_style.css"),
@@ -167,10 +150,15 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     )
 
 
-def _key(chart: Chart) -> list[tuple[str, str]]:
-    if not chart.shade_limits:
-        return key(chart.plots)
-    return [*shade_key(chart.shade_limits, chart.shade_unit), *key(chart.plots, least=1)]
+def _stacked(table: Table) -> bool:
+    """Whether a narrow screen shows each row as a list: a table of few cells that has no room on a telephone."""
+    if len(table.rows) * len(table.columns) > _MOST_STACKED:
+        return False
+    texts = [[column, *(row[i].text for row in table.rows)] for i, column in enumerate(table.columns)]
+    words = [max((len(word) for text in column for word in text.split()), default=0) for column in texts]
+    whole = [max(map(len, column[1:]), default=0) if i else 0 for i, column in enumerate(texts)]
+    characters = sum(max(word, min(text, _LONGEST)) for word, text in zip(words, whole, strict=True))
+    return characters * _CHARACTER + _GAP * len(texts) > _NARROW
 
 
 def _script_hash(script: str) -> str:

@@ -110,7 +110,7 @@ def _words(name: str) -> tuple[str, str]:
 
 def _wider_model(terms: tuple[FoundTerm, ...], arm: Arm | None) -> str:
     """The model that the arm has, with the terms that were found besides; empty where that is no other model."""
-    each = () if arm is None or arm.corrections is None else arm.corrections.functions.each
+    each = () if arm is None or arm.corrections is None else arm.corrections.functions.terms
     own = [term for term in each if isinstance(term, Term)]
     sought, added = all_sought(), []
     for kind, one in (sought[term.kind] for term in terms if term.kind in sought):

@@ -37,7 +37,7 @@ def why_undetermined(
     """
     if arm.corrections is None:
         return (), ()
-    terms = {term.name: term for term in arm.corrections.functions.each if isinstance(term, Term)}
+    terms = {term.name: term for term in arm.corrections.functions.terms if isinstance(term, Term)}
     causes: dict[str, str] = {}
     for chief, names in groups:
         for name in chief:

@@ -10,10 +10,11 @@ from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.diagnostics.missing_terms import FoundTerm
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
-from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motion, joints_first
+from aacmm_jax.kinematics.chain import forward_pass, joint_motion, joints_first
 from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections.kinds import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
+from aacmm_jax.kinematics.joint_functions import KnownFunctions
 from aacmm_jax.summaries.model_errors import _wider_model
 
 MODEL = "gravity,harmonics,gear,coupled"
@@ -123,12 +124,12 @@ def test_moment_of_gravity():
     for gravity, expected in (((0, 0, -1), moment), ((0, 0, -3), moment)):
         loaded = with_corrections(arm, "gravity", mass=[0, 2], centre=[(0, 0, 0), (-100, 0, 0)], gravity=gravity)
         assert correction_names(loaded)[:-3] == ("compliance_2",)  # the first axis is vertical
-        (found,) = function_values(arm.geometry, loaded.corrections.functions.each, q, np.asarray(loaded.gravity))
+        (found,) = function_values(arm.geometry, loaded.corrections.functions.terms, q, np.asarray(loaded.gravity))
         np.testing.assert_allclose(found, [expected], rtol=1e-12)
         yielded = loaded.replace(compliance_2=0.1)
         np.testing.assert_allclose(yielded.position(q), arm.position(q + np.array([0, 0.1 * expected])), rtol=1e-12)
     unknown = with_corrections(arm, "gravity")
-    (found,) = function_values(arm.geometry, unknown.corrections.functions.each, q, np.asarray(unknown.gravity))
+    (found,) = function_values(arm.geometry, unknown.corrections.functions.terms, q, np.asarray(unknown.gravity))
     np.testing.assert_allclose(found, -0.4 * np.cos(np.radians(30)), rtol=1e-12)
 
 
@@ -182,7 +183,7 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         ("coupled=2-9", "names joint 9 of 7"),
         (["cos1_9"], "is of a joint from 1 to 7"),
         (["compliance1_2"], "is of a link from 2 to 7"),
-        (["d_3"], "'d_3' is no coefficient's name"),
+        (["d_3"], "'d_3' is not the name of a coefficient"),
     ],
 )
 def test_refused(model, sentence):
@@ -294,7 +295,7 @@ def test_functions_together_are_those_one_by_one():
     arm = to_numpy(aj.load_arm("ur10"))
     names = ["cos1_1", "compliance3_2", "sin3_2", "gear_3", "sin99_5", "compliance2_2", "cos31_5", "coupled2_3"]
     q = np.random.default_rng(0).uniform(-6, 6, (50, 6))
-    each = with_corrections(arm, names).corrections.functions.each
+    each = with_corrections(arm, names).corrections.functions.terms
     rows, forward = joints_first(q, 1), forward_pass(arm.geometry, joint_motion(arm.geometry, q))
     together, alone = KnownFunctions(each), [KnownFunctions((one,)) for one in each]
     assert together.names == tuple(names)

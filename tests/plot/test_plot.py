@@ -121,7 +121,8 @@ def test_patterns_in_the_residuals(record):
     panels = aj.plot.residual_patterns(record).axes
     assert len(panels) == 6 + 3 + 1
     labels = [panel.get_xlabel() for panel in panels]
-    assert labels == 6 * ["reading [deg]"] + 3 * ["pose"] + ["residual [standard deviations]"]
+    assert labels[:6] == [f"reading of joint {i} [deg]" for i in range(1, 7)]
+    assert labels[6:] == 3 * ["pose, in the order of the capture"] + ["residual [standard deviations]"]
     found = signed_residuals(record)
     drawn = panels[2].lines[1].get_xydata()
     np.testing.assert_allclose(drawn[:, 0], np.asarray(record.recording.capture.readings)[:, 2] / aj.units.DEG)

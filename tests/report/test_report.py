@@ -13,8 +13,11 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.report import chart_svg, charts, elements, tried, write_report
+from aacmm_jax.plot import charts, svg
+from aacmm_jax.plot.uncertainty import tried_shades
+from aacmm_jax.report import elements, write_report
 from aacmm_jax.report.html_page import _origin
+from aacmm_jax.summaries.cells import Table, format_number, number
 from aacmm_jax.summaries.tables import decimals_for
 from tests.refusals import assert_refused
 from tests.written_study import write_study
@@ -189,14 +192,8 @@ def tables_of(report):
     found = {}
     for section in report.sections:
         for block in section.blocks:
-            table = (
-                block.table
-                if isinstance(block, elements.Chart)
-                else block
-                if isinstance(block, elements.ReportTable)
-                else None
-            )
-            if table is not None:
+            table = block.table if isinstance(block, charts.Chart) else block
+            if isinstance(table, Table):
                 found[table.caption] = table
     return found
 
@@ -205,7 +202,7 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
     from aacmm_jax.report.calibration import calibration_report
 
     record = written.record
-    report = calibration_report(record)[0]
+    report = calibration_report(record)
     tables = tables_of(report)
     evaluations, expanded = record.evaluations(), aj.uncertainty_of(record).expanded(0.95)
     stages = {"nominal": "nominal", "stage 1": "stage1", "calibrated": "calibrated"}
@@ -228,9 +225,10 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
     positions = tables["All positions"]
     np.testing.assert_allclose([row[4].value for row in positions.rows], volume.expanded_length)
     charts_by_id = {
-        block.id: block for section in report.sections for block in section.blocks if isinstance(block, elements.Chart)
+        block.id: block for section in report.sections for block in section.blocks if isinstance(block, charts.Chart)
     }
-    shade, limits = charts_by_id["volume"].plots[0].marks[0].shade, charts_by_id["volume"].shade_limits
+    marks = charts_by_id["volume"].plots[0].marks[0]
+    shade, limits = marks.shade, marks.limits
     assert limits[-1] == pytest.approx(volume.expanded_length.max())
     assert sum(np.asarray(shade) == 0) == sum(volume.expanded_length < limits[1])
     change = charts_by_id["change-mm"].plots[0]
@@ -244,7 +242,7 @@ def test_numbers_of_a_report_are_under_the_right_heading(written):
 def observed_report(observed_record):
     from aacmm_jax.report.calibration import calibration_report
 
-    return calibration_report(observed_record)[0]
+    return calibration_report(observed_record)
 
 
 def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, observed_report):
@@ -262,12 +260,13 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
     assert [cell.text for cell in socket[:3]] == ["socket", "2", "23"]
     assert socket[4].value == pytest.approx(math.sqrt(np.average(found.rms_after[:2] ** 2, weights=[15, 8])))
     charts_by_id = {
-        block.id: block for section in report.sections for block in section.blocks if isinstance(block, elements.Chart)
+        block.id: block for section in report.sections for block in section.blocks if isinstance(block, charts.Chart)
     }
-    normalised = charts_by_id["normalised"].plots[0].marks
-    in_ball = np.array(normalised[0].y)[15 + 8 + 25 :][:12]
+    normalised = {marks.name: marks for marks in charts_by_id["normalised"].plots[0].marks}
+    in_ball = np.array(normalised["sphere"].y)
+    assert len(in_ball) == 12
     assert math.sqrt(np.mean(in_ball**2)) == pytest.approx(found.reduced_chi[3], rel=1e-5)
-    assert normalised[1].x[0] == 5  # the bad pose of A is marked
+    assert normalised["half of its weight or less"].x[0] == 5  # the bad pose of A is marked
     weights = next(table for caption, table in tables.items() if caption.startswith("Poses that the robust loss"))
     assert [cell.text for cell in weights.rows[0][:3]] == ["A", "5", "0.000"]
     assert weights.rows[0][3].value > 1
@@ -309,7 +308,7 @@ def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
         return LeftOut((name, f"{name}2"), 10, rms, predicted, np.array([0.03, -0.04]), np.array([0.1, 0.1]), True)
 
     groups = left_out("low", 0.2, 0.2), left_out("high", 1.17, 0.31), left_out("open", 0.2, np.inf)
-    tables = tables_of(calibration_report(written.record._replace(validation=CrossValidation(groups)))[0])
+    tables = tables_of(calibration_report(written.record._replace(validation=CrossValidation(groups))))
     rows = tables["Groups held out [mm]"].rows
     assert rows[0][0].text.startswith("high")
     assert [cell.value for cell in rows[0][1:5]] == pytest.approx([10, 1.17, 0.31, 0.025 * math.sqrt(2)])
@@ -331,7 +330,7 @@ def test_a_report_says_where_the_scale_comes_from(observed_record, observed_repo
     recording = observed_record.recording
     alone = recording._replace(capture=aj.Capture(recording.capture.sockets))
     found = aj.identify(recording.nominal.arm, alone.capture, recording.nominal.bounds())
-    said = text_of(calibration_report(aj.calibration.record_of(found, alone))[0])
+    said = text_of(calibration_report(aj.calibration.record_of(found, alone)))
     assert "with the scale of the nominal arm" in said
     assert "The scale is that of the nominal arm: nothing that was measured set it." in said
     assert "not traceable" in said
@@ -345,7 +344,7 @@ def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
     space = aj.Parameters(recording.nominal.arm, written.record.names)
     bounds = aj.Bounds.around(recording.nominal.arm, space, length=10.0, angle=0.0175)
     record = aj.calibration.record_of(aj.calibrate(recording.nominal.arm, recording.capture, bounds), recording)
-    table = tables_of(calibration_report(record)[0])["Reference lengths [mm]"]
+    table = tables_of(calibration_report(record))["Reference lengths [mm]"]
     evaluations = record.evaluations()
     u, stated = evaluations["calibrated"].u, np.array([float(length.u) for length in recording.capture.lengths])
     expanded = aj.uncertainty_of(record).expanded_by_scatter(np.asarray(u), stated)
@@ -358,14 +357,14 @@ def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
 
 def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
     """A table of thousands of rows is cut, not written out cell by cell for minutes."""
-    from aacmm_jax.report.residuals import residual_chart
+    from aacmm_jax.report.tables import residual_chart
 
     arm = written.record.calibrated.arm
     q = np.tile(np.asarray(written.record.recording.capture.q), (120, 1)) + 1e-5 * np.random.default_rng(0).normal(
         size=(120 * 52, 6)
     )
     capture = aj.Capture({"A": q[:6000], "B": q[6000:6001]})
-    chart = residual_chart("r", "R", capture, {"calibrated": aj.evaluate(arm, capture)}, mark=True)
+    chart = residual_chart(capture, aj.evaluate(arm, capture))
     assert chart.table is not None
     assert len(chart.table.rows) == 400
     assert len(chart.plots[0].marks[0].x) <= 1001
@@ -374,20 +373,21 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
+    from aacmm_jax.plot.residuals import distances_in
     from aacmm_jax.report.arm_view import view_of_arm
-    from aacmm_jax.report.residuals import pose_distances, residual_chart, socket_table
+    from aacmm_jax.report.tables import residual_chart, socket_table
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})
     evaluation = aj.evaluate(arm, capture)
-    view = view_of_arm(arm, capture, pose_distances(capture, evaluation))
+    view = view_of_arm(arm, capture, distances_in(capture, evaluation))
     distances = [pose["distance"] for pose in view.data["poses"]]
     assert distances[10] is None
     assert None not in distances[:10]
     assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
-    assert len(residual_chart("r", "R", capture, {"calibrated": evaluation}).plots[0].marks[0].x) == 10
+    assert len(residual_chart(capture, evaluation).plots[0].marks[0].x) == 10
     single = aj.Capture({"B": q[:1]})
-    assert "no scatter" in residual_chart("r", "R", single, {"calibrated": aj.evaluate(arm, single)}).description
+    assert "no scatter" in residual_chart(single, aj.evaluate(arm, single)).description
 
 
 CONFORMITY = """
@@ -437,27 +437,24 @@ def test_an_evaluation_report_decides(written):
 
 
 def test_observations_of_an_evaluation_stand_beside_their_prediction():
-    from aacmm_jax.report.evaluation import _observation_tables
+    from aacmm_jax.report.evaluation import observation_tables
 
     row = {"observation": "bar", "kind": "artefact", "poses": 20, "nominal_rms_mm": 1.25, "rms_mm": 0.02}
     unseen = row | {"rms_predicted_mm": 0.03, "reduced_chi": 0.67}
     used = {"observations": [row | {"reduced_chi": 0.9}]}
-    first, second = _observation_tables({"held_out": {"observations": [unseen]}, "identified_from": used})
+    first, second = observation_tables({"held_out": {"observations": [unseen]}, "identified_from": used})
     assert "Held-out data" in first.caption
     assert [cell.text for cell in first.rows[0]] == ["bar", "artefact", "20", "1.2500", "0.0200", "0.0300", "0.67"]
     assert "used for identification" in second.caption
-    assert _observation_tables({"held_out": None, "identified_from": {"observations": []}}) == []
+    assert observation_tables({"held_out": None, "identified_from": {"observations": []}}) == []
 
 
 def test_charts_of_an_evaluation(written):
     from aacmm_jax.report.evaluation import evaluation_report
 
-    sections = evaluation_report(written.evaluation)[0].sections
+    sections = evaluation_report(written.evaluation).sections
     plots = {
-        block.id: block.plots[0]
-        for section in sections
-        for block in section.blocks
-        if isinstance(block, elements.Chart)
+        block.id: block.plots[0] for section in sections for block in section.blocks if isinstance(block, charts.Chart)
     }
     assert plots["margins"].y.low == 0  # of absolute values
     readings = plots["length-errors"]
@@ -471,12 +468,12 @@ def test_a_verdict_is_marked_as_what_it_is(written):
     from aacmm_jax.report.calibration import calibration_report
     from aacmm_jax.report.evaluation import points_report
 
-    report = calibration_report(written.record)[0]
+    report = calibration_report(written.record)
     assert (report.verdict[:20], report.verdict_mark) == ("To be used with care", "unsure")  # d_5 is on its bound
     assert "on a bound: d_5" in report.verdict
-    failed = calibration_report(written.record._replace(converged=False))[0]
+    failed = calibration_report(written.record._replace(converged=False))
     assert (failed.verdict[:14], failed.verdict_mark) == ("Not to be used", "bad")
-    measured = points_report(PointsRecord(aj.acceptance.Measured({"A": np.eye(3)})))[0]
+    measured = points_report(PointsRecord(aj.acceptance.Measured({"A": np.eye(3)})))
     assert (measured.verdict, measured.verdict_mark) == ("Measured; no limit was given.", "neutral")
 
 
@@ -486,7 +483,7 @@ def test_the_decision_rule_is_explained_only_where_there_is_a_limit(limits):
     from aacmm_jax.report.evaluation import points_report
 
     points = aj.acceptance.Measured({"A": 0.01 * np.random.default_rng(0).normal(size=(10, 3))})
-    (acceptance, *_) = points_report(PointsRecord(points, limits))[0].sections
+    (acceptance, *_) = points_report(PointsRecord(points, limits)).sections
     text = " ".join(block for block in acceptance.blocks if isinstance(block, str))
     assert ("ISO 14253-1" in text) == bool(limits)
     assert "ISO 14253-5" in text
@@ -503,11 +500,11 @@ def test_the_decision_rule_is_explained_only_where_there_is_a_limit(limits):
     ],
 )
 def test_numbers_are_shown(value, decimals, signed, expected):
-    assert elements.format_number(value, decimals, signed=signed) == expected
+    assert format_number(value, decimals, signed=signed) == expected
 
 
 def test_missing_numbers_are_told_from_infinite_ones():
-    cells = [elements.number_cell(value).text for value in (None, math.nan, math.inf)]
+    cells = [number(value).text for value in (None, math.nan, math.inf)]
     assert cells == ["–", "–", "not determined"]
 
 
@@ -526,7 +523,7 @@ def test_a_logarithmic_axis_marks_what_is_there():
     ],
 )
 def test_the_map_of_what_was_tried_uses_every_shade(ratio, expected):
-    shade, limits = tried.shades(ratio)
+    shade, limits = tried_shades(ratio)
     assert set(shade.tolist()) == set(range(charts.SHADES))
     assert limits[: len(expected)] == pytest.approx(expected)
     assert limits[-1] == pytest.approx(ratio.max())
@@ -551,18 +548,18 @@ def test_an_axis_has_round_numbers(low, high, expected):
 
 def test_marks_stand_where_their_numbers_say():
     """Zero-length lines at thousandths of both axes, counted from above; no mark for what is not a number."""
-    axes = charts.Axis("x", 0, 10, ((5.0, "5"),)), charts.Axis("y", 1, 100, ((10.0, "10"),), log=True)
-    marks = charts.Marks("m", [2.5, 5.0, 7.5], [10.0, math.nan, 100.0], hover=["a", "b", "c"])
+    axes = charts.Axis("x", 0, 10, ((5.0, "5"),)), charts.Axis("y", 1, 100, ((10.0, "10"),), "log")
+    marks = charts.Marks("m", [2.5, 5.0, 7.5], [10.0, math.nan, 100.0], words=["a", "b", "c"])
     plot = charts.Plot(*axes, (marks,))
-    drawn = chart_svg.drawn(plot, "caption")
+    drawn = svg.drawn(plot, "caption")
     assert 'd="M250 500h0M750 0h0"' in drawn
-    assert chart_svg.points(plot) == [[250, 500, "a"], [750, 0, "c"]]
+    assert svg.points(plot) == [[250, 500, "a"], [750, 0, "c"]]
     assert '<text x="50.00%" y="100%"' in drawn
 
 
 def test_lengths_stand_placement_by_placement():
     """Named by length where there are few, else by placement; in their order, the readings of one together."""
-    from aacmm_jax.report.lengths import by_placement
+    from aacmm_jax.plot.lengths import by_placement
 
     between = [("p2/a", "p2/b"), ("p1/a", "p1/b"), ("p2/a", "p2/b"), ("A", "B")]
     x, axis, borders = by_placement(between)

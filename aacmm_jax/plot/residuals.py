@@ -1,0 +1,259 @@
+"""Residuals pose by pose: distances, standard deviations and orientations, by arm or by kind of observation."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord
+from ..core.errors import InputError
+from ..core.units import DEG
+from ..data.capture import Capture
+from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
+from ..summaries.cells import format_number
+from .charts import SERIES, Axis, Chart, Marks, Plot, borders, level, logarithmic, round_ticks, thinned
+from .figures import draw, draw_all, save_figure
+from .parameters import error_plot
+
+_NAMED = 16  # most sockets or observations that are named along an axis
+_SEPARATED = 60  # most of them with lines between them
+_LEAST = 1e-5  # a residual of zero on a logarithmic axis, mm
+_MOST_IN_A_ROW = 3  # panels of a figure
+_QUANTITIES = {"standard deviations": "residual", "deg": "angle between orientations"}
+Marked = tuple[str, Sequence[int] | np.ndarray]  # why poses are marked, and their indices
+_LITTLE_WEIGHT = "half of its weight or less"
+
+
+class Groups(NamedTuple):
+    """Poses in groups, the sockets or observations of a capture, one after the other."""
+
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
+    kinds: tuple[str, ...]
+    word: str  # what a group is
+
+    @classmethod
+    def of(cls, capture: Capture) -> "Groups":
+        """The sockets of a capture, then its other observations."""
+        others = capture.observations
+        names = (*capture.names, *(observation.name for observation in others))
+        sizes = (*capture.sizes, *(len(observation.q) for observation in others))
+        kinds = (*("socket" for _ in capture.names), *(observation.kind for observation in others))
+        return cls(names, sizes, kinds, "observation" if others else "socket")
+
+    @property
+    def owner(self) -> np.ndarray:
+        """Index of the group of each pose."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Number of each pose within its group, from 1."""
+        return np.concatenate([np.arange(1, size + 1) for size in self.sizes])
+
+    def only(self, chosen: Sequence[int]) -> "Groups":
+        """Some of the groups."""
+        names, sizes, kinds, word = self
+        return Groups(*(tuple(part[i] for i in chosen) for part in (names, sizes, kinds)), word)  # type: ignore
+
+    def parts(self) -> tuple[tuple[tuple[float, str], ...], np.ndarray]:
+        """Names at the middle of each group, or of those that share a folder ("monday/"), and the borders between them;
+        without names where even these are too many."""
+        ends = np.cumsum(self.sizes)
+        for depth in range(max(name.count("/") for name in self.names), -1, -1):
+            names = ["/".join(name.split("/")[: depth + 1]) for name in self.names]
+            last = [i for i in range(len(names)) if i + 1 == len(names) or names[i] != names[i + 1]]
+            if 1 < len(last) <= _NAMED:
+                edges = np.array([0, *ends[last]]) + 0.5
+                middle = (edges[:-1] + edges[1:]) / 2
+                return tuple((float(x), names[i]) for x, i in zip(middle, last, strict=True)), edges[1:-1]
+        return (), ends[:-1] + 0.5 if len(ends) <= _SEPARATED else np.zeros(0)
+
+
+def pose_chart(
+    id: str,
+    title: str,
+    groups: Groups,
+    arms: Mapping[str, np.ndarray],
+    *,
+    unit: str = "mm",
+    far: Marked = ("", ()),
+    most: int | None = None,
+) -> Chart:
+    """The residual of every pose on a logarithmic axis: by arm, or of one arm by the kind of its observation.
+
+    Args:
+        id: Identifier of the chart.
+        title: Its title.
+        groups: What the poses belong to.
+        arms: Name of an arm -> residual of every pose, NaN where there is none.
+        unit: Their unit: "mm", "deg" or "standard deviations", whose expectation of 1 is drawn.
+        far: Why poses are marked, and their indices.
+        most: How many poses of each arm are drawn, besides those that are marked; None: all.
+
+    Returns:
+        The chart.
+    """
+    last_arm, last = list(arms.items())[-1]
+    known, marked = np.flatnonzero(np.isfinite(last)), np.asarray(far[1], dtype=int)
+    if not len(known):
+        return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", ())
+    drawn = np.union1d(known[thinned(len(known), most or len(known))], marked)
+    labels = [f"{groups.names[i]}, pose {n}" for i, n in zip(groups.owner, groups.numbers, strict=True)]
+
+    def series(name: str, of: str, values: np.ndarray, chosen: np.ndarray, style: Mapping[str, Any]) -> Marks:
+        words = [f"{labels[i]}: {format_number(float(values[i]))} {unit} ({of})" for i in chosen]
+        return Marks(name, chosen + 1, np.maximum(values[chosen], _LEAST), words=words, size=5, **style)
+
+    if len(arms) > 1:
+        styles = ({"symbol": "square", "tone": "soft"}, SERIES[0])
+        names = [f"{arm}, RMS {format_number(rms(values[np.isfinite(values)]), 3)} {unit}"
+                 for arm, values in arms.items()]  # fmt: skip
+        marks = [series(name, arm, values, drawn[np.isfinite(values[drawn])], style)
+                 for (arm, values), name, style in zip(arms.items(), names, styles, strict=True)]  # fmt: skip
+    else:
+        kind = np.asarray(groups.kinds)[groups.owner]
+        marks = [series(name, name, last, drawn[kind[drawn] == name], SERIES[i % len(SERIES)])
+                 for i, name in enumerate(dict.fromkeys(groups.kinds))]  # fmt: skip
+    if len(marked):
+        marks.append(Marks(far[0], marked + 1, np.maximum(last[marked], _LEAST), "ring", "accent", size=11))
+    ticks, edges = groups.parts()
+    word, end = f"{groups.word} after {groups.word}", len(labels) + 1.0
+    x = Axis("pose" if len(groups.sizes) == 1 else f"pose, {word}", 0.0, end, ticks or round_ticks(0, end),
+             named=bool(ticks))  # fmt: skip
+    centre = "geometry" if groups.word == "observation" else "socket's centroid"
+    quantity = _QUANTITIES.get(unit, f"distance from the {centre}")
+    expected = [level(1.0)] if unit == "standard deviations" else []
+    y = logarithmic(f"{quantity} [{unit}]", *(mark.y for mark in marks), *(mark.y for mark in expected))
+    plot = Plot(x, y, (*marks, *expected, borders(edges)))
+    median, largest = (format_number(float(value)) for value in (np.median(last[known]), last[known].max()))
+    description = f"Dotted lines separate the {groups.word}s. " if len(edges) else ""
+    description += f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
+    description += " The only pose of a socket has no distance." if len(known) < len(last) else ""
+    description += f" {len(drawn)} of {len(known)} poses are drawn." if len(drawn) < len(known) else ""
+    return Chart(id, title, description, (plot,))
+
+
+def distances_in(capture: Capture, evaluation: Evaluation) -> np.ndarray:
+    """Distances of all poses from their socket's centroid or their observation's geometry, mm; NaN for the only pose of
+    a socket, which shows no scatter."""
+    distances, sizes = np.concatenate(distances_of(capture, evaluation)), Groups.of(capture).sizes
+    single = np.repeat(np.asarray(sizes) == 1, sizes) & (np.arange(len(distances)) < sum(capture.sizes))
+    return np.where(single, np.nan, distances)
+
+
+def arms_chart(capture: Capture, arms: Mapping[str, np.ndarray], most: int | None = None) -> Chart:
+    """Distances of all poses by the nominal and by the calibrated arm."""
+    what = "geometry" if capture.observations else "socket's centroid"
+    return pose_chart("stages", f"Distance of every pose from its {what}", Groups.of(capture), arms, most=most)
+
+
+def distances_by_arm(record: CalibrationRecord) -> dict[str, np.ndarray]:
+    """Distances of all poses of a calibration by the nominal and by the calibrated arm, mm."""
+    capture, evaluations = record.recording.capture, record.evaluations()
+    distances = {arm: distances_in(capture, evaluations[arm]) for arm in ("nominal", "calibrated")}
+    if not record.sockets_alone:  # with the geometry of the calibration
+        distances["calibrated"] = np.concatenate([part.distance for part in observation_residuals(record)])
+    return distances
+
+
+def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
+    """Plot the distance of each pose's tip from its socket's centroid, or from the geometry of its observation, nominal
+    and calibrated, mm (logarithmic).
+
+    Args:
+        record: The calibration.
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+
+    Example:
+        >>> axes = aj.plot.pose_distances(record)
+        >>> print(axes.get_ylabel())
+        distance from the socket's centroid [mm]
+    """
+    return draw(arms_chart(record.recording.capture, distances_by_arm(record)).plots[0], axes)
+
+
+def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
+    """Plot the residual of every pose of a calibration by kind of observation (logarithmic).
+
+    Poses that a robust loss took half of their weight from or more have a ring.
+
+    Args:
+        record: The calibration.
+        unit: ``"mm"``, ``"standard deviations"``, or ``"deg"`` for orientations.
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: If the calibration has no such residuals (orientations, for ``"deg"``).
+
+    Example:
+        >>> robust = aj.calibrate(arm, capture, bounds, robust="huber")
+        >>> axes = aj.plot.residuals_by_kind(aj.calibration.record_of(robust, recording, robust="huber"))
+        >>> print(axes.get_ylabel())
+        distance from the socket's centroid [mm]
+    """
+    if unit not in ("mm", *_QUANTITIES):
+        raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
+    chart = kinds_chart(record, unit)[0]
+    if chart is None:
+        raise InputError("the calibration has no orientations; draw its residuals in mm or in standard deviations.")
+    return draw(chart.plots[0], axes)
+
+
+def kinds_chart(
+    record: CalibrationRecord, unit: str, far: Marked | None = None, most: int | None = None
+) -> tuple[Chart | None, Marked, Groups]:
+    """Residuals of a calibration in a unit, by kind of observation; ``far`` marks poses, by default those that lost
+    weight. With the poses that are marked, and what the poses belong to; without a chart where there are no
+    orientations."""
+    parts = [part for part in enumerate(observation_residuals(record)) if unit != "deg" or part[1].angle is not None]
+    groups = Groups.of(record.recording.capture).only([i for i, _ in parts])
+    if not parts:
+        return None, ("", ()), groups
+    values = np.concatenate([_in_unit(part, unit) for _, part in parts])
+    if far is None or unit == "deg":
+        far = _LITTLE_WEIGHT, np.flatnonzero(np.concatenate([part.weight for _, part in parts]) <= 0.5)
+    id, title = {
+        "mm": ("residuals", "Residuals in mm"),
+        "deg": ("angles", "Residuals of orientations"),
+        "standard deviations": ("normalised", "Residuals in standard deviations"),
+    }[unit]
+    return pose_chart(id, title, groups, {"calibrated": values}, unit=unit, far=far, most=most), far, groups
+
+
+def _in_unit(part: ObservationResiduals, unit: str) -> np.ndarray:
+    if unit == "deg":
+        return np.asarray(part.angle) / DEG
+    return part.distance if unit == "mm" else part.normalised
+
+
+def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
+    """Write the distances of the poses; of observations also the residuals in standard deviations and those of
+    orientations; and, if the truth is known, the errors of the length parameters.
+
+    Args:
+        record: The calibration.
+        path: The file to write, whole or not at all; its name ends in ``.png``, ``.svg`` or ``.pdf``.
+
+    Raises:
+        InputError: For another format, or if the file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> aj.plot.save_calibration_figure(record, Path("calibration.svg"))
+    """
+    charts = [arms_chart(record.recording.capture, distances_by_arm(record))]
+    charts += [] if record.sockets_alone else [kinds_chart(record, "standard deviations")[0]]
+    charts.append(kinds_chart(record, "deg")[0])
+    plots = [chart.plots[0] for chart in charts if chart is not None]
+    plots += [] if record.recording.true is None else [error_plot(record)]
+    columns = len(plots) if len(plots) <= _MOST_IN_A_ROW else 2
+    save_figure(draw_all(plots, columns, (5.5, 3.9), legends=True), path)

@@ -1,0 +1,362 @@
+"""Sections of the report of a calibration, one for each subject after its stages and its scale."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord
+from ..core.units import DEG, people_read
+from ..diagnostics.pose_residuals import observation_residuals
+from ..diagnostics.tried_poses import TriedPoses, tried_poses
+from ..kinematics.arm import joint_limits, parameter_unit
+from ..model.metrics import pose_outliers
+from ..plot.charts import Chart, Marks, Plot, linear, names, thinned
+from ..plot.joint_models import functions_chart
+from ..plot.parameters import bounds_chart, change_chart
+from ..plot.patterns import pattern_charts
+from ..plot.residuals import Groups, distances_in, kinds_chart
+from ..plot.uncertainty import correlation_chart, singular_chart, tried_chart, volume_chart
+from ..summaries.cells import Cell, Columns, Table, number, table
+from ..summaries.harmonics import harmonics_by_joint, listed_apart
+from ..summaries.tables import decimals_for, encoders_in_words, factor_words, seat_in_words, two_digits, volume_rows
+from ..summaries.uncertainty_sentences import tried_sentence
+from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.identifiability import Observability
+from ..uncertainty.volume import VolumetricUncertainty
+from .arm_view import view_of_arm
+from .elements import Block, Section, with_table
+from .observations import geometry_table, weights_table
+from .tables import DRAWN, pose_table, residual_chart, socket_table, with_u_digits
+
+_INDICES = {
+    "O1": "geometric mean of the singular values (Menq, Borm)",
+    "O2": "smallest over largest (Driels, Pathre)",
+    "O3": "smallest (Nahvi)",
+    "O4": "smallest squared over largest (Nahvi, Hollerbach)",
+    "O5": "harmonic sum (Sun, Hollerbach)",
+}
+_TRAVELLED = 400  # most readings of a joint that are drawn
+_FULL_TURN = 360.0
+
+
+def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
+    """Every parameter with its expanded uncertainty; hundreds of coefficients joint by joint, and on demand."""
+    listed, harmonics = listed_apart(summary["parameters"])
+    introduction = (
+        "U is the expanded uncertainty (95 %), with the coverage factor of each parameter's own degrees of freedom. A "
+        "parameter on a bound, or one that the data determine only together with others, has none of its own."
+    )
+    by_unit = {unit: [row for row in listed if row["unit"] == unit] for unit in ("mm", "rad")}
+    functions = functions_chart(record)
+    blocks: list[Block] = [
+        introduction,
+        *(change_chart(unit, rows) for unit, rows in by_unit.items() if rows),
+        _parameter_table("Parameters", listed),
+        *([] if functions is None else [functions]),
+    ]
+    if harmonics:
+        blocks += [
+            f"The {len(harmonics)} coefficients of harmonics are not printed: they are in the table below on screen, "
+            "and in the calibration's file (aacmm export --format csv).",
+            _by_joint(harmonics),
+            _parameter_table("Coefficients of harmonics", harmonics)._replace(folded=True),
+        ]
+    return Section("parameters", "Parameters", blocks)
+
+
+def _value(row: dict[str, Any], value: float, u: float | None, *, signed: bool = False) -> Cell:
+    """A number of a parameter in the unit that people read, to two digits of an uncertainty."""
+    scale, _ = people_read(row["unit"])
+    decimals = decimals_for(None if u is None else scale * u)
+    return number(scale * value, decimals, signed=signed, rounded=u is not None)
+
+
+def _expanded(row: dict[str, Any], u: float | None) -> Cell:
+    return with_u_digits(None if u is None else people_read(row["unit"])[0] * u)
+
+
+def _parameter_table(caption: str, rows: list[Any]) -> Table:
+    def state(row: dict[str, Any]) -> Cell:
+        words = "" if row["expanded"] else "only with others"
+        if row["bound"]:
+            words = f"on the {row['bound']} bound" + (" of stage 1; U is that of k" if row["expanded"] else "")
+        return Cell(words, None, "unsure" if words else "")
+
+    def nominal(row: dict[str, Any]) -> Cell:
+        scale, _ = people_read(row["unit"])
+        u = row["expanded"]
+        return number(scale * row["nominal"], max(decimals_for(None if u is None else scale * u), 4))
+
+    columns = {
+        "parameter": "parameter",
+        "unit": lambda row: people_read(row["unit"])[1],
+        "calibrated": lambda row: _value(row, row["calibrated"], row["expanded"]),
+        "U (95 %)": lambda row: _expanded(row, row["expanded"]),
+        "change": lambda row: _value(row, row["calibrated"] - row["nominal"], row["expanded"], signed=True),
+        "nominal": nominal,
+        "": state,
+    }
+    return table(caption, rows, columns)
+
+
+def _by_joint(harmonics: list[Any]) -> Table:
+    columns = {
+        "joint": "joint",
+        "coefficients": "coefficients",
+        "orders": "orders",
+        "RMS over a revolution": lambda row: _value(row, row["rms"], row["largest"]["expanded"]),
+        "largest": lambda row: row["largest"]["parameter"],
+        "its value": lambda row: _value(row, row["largest"]["calibrated"], row["largest"]["expanded"], signed=True),
+        "its U": lambda row: _expanded(row, row["largest"]["expanded"]),
+        "unit": lambda row: people_read(row["unit"])[1],
+    }
+    return table("Harmonics of the joints", harmonics_by_joint(harmonics), columns)
+
+
+def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
+    """Residuals of the calibrated arm, pose by pose; of observations in mm, in standard deviations and of orientations,
+    with the poses that a robust loss took weight from, and the geometry."""
+    capture = record.recording.capture
+    if record.sockets_alone:
+        introduction = (
+            "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than "
+            "eight times as far as the median are marked: check how the tip was seated there."
+        )
+        blocks = [introduction, socket_table(capture, evaluation), residual_chart(capture, evaluation)]
+        return [Section("residuals", "Residuals by socket and pose", blocks)]
+    parts, groups = observation_residuals(record), Groups.of(capture)
+    introduction = (
+        "The distance of each pose's tip from the geometry of its observation, by the calibrated arm, in mm and in "
+        "standard deviations of what was measured and of the arm's own scatter together (the root mean square over the "
+        "coordinates of a pose, about 1). "
+    )
+    normalised = np.concatenate([part.normalised for part in parts])
+    far = None  # those that lost weight
+    if not summary["robust"]:
+        introduction += "Poses more than eight times as far, in standard deviations, as the median are marked."
+        far = "far from its geometry", pose_outliers(normalised, groups.sizes)[0]
+    values = {
+        "mm": np.concatenate([part.distance for part in parts]),
+        "standard deviations": normalised,
+        "deg": np.concatenate([np.asarray(part.angle) / DEG for part in parts if part.angle is not None] or [[]]),
+    }
+    blocks = [introduction, *([weights_table(summary)] if summary["robust"] else [])]
+    for unit, shown in values.items():
+        chart, marked, of = kinds_chart(record, unit, far, DRAWN)
+        if chart is not None:
+            blocks.append(with_table(chart, pose_table(of, shown, unit, None if unit == "deg" else marked)))
+    introduction = (
+        "The geometry that was unknown, as determined with the parameters: positions and frames in the base frame, "
+        "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on "
+        "an indexed platform in the platform's frame."
+    )
+    return [
+        Section("residuals", "Residuals by observation and pose", blocks),
+        Section("geometry", "Geometry found", [introduction, geometry_table(summary)]),
+    ]
+
+
+def patterns(record: CalibrationRecord) -> list[Section]:
+    """Residuals with their sign."""
+    charts = pattern_charts(record)
+    introduction = (
+        "Residuals that scatter evenly about zero are noise; what the model lacks shows as a pattern. The band is the "
+        "mean of neighbouring poses with twice its standard error: where it leaves zero, the residuals follow what is "
+        "drawn along the axis."
+    )
+    return [Section("patterns", "Patterns in the residuals", [introduction, *charts])] if charts else []
+
+
+def arm_in_poses(record: CalibrationRecord, evaluation: Evaluation) -> Section:
+    """The calibrated arm in its poses."""
+    arm, capture = record.calibrated.arm, record.recording.capture
+    if record.sockets_alone:
+        return Section("arm", "The arm in its poses", [view_of_arm(arm, capture, distances_in(capture, evaluation))])
+    distances = np.concatenate([part.distance for part in observation_residuals(record)])
+    return Section("arm", "The arm in its poses", [view_of_arm(arm, capture, distances, record.observed.geometry)])
+
+
+def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
+    """Expanded uncertainty of tips and lengths over the working volume."""
+    statistics = summary["uncertainty"]["volume"]
+    ends = zip("xyz", volume.start.min(axis=0), volume.start.max(axis=0), strict=True)
+    box = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends).replace("-", "−")
+    introduction = (
+        f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
+        f"expanded to 95 % ({factor_words(statistics)})."
+    )
+    which = ("median", "95th percentile", "largest")
+    columns: Columns = {"": lambda row: row[0]}
+    columns |= {words: lambda row, i=i: with_u_digits(row[1][i]) for i, words in enumerate(which)}
+    caption = "Expanded uncertainty over the working volume [mm]"
+    u = {
+        "U of the tip [mm]": volume.expanded_tip,
+        f"U of a {volume.length:g} mm length [mm]": volume.expanded_length,
+        "with readings [mm]": volume.expanded_length_reading,
+    }
+    positions: Columns = {
+        f"{axis} [mm]": lambda i, k=k: number(float(volume.start[i, k]), 0) for k, axis in enumerate("xyz")
+    }
+    positions |= {name: lambda i, values=values: with_u_digits(float(values[i])) for name, values in u.items()}
+    every = table("All positions", range(len(volume.start)), positions)
+    chart = with_table(volume_chart(volume), every)
+    blocks = [introduction, table(caption, volume_rows(statistics), columns), chart, _noise_sentence(summary)]
+    return Section("volume", "Uncertainty over the working volume", blocks)
+
+
+def _noise_sentence(summary: dict[str, Any]) -> str:
+    uncertainty = summary["uncertainty"]
+    seating = 1e3 * uncertainty["seating_mm"]
+    noise = f"{encoders_in_words(uncertainty)}, {seat_in_words(summary)} {seating:.3g} µm"
+    basis = "All uncertainties are based on"
+    joints = ", ".join(str(row["joint"]) for row in uncertainty.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}, whose noise was estimated" if joints else ""
+    return {
+        "given": f"{basis} the given noise{replaced}: {noise}. Residuals are {uncertainty['misfit'] or 0:.2f} times "
+        "its prediction.",
+        "estimated": f"{basis} the noise estimated from the residuals: {noise}.",
+        "common": f"{basis} one variance for all poses: {seating:.3g} µm in each coordinate.",
+        "robust": "Each pose's own residual is taken as its error (robust covariance).",
+    }[uncertainty["form"]]
+
+
+def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[Section]:
+    """How much of the working volume and of the travel of the joints the poses of the calibration cover."""
+    readings, arm = np.asarray(record.recording.capture.readings), record.calibrated.arm
+    if len(readings) < 2:
+        return []
+    poses = tried_poses(arm, readings, volume.q)
+    summary = {"poses": len(poses.distance), "tried": int(poses.tried.sum()), "spacing_rad": poses.spacing}
+    chart = tried_chart(volume, np.asarray(arm.position(readings)), poses)
+    blocks = [tried_sentence(summary) + _u_within(volume, poses), chart, _travel(record, readings)]
+    return [Section("tried", "Coverage of the working volume", blocks)]
+
+
+def _u_within(volume: VolumetricUncertainty, poses: TriedPoses) -> str:
+    medians = [float(np.median(volume.expanded_tip[part])) for part in (poses.tried, ~poses.tried) if np.any(part)]
+    if len(medians) < 2 or not all(map(math.isfinite, medians)):
+        return ""
+    near, far = map(two_digits, medians)
+    return f" The median U of a tip is {near} mm where it was tried and {far} mm elsewhere."
+
+
+def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
+    """The readings of each joint within its limits."""
+    arm = record.calibrated.arm
+    slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
+    units = np.where(slides, 1.0, DEG)
+    limits, shown = np.asarray(joint_limits(arm, None)) / units[:, None], readings[:, : arm.joints] / units
+    low, high, x = shown.min(axis=0), shown.max(axis=0), np.arange(arm.joints)
+    columns = {"joint": lambda i: i + 1, "unit": lambda i: "mm" if slides[i] else "deg"} | {
+        heading: lambda i, values=values: number(float(values[i]), 1)
+        for heading, values in {
+            "lowest limit": limits[:, 0], "highest limit": limits[:, 1], "lowest reading": low, "highest reading": high
+        }.items()
+    } | {"travel tried [%]": lambda i: number(100 * _share(shown[:, i], limits[i], slides[i]), 0)}  # fmt: skip
+    drawn = shown[thinned(len(shown), _TRAVELLED)]
+    marks = (
+        Marks("travel", x, limits.mean(axis=1), "bars", "soft", low=limits[:, 0], high=limits[:, 1], size=14),
+        Marks("readings of the calibration", np.repeat(x, len(drawn)), drawn.T.ravel(), "square", size=3),
+    )
+    axis = linear("reading [deg]" + (" or [mm]" if any(slides) else ""), limits, shown)
+    plot = Plot(names("", [f"joint {i + 1}" for i in x]), axis, marks, height=260)
+    description = "The travel of each joint within its limits, and the readings of the calibration in it."
+    by_joint = table("Travel by joint", x.tolist(), columns)
+    return Chart("travel", "Travel of the joints", description, (plot,), by_joint)
+
+
+def _share(readings: np.ndarray, limits: np.ndarray, slides: bool) -> float:
+    """The part of a joint's travel, in twentieths, that has readings; the full turn of a joint without limits."""
+    low, high = limits if slides else (limits[0], min(limits[1], limits[0] + _FULL_TURN))
+    around = readings if slides else (readings - low) % _FULL_TURN + low
+    counts, _ = np.histogram(around, 20, (low, high))
+    return float(np.mean(counts > 0))
+
+
+def monte_carlo(record: CalibrationRecord) -> list[Section]:
+    """The Monte Carlo evaluation after JCGM 101, if it was run."""
+    sampled = record.sampled
+    if sampled is None:
+        return []
+    keys = {"value": "estimate", "u by Monte Carlo": "u", "u by propagation": "linear_u", "from": "low", "to": "high"}
+    columns: Columns = {"quantity": lambda i: str(sampled["quantity"][i])}
+    columns |= {name: lambda i, values=sampled[key]: number(float(values[i]), 6) for name, key in keys.items()}
+    agrees = sampled["agrees"]
+    columns["agree"] = lambda i: "yes" if agrees[i] else Cell("no", None, "unsure")
+    caption = "Quantities, in mm and rad; 95 % coverage intervals"
+    quantities = table(caption, range(len(sampled["quantity"])), columns)
+    return [Section("monte-carlo", "Monte Carlo (JCGM 101)", [record.sampled_says or "", quantities])]
+
+
+def correlations(uncertainty: Uncertainty) -> Section:
+    """Correlations of the parameters."""
+    columns = {
+        "parameter": lambda pair: pair[0],
+        "with": lambda pair: pair[1],
+        "correlation": lambda pair: number(pair[2], 3, signed=True),
+    }
+    pairs = table("Pairs correlated by 0.5 or more", uncertainty.correlated(0.5), columns)
+    return Section("correlations", "Correlations", [with_table(correlation_chart(uncertainty), pairs)])
+
+
+def observability(observability: Observability) -> Section:
+    """What the data determine, and how strongly."""
+    count, rank = len(observability.names), observability.rank
+    determined = f"These data determine all {count} parameters."
+    if rank < count:
+        determined = (
+            f"These data determine {rank} directions of the {count} parameters; with their priors, all are determined."
+        )
+    rows = [
+        ("rank", f"{rank} of {count}", "number of directions that are determined"),
+        ("condition", f"{observability.condition:.3g}", "of what is determined, columns scaled"),
+        *((name, f"{x:.3g}", f"{_INDICES[name]}; larger is better") for name, x in observability.indices.items()),
+    ]
+    metrics = table(
+        "Metrics", rows, {"": lambda row: row[0], "value": lambda row: row[1], "meaning": lambda row: row[2]}
+    )
+    singular = observability.singular.tolist()
+    columns = {"number": lambda i: i + 1, "value": lambda i: number(singular[i], 6)}
+    chart = with_table(singular_chart(observability), table("Singular values", range(len(singular)), columns))
+    sentences = " ".join(observability.sentences() or [determined])
+    return Section("observability", "Observability", [sentences, metrics, chart])
+
+
+def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
+    """Which bounds are active, and the position of each parameter within its bounds."""
+    vector, lower, upper = record.vectors()["calibrated"], np.asarray(record.lower), np.asarray(record.upper)
+    active, stage1 = summary["active"], summary["active_stage1"]
+    on_bound = sorted({*active, *stage1})
+    listed, harmonics = listed_apart(summary["parameters"])
+    shown = [*(row["parameter"] for row in listed), *(r["parameter"] for r in harmonics if r["parameter"] in on_bound)]
+    index = [record.names.index(name) for name in shown]
+
+    def in_unit(values: np.ndarray) -> Any:
+        arm = record.recording.nominal.arm
+        return lambda i: number(people_read(parameter_unit(arm, record.names[i]))[0] * float(values[i]))
+
+    def state(i: int) -> Cell:
+        name = record.names[i]
+        side = active.get(name) or stage1.get(name)
+        words = f"on the {side} bound" + ("" if name in active else " in stage 1") if side else ""
+        return Cell(words, None, "unsure" if side else "")
+
+    columns = {
+        "parameter": lambda i: record.names[i],
+        "unit": lambda i: people_read(parameter_unit(record.recording.nominal.arm, record.names[i]))[1],
+        "lower": in_unit(lower),
+        "calibrated": in_unit(vector),
+        "upper": in_unit(upper),
+        "": state,
+    }
+    introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
+    if record.final_method == "two-stage":
+        introduction += " Bounds are those of stage 1; the scale fix comes after it."
+    width = upper - lower
+    with np.errstate(invalid="ignore", divide="ignore"):
+        within = np.where(np.isfinite(width) & (width > 0), 2 * (vector - lower) / width - 1, math.nan)[index]
+    on = np.array([name in on_bound for name in shown])
+    chart = bounds_chart(shown, within, on, len(record.names) - len(shown))
+    return Section("bounds", "Bounds", [introduction, with_table(chart, table("Bounds", index, columns))])

@@ -1,0 +1,87 @@
+"""Commanded and measured readings in one table: found by their names, and compared by calibrating from both."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+import aacmm_jax as aj
+from aacmm_jax.files.reading_checks import ReadingSet, compare_reading_sets, reading_sets, reading_sets_sentence
+from tests.conftest import EXAMPLES
+
+
+def numbered(*patterns: str, first: int = 1) -> list[str]:
+    return [pattern.format(i) for pattern in patterns for i in range(first, first + 3)]
+
+
+@pytest.mark.parametrize(
+    ("header", "commanded", "measured"),
+    [
+        (numbered("q_cmd_{}", "q_{}"), 0, 3),
+        (numbered("target_q_{}", "actual_q_{}", "actual_qd_{}", "actual_current_{}", first=0), 0, 3),
+        (["time", *numbered("q{}_meas [rad]", "q{}_des [rad]")], 4, 1),
+        (numbered("A{}_ist", "A{}_soll"), 3, 0),
+        (numbered("qMeas{}", "qCmd{}"), 3, 0),
+        (numbered("J{} [deg]", "J{} actual [deg]"), 0, 3),
+        (numbered("q_{}", "qd_{}"), None, None),
+        ([*numbered("q_cmd_{}"), "q_1", "q_2"], None, None),
+        (numbered("q_{}"), None, None),
+        ([], None, None),
+    ],
+)
+def test_roles_by_name(header, commanded, measured):
+    found = reading_sets(header, 3)
+    if commanded is None:
+        assert not found
+    else:
+        assert found == {
+            "commanded": list(range(commanded, commanded + 3)), "measured": list(range(measured, measured + 3)),
+        }  # fmt: skip
+
+
+@pytest.fixture
+def both(tmp_path):
+    """A robot with a tracker; commanded readings differ from the measured ones by 0.03 deg."""
+    source = EXAMPLES / "simulated_robot"
+    lines = (source / "tracker.csv").read_text().splitlines()
+    table = np.array([line.split(",") for line in lines[1:]], dtype=float)
+    commanded = table[:, :6] + np.random.default_rng(0).normal(0, 0.03, (len(table), 6))
+    header = [*(f"q_cmd_{i} [deg]" for i in range(1, 7)), *(f"q_{i} [deg]" for i in range(1, 7))]
+    header += lines[0].split(",")[6:]
+    np.savetxt(tmp_path / "t.csv", np.hstack([commanded, table]), delimiter=",", header=",".join(header), comments="")
+    shutil.copy(source / "robot.urdf", tmp_path)
+    return tmp_path
+
+
+def manifest(folder, pattern):
+    path = folder / "m.toml"
+    path.write_text(
+        'arm = "robot.urdf"\ntip = "tool0"\n[[points]]\nfile = "t.csv"\ntarget = "ball"\nu = 0.02\n'
+        f'columns = {{ q = "{pattern}", points = ["x", "y", "z"] }}\n'
+    )
+    return path
+
+
+@pytest.mark.slow
+def test_the_better_ones_are_named_with_both_figures(both):
+    path = manifest(both, "q_cmd_*")
+    recording = aj.files.read_manifest(path)
+    commanded, measured = compare_reading_sets(path, recording)
+    assert (commanded.role, commanded.taken, measured.role, measured.taken) == ("commanded", True, "measured", False)
+    assert measured.rms == pytest.approx(0.045, abs=0.002)
+    assert commanded.rms > 0.3
+    said = reading_sets_sentence((commanded, measured), 80)
+    assert f"the measured ones leave 0.045 mm RMS after a calibration, the commanded ones {commanded.rms:.3g}" in said
+    (line,) = measured.lines
+    assert line == 'columns = {q = "q_[0-9]*", points = ["x", "y", "z"]} in [[points]]'
+    manifest(both, "q_[0-9]*")  # as the line says
+    again = compare_reading_sets(path, aj.files.read_manifest(path))
+    assert [one.taken for one in again] == [False, True]
+    assert "the manifest takes the better" in reading_sets_sentence(again, 80)
+    assert not compare_reading_sets(EXAMPLES / "simulated_robot" / "tracker.toml", recording)  # whose table has one set
+
+
+def test_alike_is_said():
+    sets = [ReadingSet("commanded", ("a",), 0.31, True), ReadingSet("measured", ("b",), 0.30, False)]
+    assert "which fit alike" in reading_sets_sentence(sets, 80)
+    assert reading_sets_sentence([sets[0], sets[1]._replace(rms=None)], 80) == ""
