@@ -18,9 +18,8 @@ from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
 from ..uncertainty.target_parameters import determined_parameters
 from .arm_tables import ArmFile, NoiseTable
-from .atomic_write import storable, write_text
 from .corrections import corrections_toml
-from .outputs import as_path
+from .outputs import as_path, storable, write_text
 from .priors import prior_toml
 from .toml import read_toml
 from .ur_kinematics import read_ur_kinematics

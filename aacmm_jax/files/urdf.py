@@ -29,8 +29,8 @@ from ..kinematics.axes_to_dh import (
 )
 from ..kinematics.chain import JointKinds
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single, with_tool
-from .atomic_write import write_text
 from .inputs import InputFile
+from .outputs import write_text
 from .urdf_text import Robot, UrdfJoint, edited, parse_urdf
 
 _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readings of -pi to pi and of 0 to 2 pi
