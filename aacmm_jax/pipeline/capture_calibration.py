@@ -185,8 +185,8 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
     Example:
         >>> drawn = [aj.simulate(true, {"A": (400, 200, 300)}, poses=5, seed=seed) for seed in (1, 2)]
         >>> monday, friday = (aj.Recording(part, nominal) for part in drawn)
-        >>> print(aj.pipeline.join_recordings({"monday": monday, "friday": friday}).capture.names)
-        ('monday/A', 'friday/A')
+        >>> print(aj.pipeline.join_recordings({"monday": monday, "friday": friday}).capture.sessions)
+        ('monday', 'friday')
     """
     first, *rest = recordings.values()
     if not rest:
