@@ -110,7 +110,7 @@ def arm(
 
 def _template(path: Path, joints: int, as_json: bool) -> None:
     from ..files.arm_tables import arm_template
-    from ..files.atomic_write import write_text
+    from ..files.outputs import write_text
 
     with together(path):
         if os.path.lexists(path):

@@ -7,9 +7,8 @@ import typer
 
 from ..core.errors import InputError
 from ..core.units import people_read, people_read_change
-from ..files.atomic_write import write_text
 from ..files.hdf5 import read_tables
-from ..files.outputs import together
+from ..files.outputs import together, write_text
 from ..summaries.harmonics import listed_apart
 from ..summaries.tables import Styled, Table, decimals_for, limits_of, warnings_of, written_of
 from .app import JSON, app, argument, examples, option, show_summary, with_spinner

@@ -85,9 +85,9 @@ def correct(
     reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
     """
     from ..core.numpy_or_jax import to_numpy
-    from ..files.atomic_write import write_text
     from ..files.calibrations import load_calibration
     from ..files.commanded_poses import corrected_csv, read_commanded_poses
+    from ..files.outputs import write_text
     from ..kinematics.correction import corrected_readings, readings_at_poses
     from ..summaries.correction import correction_summary
 

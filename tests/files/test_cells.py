@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.files import load_cell
-from aacmm_jax.files.urdf_shapes import bounding_capsule, mesh_path
+from aacmm_jax.files.cells import bounding_capsule, mesh_path
 from aacmm_jax.kinematics import Box, HalfSpace, Post, clearances
 from aacmm_jax.kinematics.body import capsule_ends, frames_at
 from tests.example_counts import example_count
