@@ -71,8 +71,8 @@ class Noise(eqx.Module):
 
     def of_columns(self, kinds: JointKinds | None, joints: int, columns: int) -> Float[np.ndarray, " columns"]:
         """Standard deviations of all columns of readings, rad and mm; 0 for that of a thermometer."""
-        each = np.broadcast_to(np.asarray(self.of_readings(kinds)), (joints,))
-        return np.concatenate([each, np.zeros(columns - joints)])
+        of_joints = np.broadcast_to(np.asarray(self.of_readings(kinds)), (joints,))
+        return np.concatenate([of_joints, np.zeros(columns - joints)])
 
     def check(self, joints: int) -> None:
         """Check that this noise can weight the poses of an arm.
@@ -125,9 +125,9 @@ def at_tip(noise: Noise, arm: Arm, distance: float) -> tuple[float, float, float
     Standard deviations, each the root mean square of its joints; 0 without such joints.
     """
     kinds = arm.geometry.kinds
-    each = np.broadcast_to(np.asarray(noise.of_readings(kinds)), (arm.joints,))
+    u = np.broadcast_to(np.asarray(noise.of_readings(kinds)), (arm.joints,))
     linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()
-    turning, sliding = (float(np.sqrt(np.mean(x**2))) if len(x) else 0.0 for x in (each[~linear], each[linear]))
+    turning, sliding = (float(np.sqrt(np.mean(x**2))) if len(x) else 0.0 for x in (u[~linear], u[linear]))
     return turning * distance, sliding, float(noise.seating)
 
 
@@ -135,8 +135,8 @@ def linear_encoder_mm(noise: Noise, arm: Arm) -> float | list[float] | None:
     """Standard deviation of the readings of an arm's prismatic joints, mm, one or one each; None without any."""
     if not arm.prismatic:
         return None
-    each = np.asarray(noise.of_readings(arm.geometry.kinds))[np.array(arm.prismatic) - 1].tolist()
-    return each[0] if len(set(each)) == 1 else each
+    of_slides = np.asarray(noise.of_readings(arm.geometry.kinds))[np.array(arm.prismatic) - 1].tolist()
+    return of_slides[0] if len(set(of_slides)) == 1 else of_slides
 
 
 def one_arcsec(kinds: JointKinds | None) -> Float[np.ndarray, "..."]:
@@ -158,6 +158,6 @@ def encoder_covariances(
     """J_q S J_q^T of every pose, mm^2, for readings of standard deviation ``encoder``, scalar or ``(n,)``."""
     columns = reading_columns(forward_pass(geometry, motion))
     xp = namespace(columns, encoder)
-    each = xp.broadcast_to(encoder, (columns.shape[0],))
-    columns = columns * each.reshape(-1, *(1,) * (columns.ndim - 1))
+    deviations = xp.broadcast_to(encoder, (columns.shape[0],))
+    columns = columns * deviations.reshape(-1, *(1,) * (columns.ndim - 1))
     return xp.sum(columns[..., :, None, :] * columns[..., None, :, :], axis=0)

@@ -293,8 +293,8 @@ OTHER_KINDS: list[type[Declared]] = []  # observations and what simulates them, 
 
 def kinds() -> dict[str, type[AbstractObservation]]:
     """Every kind of observations by its name: those of the files of this folder, and others."""
-    found = {one.__name__: one for one in classes() if issubclass(one, AbstractObservation)}
-    return {found[name].kind: found[name] for name in sorted(found)}
+    by_class = {one.__name__: one for one in classes() if issubclass(one, AbstractObservation)}
+    return {by_class[name].kind: by_class[name] for name in sorted(by_class)}
 
 
 def classes() -> list[type[Declared]]:
