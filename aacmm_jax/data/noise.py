@@ -1,10 +1,13 @@
 """The noise of a measurement: errors of the encoders, and of the tip in its seat."""
 
+from typing import Annotated
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arrays import Numbers, as_floats, is_concrete
+from ..core.arguments import NOT_EMPTY, Range, checked
+from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
@@ -13,6 +16,10 @@ from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass
 from ..kinematics.jacobian import reading_columns
 
 _MOST = {"encoder_arcsec": 36_000.0, "linear_encoder": 100.0, "seating": 100.0}  # ten degrees; mm
+
+
+_ONE = Annotated[Float[AnyArray, ""], Range(least=0)]
+_ONE_OR_EACH = Annotated[Float[AnyArray, ""] | Float[AnyArray, " joints"], NOT_EMPTY, Range(least=0)]
 
 
 class Noise(eqx.Module):
@@ -38,17 +45,11 @@ class Noise(eqx.Module):
     linear_encoder: Float[AnyArray, "..."] | None  # mm; None: ``encoder`` at 1 m
 
     def __init__(self, *, encoder_arcsec: Numbers = 0.0, seating: Numbers = 0.0, linear_encoder: Numbers | None = None):
-        self.encoder = to_jax(to_numpy(as_floats(encoder_arcsec, "encoder_arcsec")) * ARCSEC)
-        self.seating = as_floats(seating, "seating")
-        self.linear_encoder = None if linear_encoder is None else as_floats(linear_encoder, "linear_encoder")
-        for what, values in self._given(self.encoder):
-            if values.ndim > (what != "seating"):
-                allowed = "one number" if what == "seating" else "one number, or one a joint"
-                raise InputError(f"{what} has shape {values.shape}; give {allowed}.")
-            if values.size == 0:
-                raise InputError(f"{what} is empty; give one number, or one a joint.")
-            if is_concrete(values) and np.any(np.asarray(values) < 0):
-                raise InputError(f"{what} must be a standard deviation: zero or positive.")
+        arcsec = checked(encoder_arcsec, _ONE_OR_EACH, "encoder_arcsec")
+        self.encoder = to_jax(to_numpy(arcsec) * ARCSEC)
+        self.seating = checked(seating, _ONE, "seating")
+        linear = None if linear_encoder is None else checked(linear_encoder, _ONE_OR_EACH, "linear_encoder")
+        self.linear_encoder = linear
 
     @property
     @numpy_if_known
