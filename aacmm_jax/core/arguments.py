@@ -193,7 +193,10 @@ def checked(value: Any, annotation: Any, what: str, sizes: Sizes | None = None) 
 
     ``sizes`` holds the sizes of dimensions by name; those that this value determines are added.
     """
-    check = _check_of(annotation)
+    try:
+        check = _known_check(annotation)
+    except TypeError:  # a rule that has no hash, such as names in a list
+        check = _check_of(annotation)
     return value if check is None else check(value, what, {} if sizes is None else sizes)
 
 
@@ -221,6 +224,11 @@ def _field_checks(kind: type) -> dict[str, Check]:
         annotations = kind.__annotations__
     checks = {name: _check_of(annotation) for name, annotation in annotations.items()}
     return {name: check for name, check in checks.items() if check is not None}
+
+
+@cache
+def _known_check(annotation: Any) -> Check | None:
+    return _check_of(annotation)
 
 
 def _check_of(annotation: Any) -> Check | None:
