@@ -104,9 +104,9 @@ def deviation_of(cell: Mapping[str, Any], arm: Arm, name: str) -> tuple[Any, flo
 
 def check_deviations(given: Iterable[str], arm: Arm, names: Iterable[str]) -> None:
     """Raise `InputError` for a deviation of coefficients that no arm of the study has."""
-    known = {_coefficient(arm, name)[0] for name in names if name in correction_names(arm)}
+    present = {_coefficient(arm, name)[0] for name in names if name in correction_names(arm)}
     for kind, _, key, _ in _COEFFICIENTS:
-        if key in given and key not in known:
+        if key in given and key not in present:
             raise InputError(
                 f"deviation.{key} is of coefficients that no arm of this study has; name them in deviation.model, such "
                 f"as model = '{kind}'."
@@ -115,8 +115,7 @@ def check_deviations(given: Iterable[str], arm: Arm, names: Iterable[str]) -> No
 
 def _coefficient(arm: Arm, name: str) -> tuple[str, float]:
     unit = parameter_unit(arm, name)
-    found = (row[2:] for row in _COEFFICIENTS if is_of_group(row[0], name) and row[1] == unit)
-    return next(found, ("", 1.0))
+    return next((row[2:] for row in _COEFFICIENTS if is_of_group(row[0], name) and row[1] == unit), ("", 1.0))
 
 
 def _modelled(nominal: ArmSpecification, model: str | tuple[str, ...]) -> Arm:
