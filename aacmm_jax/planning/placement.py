@@ -209,7 +209,7 @@ def check_region(ranges: Ranges) -> None:
     for axis, (low, high) in ranges.items():
         if not low < high:
             raise InputError(
-                f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
+                f"the region's {axis} is {low:g} to {high:g} mm, which is not a range; give the lower number first."
             )
     unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
     if unknown:

@@ -97,12 +97,14 @@ def _trial(
 def _taken(
     recorded: _Recorded, true: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "M n"], list[Float[np.ndarray, "r m"]]]:
-    """Configurations in which the true arm owes as little as it can, and the residuals that are left."""
+    """Configurations in which the true arm has the least residuals that it can have, and these."""
     observed, z = recorded.truth.observed, np.concatenate([true, recorded.geometry])
     q, units = np.asarray(observed.q).copy(), reading_units(recorded.space.base.geometry)
     for number in range(_ROUNDS + 1):
         now = observed.moved(recorded.space.base, q)
-        left = [np.asarray(one) for one in now.by_observation([r.values for r in rows_at(recorded.space, now, z).rows])]
+        left = [
+            np.asarray(rows) for rows in now.by_observation([r.values for r in rows_at(recorded.space, now, z).rows])
+        ]
         if number == _ROUNDS:
             break
         for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):

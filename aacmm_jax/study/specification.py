@@ -61,7 +61,7 @@ Ends = Annotated[tuple[Point, Point], Field(strict=False)]
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     if not pair[0] < pair[1]:
-        raise ValueError(f"{pair[0]:g} to {pair[1]:g} is no range; give the lower number first.")
+        raise ValueError(f"{pair[0]:g} to {pair[1]:g} is not a range; give the lower number first.")
     return pair
 
 

@@ -292,7 +292,7 @@ REFUSED = {
         "in the same position",
     ),
     "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; give a part of the reach"),
-    "no range": ({"region": {"z": (10.0, 0.0)}}, "which is no range"),
+    "no range": ({"region": {"z": (10.0, 0.0)}}, "which is not a range"),
     "under the table": ({"above": 2000.0}, "can be reached well"),
     "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "determine the parameters.*the scale"),
     "unknown end": (
