@@ -114,8 +114,7 @@ def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
         {
             "it holds no models": not models,
             "a model is named twice": len(set(names)) != len(names),
-            "the recommended model is not one of its models": not {summary["best"], summary["recommended"]}
-            <= set(names),
+            "the recommended model is not one of its models": not chosen <= set(names),
             "a model lacks a region": uneven,
             "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
             "a number is larger than any can be": any(abs(value) > _LARGEST for value in numbers if value is not None),

@@ -102,9 +102,8 @@ def _taken(
     q, units = np.asarray(observed.q).copy(), reading_units(recorded.space.base.geometry)
     for number in range(_ROUNDS + 1):
         now = observed.moved(recorded.space.base, q)
-        left = [
-            np.asarray(rows) for rows in now.by_observation([r.values for r in rows_at(recorded.space, now, z).rows])
-        ]
+        values = [rows.values for rows in rows_at(recorded.space, now, z).rows]
+        left = [np.asarray(rows) for rows in now.by_observation(values)]
         if number == _ROUNDS:
             break
         for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):
