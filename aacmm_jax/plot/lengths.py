@@ -9,7 +9,7 @@ from ..acceptance.results import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..summaries.tables import format_number
-from .charts import Axis, Chart, Marks, Plot, borders, level, linear, names
+from .charts import Axis, Chart, Marks, Plot, borders, level, linear, names, ordinates, runs
 from .figures import draw
 
 _NAMED = 16  # most lengths or placements along an axis
@@ -34,13 +34,9 @@ def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, Axis, 
     x[order] = np.arange(len(keys))
     alone = len(length_number) == len(place_number)  # each length in a placement of its own
     for words, plural in ((placements if alone else lengths, "length"), (placements, "placement")):
-        sorted_words = [words[i] for i in order]
-        last = [i for i, word in enumerate(sorted_words) if i + 1 == len(order) or sorted_words[i + 1] != word]
-        if len(last) <= _NAMED:
-            edges = np.array([-1, *last]) + 0.5
-            middles = (edges[:-1] + edges[1:]) / 2
-            ticks = tuple((float(at), sorted_words[i]) for at, i in zip(middles, last, strict=True))
-            return x, Axis(plural, -0.6, len(x) - 0.4, ticks, named=True), edges[1:-1]
+        ticks, edges = runs([words[i] for i in order])
+        if len(ticks) <= _NAMED:
+            return x, Axis(plural, -0.6, len(x) - 0.4, ticks, named=True), edges
     title = f"{len(length_number)} lengths in {len(place_number)} placements, one after the other"
     return x, Axis(title, -0.6, len(x) - 0.4, named=True), np.zeros(0)
 
@@ -59,7 +55,7 @@ def length_chart(between: Sequence[tuple[str, str]], errors: Mapping[str, np.nda
     name = f"{last}, with U (95 %)" if np.any(np.isfinite(expanded)) else last
     low, high = error - expanded, error + expanded
     marks.append(Marks(name, x, error, "square", "main", words, low, high, size=7))
-    y = linear(_TITLE, *errors.values(), low, high, [0.0])
+    y = linear(_TITLE, *ordinates(marks), [0.0])
     description = "Measured minus calibrated value" + (", before and after the scale fix." if earlier else ".")
     plot = Plot(axis, y, (*marks, borders(edges), level(0.0)))
     return Chart("lengths", "Errors of the reference lengths", description, (plot,))
@@ -86,7 +82,7 @@ def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
     limited, order = bool(np.any(np.isfinite(limits))), np.argsort(x)
     if limited:
         marks += [Marks("MPE", x[order], side * limits[order], "dashed", "ink") for side in (1, -1)]
-    y = linear(_TITLE, low, high, limits, -limits, [0.0])
+    y = linear(_TITLE, *ordinates(marks), [0.0])
     description = "Errors of the reference lengths, reading by reading, by the calibrated arm"
     plot = Plot(axis, y, (*marks, borders(edges), level(0.0)))
     return Chart(

@@ -23,7 +23,7 @@ from ..diagnostics.pose_residuals import (
 )
 from ..kinematics.arm import by_joint
 from ..summaries.tables import format_number
-from .charts import SERIES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, round_ticks, thinned
+from .charts import SERIES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, round_ticks, runs, thinned
 from .figures import draw, draw_all, save_figure
 from .parameters import error_plot
 
@@ -34,7 +34,6 @@ _MOST_IN_A_ROW = 3  # panels of a figure
 _QUANTITIES = {"standard deviations": "residual", "deg": "angle between orientations"}
 Marked = tuple[str, Sequence[int] | np.ndarray]  # why poses are marked, and their indices
 _LITTLE_WEIGHT = "half of its weight or less"
-
 _DRAWN = 400  # most poses in one plot of a pattern in a page
 _FEWEST = 12  # poses: fewer show no pattern
 _BINS = (4, 12)  # least and most of them; a band needs some 15 poses in each
@@ -77,15 +76,12 @@ class Groups(NamedTuple):
     def parts(self) -> tuple[tuple[tuple[float, str], ...], np.ndarray]:
         """Names at the middle of each group, or of those that share a folder ("monday/"), and the borders between them;
         without names where even these are too many."""
-        ends = np.cumsum(self.sizes)
         for depth in range(max(name.count("/") for name in self.names), -1, -1):
             names = ["/".join(name.split("/")[: depth + 1]) for name in self.names]
-            last = [i for i in range(len(names)) if i + 1 == len(names) or names[i] != names[i + 1]]
-            if 1 < len(last) <= _NAMED:
-                edges = np.array([0, *ends[last]]) + 0.5
-                middle = (edges[:-1] + edges[1:]) / 2
-                return tuple((float(x), names[i]) for x, i in zip(middle, last, strict=True)), edges[1:-1]
-        return (), ends[:-1] + 0.5 if len(ends) <= _SEPARATED else np.zeros(0)
+            ticks, edges = runs(np.repeat(names, self.sizes).tolist(), 1.0)
+            if 1 < len(ticks) <= _NAMED:
+                return ticks, edges
+        return (), np.cumsum(self.sizes)[:-1] + 0.5 if len(self.sizes) <= _SEPARATED else np.zeros(0)
 
 
 def pose_chart(
