@@ -12,8 +12,9 @@ from typing import Any
 
 from ..core.errors import InputError
 from ..files.outputs import together
-from . import INTERRUPTED, INTERRUPTED_SENTENCE
-from .app import JSON, Stopped, app, argument, examples, flag, option, output, show_summary, with_spinner
+from . import INTERRUPTED, INTERRUPTED_SENTENCE, options
+from .app import Stopped, app, examples, show_summary, with_spinner
+from .options import argument, flag, option, output
 
 
 @app.command(
@@ -45,7 +46,7 @@ def study(
     keep_parts: bool = flag(
         "--keep-parts", "Leave the workers' files in their folder at the end: for results too large to copy."
     ),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Run a Monte Carlo study of simulated calibrations.
 
