@@ -26,8 +26,8 @@ from .core import units as units
 from .core.errors import IdentifiabilityWarning as IdentifiabilityWarning
 from .core.errors import InputError as InputError
 from .data.capture import Capture as Capture
-from .data.capture import join_sessions as join_sessions
-from .data.capture import stack_captures as stack_captures
+from .data.joined_captures import join_sessions as join_sessions
+from .data.joined_captures import stack_captures as stack_captures
 from .data.noise import Noise as Noise
 from .data.recording import Recording as Recording
 from .data.reference_length import ReferenceLength as ReferenceLength

@@ -24,5 +24,5 @@ def write_study(path: Path, study: "aj.study.Study") -> None:
         results["k"] = results["scale"] = 1 + 1e-5 * random.normal(size=shapes["k"])
         results["true"] = nominal + 0.1 * steps * random.normal(size=shapes["true"])
         results["estimate"] = results["true"] + 0.001 * steps * random.normal(size=shapes["true"])
-        store.write_part(path, block, store.pack(results, layout), layout)
+        store.write_part(path, block, results, layout)
     store.finish(path, study, layout, chunk)

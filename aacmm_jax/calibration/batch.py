@@ -1,19 +1,22 @@
 """Thousands of calibrations at once (`identify_many`, `calibrate_many`), which every Monte Carlo study uses.
 
-The batch is cut into chunks, which are distributed over devices and cores; `batch_kernel` solves a chunk.
+The batch is cut into chunks, which threads compute on the machine's cores or devices; `batch_kernel` solves a chunk.
 """
 
+import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments, with_options
+from ..core.arguments import check_finite, checked_arguments, items_of, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_jax, to_numpy
@@ -26,18 +29,25 @@ from ..model.loss_names import LossName
 from ..model.observed import Observed
 from ..model.robust import Loss, check_loss
 from ..solver.reason import numbers_of, reasons
-from .batch_kernel import Form, Problems, pick, solve_chunk, without_lengths
-from .checks import check_enough, check_method, check_noise_model
-from .chunks import cut_into_chunks, default_workers, devices_of, round_up, run_chunks
+from .batch_kernel import Form, Problems, selected, solve_chunk
 from .results import ManyCalibrations, ManyIdentifications
-from .scale_anchor import default_method, scale_anchor, scale_from_slides
+from .scale_anchor import Method
 from .scale_fix import divided
-from .task import NO_ANCHOR, check_observed, configurations, unknown_parameters
+from .task import (
+    Solving,
+    anchor_of,
+    check_data,
+    checked_noise_model,
+    configurations,
+    method_of,
+    without_lengths,
+)
 
 # Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
 # 7,000 poses: five times slower where they do not); a GPU needs thousands.
 _SLOTS_CPU, _POSES_IN_CACHE = 16, 2000
 _SLOTS_ELSEWHERE = 4096
+_ROUNDS = 64  # problems that a slot of one chunk takes at most, one after the other
 
 
 class BatchOptions(NamedTuple):
@@ -54,6 +64,12 @@ class BatchOptions(NamedTuple):
     robust: LossName | None = None
     prior: Prior | None = None
     covariance: bool = False
+
+    @property
+    def solving(self) -> Solving:
+        """How each problem is solved."""
+        own = self._asdict()
+        return Solving(**{name: own[name] for name in Solving._fields if name in own})
 
 
 @checked_arguments
@@ -117,7 +133,7 @@ def calibrate_many(
     upper: Numbers | None = None,
     start: Numbers | None = None,
     *,
-    method: Literal["two-stage", "joint"] | None = None,
+    method: Method | None = None,
     **options: Any,
 ) -> ManyCalibrations:
     """Both stages for a batch: what `calibrate` does, problem by problem, fast.
@@ -142,67 +158,56 @@ def calibrate_many(
     """
     given = BatchOptions(**options)
     _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
-    by_slides = scale_from_slides(arm, capture, space, given.noise)
-    general = bool(capture.observations) or any((given.robust, given.prior, given.covariance, by_slides))
-    method = default_method(arm, general) if method is None else method
-    check_method(method, general)
-    if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
-        raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one, or use identify_many."
-        )
-    if general:
-        everything = given._replace(hold=None)
-        found = _Batch.of("calibrate", arm, capture, lower, upper, start, everything, with_lengths=True).identify()
-        return _of_joint(found, found, None, "joint")
-    batch = _Batch.of("calibrate", arm, capture, lower, upper, start, given._replace(covariance=False), False)
-    stage1 = batch.identify()
-    return _divided(batch, stage1, method)
-
-
-_SHARED = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi", "prior")
+    method, at_once = method_of(arm, capture, space, given.solving, method, given.covariance)
+    if at_once:
+        given = given._replace(hold=None)
+        many = _Batch.of("calibrate", arm, capture, lower, upper, start, given, with_lengths=True).identify()
+        return _of_joint(many, many, None)
+    given = given._replace(covariance=False)
+    batch = _Batch.of("calibrate", arm, capture, lower, upper, start, given, with_lengths=False)
+    return _in_two_stages(batch, batch.identify(), method)
 
 
 def _of_joint(
-    found: ManyIdentifications, stage1: ManyIdentifications, k: Float[np.ndarray, " b"] | None, method: str
+    many: ManyIdentifications, stage1: ManyIdentifications, k: Float[np.ndarray, " b"] | None
 ) -> ManyCalibrations:
-    fields = {name: getattr(found, name) for name in _SHARED}
-    apart = np.zeros(len(found.de), dtype=bool)
-    return ManyCalibrations(k=k, stage1=stage1, method=method, divided=apart, **fields)
+    names = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi", "prior")
+    fields = {name: getattr(many, name) for name in names}
+    return ManyCalibrations(k=k, stage1=stage1, method="joint", divided=np.zeros(len(many.de), dtype=bool), **fields)
 
 
-def _divided(batch: "_Batch", stage1: ManyIdentifications, method: str) -> ManyCalibrations:
-    """Both stages: everything divided by k, and solved at once where something stands against that, or with "joint"."""
+def _in_two_stages(batch: "_Batch", stage1: ManyIdentifications, method: Method) -> ManyCalibrations:
+    """Stage 1 divided by k, and solved at once where something stands against that, or all with "joint"."""
     assert stage1.k is not None
     anchor, shape = batch.form.anchor, stage1.parameters.shape
     sides = (np.broadcast_to(side, shape) for side in (stage1.bounds.lower, stage1.bounds.upper))
     bounds = Bounds(stage1.space, *sides)
     division = divided(anchor, bounds, stage1.active, stage1.parameters, stage1.k)
     # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
-    scaled = np.array(division.parameters, order="C")
+    parameters = np.array(division.parameters, order="C")
     if method == "joint":
-        found = batch.jointly(np.arange(len(scaled)), scaled)
-        joint = _of_joint(found, stage1, stage1.k, method)
-        return eqx.tree_at(lambda one: one.steps, joint, stage1.steps + found.steps)
+        joint = _of_joint(batch.jointly(np.arange(len(parameters)), parameters), stage1, stage1.k)
+        return dataclasses.replace(joint, steps=stage1.steps + joint.steps)
     # Divided by k, the whole arm shrinks about the base, and so do the distances between its tips.
     factor = stage1.k if anchor.can_scale else np.ones_like(stage1.k)
     columns = {
-        "parameters": scaled,
+        "parameters": parameters,
         "de": stage1.de / factor,
         "deltam": stage1.deltam / factor,
         "steps": np.array(stage1.steps),
         "reason": np.array(numbers_of(stage1.result)),
-        "active": np.array(bounds.active(scaled) if anchor.can_scale else stage1.active),
-        "divided": ~np.asarray(division.stands_against),
+        "active": np.array(bounds.active(parameters) if anchor.can_scale else stage1.active),
     }
     rows = np.flatnonzero(division.stands_against)
     if len(rows):
-        found = batch.jointly(rows, scaled[rows])
+        many = batch.jointly(rows, parameters[rows])
         for name in ("parameters", "de", "deltam", "active"):
-            columns[name][rows] = getattr(found, name)
-        columns["steps"][rows] += found.steps
-        columns["reason"][rows] = numbers_of(found.result)
+            columns[name][rows] = getattr(many, name)
+        columns["steps"][rows] += many.steps
+        columns["reason"][rows] = numbers_of(many.result)
     result = to_jax(reasons(np.asarray(columns.pop("reason"))))
-    return ManyCalibrations(k=stage1.k, result=result, stage1=stage1, method=method, **columns)
+    kept = ~np.asarray(division.stands_against)
+    return ManyCalibrations(k=stage1.k, result=result, stage1=stage1, method=method, divided=kept, **columns)
 
 
 def _checked_box(
@@ -221,19 +226,17 @@ def _checked_box(
             f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call it outside, "
             f"or use jax.vmap of {single} there."
         )
-    if isinstance(lower, Bounds):
-        for what, given in (("upper bounds", upper), ("a space", options.space)):
-            if given is not None:
-                raise InputError(
-                    f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by "
-                    "its name: start=...)."
-                )
-        bounds, space = (lower.lower, lower.upper), lower.space
-    elif upper is None:
-        raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
-    else:
-        bounds, space = (lower, upper), Parameters.free_of(arm) if options.space is None else options.space
-    return bounds, space
+    if not isinstance(lower, Bounds):
+        if upper is None:
+            raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
+        return (lower, upper), Parameters.free_of(arm) if options.space is None else options.space
+    for what, given in (("upper bounds", upper), ("a space", options.space)):
+        if given is not None:
+            raise InputError(
+                f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by "
+                "its name: start=...)."
+            )
+    return (lower.lower, lower.upper), lower.space
 
 
 def _check_options(arm: Arm, options: BatchOptions) -> None:
@@ -267,6 +270,7 @@ class _Batch(NamedTuple):
         upper: Numbers | None,
         start: Numbers | None,
         options: BatchOptions,
+        *,
         with_lengths: bool,
     ) -> "_Batch":
         """Everything checked and laid out; ``single`` is the function that solves one problem. Reference lengths take
@@ -282,24 +286,29 @@ class _Batch(NamedTuple):
 
     def identify(self) -> ManyIdentifications:
         """All problems."""
-        options, devices = self.options, devices_of(self.options.devices)
+        options = self.options
+        devices = jax.local_devices() if options.devices is None else items_of(options.devices, "devices")
+        if not devices:
+            raise InputError("devices is empty; name at least one, or leave it out.")
         slots = options.slots or _default_slots(devices, len(self.form.pose))
-        workers = options.workers or default_workers(devices)
-        chunks = cut_into_chunks(self.size, slots, workers, options.chunk)
-        form = self.form._replace(slots=slots, capacity=round_up(max(map(len, chunks)), slots))
+        workers = options.workers or _default_workers(devices)
+        chunks = _chunks(self.size, slots, workers, options.chunk)
+        # Whole rounds of the slots, their number a power of two: each size is compiled once, so there should be few.
+        capacity = slots * 2 ** math.ceil(math.log2(-(-max(map(len, chunks)) // slots)))
+        form = self.form._replace(slots=slots, capacity=capacity)
 
         def run(chunk: range, device: Any) -> dict[str, Any]:
             # Filled up to the capacity with copies of the first problem, which are never begun.
             rows = np.full(form.capacity, chunk.start)
             rows[: len(chunk)] = chunk
             with jax.default_device(device):
-                part = _selected(self.problems, form.axes, rows)
+                part = selected(self.problems, form.axes, rows)
                 given = jax.device_put((part, np.asarray(len(chunk)), options.noise, options.prior), device)
-                found = solve_chunk(form, *given)
-            return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], found)
+                fields = solve_chunk(form, *given)
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(chunk)], fields)
 
-        found = run_chunks(run, chunks, devices, workers)
-        fields = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+        parts = _run(run, chunks, devices, workers)
+        fields = jax.tree.map(lambda *columns: np.concatenate(columns), *parts)
         return ManyIdentifications(
             result=reasons(jnp.asarray(fields.pop("reason"))),
             bounds=Bounds(self.space, self.problems.lower, self.problems.upper),
@@ -309,7 +318,7 @@ class _Batch(NamedTuple):
 
     def jointly(self, rows: np.ndarray, near: Float[np.ndarray, "b p"]) -> ManyIdentifications:
         """Some of the problems, with all that the capture holds in one least squares, from parameters near to it."""
-        part = _selected(self.problems, self.form.axes, rows)._replace(near=near)
+        part = selected(self.problems, self.form.axes, rows)._replace(near=near)
         form = _form(part, self.space, self.options._replace(hold=None), with_lengths=True)
         return self._replace(problems=part, form=form, size=len(rows)).identify()
 
@@ -321,24 +330,18 @@ def _form(problems: Problems, space: Parameters, options: BatchOptions, with_len
     of_arm = jax.tree.map(lambda leaf: 0 if leaf.ndim > 1 else None, arm)
     of_capture: Any = jax.tree.map(lambda leaf: 0, capture) if capture.q.ndim > 2 else None
     axes = Problems(of_arm, of_capture, *box)
-    first = _selected(problems, axes, 0)
-    one = first.capture if with_lengths else without_lengths(first.capture)
-    scaled = bool(one.lengths) or any(observation.fixes_scale for observation in one.observations)
-    hold = None if scaled and options.hold == "longest" else options.hold
-    anchor = NO_ANCHOR
-    if not scaled or hold:
-        anchor = scale_anchor(space, arm, hold, options.noise, first.capture)
+    # What is checked of the first problem holds for all: captures of a batch have one form.
+    first = selected(problems, axes, 0)
+    solved = first.capture if with_lengths else without_lengths(first.capture)
+    anchor = anchor_of(space, solved, first.capture, options.hold, options.noise)
+    observed = Observed.of(solved, first.arm)
     of_first = Parameters(first.arm, space.names)
-    observed = Observed.of(one, first.arm)
-    if options.prior is None and not one.observations and not one.lengths:
-        check_enough(one.sizes, len(space.names) - int(space.lengths.any()))
-    known = unknown_parameters(of_first, anchor, options.prior, options.noise)
-    check_observed(observed, of_first, np.asarray(first.start), known)
+    check_data(solved, observed, of_first, np.asarray(first.start), anchor, options.solving)
     return Form(
         names=space.names,
         anchor=anchor,
         with_lengths=with_lengths,
-        noise_model=check_noise_model(None, options.noise, arm.joints),
+        noise_model=checked_noise_model(None, options.noise, arm.joints),
         loss=None if options.robust is None else Loss(options.robust),
         # Only covariances need to know which readings are one, and each answer is a program.
         pose=configurations(observed.q) if options.covariance else tuple(range(observed.q.shape[0])),
@@ -350,15 +353,48 @@ def _form(problems: Problems, space: Parameters, options: BatchOptions, with_len
     )
 
 
-def _selected(problems: Problems, axes: Problems, rows: Any) -> Problems:
-    """The problems of some rows; what all share stays as it is."""
-    return Problems(*(pick(tree, axis, rows) for tree, axis in zip(problems, axes, strict=True)))
-
-
 def _default_slots(devices: Sequence[Any], poses: int) -> int:
     if devices[0].platform != "cpu":
         return _SLOTS_ELSEWHERE
     return min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
+
+
+def _default_workers(devices: Sequence[Any]) -> int:
+    """Chunks in work at the same time: one for each device; on a CPU, one for each core."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
+
+
+def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
+    """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at the end of
+    each."""
+    if chunk is None:
+        rounds = -(-size // (slots * _ROUNDS))
+        calls = min(-(-rounds // workers) * workers, -(-size // slots))
+        chunk = -(-size // calls)
+    return [range(first, min(first + chunk, size)) for first in range(0, size, chunk)]
+
+
+def _run(run: Callable, chunks: Sequence[range], devices: Sequence[Any], workers: int) -> list:
+    """Results of all chunks in their order, computed by threads: XLA releases the interpreter's lock while it computes.
+
+    A single chunk needs no thread, which takes a millisecond to start.
+    """
+    if len(chunks) == 1:
+        return [run(chunks[0], devices[0])]
+    failed = threading.Event()
+
+    def work(i: int) -> Any:
+        if failed.is_set():  # the failure is raised in the place of what is missing
+            return None
+        try:
+            return run(chunks[i], devices[i % len(devices)])
+        except BaseException:
+            failed.set()
+            raise
+
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(work, range(len(chunks))))
 
 
 def _lay_out(
@@ -376,7 +412,7 @@ def _lay_out(
     sizes = {value.shape[0] for value in boxes.values() if value.ndim > 1}
     sizes |= {leaf.shape[0] for leaf in jax.tree.leaves(arm) if leaf.ndim > 1}
     sizes |= {capture.q.shape[0]} if capture.q.ndim > 2 else set()
-    sizes |= {np.shape(one.value)[0] for one in capture.lengths if np.ndim(one.value)}
+    sizes |= {np.shape(length.value)[0] for length in capture.lengths if np.ndim(length.value)}
     if not sizes:
         raise InputError(
             "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use "
@@ -387,9 +423,7 @@ def _lay_out(
     if len(sizes) > 1:
         numbers = " and ".join(map(str, sorted(sizes)))
         raise InputError(f"batches of {numbers} problems do not fit together; give each the same number.")
-    crossed = np.argwhere(~(np.atleast_2d(boxes["lower"]) <= np.atleast_2d(boxes["upper"])))
-    if len(crossed):
-        row, i = crossed[0]
+    for row, i in np.argwhere(~(np.atleast_2d(boxes["lower"]) <= np.atleast_2d(boxes["upper"]))):
         raise InputError(
             f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
         )

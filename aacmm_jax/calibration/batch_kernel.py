@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..core.numpy_or_jax import AnyArray, set_at
 from ..data.capture import Capture
@@ -31,13 +31,12 @@ from ..solver.levenberg_marquardt import Rules, advance
 from ..solver.levenberg_marquardt import begin as begin_steps
 from ..solver.reason import MAX_STEPS, RUNNING, numbers_of, reasons
 from ..uncertainty.covariance import NoiseModel
-from .bounded_fit import Fit
-from .conclusion import concluded, repeatability_of
+from .prior_fit import OfPrior, fitted_with_prior, prior_of, weights
 from .scale_anchor import ScaleAnchor
 from .scale_fix import ends_between
-from .solve import args_of, begin, box_of, fitted_with_prior, losses_of, prior_of, rules_of, state_after, weights
-from .solve_state import whitening_at
-from .task import Task
+from .solve import concluded, repeatability_of
+from .task import Task, without_lengths
+from .weighted_least_squares import Fit, State, args_of, begin, box_of, losses_of, rules_of, state_after, whitening_at
 
 
 class Problems(NamedTuple):
@@ -67,12 +66,93 @@ class Form(NamedTuple):
     axes: Problems  # trees of the axes, 0 or None
 
 
+class _Ended(NamedTuple):
+    """A least squares that began at z with these weights and ended at y; its results besides."""
+
+    z: Float[AnyArray, "*c z"]
+    whitening: Whitening
+    y: Float[AnyArray, "*c n"]
+    steps: Int[AnyArray, "*c"]  # evaluations, of all so far
+    reason: Int[AnyArray, "*c"]
+
+    def unknowns(self, task: Task, loss: Loss | None, batch: bool | None = None) -> tuple[AnyArray, PointRows]:
+        """All unknowns at its end, and the rows there."""
+        args = args_of(task, self.whitening, loss, self.z)[0]
+        return with_linear_geometry(self.y, args._replace(batch=batch))
+
+
 class _Chunk(NamedTuple):
     """The problems of a chunk, prepared."""
 
+    form: Form
     problems: Problems
     observed: Observed
-    axes: "_Chunk"  # of both
+    observed_axes: Any  # of its leaves; None where all problems share them
+    noise: Noise | None
+    prior: Prior | None
+
+    def task(self, problem: Problems, observed: Observed) -> Task:
+        """One problem, traced."""
+        form = self.form
+        return Task(
+            observed=observed,
+            bounds=Bounds(Parameters(problem.arm, form.names), problem.lower, problem.upper),
+            start=jnp.clip(problem.start, problem.lower, problem.upper),
+            noise=self.noise,
+            anchor=form.anchor,
+            noise_model=form.noise_model,
+            max_steps=form.max_steps,
+            loss=form.loss,
+            pose=form.pose,
+            differentiable=False,
+            prior=self.prior,
+        )
+
+    def first(self) -> Task:
+        """The task of the first problem, for what is the same for all."""
+        return self.task(*self.selected(jnp.asarray(0)))
+
+    def selected(self, index: Any) -> tuple[Problems, Observed]:
+        """The problems of an index."""
+        problems = selected(self.problems, self.form.axes, index)
+        return problems, _pick(self.observed, self.observed_axes, index)
+
+    def by_slot(self, work: Callable, extra: int) -> Callable:
+        """``work(problem, task, *extra)`` for a problem in each slot, by ``(index, *extra)``."""
+        axes = (self.form.axes, self.observed_axes, *(0,) * extra)
+
+        def one(problem: Problems, observed: Observed, *extra: Any) -> Any:
+            return work(problem, self.task(problem, observed), *extra)
+
+        function = jax.vmap(one, in_axes=axes, axis_size=self.form.slots)
+        return lambda index, *extra: function(*self.selected(index), *extra)
+
+    def in_groups(self, work: Callable, *extra: Any) -> Any:
+        """``work(problem, task, *extra)`` for all problems, as many at a time as there are slots."""
+        function, form = self.by_slot(work, len(extra)), self.form
+
+        def group(row: Int[Array, ""]) -> Any:
+            index = row * form.slots + jnp.arange(form.slots)
+            return function(index, *jax.tree.map(lambda leaf: leaf[index], extra))
+
+        results = jax.lax.map(group, jnp.arange(form.capacity // form.slots))
+        return jax.tree.map(lambda leaf: leaf.reshape(form.capacity, *leaf.shape[2:]), results)
+
+
+def _pick(tree: Any, axis: Any, index: Any) -> Any:
+    """The problems of an index of a tree with such axes; what is shared stays as it is."""
+    if axis is None:
+        return tree
+
+    def leaf_at(axis: int | None, leaf: Any) -> Any:
+        return leaf if axis is None else leaf[index] if not axis else leaf[:, index]
+
+    return jax.tree.map(leaf_at, axis, tree, is_leaf=lambda leaf: leaf is None)
+
+
+def selected(problems: Problems, axes: Problems, index: Any) -> Problems:
+    """The problems of an index; what all share stays as it is."""
+    return Problems(*(_pick(tree, axis, index) for tree, axis in zip(problems, axes, strict=True)))
 
 
 @eqx.filter_jit
@@ -80,117 +160,59 @@ def solve_chunk(
     form: Form, problems: Problems, count: Int[Array, ""], noise: Noise | None, prior: Prior | None
 ) -> dict[str, Any]:
     """Solve the first ``count`` of the problems of a chunk: the fields of `ManyIdentifications`."""
-    chunk = _prepared(form, problems)
-    one = partial(_task, form, noise, prior)
-    z, whitening = _in_groups(form, chunk, lambda *of: _first(one(*of), of[0].near))
-    first = _of_first(form, chunk, one)
-    steps, reason, losses = jnp.zeros(form.capacity, dtype=jnp.int64), None, losses_of(first)
-    solved = (z, whitening, z)
-    for number, loss in enumerate(losses, 1):
-        last, rules = number == len(losses), rules_of(number, len(losses))
-        if last and prior_of(first) is not None:
-            break
-        y, more, reason = _solve_all(form, chunk, one, loss, rules, z, whitening, count)
-        steps, solved = steps + more, (z, whitening, y)
-        if not last:
-            z, whitening = _in_groups(form, chunk, partial(_again, one, losses[number - 1 :]), *solved)
-    return _in_groups(form, chunk, partial(_concluded, form, one, losses[-1]), steps, reason, *solved)
+    chunk = _Chunk(form, problems, *_prepared(form, problems), noise, prior)
+    first = chunk.first()
+    losses = losses_of(first)
+    # With a prior the last least squares is part of what follows the loop (`_fields`).
+    solves = losses if prior_of(first) is None else losses[:-1]
+    z, whitening = chunk.in_groups(_beginning)
+    ended = _Ended(z, whitening, z, *(jnp.zeros(form.capacity, dtype=kind) for kind in (jnp.int64, jnp.int32)))
+    for number, loss in enumerate(solves, 1):
+        y, steps, reason = _solve_all(chunk, loss, rules_of(number, len(losses)), ended, count)
+        ended = ended._replace(y=y, steps=ended.steps + steps, reason=reason)
+        if number < len(solves):
+            z, whitening = chunk.in_groups(partial(_again, losses[number - 1 : number + 1]), ended)
+            ended = ended._replace(z=z, whitening=whitening)
+    return chunk.in_groups(partial(_fields, form, losses), ended)
 
 
-def _prepared(form: Form, problems: Problems) -> _Chunk:
-    """With what the poses do to the joints, which every evaluation needs and none changes."""
-    axes = form.axes
-    batched = axes.capture is not None
+def _again(
+    losses: list[Loss | None], problem: Problems, task: Task, ended: _Ended
+) -> tuple[Float[AnyArray, " z"], Whitening]:
+    """Where the next least squares begins, and its weights; of the losses, the last and the next."""
+    z, state = _state_after(task, ended, losses[0])
+    return z, weights(task, begin(task), state, losses[1])
+
+
+def _state_after(task: Task, ended: _Ended, loss: Loss | None) -> tuple[AnyArray, State]:
+    """All unknowns after a least squares that is not the last, and the state there."""
+    z, point = ended.unknowns(task, loss)
+    return z, state_after(task, begin(task), z, point, False)
+
+
+def _prepared(form: Form, problems: Problems) -> tuple[Observed, Any]:
+    """What is observed, with what the poses do to the joints, which every evaluation needs and none changes; and the
+    axes of its leaves."""
+    axes, arm = form.axes, problems.arm
 
     def observed_of(arm: Arm, capture: Capture) -> Observed:
         return Observed.of(capture if form.with_lengths else without_lengths(capture), arm)
 
-    arm = problems.arm
-    if not batched and arm.corrections is None:
+    if axes.capture is None and arm.corrections is None:
         # The arm's values do not matter.
-        arm = jax.tree.map(lambda leaf, axis: leaf if axis is None else leaf[0], arm, axes.arm, is_leaf=_is_none)
-        observed, of_observed = observed_of(arm, problems.capture), None
-    else:
-        observed = jax.vmap(observed_of, in_axes=(axes.arm, axes.capture), axis_size=form.capacity)(
-            arm, problems.capture
-        )
-        # The joints before the problems, as the chain takes them.
-        turned = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), observed.motion)
-        of_observed: Any = eqx.tree_at(
-            lambda one: one.motion, jax.tree.map(lambda _: 0, observed), jax.tree.map(lambda _: 1, turned)
-        )
-        observed = eqx.tree_at(lambda one: one.motion, observed, turned)
-    return _Chunk(problems, observed, _Chunk(axes, of_observed, None))  # pyright: ignore[reportArgumentType]
+        return observed_of(_pick(arm, axes.arm, 0), problems.capture), None
+    mapped = jax.vmap(observed_of, in_axes=(axes.arm, axes.capture), axis_size=form.capacity)
+    observed = mapped(arm, problems.capture)
+    # The joints before the problems, as the chain takes them.
+    turned = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), observed.motion)
+    zeros, ones = jax.tree.map(lambda _: 0, observed), jax.tree.map(lambda _: 1, turned)
+    of_motion = lambda tree: tree.motion  # noqa: E731
+    return eqx.tree_at(of_motion, observed, turned), eqx.tree_at(of_motion, zeros, ones)
 
 
-def _is_none(leaf: object) -> bool:
-    return leaf is None
-
-
-def without_lengths(capture: Capture) -> Capture:
-    """The capture without its reference lengths."""
-    return eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
-
-
-def _task(form: Form, noise: Noise | None, prior: Prior | None, problem: Problems, observed: Observed) -> Task:
-    """One problem, traced."""
-    bounds = Bounds(Parameters(problem.arm, form.names), problem.lower, problem.upper)
-    return Task(
-        observed=observed,
-        bounds=bounds,
-        start=jnp.clip(problem.start, problem.lower, problem.upper),
-        noise=noise,
-        anchor=form.anchor,
-        noise_model=form.noise_model,
-        max_steps=form.max_steps,
-        loss=form.loss,
-        pose=form.pose,
-        differentiable=False,
-        prior=prior,
-    )
-
-
-def _of_first(form: Form, chunk: _Chunk, one: Callable) -> Task:
-    """The task of the first problem, for what is the same for all."""
-    return one(*_selected(form, chunk, jnp.asarray(0)))
-
-
-def pick(tree: Any, axis: Any, index: Any) -> Any:
-    """The problems of an index of a tree with such axes; what is shared stays as it is."""
-    if axis is None:
-        return tree
-
-    def of(axis: int | None, leaf: Any) -> Any:
-        return leaf if axis is None else leaf[index] if not axis else leaf[:, index]
-
-    return jax.tree.map(of, axis, tree, is_leaf=_is_none)
-
-
-def _selected(form: Form, chunk: _Chunk, index: Any) -> tuple[Problems, Observed]:
-    parts = (pick(tree, axis, index) for tree, axis in zip(chunk.problems, form.axes, strict=True))
-    return Problems(*parts), pick(chunk.observed, chunk.axes.observed, index)
-
-
-def _vmapped(form: Form, chunk: _Chunk, work: Callable, extra: int) -> Callable:
-    axes: Any = chunk.axes.observed
-    return jax.vmap(work, in_axes=(form.axes, axes, *(0,) * extra), axis_size=form.slots)
-
-
-def _in_groups(form: Form, chunk: _Chunk, work: Callable, *extra: Any) -> Any:
-    """``work(problem, observed, *extra)`` for all problems, as many at a time as there are slots."""
-    function = _vmapped(form, chunk, work, len(extra))
-
-    def group(row: Int[Array, ""]) -> Any:
-        index = row * form.slots + jnp.arange(form.slots)
-        own = jax.tree.map(lambda leaf: leaf[index], extra)
-        return function(*_selected(form, chunk, index), *own)
-
-    found = jax.lax.map(group, jnp.arange(form.capacity // form.slots))
-    return jax.tree.map(lambda leaf: leaf.reshape(form.capacity, *leaf.shape[2:]), found)
-
-
-def _first(task: Task, near: Float[AnyArray, " p"] | None) -> tuple[Float[AnyArray, " z"], Whitening]:
+def _beginning(problem: Problems, task: Task) -> tuple[Float[AnyArray, " z"], Whitening]:
     """Where a solve begins, and its first weights."""
+    near = problem.near
     if task.needs_no_weights:
         # Positions of sockets are no unknowns of the solve, so any will do.
         start = task.start if near is None else jnp.clip(near, task.bounds.lower, task.bounds.upper)
@@ -200,162 +222,110 @@ def _first(task: Task, near: Float[AnyArray, " p"] | None) -> tuple[Float[AnyArr
     return begun.z, weights(task, begun, begun.state, losses_of(task)[0])
 
 
-def _whole(
-    task: Task,
-    loss: Loss | None,
-    z: Float[AnyArray, " z"],
-    whitening: Whitening,
-    y: Float[AnyArray, " n"],
-    batch: bool | None = None,
-) -> tuple[Float[AnyArray, " z"], PointRows]:
-    """All unknowns after a least squares that began at z and ended at y, and the rows there."""
-    return with_linear_geometry(y, args_of(task, whitening, loss, z)[0]._replace(batch=batch))
-
-
-def _again(
-    one: Callable,
-    losses: list[Loss | None],
-    problem: Problems,
-    observed: Observed,
-    z: Float[AnyArray, " z"],
-    whitening: Whitening,
-    y: Float[AnyArray, " n"],
-) -> tuple[Float[AnyArray, " z"], Whitening]:
-    """Where the next least squares begins, and its weights; ``losses`` are that of the last, and those to come."""
-    task = one(problem, observed)
-    z, point = _whole(task, losses[0], z, whitening, y)
-    begun = begin(task)
-    return z, weights(task, begun, state_after(task, begun, z, point, False), losses[1])
-
-
-def _concluded(
-    form: Form,
-    one: Callable,
-    loss: Loss | None,
-    problem: Problems,
-    observed: Observed,
-    steps: Int[AnyArray, ""],
-    reason: Int[AnyArray, ""] | None,
-    z: Float[AnyArray, " z"],
-    whitening: Whitening,
-    y: Float[AnyArray, " n"],
-) -> dict[str, Any]:
+def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task, ended: _Ended) -> dict[str, Any]:
     """The fields of one problem after its last least squares; that with a prior is still to come."""
-    task = one(problem, observed)
     begun, prior, of_prior = begin(task), prior_of(task), None
     if prior is not None:
-        state = begun.state
-        if len(losses_of(task)) > 1:
-            z, point = _whole(task, losses_of(task)[-2], z, whitening, y)
-            state = state_after(task, begun, z, point, False)
-        z, state, found, of_prior = fitted_with_prior(task, prior, begun, state, z)
-        found = found._replace(steps=steps + found.steps)
+        z, state = _state_after(task, ended, losses[-2])
+        z, state, last, of_prior = fitted_with_prior(task, prior, begun, state, z)
+        last = last._replace(steps=ended.steps + last.steps)
     else:
-        assert reason is not None
         tips_alone = task.needs_no_weights and not form.covariance
-        z, point = _whole(task, loss, z, whitening, y, tips_alone or None)
-        state, found = state_after(task, begun, z, point, True), Fit(z, steps, reasons(reason), jnp.zeros(()))
-    free, spent = task.free, z.shape[0] if of_prior is None else of_prior.effective
-    parameters, tips = set_at(task.start, free, z[: len(free)]), repeatability_of(state, task.observed)
+        z, point = ended.unknowns(task, losses[-1], tips_alone or None)
+        state = state_after(task, begun, z, point, True)
+        last = Fit(z, ended.steps, reasons(ended.reason), jnp.zeros(()))
+    free, tips = task.free, repeatability_of(state, task.observed)
     side = Bounds(begun.space, *(side[: len(free)] for side in begun.sides)).active(z[: len(free)])
-    if task.needs_no_weights:
-        whitening, sigma = weights(task, begun, state, None), state.sigma
-        white = [rows.values / sigma for rows in state.point.rows]
-    else:
-        whitening, sigma = whitening_at(task, state, None if of_prior is None else of_prior.rows), 1.0
-        each = zip(whitening.roots, state.point.rows, strict=True)
-        white = [jnp.einsum("mab,bm->am", root, rows.values) for root, rows in each if root is not None]
-    spare = jnp.maximum(task.observed.equations - spent, 1.0)
     fields = {
-        "parameters": parameters,
+        "parameters": set_at(task.start, free, z[: len(free)]),
         "de": tips.de,
         "deltam": tips.deltam,
         "sigma": state.sigma,
-        "steps": found.steps,
-        "reason": numbers_of(found.result),
-        "active": set_at(jnp.zeros(parameters.shape, dtype=side.dtype), free, side),
-        "reduced_chi": jnp.sqrt(sum(jnp.sum(one**2) for one in white) / spare),
+        "steps": last.steps,
+        "reason": numbers_of(last.result),
+        "active": set_at(jnp.zeros(task.start.shape, dtype=side.dtype), free, side),
         "prior": None if of_prior is None else of_prior.metrics,
-        "k": None,
+        **_agreement(form, problem, task, z, state, of_prior),
     }
-    if problem.capture.lengths and not form.with_lengths:
-        own = [sigma**2 * one for one in own_covariances(task.observed, state.point, whitening)]
-        ends = ends_between(task.observed, z[len(free) :], own, problem.capture)
-        fields["k"] = scale_and_weights(ends)[0].value
     if form.covariance:
-        fields["covariance"] = concluded(task, begun, z, state, found, of_prior).identification.covariance
+        fields["covariance"] = concluded(task, begun, z, state, last, of_prior).identification.covariance
     return fields
 
 
+def _agreement(
+    form: Form, problem: Problems, task: Task, z: AnyArray, state: State, of_prior: OfPrior | None
+) -> dict[str, Any]:
+    """Residuals in standard deviations, and k where lengths do not take part."""
+    if task.needs_no_weights:
+        roots = (None,) * len(task.observed.layout.groups)
+        whitening, sigma = Whitening(roots, jnp.zeros(0), {}), state.sigma
+        white = [rows.values / sigma for rows in state.point.rows]
+    else:
+        whitening, sigma = whitening_at(task, state, None if of_prior is None else of_prior.rows), 1.0
+        pairs = zip(whitening.roots, state.point.rows, strict=True)
+        white = [jnp.einsum("mab,bm->am", root, rows.values) for root, rows in pairs if root is not None]
+    spare = jnp.maximum(task.observed.equations - (z.shape[0] if of_prior is None else of_prior.effective), 1.0)
+    k = None
+    if problem.capture.lengths and not form.with_lengths:
+        own = [sigma**2 * matrices for matrices in own_covariances(task.observed, state.point, whitening)]
+        ends = ends_between(task.observed, z[len(task.free) :], own, problem.capture)
+        k = scale_and_weights(ends)[0].value
+    return {"reduced_chi": jnp.sqrt(sum(jnp.sum(rows**2) for rows in white) / spare), "k": k}
+
+
 def _solve_all(
-    form: Form,
-    chunk: _Chunk,
-    one: Callable,
-    loss: Loss | None,
-    rules: Rules,
-    z: Float[AnyArray, "c z"],
-    whitening: Whitening,
-    count: Int[Array, ""],
+    chunk: _Chunk, loss: Loss | None, rules: Rules, begun: _Ended, count: Int[Array, ""]
 ) -> tuple[Float[AnyArray, "c n"], Int[Array, " c"], Int[Array, " c"]]:
     """One least squares of every problem: its unknowns, evaluations, and numbers of the reasons."""
-    capacity, slots = form.capacity, form.slots
+    capacity, slots, most = chunk.form.capacity, chunk.form.slots, chunk.form.max_steps
 
-    def of_slot(work: Callable) -> Callable:
-        """``work(task, args, begun, unknowns of the solve)`` for each slot, by the number of its problem."""
+    def of_slot(work: Callable, extra: int) -> Callable:
+        """``work(task, args, unknowns of the solve, *extra)`` for each slot, by the number of its problem."""
 
-        def each(problem: Problems, observed: Observed, z: AnyArray, whitening: Whitening, trial: Any) -> Any:
-            task = one(problem, observed)
+        def one(_: Problems, task: Task, z: AnyArray, whitening: Whitening, *extra: Any) -> Any:
             args, size = args_of(task, whitening, loss, z)
-            return work(task, args._replace(batch=True), z[:size], trial)
+            return work(task, args._replace(batch=True), z[:size], *extra)
 
-        function = _vmapped(form, chunk, each, 3)
+        function = chunk.by_slot(one, 2 + extra)
+        return lambda index, *extra: function(index, begun.z[index], _at(begun.whitening, index), *extra)
 
-        def call(index: Int[Array, " w"], trial: Any = None) -> Any:
-            own = jax.tree.map(lambda leaf: leaf[index], (z, whitening))
-            trial = jnp.zeros((slots, 0)) if trial is None else trial
-            return function(*_selected(form, chunk, index), *own, trial)
+    def start_and_box(task: Task, _: Any, first: AnyArray) -> tuple[AnyArray, Box]:
+        return first, Box(*(side[: first.shape[0]] for side in box_of(task)))
 
-        return call
-
-    def start_and_box(task: Task, args: Any, first: AnyArray, _: Any) -> tuple[AnyArray, Box]:
-        size = first.shape[0]
-        return first, Box(*(side[:size] for side in box_of(task)))
-
-    starts = of_slot(start_and_box)
-    evaluate = of_slot(lambda task, args, first, trial: observed_model(trial, args))
-    first = jnp.arange(slots)
-    shapes = jax.eval_shape(lambda index: evaluate(index, starts(index)[0]).gram, first)
+    starts = of_slot(start_and_box, 0)
+    evaluate = of_slot(lambda task, args, first, trial: observed_model(trial, args), 1)
+    slot = jnp.arange(slots)
+    shapes = jax.eval_shape(lambda index: evaluate(index, starts(index)[0]).gram, slot)
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     def fresh(index: Int[Array, " w"]) -> Any:
         first, box = starts(jnp.minimum(index, count - 1))
         return begin_steps(first, box, zeros)
 
-    def more(carry: Any) -> Bool[Array, ""]:
-        return jnp.any(carry[1] < count)
-
     def once(carry: Any) -> Any:
-        progress, index, upcoming, (found, steps, reason) = carry
+        progress, index, upcoming, results = carry
         now = jnp.minimum(index, count - 1)  # a slot without a problem repeats the last problem; its result is dropped
         _, box = starts(now)
         progress = advance(progress, evaluate(now, progress.step.trial), box, rules)
-        late = progress.steps >= form.max_steps
+        late = progress.steps >= most
         done = (progress.reason != RUNNING) | late
         ended = jnp.where(late & (progress.reason == RUNNING), MAX_STEPS, progress.reason)
-        slot = jnp.where(done & (index < count), index, capacity)
-        solutions = (
-            found.at[slot].set(progress.y, mode="drop"),
-            steps.at[slot].set(progress.steps, mode="drop"),
-            reason.at[slot].set(ended, mode="drop"),
-        )
+        place = jnp.where(done & (index < count), index, capacity)
+        columns = zip(results, (progress.y, progress.steps, ended), strict=True)
+        results = tuple(column.at[place].set(values, mode="drop") for column, values in columns)
         index = jnp.where(done, upcoming + jnp.cumsum(done) - 1, index)
         upcoming = upcoming + jnp.sum(done)
-        return choose(done, fresh(index), progress), index, upcoming, solutions
+        return choose(done, fresh(index), progress), index, upcoming, results
 
-    began = fresh(first)
+    progress = fresh(slot)
     empty = (
-        jnp.zeros((capacity, began.y.shape[-1])),
+        jnp.zeros((capacity, progress.y.shape[-1])),
         jnp.zeros(capacity, dtype=jnp.int64),
         jnp.zeros(capacity, dtype=jnp.int32),
     )
-    return jax.lax.while_loop(more, once, (began, first, jnp.asarray(slots), empty))[3]
+    start = (progress, slot, jnp.asarray(slots), empty)
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[1] < count), once, start)[3]
+
+
+def _at(tree: Any, index: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)

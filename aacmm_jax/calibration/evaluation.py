@@ -1,7 +1,13 @@
-"""Repeatability of an arm's sockets, errors of its reference lengths and residuals of its observations on a capture."""
+"""Repeatability of an arm's sockets, errors of its reference lengths and residuals of its observations on a capture.
+
+The geometry is fitted, the arm is given: the same solve as that of a calibration, with every parameter held
+(`fit_geometry`). Sockets are observations like any other; where nothing but sockets was observed and every coordinate
+of a tip weighs the same, their positions are the means of their tips.
+"""
 
 from collections.abc import Mapping
 from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,17 +16,41 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arguments import check_finite, checked_arguments
-from ..core.arrays import Numbers
-from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.arrays import Numbers, as_array
+from ..core.errors import InputError, nearest
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, set_at, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.socket import position_of
 from ..kinematics.arm import Arm, check_columns
+from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
 from ..model.socket_sums import to_poses
-from .observed_evaluation import ObservedEvaluation, checked_geometry, described, fit_geometry
+from ..solver.arrow import split
+from ..uncertainty.linear_propagation import variances_of_functions
+from ..uncertainty.linearisation import Linearisation
+from .scale_anchor import ScaleAnchor
+from .solve import minimised
+from .task import Task
+from .weighted_least_squares import begin, whitening_at
+
+_MAX_STEPS = 300
+_POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
+
+
+class ObservedEvaluation(eqx.Module):
+    """How the observations of a capture agree with one arm; in their order, sockets first."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    residuals: tuple[Float[AnyArray, "*batch _ _"], ...]  # rows and poses of each, mm; of orientations rad
+    normalised: tuple[Float[AnyArray, "*batch _ _"], ...]  # the same in standard deviations, uncorrelated
+    rms: Float[AnyArray, "*batch k"]  # root mean square distance of a pose from the geometry, mm
+    rms_angle: Float[AnyArray, "*batch k"]  # root mean square angle, rad; NaN where no orientation was measured
+    reduced_chi: Float[AnyArray, "*batch k"]  # root mean square in standard deviations of a residual
+    sigma: Float[AnyArray, "*batch"]  # standard deviation of a tip coordinate by these residuals, mm
+    geometry: dict[str, Float[AnyArray, "*batch _"]]  # part of the unknown geometry -> its numbers, mm and rad
 
 
 class Evaluation(eqx.Module):
@@ -79,7 +109,7 @@ def evaluate(
         raise InputError("the capture is a batch; evaluate its captures one by one, or map over them with jax.vmap.")
     check_finite(noise=noise)
     observed, lengths = Observed.of(capture, arm, lengths=False), _Lengths.of(capture)
-    kept = checked_geometry(observed, geometry)
+    kept = _checked_geometry(observed, geometry)
     whole = bool(capture.observations) or bool(kept) or noise is not None
     subject = observed, lengths, *to_numpy((kept, noise))
     shape = np.broadcast_shapes(*(leaf.shape[:-1] for leaf in jax.tree.leaves(arm)))
@@ -121,19 +151,118 @@ def _evaluated(
 ) -> Evaluation:
     """`evaluate` with the observations of a capture, of which the first are its sockets of so many poses; and with the
     residuals of all of them, where these are wanted (``whole``)."""
-    found = fit_geometry(arm, observed, kept, noise)
-    xp, positions = namespace(found.linear.z), observed.positions
-    unknown = not found.redundant and noise is None
-    metrics, distances, measured, u = no_repeatability(found.sigma), xp.zeros(0), xp.zeros(0), xp.zeros(0)
+    fitted = fit_geometry(arm, observed, kept, noise)
+    xp, positions, geometry = namespace(fitted.linear.z), observed.positions, fitted.geometry
+    metrics, distances, measured, u = no_repeatability(fitted.sigma), xp.zeros(0), xp.zeros(0), xp.zeros(0)
     if sizes:
-        tips = found.linear.point.forward.tip[:, : sum(sizes)]
+        tips = fitted.linear.point.forward.tip[:, : sum(sizes)]
         metrics = repeatability(tips.T, sizes)
-        index = np.array([positions[position_of(one.name)] for one in observed.observations[: len(sizes)]])
-        distances = xp.sqrt(xp.sum((tips - to_poses(found.geometry[index.T], sizes)) ** 2, axis=0))
+        sockets = observed.observations[: len(sizes)]
+        index = np.array([positions[position_of(socket.name)] for socket in sockets])
+        distances = xp.sqrt(xp.sum((tips - to_poses(geometry[index.T], sizes)) ** 2, axis=0))
     if lengths.ends:
         start, end = (np.array([positions[pair[side]] for pair in lengths.ends]) for side in (0, 1))
-        between = found.geometry[end] - found.geometry[start]
+        between = geometry[end] - geometry[start]
         measured = xp.sqrt(xp.sum(between**2, axis=1))
-        scatter = found.variances_between(lengths.ends, between / measured[:, None])
-        u = xp.sqrt((np.nan if unknown else scatter) + lengths.u**2)
-    return Evaluation(metrics, measured, measured - lengths.nominal, u, distances, described(found) if whole else None)
+        scatter = fitted.variances_between(lengths.ends, between / measured[:, None])
+        known = fitted.redundant or noise is not None
+        u = xp.sqrt((scatter if known else np.nan) + lengths.u**2)
+    return Evaluation(
+        metrics, measured, measured - lengths.nominal, u, distances, _described(fitted) if whole else None
+    )
+
+
+class GeometryFit(NamedTuple):
+    """The geometry that fits one arm best."""
+
+    linear: Linearisation  # of one parameter, which does not change
+    free: np.ndarray  # which numbers of the geometry are fitted
+    sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
+    redundant: bool  # whether there are more equations than numbers are fitted; otherwise nothing shows the scatter
+
+    @property
+    def geometry(self) -> Float[AnyArray, " g"]:
+        """The numbers of the geometry."""
+        return self.linear.z[1:]
+
+    def variances_between(
+        self, ends: tuple[tuple[str, str], ...], directions: Float[AnyArray, "l 3"]
+    ) -> Float[AnyArray, " l"]:
+        """Variances of the distances between positions, along unit vectors, by an arm without errors but the noise of
+        its readings."""
+        xp, observed = namespace(self.linear.z, directions), self.linear.observed
+        influence = self.linear.influence(np.concatenate([[True], ~self.free]))
+        positions, pull = observed.positions, xp.zeros((len(ends), len(self.free)))
+        for side, along in enumerate((-directions, directions)):
+            index = np.array([positions[pair[side]] for pair in ends])
+            pull = set_at(pull, (np.arange(len(ends))[:, None], index), along)
+        head, components = split(pull * observed.steps[None, :], observed.layout.shared, observed.layout.classes)
+        return variances_of_functions(influence, xp.concatenate([xp.zeros((len(ends), 1)), head], axis=1), components)
+
+
+def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noise: Noise | None) -> GeometryFit:
+    """Fit the unknown geometry, except for the parts that are kept, to the tips of an arm.
+
+    ``observed`` has no reference lengths: they are to be measured. Where the noise is not given, tips are taken to
+    scatter as much as these residuals do.
+    """
+    space = Parameters(arm, ("d_1",))
+    vector = namespace(arm, observed, kept, noise).asarray(space.vector())
+    task = Task(
+        observed=observed,
+        bounds=Bounds(space, vector, vector),
+        start=vector,
+        noise=noise,
+        anchor=ScaleAnchor(),
+        noise_model="estimated" if noise is None else "given",
+        max_steps=_MAX_STEPS,
+        loss=None,
+        pose=(),
+        kept=kept,
+    )
+    z, state, _, _ = minimised(task, begin(task))
+    linear = Linearisation.of(observed, space, z, state.point, state.errors, whitening_at(task, state), None)
+    return GeometryFit(linear, task.fitted[1:], state.sigma, observed.equations > task.fitted.sum())
+
+
+def _checked_geometry(observed: Observed, geometry: Mapping[str, Numbers] | None) -> dict[str, AnyArray]:
+    """The parts of a given geometry that these observations have, or `InputError` where there is none."""
+    if geometry is None:
+        return {}
+    if not isinstance(geometry, Mapping):
+        raise InputError("geometry must be a dictionary; give that of a calibration: result.observed.geometry.")
+    parts = {}
+    for name, units in observed.blocks.items():
+        if name in geometry:
+            parts[name] = as_array(geometry[name], name, like=np.zeros(0))
+            if parts[name].shape != (len(units),):
+                raise InputError(f"{name} has shape {parts[name].shape}; give ({len(units)},).")
+    if geometry and not parts:
+        first = next(iter(geometry))
+        raise InputError(
+            f"the capture has no '{first}' or other part of this geometry{nearest(first, observed.blocks)}"
+        )
+    return parts
+
+
+def _described(fitted: GeometryFit) -> ObservedEvaluation:
+    """Residuals of all observations by an arm whose geometry is fitted."""
+    linear, observed = fitted.linear, fitted.linear.observed
+    xp, parts = namespace(linear.z), observed.split(fitted.geometry)
+    residuals, normalised = observed.by_observation([part.values for part in linear.point.rows]), linear.white()
+    return ObservedEvaluation(
+        names=tuple(observation.name for observation in observed.observations),
+        kinds=tuple(observation.kind for observation in observed.observations),
+        residuals=tuple(residuals),
+        normalised=tuple(normalised),
+        rms=xp.stack([_rms(xp, values[:_POSITION_ROWS]) for values in residuals]),
+        rms_angle=xp.stack([_rms(xp, values[_POSITION_ROWS:]) for values in residuals]),
+        reduced_chi=xp.stack([xp.sqrt(xp.mean(white**2)) for white in normalised]),
+        sigma=fitted.sigma,
+        geometry={name: parts[name] for name in observed.names},
+    )
+
+
+def _rms(xp: Any, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, ""]:
+    """Root mean square length of the columns; NaN where they have no rows."""
+    return xp.sqrt(xp.mean(xp.sum(rows**2, axis=0))) if rows.shape[0] else xp.asarray(np.nan)

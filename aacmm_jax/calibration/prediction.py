@@ -18,8 +18,8 @@ from jaxtyping import Float
 from ..core.distributions import chance
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
+from ..data.copies import visits_of
 from ..data.observations.socket import position_of
-from ..data.visits import visits_of
 from ..model.elimination import followed
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -28,8 +28,8 @@ from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .batch_kernel import without_lengths
-from .observed_evaluation import fit_geometry
+from .evaluation import fit_geometry
+from .task import without_lengths
 
 _NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position

@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core._compat import member_numbers
 from ..core.linear_algebra import inverse_positive_definite, singular_values, solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, stop_gradient, while_loop
-from ..kinematics.parameters import Parameters
 from ..kinematics.priors import LEAST_STEPS, MIXED, ParameterPrior
-from ..model.elimination import Args, observed_model, observed_rows, reduced
+from ..model.elimination import Args, observed_model, reduced
 from ..model.robust import Loss
 from ..model.rows import PriorRows, Whitening
 from ..solver.reason import MAX_STEPS, reasons
@@ -30,10 +29,9 @@ from ..uncertainty.evidence import (
     learned_log_variances,
     slope_of_expectation,
 )
-from .bounded_fit import NEAR, Fit, fit
 from .results import PriorMetrics
-from .solve_state import State, state_at, whitening_at
 from .task import Task
+from .weighted_least_squares import NEAR, Begun, Fit, State, fit, state_at, whitening_at
 
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
 # Largest change of the log of a variance that no further round is worth, where derivatives pass through, and elsewhere.
@@ -49,6 +47,47 @@ _LEAST_LOG = 2 * np.log(LEAST_STEPS)
 _LEAST_SCALE = 1e-3
 
 
+class OfPrior(NamedTuple):
+    """What the last least squares with a prior found besides the unknowns."""
+
+    rows: PriorRows
+    metrics: PriorMetrics
+    effective: Float[AnyArray, ""]  # how many unknowns the data determine
+    by_scales: "ByScales | None"
+
+
+def prior_of(task: Task) -> ParameterPrior | None:
+    """The prior of the parameters that are free; None where nothing is known of any."""
+    if task.prior is None:
+        return None
+    return task.prior.of(task.space.names, task.bounds.space.vector()[task.free])
+
+
+def weights(task: Task, begun: Begun, state: State, loss: Loss | None) -> Whitening:
+    """Of the next least squares; scales of a prior are those before anything is learned."""
+    if task.needs_no_weights:
+        return Whitening((None,) * len(task.observed.layout.groups), np.zeros(0), {})
+    prior = prior_of(task)
+    if prior is None:
+        return whitening_at(task, state)
+    problem = PriorProblem(task, begun, prior, loss, state)
+    return whitening_at(task, state, problem.rows(problem.first_scales()))
+
+
+def fitted_with_prior(
+    task: Task, prior: ParameterPrior, begun: Begun, state: State, z: Float[AnyArray, " z"]
+) -> tuple[Float[AnyArray, " z"], State, Fit, OfPrior]:
+    """The last least squares with a prior, whose weights agree with what it leads to."""
+    problem = PriorProblem(task, begun, prior, task.loss, state)
+    scales, solution = _settled(problem, z)
+    z, model = solution.parameters, problem.model(scales, solution.parameters)
+    effective = effective_parameters(model, problem.sd(scales))
+    determined = z.shape[0] - len(prior.index) + namespace(effective).sum(effective)
+    by_scales = problem.by_scales(scales, model) if any(prior.learned) else None
+    of_prior = OfPrior(problem.rows(scales), problem.metrics(scales, effective), determined, by_scales)
+    return z, state_at(task, begun.space, z, effective=determined), solution, of_prior
+
+
 class PriorProblem(NamedTuple):
     """One least squares with a prior, whose weights are those at a nearly right arm (``reference``).
 
@@ -57,10 +96,8 @@ class PriorProblem(NamedTuple):
     """
 
     task: Task
-    space: Parameters
+    begun: Begun
     prior: ParameterPrior
-    sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]]
-    steps: Float[AnyArray, " z"]
     loss: Loss | None
     reference: State
 
@@ -79,8 +116,8 @@ class PriorProblem(NamedTuple):
         """The scales before anything is learned; those that are given keep these values."""
         xp, prior = namespace(self.reference.sigma, self.prior), self.prior
         first = np.array([own[0] for own in prior.members])
-        variances = 2 * xp.log(xp.maximum((prior.sd / self.steps[: prior.sd.shape[0]])[first], _LEAST_GIVEN))
-        return xp.concatenate([xp.log(xp.maximum(self.reference.sigma, 1e-9))[None], variances])
+        variances = 2 * xp.log(xp.maximum((prior.sd / self.begun.steps[: prior.sd.shape[0]])[first], _LEAST_GIVEN))
+        return xp.concatenate([_log_sigma(self.reference.sigma), variances])
 
     def sd(self, scales: Float[AnyArray, " s"]) -> Float[AnyArray, " k"]:
         """Standard deviation of every parameter that has a prior, in natural steps."""
@@ -89,49 +126,45 @@ class PriorProblem(NamedTuple):
     def rows(self, scales: Float[AnyArray, " s"]) -> PriorRows:
         """The rows of the prior with these scales."""
         xp, index = namespace(scales, self.prior), self.prior.index
-        weight = 1 / (self.sd(scales) * self.steps[index])
+        weight = 1 / (self.sd(scales) * self.begun.steps[index])
         return PriorRows(self.prior.mean, set_at(xp.zeros_like(self.prior.mean), index, weight))
 
-    def whitening(self, scales: Float[AnyArray, " s"], prior: PriorRows | None) -> Whitening:
-        """The weights with these scales."""
-        sigma = namespace(scales).exp(scales[0])
-        return whitening_at(self.task, self.reference._replace(sigma=sigma), prior)
+    def args(self, scales: Float[AnyArray, " s"], prior: PriorRows | None) -> Args:
+        """The least squares with these scales."""
+        reference = self.reference._replace(sigma=namespace(scales).exp(scales[0]))
+        whitening = whitening_at(self.task, reference, prior)
+        return Args(self.begun.space, self.task.observed, whitening, self.loss)
 
     def fit(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], *, differentiable: bool) -> Fit:
-        """The least squares with these scales."""
-        xp, index = namespace(scales, z), self.prior.index
-        args = Args(self.space, self.task.observed, self.whitening(scales, self.rows(scales)), self.loss)
-        tight = xp.clip(stop_gradient(self.sd(scales)), _LEAST_SCALE, 1.0)
-        step = set_at(self.steps, index, self.steps[index] * tight)
-        functions, limit = (observed_rows, observed_model), self.task.max_steps
-        return fit(*functions, z, args, self.sides, step, limit, rules=NEAR, differentiable=differentiable)
+        """The unknowns with these scales."""
+        index, steps = self.prior.index, self.begun.steps
+        tight = namespace(scales, z).clip(stop_gradient(self.sd(scales)), _LEAST_SCALE, 1.0)
+        steps, args = set_at(steps, index, steps[index] * tight), self.args(scales, self.rows(scales))
+        return fit(self.task, args, z, self.begun, NEAR, steps=steps, differentiable=differentiable)
 
     def model(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> PriorModel:
         """The model of the parameters that have a prior, linear at a point."""
-        xp, index = namespace(scales, z), self.prior.index
-        args = Args(self.space, self.task.observed, self.whitening(scales, None), self.loss)
-        data: Any = observed_model(z, args, curved=False)
-        pinned = (z <= self.sides[0]) | (z >= self.sides[1])
-        deviation = (z[: self.prior.mean.shape[0]] - self.prior.mean)[index] / self.steps[index]
-        gram, gradient = reduced(data.gram.scaled(self.steps), data.gradient * self.steps)
+        xp, index, (lower, upper), steps = namespace(scales, z), self.prior.index, self.begun.sides, self.begun.steps
+        data: Any = observed_model(z, self.args(scales, None), curved=False)
+        pinned = (z <= lower) | (z >= upper)
+        deviation = (z[: self.prior.mean.shape[0]] - self.prior.mean)[index] / steps[index]
+        gram, gradient = reduced(data.gram.scaled(steps), data.gradient * steps)
         return eliminated(gram, gradient, deviation, index, xp.asarray(pinned)[: gram.shape[0]])
 
-    def sigma(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], effective: Any) -> Float[AnyArray, ""]:
+    def log_sigma(self, z: Float[AnyArray, " z"], effective: Float[AnyArray, " k"]) -> Float[AnyArray, " 1"]:
         """The tips' standard deviation by the residuals; as in the reference where the noise is given."""
         if self.task.noise is not None:
-            return self.reference.sigma
+            return _log_sigma(self.reference.sigma)
         spent = z.shape[0] - effective.shape[0] + namespace(effective).sum(effective)
-        return state_at(self.task, self.space, z, effective=spent).sigma
+        return _log_sigma(state_at(self.task, self.begun.space, z, effective=spent).sigma)
 
     def updated(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """The scales that the result of the least squares with these scales leads to."""
-        xp, model = namespace(scales, z), self.model(scales, z)
-        groups = self.groups
+        xp, model, groups = namespace(scales, z), self.model(scales, z), self.groups
         # Where nothing is expected, every search begins at a broad prior, so that it depends on the data alone.
         variances = learned_log_variances(model, groups, xp.where(groups.expected, scales[1:], groups.first))
-        new = xp.concatenate([scales[:1], variances])
-        sigma = self.sigma(scales, z, effective_parameters(model, self.sd(new)))
-        return xp.concatenate([xp.log(xp.maximum(sigma, 1e-9))[None], variances])
+        effective = effective_parameters(model, self.sd(xp.concatenate([scales[:1], variances])))
+        return xp.concatenate([self.log_sigma(z, effective), variances])
 
     def allowed(self, scales: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
         """Extrapolated scales, those of learned groups not below the least."""
@@ -140,53 +173,54 @@ class PriorProblem(NamedTuple):
 
     def mismatch(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """Zero at the fixed point: the equations that `updated` solves."""
-        xp, model, sd = namespace(scales, z), self.model(scales, z), self.sd(scales)
-        effective, groups, first = effective_parameters(model, sd), self.groups, self.first_scales()
+        xp, model, sd, variances = namespace(scales, z), self.model(scales, z), self.sd(scales), scales[1:]
+        effective, groups = effective_parameters(model, sd), self.groups
         slope = xp.asarray(groups.members) @ ((model.deviation / sd) ** 2 - effective)
-        slope = slope + slope_of_expectation(groups, scales[1:])
-        smallest = stop_gradient(scales[1:]) <= _LEAST_LOG + 1e-9
-        of_groups = xp.where(smallest, scales[1:] - _LEAST_LOG, slope)
-        of_groups = xp.where(xp.asarray(self.learned), of_groups, scales[1:] - first[1:])
-        of_sigma = scales[0] - xp.log(xp.maximum(self.sigma(scales, z, effective), 1e-9))
-        return xp.concatenate([of_sigma[None], of_groups])
+        slope = slope + slope_of_expectation(groups, variances)
+        smallest = stop_gradient(variances) <= _LEAST_LOG + 1e-9
+        of_groups = xp.where(smallest, variances - _LEAST_LOG, slope)
+        of_groups = xp.where(xp.asarray(self.learned), of_groups, variances - groups.first)
+        return xp.concatenate([scales[:1] - self.log_sigma(z, effective), of_groups])
 
-    def by_scales(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], model: PriorModel) -> "ByScales":
+    def moving(self, scales: Float[AnyArray, " s"]) -> Bool[AnyArray, " g"]:
+        """Which groups are learned, and deviate from their mean."""
+        return namespace(scales).asarray(self.learned) & (scales[1:] > _LEAST_LOG + 1e-9)
+
+    def by_scales(self, scales: Float[AnyArray, " s"], model: PriorModel) -> "ByScales":
         """How the unknowns follow learned scales."""
-        xp, index = namespace(scales, z), self.prior.index
-        moving = xp.asarray(self.learned) & (scales[1:] > _LEAST_LOG + 1e-9)
-        covariance = covariance_of_log_variances(model, self.groups, scales[1:], moving)
-        members, known = xp.asarray(self.prior.membership), 1 / self.sd(scales) ** 2
-        pull = (model.deviation * known)[:, None] * members.T
+        xp, index = namespace(scales, model), self.prior.index
+        covariance = covariance_of_log_variances(model, self.groups, scales[1:], self.moving(scales))
+        members, information = xp.asarray(self.prior.membership), 1 / self.sd(scales) ** 2
+        pull = (model.deviation * information)[:, None] * members.T
         alone = xp.asarray(~self.groups.expected)
-        lost = known * (xp.where(alone, xp.minimum(xp.diagonal(covariance), _MOST_SPREAD), 0.0) @ members)
+        spread = xp.where(alone, xp.minimum(xp.diagonal(covariance), _MOST_SPREAD), 0.0)
         height = self.prior.mean.shape[0] + self.task.observed.layout.shared
-        lost = set_at(xp.zeros(height), index, xp.where(model.pinned, 0.0, lost))
+        lost = xp.where(model.pinned, 0.0, information * (spread @ members))
+        lost = set_at(xp.zeros(height), index, lost)
         return ByScales(set_at(xp.zeros((height, pull.shape[1])), index, pull), covariance, lost)
 
-    def metrics(
-        self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]
-    ) -> tuple[PriorMetrics, AnyArray, "ByScales | None"]:
-        """What the result says of the prior; how many unknowns the data determine; and how they follow the scales."""
-        xp, prior, sd = namespace(scales, z), self.prior, self.sd(scales)
-        model = self.model(scales, z)
-        effective = effective_parameters(model, sd)
+    def metrics(self, scales: Float[AnyArray, " s"], effective: Float[AnyArray, " k"]) -> PriorMetrics:
+        """What the result says of the prior."""
+        xp, prior = namespace(scales, effective), self.prior
         first = np.array([own[0] for own in prior.members])
-        in_units = np.array([unit != MIXED for unit in prior.units])
-        of_groups = xp.exp(0.5 * scales[1:])
-        metrics = PriorMetrics(
+        in_units, of_groups = np.array([unit != MIXED for unit in prior.units]), xp.exp(0.5 * scales[1:])
+        return PriorMetrics(
             groups=prior.groups,
             learned=prior.learned,
             units=prior.units,
             parameters=tuple(len(own) for own in prior.members),
-            sd=xp.where(in_units, of_groups * self.steps[first], of_groups),
+            sd=xp.where(in_units, of_groups * self.begun.steps[first], of_groups),
             effective=xp.asarray(prior.membership) @ effective,
-            supported=~xp.asarray(self.learned) | (scales[1:] > _LEAST_LOG + 1e-9),
-            names=self.space.names,
+            supported=~xp.asarray(self.learned) | self.moving(scales),
+            names=self.begun.space.names,
             mean=prior.mean,
             weight=self.rows(scales).weight,
         )
-        follow = self.by_scales(scales, z, model) if any(prior.learned) else None
-        return metrics, z.shape[0] - len(prior.index) + xp.sum(effective), follow
+
+
+def _log_sigma(sigma: Float[AnyArray, ""]) -> Float[AnyArray, " 1"]:
+    xp = namespace(sigma)
+    return xp.log(xp.maximum(sigma, 1e-9))[None]
 
 
 class ByScales(NamedTuple):
@@ -265,38 +299,35 @@ class _Rounds(NamedTuple):
     history: _History
 
 
-def fit_with_prior(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, " s"], Fit]:
+def _settled(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, " s"], Fit]:
     """The scales at their fixed point, and the least squares with them.
 
     The derivative of the scales is that of an implicit function, exact where the fixed point is reached.
     """
     xp, differentiable = namespace(z, problem.task), problem.task.differentiable
     tolerance = _TOLERANCE if xp is np or differentiable else _BATCH_TOLERANCE
+    none = xp.zeros((), dtype=np.int64)
+    # Constants of differentiation, which passes through the fixed point alone.
+    constant, begin = stop_gradient((problem, z))
 
-    def one_round(known: PriorProblem) -> Callable:
-        def again(state: _Rounds) -> _Rounds:
-            found = known.fit(state.scales, state.z, differentiable=False)
-            new = known.updated(state.scales, found.parameters)
-            count, evaluations = state.count + 1, state.evaluations + found.steps
-            history = state.history.continued(state.scales, new)
-            change = xp.max(xp.abs(new - state.scales))
-            # Few data can lead to and fro between two sets of scales.
-            damped = xp.where(state.count < _UNDAMPED, new, 0.5 * (new + state.scales))
-            after = xp.where(change < _NEAR, known.allowed(history.extrapolated()), damped)
-            return _Rounds(count, after, found.parameters, evaluations, change, history)
-
-        return again
-
-    def settle(known: PriorProblem, first: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> _Rounds:
-        none = xp.zeros((), dtype=np.int64)
-        return while_loop(
-            lambda state: (state.count < _ROUNDS) & (state.change > tolerance),
-            one_round(known),
-            _Rounds(none, first, z, none, xp.asarray(np.inf), _History.empty(first)),
-        )
+    def again(state: _Rounds) -> _Rounds:
+        solution = constant.fit(state.scales, state.z, differentiable=False)
+        new = constant.updated(state.scales, solution.parameters)
+        history = state.history.continued(state.scales, new)
+        change = xp.max(xp.abs(new - state.scales))
+        # Few data can lead to and fro between two sets of scales.
+        damped = xp.where(state.count < _UNDAMPED, new, 0.5 * (new + state.scales))
+        after = xp.where(change < _NEAR, constant.allowed(history.extrapolated()), damped)
+        evaluations = state.evaluations + solution.steps
+        return _Rounds(state.count + 1, after, solution.parameters, evaluations, change, history)
 
     def solve(_: Any, first: Float[AnyArray, " s"]) -> tuple[Any, tuple[Any, Any, Any]]:
-        ended = settle(*stop_gradient((problem, first, z)))
+        first = stop_gradient(first)
+        ended = while_loop(
+            lambda state: (state.count < _ROUNDS) & (state.change > tolerance),
+            again,
+            _Rounds(none, first, begin, none, xp.asarray(np.inf), _History.empty(first)),
+        )
         # As a float: custom_root gives this a tangent of its own type, which an integer must not have.
         return ended.scales, (ended.z, xp.asarray(ended.evaluations, dtype=float), ended.change)
 
@@ -305,14 +336,15 @@ def fit_with_prior(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Flo
 
     def solve_linear(derivative: Callable, right: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
         left, values, transposed = singular_values(jax.jacfwd(derivative)(right))
-        known = values > 1e-14 * values[0]
-        return transposed @ (xp.where(known, 1 / xp.where(known, values, 1.0), 0.0) * (left.T @ right))
+        large = values > 1e-14 * values[0]
+        return transposed @ (xp.where(large, 1 / xp.where(large, values, 1.0), 0.0) * (left.T @ right))
 
     first = stop_gradient(problem.first_scales())
     if xp is np or not differentiable:
         scales, (last, evaluations, change) = solve(None, first)
     else:
         scales, (last, evaluations, change) = jax.lax.custom_root(mismatch, first, solve, solve_linear, has_aux=True)
-    found = problem.fit(scales, stop_gradient(last), differentiable=differentiable)
-    reason = xp.where(change > 1e-4, MAX_STEPS, member_numbers(found.result))
-    return scales, found._replace(steps=xp.asarray(evaluations, dtype=np.int64) + found.steps, result=reasons(reason))
+    solution = problem.fit(scales, stop_gradient(last), differentiable=differentiable)
+    reason = xp.where(change > 1e-4, MAX_STEPS, member_numbers(solution.result))
+    steps = xp.asarray(evaluations, dtype=np.int64) + solution.steps
+    return scales, solution._replace(steps=steps, result=reasons(reason))

@@ -18,10 +18,17 @@ from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.shared_errors import SharedErrors
-from .checks import largest_plausible_residual, plausible
 from .evaluation import Evaluation, evaluate
 from .left_out import CrossValidation
-from .results import Calibration, Identification, NoisyEncoder, ObservedMetrics, PriorMetrics
+from .results import (
+    Calibration,
+    Identification,
+    NoisyEncoder,
+    ObservedMetrics,
+    PriorMetrics,
+    largest_plausible_residual,
+    plausible,
+)
 from .scale_fix import against_division
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone

@@ -1,7 +1,11 @@
-"""What identifications and calibrations, of one and of many, return."""
+"""What identifications and calibrations, of one and of many, return: fields of the same names.
 
-import abc
-from typing import NamedTuple
+One is a PyTree of arrays of JAX, also under jit, vmap and derivatives; many are NumPy's arrays with the batch axis
+first, without what costs more than the solve.
+"""
+
+import math
+from typing import Any, NamedTuple, Union
 
 import equinox as eqx
 import jax
@@ -13,55 +17,23 @@ from ..core._compat import member_numbers
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
-from ..data.noise import Noise
+from ..data.noise import Noise, at_tip
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.workspace import total_link_length
 from ..model.metrics import Repeatability
 from ..model.scale import Scale
 from ..solver.reason import Reason
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
 from ..uncertainty.shared_errors import SharedErrors
-from .checks import PLAUSIBLE_SCALE, largest_plausible_residual
 from .scale_anchor import ScaleAnchor
 
 _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
-
-
-class AbstractResult(eqx.Module):
-    """What the results of stage 1 and of a calibration have in common, of one problem and of many."""
-
-    result: eqx.AbstractVar[Reason]
-    parameters: eqx.AbstractVar[Float[AnyArray, "*batch p"]]
-
-    @property
-    @abc.abstractmethod
-    def _stage1(self) -> "Identification | ManyIdentifications":
-        """The result of stage 1: this one, or that of a calibration."""
-
-    @property
-    def space(self) -> Parameters:
-        """The free parameters."""
-        return self._stage1.bounds.space
-
-    @property
-    def hold(self) -> str | None:
-        """The scale anchor of stage 1."""
-        return self._stage1.anchor.hold
-
-    @property
-    def scale_set_by(self) -> tuple[str, ...]:
-        """Fixed lengths that set the scale, so that k changes nothing in a two-stage calibration."""
-        return self._stage1.anchor.set_by
-
-    @property
-    def converged(self) -> Bool[AnyArray, "*batch"]:
-        """Whether every solve ended at a minimum, with finite parameters and, in a calibration, a plausible k."""
-        parameters, k = to_numpy((self.parameters, self._stage1.k))
-        xp = namespace(parameters)
-        good = converged(self._stage1.result) & converged(self.result) & xp.all(xp.isfinite(parameters), axis=-1)
-        if k is not None and self._stage1 is not self:
-            good = good & (k >= PLAUSIBLE_SCALE[0]) & (k <= PLAUSIBLE_SCALE[1])
-        return np.asarray(good) if is_concrete(good) else good
+_PLAUSIBLE_SCALE = (0.5, 2.0)
+# Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
+_RELATIVE_REPEATABILITY = 1e-5
+# Residuals larger by these factors come from wrong data, not from an arm: than that, and than its noise predicts.
+_OVER_REPEATABILITY, _OVER_NOISE = 100.0, 10.0
 
 
 class PriorMetrics(eqx.Module):
@@ -94,86 +66,6 @@ class NoisyEncoder(NamedTuple):
     probability: float  # of such residuals or larger ones, where the noise is as expected
 
 
-class AbstractSingleResult(AbstractResult):
-    """What an `Identification` and a `Calibration` have in common."""
-
-    arm: eqx.AbstractVar[Arm]
-    active: eqx.AbstractVar[Int[AnyArray, " p"]]
-    parameter_covariance: eqx.AbstractVar[ParameterCovariance]
-    after: eqx.AbstractVar[Repeatability]
-
-    @property
-    @abc.abstractmethod
-    def _stage1(self) -> "Identification":
-        """The result of stage 1: this one, or that of a calibration."""
-
-    @property
-    def covariance(self) -> Float[AnyArray, "*batch p p"]:
-        """Covariance of the parameters; that of what is determined, where not all is."""
-        return self.parameter_covariance.matrix
-
-    @property
-    def determined(self) -> Bool[AnyArray, "*batch p"]:
-        """Which parameters are determined one by one, and not only in combination with others."""
-        return self.parameter_covariance.determined
-
-    @property
-    def noise(self) -> Noise:
-        """Noise of readings and seat: as given, or as estimated from the residuals."""
-        return self.parameter_covariance.noise
-
-    @property
-    def prior(self) -> PriorMetrics | None:
-        """The prior, where one was given, with its learned standard deviations and effective parameters."""
-        return self._stage1.prior_metrics
-
-    @property
-    def degrees_of_freedom(self) -> Float[AnyArray, "*batch"] | float:
-        """Degrees of freedom behind the covariance, equations less effective parameters; infinite where the noise was
-        given."""
-        fitted, prior = self._stage1.fitted_degrees_of_freedom, self.prior
-        if prior is None:
-            return max(fitted, 1.0)
-        spared = sum(prior.parameters) - namespace(prior.effective).sum(prior.effective)
-        if is_concrete(spared) and np.ndim(spared) == 0:
-            return max(fitted + float(spared), 1.0)
-        return namespace(spared).maximum(fitted + spared, 1.0)
-
-    @property
-    def given_noise(self) -> Noise | None:
-        """The noise, where it was given and not estimated."""
-        return None if self._stage1.reduced_chi is None else self.noise
-
-    @property
-    def noisy_encoders(self) -> tuple[NoisyEncoder, ...]:
-        """Encoders that proved noisier than given, or than the others, and whose noise was estimated."""
-        return self._stage1.noisy_encoders
-
-    @property
-    def weighting_noise(self) -> Noise | None:
-        """The noise by which poses were weighted: given, or estimated by joint; None where all count alike."""
-        return self.noise if self.noisy_encoders else self.given_noise
-
-    @property
-    def implausible_residual(self) -> bool:
-        """Whether the residual is larger than that of an arm of this size with such noise, so that data and arm do not
-        belong together. What is usual for a class of arms only a record knows (`calibration.record_of`)."""
-        self._check_single()
-        return float(self.after.rms) > largest_plausible_residual(self.arm, self.given_noise)
-
-    def active_names(self) -> dict[str, str]:
-        """Parameters on a bound: name -> 'lower' or 'upper'."""
-        self._check_single()
-        return active_names(self.space, self.active)
-
-    def _check_single(self) -> None:
-        if self.active.ndim != 1 or not is_concrete(self.active):
-            raise InputError(
-                "this result is a batch, or inside jit or vmap, where its values are not known; take one result of it "
-                "outside: jax.tree.map(lambda leaf: leaf[0], results)."
-            )
-
-
 class ObservedMetrics(eqx.Module):
     """How the observations of a capture agree with their geometry, and that geometry; in their order, sockets first."""
 
@@ -195,6 +87,125 @@ class ObservedMetrics(eqx.Module):
         return float(np.sqrt(np.average(np.asarray(self.rms_after) ** 2, weights=poses)))
 
 
+class AbstractResult(eqx.Module):
+    """What the results of stage 1 and of a calibration have in common, of one problem and of many."""
+
+    result: eqx.AbstractVar[Reason]
+    parameters: eqx.AbstractVar[Float[AnyArray, "*batch p"]]
+    stage1: eqx.AbstractVar[Union["Identification", "ManyIdentifications"]]  # of stage 1 itself, the result
+
+    @property
+    def space(self) -> Parameters:
+        """The free parameters."""
+        return self.stage1.bounds.space
+
+    @property
+    def hold(self) -> str | None:
+        """The scale anchor of stage 1."""
+        return self.stage1.anchor.hold
+
+    @property
+    def scale_set_by(self) -> tuple[str, ...]:
+        """Fixed lengths that set the scale, so that k changes nothing in a two-stage calibration."""
+        return self.stage1.anchor.set_by
+
+    @property
+    def converged(self) -> Bool[AnyArray, "*batch"]:
+        """Whether every solve ended at a minimum, with finite parameters and, in a calibration, a plausible k."""
+        parameters, k = to_numpy((self.parameters, self.stage1.k))
+        xp = namespace(parameters)
+        good = converged(self.stage1.result) & converged(self.result) & xp.all(xp.isfinite(parameters), axis=-1)
+        if k is not None and self.stage1 is not self:
+            good = good & plausible(k)
+        return np.asarray(good) if is_concrete(good) else good
+
+
+class AbstractSingleResult(AbstractResult):
+    """What an `Identification` and a `Calibration` have in common; mm and rad."""
+
+    stage1: eqx.AbstractVar["Identification"]
+    arm: Arm
+    parameters: Float[AnyArray, " p"]
+    de: Float[AnyArray, ""]  # mean distance from the centroid, mm
+    deltam: Float[AnyArray, ""]  # largest half range, mm
+    active: Int[AnyArray, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
+    steps: Int[AnyArray, ""]  # evaluations of all solves
+    result: Reason  # why the last solve ended
+    scale: Scale | None  # k of stage 1, where the capture holds reference lengths
+    # Of stage 1 given the scale anchor: its rows are 0, and those of active parameters but for near-degenerate
+    # directions.
+    parameter_covariance: ParameterCovariance
+    before: Repeatability  # the start
+    after: Repeatability
+    observed: ObservedMetrics  # how the observations agree, sockets first
+
+    @property
+    def k(self) -> Float[AnyArray, "*batch"] | None:
+        """k = measured / nominal of stage 1, where the capture holds reference lengths."""
+        return None if self.scale is None else self.scale.value
+
+    @property
+    def covariance(self) -> Float[AnyArray, "*batch p p"]:
+        """Covariance of the parameters; that of what is determined, where not all is."""
+        return self.parameter_covariance.matrix
+
+    @property
+    def determined(self) -> Bool[AnyArray, "*batch p"]:
+        """Which parameters are determined one by one, and not only in combination with others."""
+        return self.parameter_covariance.determined
+
+    @property
+    def noise(self) -> Noise:
+        """Noise of readings and seat: as given, or as estimated from the residuals."""
+        return self.parameter_covariance.noise
+
+    @property
+    def prior(self) -> PriorMetrics | None:
+        """The prior, where one was given, with its learned standard deviations and effective parameters."""
+        return self.stage1.prior_metrics
+
+    @property
+    def degrees_of_freedom(self) -> Float[AnyArray, "*batch"] | float:
+        """Degrees of freedom behind the covariance, equations less effective parameters; infinite where the noise was
+        given."""
+        fitted, prior = self.stage1.fitted_degrees_of_freedom, self.prior
+        if prior is None:
+            return max(fitted, 1.0)
+        spared = sum(prior.parameters) - namespace(prior.effective).sum(prior.effective)
+        if is_concrete(spared) and np.ndim(spared) == 0:
+            return max(fitted + float(spared), 1.0)
+        return namespace(spared).maximum(fitted + spared, 1.0)
+
+    @property
+    def given_noise(self) -> Noise | None:
+        """The noise, where it was given and not estimated."""
+        return None if self.stage1.reduced_chi is None else self.noise
+
+    @property
+    def weighting_noise(self) -> Noise | None:
+        """The noise by which poses were weighted: given, or estimated by joint; None where all count alike."""
+        return self.noise if self.stage1.noisy_encoders else self.given_noise
+
+    @property
+    def implausible_residual(self) -> bool:
+        """Whether the residual is larger than that of an arm of this size with such noise, so that data and arm do not
+        belong together. What is usual for a class of arms only a record knows (`calibration.record_of`)."""
+        self._check_single()
+        return float(self.after.rms) > largest_plausible_residual(self.arm, self.given_noise)
+
+    def active_names(self) -> dict[str, str]:
+        """Parameters on a bound: name -> 'lower' or 'upper'."""
+        self._check_single()
+        return active_names(self.space, self.active)
+
+    def _check_single(self) -> None:
+        if self.active.ndim != 1 or not is_concrete(self.active):
+            raise InputError(
+                "this result is a batch, or inside jit or vmap, where its values are not known; take one result of it "
+                "outside: jax.tree.map(lambda leaf: leaf[0], results)."
+            )
+
+
 class Identification(AbstractSingleResult):
     """Result of stage 1. A PyTree: under ``eqx.filter_vmap`` every array has the batch axis first.
 
@@ -208,19 +219,7 @@ class Identification(AbstractSingleResult):
         {'a_5': 0.159, 'd_2': 0.137, 'd_3': 750.0}
     """
 
-    arm: Arm
-    parameters: Float[AnyArray, " p"]
-    de: Float[AnyArray, ""]  # mean distance from the centroid, mm
-    deltam: Float[AnyArray, ""]  # largest half range, mm
-    active: Int[AnyArray, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
-    steps: Int[AnyArray, ""]  # evaluations
-    result: Reason  # why it ended
     optimality: Float[AnyArray, ""]  # projected gradient as a cosine; 0 at a minimum
-    scale: Scale | None  # k of this arm, where the capture holds reference lengths
-    # Given the scale anchor: its rows are 0, and those of active parameters but for near-degenerate directions.
-    parameter_covariance: ParameterCovariance
-    before: Repeatability  # the start
-    after: Repeatability
     # Root mean square of the residuals in units of what the given noise predicts (1 where it is right), or None.
     reduced_chi: Float[AnyArray, ""] | None
     bounds: Bounds
@@ -228,18 +227,14 @@ class Identification(AbstractSingleResult):
     noise_model: NoiseModel = eqx.field(static=True)  # model of the tips' errors
     # Of the covariance, with every parameter as fitted in full; infinite where the noise was given.
     fitted_degrees_of_freedom: float = eqx.field(static=True)
-    observed: ObservedMetrics  # how the observations agree, sockets first
     prior_metrics: PriorMetrics | None = None
+    # Encoders that proved noisier than given, or than the others, and whose noise was estimated.
     noisy_encoders: tuple[NoisyEncoder, ...] = eqx.field(static=True, default=())
 
     @property
-    def _stage1(self) -> "Identification":
+    def stage1(self) -> "Identification":
+        """This result."""
         return self
-
-    @property
-    def k(self) -> Float[AnyArray, "*batch"] | None:
-        """k = measured / nominal, where the capture holds reference lengths."""
-        return None if self.scale is None else self.scale.value
 
 
 class Calibration(AbstractSingleResult):
@@ -256,35 +251,14 @@ class Calibration(AbstractSingleResult):
         d_3 = 750.579 mm, u = 0.010 mm
     """
 
-    arm: Arm
-    parameters: Float[AnyArray, " p"]
-    scale: Scale | None  # k of stage 1; None where observations fix the scale and there is no reference length
-    de: Float[AnyArray, ""]  # mean distance from the centroid, mm
-    deltam: Float[AnyArray, ""]  # largest half range, mm
-    active: Int[AnyArray, " p"]  # -1 on the lower bound, +1 on the upper, 0 inside
-    steps: Int[AnyArray, ""]  # evaluations of all solves
-    result: Reason  # why the last solve ended
-    parameter_covariance: ParameterCovariance
-    before: Repeatability
-    after: Repeatability
     length_before: Float[AnyArray, " l"]  # measured reference lengths, mm: at the start
     length_after: Float[AnyArray, " l"]  # by the calibrated arm
     stage1: Identification
     method: str = eqx.field(static=True)  # "two-stage" or "joint", as it was asked for or chosen
-    observed: ObservedMetrics  # how the observations agree, sockets first
     # Whether the result is stage 1 divided by k; not where a bound or a fixed length stood against that, and everything
     # was solved at once, as with the method "joint".
     divided: Bool[AnyArray, ""]
     shared: SharedErrors | None = None  # errors that poses share, which the covariance contains; None: none were found
-
-    @property
-    def _stage1(self) -> Identification:
-        return self.stage1
-
-    @property
-    def k(self) -> Float[AnyArray, "*batch"] | None:
-        """k = measured / nominal of stage 1."""
-        return None if self.scale is None else self.scale.value
 
     @property
     def noise_model(self) -> NoiseModel:
@@ -296,12 +270,26 @@ class Calibration(AbstractSingleResult):
         """The box of the identification."""
         return self.stage1.bounds
 
+    @property
+    def noisy_encoders(self) -> tuple[NoisyEncoder, ...]:
+        """Encoders that proved noisier than given, or than the others, and whose noise was estimated."""
+        return self.stage1.noisy_encoders
+
 
 class AbstractManyResults(AbstractResult):
-    """What `ManyIdentifications` and `ManyCalibrations` have in common."""
+    """What `ManyIdentifications` and `ManyCalibrations` have in common; mm and rad."""
 
-    parameters: eqx.AbstractVar[Float[np.ndarray, "b p"]]
-    covariance: eqx.AbstractVar[Float[np.ndarray, "b p p"] | None]
+    parameters: Float[np.ndarray, "b p"]
+    k: Float[np.ndarray, " b"] | None  # measured / nominal of stage 1, where the capture holds reference lengths
+    de: Float[np.ndarray, " b"]  # mm
+    deltam: Float[np.ndarray, " b"]  # mm
+    steps: Int[np.ndarray, " b"]  # evaluations of all solves
+    result: Reason  # why the last solve of each ended
+    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or fixed, in the last solve
+    covariance: Float[np.ndarray, "b p p"] | None = eqx.field(default=None, kw_only=True)  # where it was asked for
+    # Of all observations, where there are any but sockets.
+    reduced_chi: Float[np.ndarray, " b"] | None = eqx.field(default=None, kw_only=True)
+    prior: PriorMetrics | None = eqx.field(default=None, kw_only=True)  # with a batch axis
 
     @property
     def u(self) -> Float[np.ndarray, "b p"]:
@@ -330,22 +318,13 @@ class ManyIdentifications(AbstractManyResults):
         (3, 21) False
     """
 
-    parameters: Float[np.ndarray, "b p"]
-    de: Float[np.ndarray, " b"]  # mm
-    deltam: Float[np.ndarray, " b"]  # mm
     sigma: Float[np.ndarray, " b"]  # ``after.sigma`` of an `Identification`, mm
-    k: Float[np.ndarray, " b"] | None  # measured / nominal, where the capture holds reference lengths
-    steps: Int[np.ndarray, " b"]  # evaluations
-    result: Reason  # why each ended
-    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, 0 inside or fixed
     bounds: Bounds  # with a batch axis where bounds or arms were given as a batch
     anchor: ScaleAnchor = eqx.field(static=True)  # what sets the scale
-    covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
-    reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
-    prior: PriorMetrics | None = None  # with a batch axis
 
     @property
-    def _stage1(self) -> "ManyIdentifications":
+    def stage1(self) -> "ManyIdentifications":
+        """These results."""
         return self
 
 
@@ -361,23 +340,9 @@ class ManyCalibrations(AbstractManyResults):
         (2, 21) (2,) (2,)
     """
 
-    parameters: Float[np.ndarray, "b p"]
-    k: Float[np.ndarray, " b"] | None  # of stage 1; None where observations fix the scale
-    de: Float[np.ndarray, " b"]  # mm
-    deltam: Float[np.ndarray, " b"]  # mm
-    steps: Int[np.ndarray, " b"]  # evaluations of all solves
-    result: Reason  # why the last solve ended
-    active: Int[np.ndarray, "b p"]  # -1 on the lower bound, +1 on the upper, in the last solve
     stage1: ManyIdentifications
     method: str = eqx.field(static=True)
     divided: Bool[np.ndarray, " b"]  # as in a `Calibration`
-    covariance: Float[np.ndarray, "b p p"] | None = None  # where it was asked for
-    reduced_chi: Float[np.ndarray, " b"] | None = None  # of all observations, where there are any but sockets
-    prior: PriorMetrics | None = None  # with a batch axis
-
-    @property
-    def _stage1(self) -> ManyIdentifications:
-        return self.stage1
 
     @property
     def bounds(self) -> Bounds:
@@ -401,10 +366,23 @@ def converged(result: Reason) -> Bool[AnyArray, "*batch"]:
     return jnp.isin(number, np.array(_GOOD, dtype=number.dtype))
 
 
+def plausible(k: Any) -> Any:
+    """Whether a scale can be a calibration's at all, and not a mistaken unit or socket."""
+    return (k >= _PLAUSIBLE_SCALE[0]) & (k <= _PLAUSIBLE_SCALE[1])
+
+
+def largest_plausible_residual(arm: Arm, *noises: Noise | None) -> float:
+    """RMS distance from the sockets' centroids, mm, above which data and arm do not belong together.
+
+    A hundred times the repeatability of a good arm of this size, or, where that is more, ten times what one of the
+    noises predicts at full reach: that which was given, and that which is usual for the class of the arm.
+    """
+    size = total_link_length(arm)
+    predicted = [math.sqrt(3) * math.hypot(*at_tip(noise, arm, size)) for noise in noises if noise is not None]
+    return max([_OVER_REPEATABILITY * _RELATIVE_REPEATABILITY * size, *(_OVER_NOISE * rms for rms in predicted)])
+
+
 def active_names(space: Parameters, active: Numbers) -> dict[str, str]:
     """Parameters on a bound: name -> 'lower' or 'upper'."""
-    return {
-        name: "lower" if side < 0 else "upper"
-        for name, side in zip(space.names, np.asarray(active), strict=True)
-        if side
-    }
+    pairs = zip(space.names, np.asarray(active), strict=True)
+    return {name: "lower" if side < 0 else "upper" for name, side in pairs if side}

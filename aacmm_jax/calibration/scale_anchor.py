@@ -38,6 +38,8 @@ from ..kinematics.parameters import Parameters, based_on
 from ..kinematics.workspace import total_link_length
 from ..model.scale import Partners
 
+Method = Literal["two-stage", "joint"]
+
 # Fixed lengths and slides set the scale where repeatability with them would determine it to this relative standard
 # uncertainty ...
 _LARGEST_UNCERTAINTY = 1e-4
@@ -55,15 +57,15 @@ _EXACT = 1e-9  # residual, relative to the column, below which free lengths repl
 class ScaleAnchor(NamedTuple):
     """What sets the scale in stage 1, and whether it may be divided; static, so that it may fix a compiled program."""
 
-    hold: str | None  # free length that stage 1 keeps at its start
+    hold: str | None = None  # free length that stage 1 keeps at its start
     # Whether a length is free; False too where neither an anchor nor the values of the arm are known.
-    free: bool
+    free: bool = False
     # Fixed lengths, and readings ``q_i`` of prismatic joints, that determine the scale well, so that a division by k
     # changes nothing.
-    set_by: tuple[str, ...]
+    set_by: tuple[str, ...] = ()
     # Fixed lengths that free ones replace exactly in a division; None where some have no such partner, as slides have
     # not, or are not known.
-    partners: Partners | None
+    partners: Partners | None = None
 
     @property
     def can_scale(self) -> bool:
@@ -91,41 +93,60 @@ def scale_anchor(
     """
     space = based_on(space, arm)
     arm = space.base
-    known = is_concrete(*jax.tree.leaves(arm))
+    concrete = is_concrete(*jax.tree.leaves(arm))
     lengths = [name for name in space.names if is_length(name)]
+    hold = _checked_hold(hold, space, lengths, concrete)
+    fixed, slides = fixed_lengths(arm, space), tuple(f"q_{i}" for i in arm.prismatic)
+    partners = None if fixed or slides else ((), ())
+    longest = _longest_link(lengths, arm if concrete else None)
+    set_by, without_anchor = (), False
+    if concrete and (fixed or slides):
+        single = _first(arm)
+        if longest is not None and hold in (None, "longest"):
+            poses = _known_poses(single, capture) if slides else None
+            scaling = _of_lengths(single, space, fixed) if poses is None else _of_slides(single, space, longest, poses)
+            least = min(_left_of_scaling(*part) for part in scaling)
+            u = _scatter(single, noise) / (math.sqrt(_EQUATIONS) * max(least, 1e-300))
+            moving = () if poses is None else tuple(name for name in slides if _slides(poses, name))
+            set_by = (moving or fixed) if u <= _LARGEST_UNCERTAINTY else ()
+            without_anchor = bool(slides) and u <= _LARGEST_OF_SLIDES
+        if not slides:
+            partners = _partners(arm, _columns_of_both(single, space, fixed), space, fixed)
+    if hold == "longest":
+        hold = None if set_by or without_anchor else longest
+    return ScaleAnchor(hold, hold is not None or (concrete and bool(lengths)), set_by, partners)
+
+
+def _checked_hold(hold: object, space: Parameters, lengths: list[str], concrete: bool) -> str | None:
+    """The length to hold, "longest", or None, as where no length is free."""
     if not isinstance(hold, str | None):
         raise InputError(f"hold is {shown(hold)}; give the name of a length, 'longest' or None.")
-    if hold not in (None, "longest") and hold not in lengths:
+    if hold not in (None, "longest", *lengths):
         space.index(hold)
         example = f", for example '{lengths[0]}'" if lengths else ", or leave out hold, since no length is free"
         raise InputError(f"hold is '{hold}', which is an angle; hold a length{example}.")
     if hold == "longest" and (not lengths or len(space.names) == 1):
-        hold = None
-    if hold == "longest" and not known:
+        return None
+    if hold == "longest" and not concrete:
         raise InputError(
             "hold='longest' needs an arm with known values; where the arm itself is traced, name the length to hold."
         )
-    fixed, slides = fixed_lengths(arm, space), tuple(f"q_{i}" for i in arm.prismatic)
-    one = _first(arm) if known and (fixed or slides) else None
-    set_by, free_of_anchor = (), False
-    longest = _longest_link(lengths, arm if known else None)
-    if one is not None and longest is not None and hold in (None, "longest"):
-        poses = _known_poses(one, capture) if slides else None
-        scaling = _of_lengths(one, space, fixed) if poses is None else _of_slides(one, space, longest, poses)
-        least = min(_left_of_scaling(*part) for part in scaling)
-        u = _scatter(one, noise) / (math.sqrt(_EQUATIONS) * max(least, 1e-300))
-        moving = () if poses is None else tuple(name for name in slides if _slides(poses, name))
-        set_by = (moving or fixed) if u <= _LARGEST_UNCERTAINTY else ()
-        free_of_anchor = bool(slides) and u <= _LARGEST_OF_SLIDES
-    if hold == "longest":
-        hold = None if set_by or free_of_anchor else longest
-    partners = None if fixed or slides else ((), ())
-    if one is not None and not slides:
-        partners = _partners(arm, _columns_of_both(one, space, fixed), space, fixed)
-    return ScaleAnchor(hold, hold is not None or (known and bool(lengths)), set_by, partners)
+    return hold
 
 
-def default_method(arm: Arm, general: bool) -> Literal["two-stage", "joint"]:
+def fixes_scale(capture: Capture) -> bool:
+    """Whether reference lengths or other observations of a capture fix the scale."""
+    return bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
+
+
+def scale_from_slides(arm: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> bool:
+    """Whether slides of prismatic joints determine the scale of a capture that has nothing else to fix it."""
+    if not arm.prismatic or fixes_scale(capture) or not space.lengths.any():
+        return False
+    return scale_anchor(space, arm, "longest", noise, capture).hold is None
+
+
+def default_method(arm: Arm, general: bool) -> Method:
     """How an arm is calibrated where nobody says: in two stages, but at once where more than lengths fixes the scale.
 
     ``general``: whether there are observations besides sockets and lengths, or a robust loss.
@@ -133,14 +154,7 @@ def default_method(arm: Arm, general: bool) -> Literal["two-stage", "joint"]:
     return "joint" if general or arm.prismatic else "two-stage"
 
 
-def scale_from_slides(arm: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> bool:
-    """Whether slides of prismatic joints determine the scale of a capture that has nothing else to fix it."""
-    if not arm.prismatic or capture.lengths or any(observation.fixes_scale for observation in capture.observations):
-        return False
-    return bool(space.lengths.any()) and scale_anchor(space, arm, "longest", noise, capture).hold is None
-
-
-def warn_of_a_known_scale(set_by: tuple[str, ...], prismatic: bool) -> None:
+def warn_of_known_scale(set_by: tuple[str, ...], prismatic: bool) -> None:
     """Warn where a division by k changes nothing: ``set_by`` names the fixed parameters that set the scale."""
     if set_by:
         sentence = (
@@ -172,16 +186,13 @@ def _longest_link(lengths: list[str], arm: Arm | None) -> str | None:
     links = [name for name in lengths if not name.startswith("probe") and name != "d_1"] or lengths
     if not links or arm is None:
         return links[0] if links else None
-
-    def size(name: str) -> float:
-        return float(np.abs(value_of(arm, name)).max())
-
+    sizes = {name: float(np.abs(value_of(arm, name)).max()) for name in lengths}
     # The links of a gantry are slides, and all that scales with the wrist may be the probe.
-    return max(links if any(map(size, links)) else lengths, key=size)
+    return max(links if any(sizes[name] for name in links) else lengths, key=sizes.__getitem__)
 
 
 def _first(arm: Arm) -> Arm:
-    """One arm of a batch, which may be one in some of its parameters only."""
+    """The first arm of a batch, which may be a batch in some of its parameters only."""
     if is_single(arm):
         return arm
     with jax.ensure_compile_time_eval():
@@ -191,13 +202,13 @@ def _first(arm: Arm) -> Arm:
 def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[Float[np.ndarray, "rows k"]]:
     """Derivatives of the tips by free parameters and fixed lengths at random configurations, less what they have in
     common: of the nominal arm and of a neighbouring one, which has no special position."""
-    names, found = (*space.names, *fixed), []
+    names, matrices = (*space.names, *fixed), []
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints))
     with jax.ensure_compile_time_eval():
-        for one in (arm, neighbouring_arm(arm, space.names)):
-            columns = jacobian_at(one, q, names)
-            found.append((columns - columns.mean(axis=0)).reshape(-1, len(names)))
-    return found
+        for variant in (arm, neighbouring_arm(arm, space.names)):
+            columns = jacobian_at(variant, q, names)
+            matrices.append((columns - columns.mean(axis=0)).reshape(-1, len(names)))
+    return matrices
 
 
 def _of_lengths(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -211,13 +222,13 @@ def _of_lengths(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[tup
 def _of_slides(arm: Arm, space: Parameters, longest: str, poses: SocketPoses) -> list[tuple[np.ndarray, np.ndarray]]:
     """How the other free parameters, and a relative change of the longest length, move the tips of every socket apart:
     at the poses of a capture, brought to their sockets."""
-    others, found = [name for name in space.names if name != longest], []
+    others, matrices = [name for name in space.names if name != longest], []
     with jax.ensure_compile_time_eval():
-        for one in (to_numpy(arm), neighbouring_arm(arm, space.names)):
-            rows, _ = equations(one, poses, (*others, longest), project_to_centroids(one, poses, targets_of=arm))
-            rows = rows.reshape(-1, len(space.names))
-            found.append((rows[:, :-1] * natural_steps(others), rows[:, -1] * value_of(arm, longest)))
-    return found
+        for variant in (to_numpy(arm), neighbouring_arm(arm, space.names)):
+            q = project_to_centroids(variant, poses, targets_of=arm)
+            rows = equations(variant, poses, (*others, longest), q)[0].reshape(-1, len(space.names))
+            matrices.append((rows[:, :-1] * natural_steps(others), rows[:, -1] * value_of(arm, longest)))
+    return matrices
 
 
 def _known_poses(arm: Arm, capture: SocketPoses | None) -> SocketPoses:

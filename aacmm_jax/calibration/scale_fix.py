@@ -20,20 +20,20 @@ from jaxtyping import Bool, Float, Int
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from ..data.capture import Capture
 from ..data.observations.socket import position_of
-from ..kinematics.parameters import Bounds, Parameters
+from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
 from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
 from ..uncertainty.covariance import DISAGREEMENT, STATED
 from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.linear_propagation import rows_of_functions
-from .conclusion import Solution
 from .results import Calibration
 from .scale_anchor import ScaleAnchor, fixed_lengths
+from .solve import Solution
 
 _ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
 
 
-class ScaleFound(NamedTuple):
+class MeasuredScale(NamedTuple):
     """k of stage 1, and how it follows the data."""
 
     scale: Scale
@@ -47,7 +47,7 @@ class ScaleFound(NamedTuple):
         return self.variance_of_lengths + self.scale.surplus
 
 
-def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
+def measured_scale(solution: Solution, capture: Capture) -> MeasuredScale:
     """k by the reference lengths of a capture, between positions that an identification has found.
 
     Its standard uncertainty includes that of the identified parameters, and takes those on a bound as exact.
@@ -60,21 +60,22 @@ def measured_scale(solution: Solution, capture: Capture) -> ScaleFound:
     head = xp.zeros((1, linear.height))
     components = [xp.zeros((1, count, size)) for count, size in layout.classes]
     for name, derivative in zip(positions_at_ends(capture), by_positions, strict=True):
-        of, component, first = layout.component_of(int(positions[name][0]))
-        if of < 0:
+        number, component, first = layout.component_of(int(positions[name][0]))
+        if number < 0:
             head = set_at(head, (0, p + positions[name]), derivative)
         else:
-            components[of] = set_at(components[of], (0, component, slice(first, first + 3)), derivative)
+            place = 0, component, slice(first, first + 3)
+            components[number] = set_at(components[number], place, derivative)
     rows = rows_of_functions(influence, head, components)
     by_lengths = -relative * scale.measured / scale.nominal
     of_lengths = xp.sum((by_lengths * ends.u) ** 2)
     u = xp.sqrt(solution.covariance_of(rows)[0, 0] + of_lengths + scale.surplus)
-    return ScaleFound(eqx.tree_at(lambda s: s.u, scale, u), rows, by_lengths, of_lengths)
+    return MeasuredScale(eqx.tree_at(lambda s: s.u, scale, u), rows, by_lengths, of_lengths)
 
 
 def positions_at_ends(capture: Capture) -> list[str]:
     """Names of the positions at the ends of reference lengths."""
-    return list(dict.fromkeys(position_of(name) for one in capture.lengths for name in (one.start, one.end)))
+    return list(dict.fromkeys(position_of(name) for pair in capture.lengths for name in (pair.start, pair.end)))
 
 
 def ends_between(
@@ -83,12 +84,13 @@ def ends_between(
     """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
     xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
     for name in used:
-        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        covariances.append(own[of][component, first : first + 3, first : first + 3])
+        number, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        covariances.append(own[number][component, first : first + 3, first : first + 3])
+    pairs = [(length.start, length.end) for length in capture.lengths]
     return MeasuredEnds(
         positions=xp.stack([geometry[observed.positions[name]] for name in used]),
         covariances=xp.stack(covariances),
-        ends=np.array([[used.index(position_of(name)) for name in (one.start, one.end)] for one in capture.lengths]),
+        ends=np.array([[used.index(position_of(name)) for name in pair] for pair in pairs]),
         nominal=xp.stack([length.value for length in capture.lengths]),
         u=xp.stack([length.u for length in capture.lengths]),
     )
@@ -97,8 +99,8 @@ def ends_between(
 class Division(NamedTuple):
     """The parameters of stage 1 divided by k."""
 
-    parameters: Float[AnyArray, " p"]
-    stands_against: Bool[AnyArray, ""]  # whether a bound or a fixed length does not allow it
+    parameters: Float[AnyArray, "*batch p"]
+    stands_against: Bool[AnyArray, "*batch"]  # whether a bound or a fixed length does not allow it
 
 
 def divided(anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], parameters: Any, k: Any) -> Division:
@@ -111,7 +113,12 @@ def divided(anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"],
     below, above = _on_bounds(anchor, bounds, active, scaled)
     concerned = xp.ones_like(below) if anchor.partners is None else below | above
     against = xp.any(concerned & lengths, axis=-1) & xp.all(xp.isfinite(scaled), axis=-1)
-    return Division(_clipped(space, bounds.lower, bounds.upper, scaled), against)
+    # Within the bounds, and on a bound that only rounding separates a length from: so short a step would not bring a
+    # solve onto the bound, which then counts as inactive, in derivatives too.
+    lower, upper = bounds.lower, bounds.upper
+    inside = xp.clip(scaled, lower, upper)
+    inside = xp.where(inside - lower <= _ROUNDING, lower, xp.where(upper - inside <= _ROUNDING, upper, inside))
+    return Division(xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled), against)
 
 
 def _on_bounds(
@@ -128,32 +135,16 @@ def against_division(calibration: Calibration) -> tuple[str, ...]:
     """What stood against the division by k of a calibration in two stages, in words; nothing where it was divided."""
     if calibration.method != "two-stage" or bool(calibration.divided) or calibration.scale is None:
         return ()
-    found, bounds = to_numpy((calibration.stage1, calibration.bounds))
-    space, anchor = bounds.space, found.anchor
-    scaled = divide_lengths(space, found.parameters, np.asarray(calibration.scale.value), anchor.partners)
-    below, above = _on_bounds(anchor, bounds, found.active, scaled)
+    stage1, bounds = to_numpy((calibration.stage1, calibration.bounds))
+    space, anchor = bounds.space, stage1.anchor
+    scaled = divide_lengths(space, stage1.parameters, np.asarray(calibration.scale.value), anchor.partners)
+    below, above = _on_bounds(anchor, bounds, stage1.active, scaled)
     concerned = np.flatnonzero((below | above) & divisible(space))
     names = [f"{space.names[i]} ({'upper' if above[i] else 'lower'} bound)" for i in concerned]
     if anchor.partners is None:
         names += [f"{name} (fixed length)" for name in fixed_lengths(space.base, space)]
         names += [f"q_{joint} (slide)" for joint in space.base.prismatic]
     return tuple(names)
-
-
-def _clipped(
-    space: Parameters,
-    lower: Float[AnyArray, "... p"],
-    upper: Float[AnyArray, "... p"],
-    scaled: Float[AnyArray, "... p"],
-) -> Float[AnyArray, "... p"]:
-    """Divided lengths within their bounds, and on a bound that only rounding separates them from.
-
-    So short a step would not bring a solve onto the bound, which then counts as inactive, in derivatives too.
-    """
-    xp = namespace(lower, upper, scaled)
-    inside = xp.clip(scaled, lower, upper)
-    inside = xp.where(inside - lower <= _ROUNDING, lower, xp.where(upper - inside <= _ROUNDING, upper, inside))
-    return xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled)
 
 
 class DividedUncertainty(NamedTuple):
@@ -164,30 +155,24 @@ class DividedUncertainty(NamedTuple):
     rows: list[Float[AnyArray, "p _ _"]]  # how they follow the whitened rows of every block
 
 
-def divided_uncertainty(solution: Solution, found: ScaleFound, anchor: ScaleAnchor, divided: Any) -> DividedUncertainty:
+def divided_uncertainty(
+    solution: Solution, measured: MeasuredScale, parameters: Float[AnyArray, " p"]
+) -> DividedUncertainty:
     """Of parameters that were divided by k.
 
     x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_lengths`), so
     dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
     """
-    linear, influence, k = solution.linear, solution.influence, found.scale.value
-    xp, free, p = namespace(divided, k), len(linear.space.names), divided.shape[0]
-    space = solution.identification.bounds.space
-    index = np.array([space.names.index(name) for name in linear.space.names], dtype=int)
-    head = xp.concatenate([xp.asarray(np.eye(free)), xp.zeros((free, linear.height - free))], axis=1)
-    head = head * xp.where(influence.fixed[:free], 0.0, linear.steps[:free])[:, None]
-    components = [xp.zeros((free, *own.shape[:2])) for own in influence.own]
-    of_free = rows_of_functions(influence, head, components)
+    k, anchor, space = measured.scale.value, solution.identification.anchor, solution.identification.bounds.space
+    xp = namespace(parameters, k)
     divides = xp.asarray(divisible(space) & anchor.can_scale)
-    by_k = xp.where(divides, (divided + replaced_lengths(space, anchor.partners)) / k, 0.0)
-    change = xp.where(divides, 1 / k, 1.0)
-    rows = []
-    for one, of_k in zip(of_free, found.rows, strict=True):
-        whole = set_at(xp.zeros((p, *one.shape[1:])), index, one)
-        rows.append(change[:, None, None] * whole - by_k[:, None, None] * of_k)
+    by_k = xp.where(divides, (parameters + replaced_lengths(space, anchor.partners)) / k, 0.0)
+    change = xp.where(divides, 1 / k, 1.0)[:, None, None]
+    pairs = zip(solution.rows_of_parameters(), measured.rows, strict=True)
+    rows = [change * of_parameters - by_k[:, None, None] * of_k for of_parameters, of_k in pairs]
     of_k = by_k[:, None] * by_k[None, :]
     parts = {
-        STATED: (found.variance_of_lengths * of_k, np.inf),
-        DISAGREEMENT: (found.scale.surplus * of_k, max(len(found.by_lengths) - 1, 1)),
+        STATED: (measured.variance_of_lengths * of_k, np.inf),
+        DISAGREEMENT: (measured.scale.surplus * of_k, max(len(measured.by_lengths) - 1, 1)),
     }
-    return DividedUncertainty(solution.covariance_of(rows) + found.added * of_k, Components.of(parts), rows)
+    return DividedUncertainty(solution.covariance_of(rows) + measured.added * of_k, Components.of(parts), rows)

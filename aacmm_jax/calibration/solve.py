@@ -1,139 +1,291 @@
-"""The engine's solve: one least squares of the parameters and of every unknown geometry.
+"""The engine's solve: the parameters and every unknown geometry that agree best with all that was observed.
 
-Solved at least twice where weights depend on the arm: with those of the start, and with those of that solution. Where
-the noise is not given, tips are taken to scatter as much as the residuals then do (`tip_errors.scatter_of`). With a
-prior the last solve is repeated until the weights agree with what it leads to (`prior_fit`).
+`solve` runs the least squares of a task in turn (`weighted_least_squares`; with a prior the last of them is repeated
+until the weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with
+whitened rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, where G is the inverse of the
+information A^T W A (`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows,
+which is that of the given noise, or of noise estimated from the residuals.
+
+Example, of the parameters of stage 1 and their standard uncertainties:
+    solution = solve(task_of(arm, without_lengths(capture), bounds, Solving()))
+    solution.identification.parameters, jnp.sqrt(jnp.diag(solution.identification.covariance))
 """
 
+from typing import Any, NamedTuple
+
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ..core.numpy_or_jax import AnyArray, namespace, stop_gradient
-from ..kinematics.priors import ParameterPrior
-from ..model.elimination import Args, observed_model, observed_rows, with_linear_geometry
-from ..model.robust import Loss
-from ..model.rows import PointRows, Whitening
-from ..solver.levenberg_marquardt import Rules
-from .bounded_fit import NEAR, RULES, Fit, fit
-from .conclusion import OfPrior, Solution, concluded
-from .prior_fit import PriorProblem, fit_with_prior
-from .solve_state import Begun, State, scatter_at_start, state_at, whitening_at
+from ..core.numpy_or_jax import AnyArray, added_to, namespace, set_at
+from ..data.noise import Noise
+from ..kinematics.parameters import Bounds
+from ..model.elimination import with_linear_geometry
+from ..model.metrics import Repeatability, no_repeatability, repeatability
+from ..model.observed import Observed
+from ..uncertainty.covariance import STATED, ParameterCovariance
+from ..uncertainty.degrees_of_freedom import Components
+from ..uncertainty.linear_propagation import (
+    Influence,
+    UnknownsCovariance,
+    alone,
+    covariance_of_rows,
+    of_shared_readings,
+    of_stated,
+    propagated,
+    row_covariances,
+    rows_of_functions,
+)
+from ..uncertainty.linearisation import Linearisation
+from ..uncertainty.variance_components import Moments, moments, noise_from
+from .prior_fit import OfPrior, fitted_with_prior, prior_of, weights
+from .results import Identification, ObservedMetrics
 from .task import Task
+from .weighted_least_squares import (
+    Begun,
+    Fit,
+    State,
+    args_of,
+    begin,
+    fit,
+    losses_of,
+    rules_of,
+    state_after,
+    whitening_at,
+)
 
-_ROUGH = 1e-7  # tolerance of solves whose result only gives the weights of the next, or its start
+
+class Solution(NamedTuple):
+    """An identification, and what its uncertainty follows from."""
+
+    identification: Identification
+    linear: Linearisation
+    influence: Influence
+    covariances: list[Float[AnyArray, "_ _ _"]]  # of the whitened rows of every group
+    reading: list[np.ndarray]  # number of the reading of each pose of each group; equal ones were read at once
+    state: State
+
+    def covariance_of(self, rows: list[Float[AnyArray, "q _ _"]]) -> Float[AnyArray, "q q"]:
+        """Of functions that follow the rows of every block so."""
+        identification = self.identification
+        total = covariance_of_rows(rows, self.covariances)
+        if identification.noise_model == "robust":
+            return total
+        shared = of_shared_readings(rows, self.state.errors, self.linear.whitening, identification.noise, self.reading)
+        return total if shared is None else total + shared
+
+    def rows_of_parameters(self) -> list[Float[AnyArray, "p _ _"]]:
+        """How all parameters, mm and rad, follow the rows of every block; not at all where they are held."""
+        linear, influence, space = self.linear, self.influence, self.identification.bounds.space
+        xp, names, height = namespace(linear.z), linear.space.names, linear.height
+        steps = xp.where(influence.fixed[: len(names)], 0.0, linear.steps[: len(names)])
+        head = xp.concatenate([xp.diag(steps), xp.zeros((len(names), height - len(names)))], axis=1)
+        components = [xp.zeros((len(names), *own.shape[:2])) for own in influence.own]
+        of_free, index = rows_of_functions(influence, head, components), [space.names.index(name) for name in names]
+        return [set_at(xp.zeros((len(space.names), *rows.shape[1:])), np.array(index), rows) for rows in of_free]
 
 
 def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
-    """The parameters and the unknown geometry that agree best with everything observed; from ``near``, where parameters
-    close to the solution are known, else from the start."""
-    xp, begun = namespace(task), begin(task, near)
-    z, state, evaluations = begun.z, begun.state, xp.zeros((), dtype=int)
-    losses, of_prior = losses_of(task), None
+    """The identification of a task; from ``near``, where parameters close to the solution are known, else from the
+    start."""
+    begun = begin(task, near)
+    return concluded(task, begun, *minimised(task, begun))
+
+
+def minimised(task: Task, begun: Begun) -> tuple[Float[AnyArray, " z"], State, Fit, OfPrior | None]:
+    """The unknowns after all least squares, the state there, and the last result with the evaluations of all."""
+    z, state, evaluations, losses = begun.z, begun.state, namespace(task).zeros((), dtype=int), losses_of(task)
+    solution = of_prior = None
     for number, loss in enumerate(losses, 1):
         last = number == len(losses)
         prior = prior_of(task) if last else None
         if prior is not None:
-            z, state, found, of_prior = fitted_with_prior(task, prior, begun, state, z)
+            z, state, solution, of_prior = fitted_with_prior(task, prior, begun, state, z)
         else:
-            whitening = weights(task, begun, state, loss)
-            args, count = args_of(task, whitening, loss, z)
-            found = _fit(args, begun, z[:count], task, rules_of(number, len(losses)))
-            z, point = with_linear_geometry(found.parameters, args)
+            args, count = args_of(task, weights(task, begun, state, loss), loss, z)
+            solution = fit(task, args, z[:count], begun, rules_of(number, len(losses)))
+            z, point = with_linear_geometry(solution.parameters, args)
             state = state_after(task, begun, z, point, last)
-        evaluations = evaluations + found.steps
-    return concluded(task, begun, z, state, found._replace(steps=evaluations), of_prior)
+        evaluations = evaluations + solution.steps
+    assert solution is not None
+    return z, state, solution._replace(steps=evaluations), of_prior
 
 
-def begin(task: Task, near: Float[AnyArray, " p"] | None = None) -> Begun:
-    """Where a solve begins: at the start, or near the solution."""
-    xp, free, space = namespace(task), task.free, task.space
-    (*sides, steps) = box_of(task)
-    z = xp.concatenate([task.start[free], task.observed.start(space, task.start[free])])
-    before = state = state_at(task, space, z, scatter_at_start(task, space, z))
-    if near is not None:
-        inside = xp.clip(near, task.bounds.lower, task.bounds.upper)[free]
-        z = xp.concatenate([inside, task.observed.start(space, inside)])
-        state = state_at(task, space, z)
-    return Begun(space, (sides[0], sides[1]), steps, before, z, state)
+def concluded(
+    task: Task, begun: Begun, z: Float[AnyArray, " z"], state: State, last: Fit, of_prior: OfPrior | None
+) -> Solution:
+    """The identification whose unknowns are ``z``; ``last`` is the last least squares, with the evaluations of all."""
+    xp, names, free, space = namespace(task, z), task.bounds.space.names, task.free, begun.space
+    p, count = len(free), z.shape[0] - len(free)
+    prior_rows = None if of_prior is None else of_prior.rows
+    whitening = whitening_at(task, state, prior_rows)
+    active = Bounds(space, *(side[:p] for side in begun.sides)).active(z[:p])
+    linear = Linearisation.of(task.observed, space, z, state.point, state.errors, whitening, task.loss)
+    influence = linear.influence(xp.concatenate([active != 0, xp.zeros(count, dtype=bool)]))
+    noise = _noise_of(task, linear, influence, state)
+    covariances, shared, reading = _of_rows(task, linear, influence, noise)
+    by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales.added(influence.inverse)
+    unknowns = propagated(influence, covariances, shared, by_scales)
+    parameters = set_at(task.start, free, z[:p])
+    spent = p + count if of_prior is None else of_prior.effective
+    observed = observed_metrics(
+        task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent
+    )
+    after = repeatability_of(state, task.observed, state.sigma)
+    identification = Identification(  # pyright: ignore[reportCallIssue] - `stage1` is itself
+        arm=task.bounds.space.arm(parameters),
+        parameters=parameters,
+        de=after.de,
+        deltam=after.deltam,
+        active=set_at(xp.zeros(len(names), dtype=active.dtype), free, active),
+        steps=last.steps,
+        result=last.result,
+        optimality=last.optimality,
+        scale=None,
+        parameter_covariance=_of_parameters(task, linear, influence, unknowns, noise),
+        before=repeatability_of(begun.before, task.observed),
+        after=after,
+        reduced_chi=observed.reduced_chi_of_all if task.noise is not None else None,
+        bounds=task.bounds,
+        anchor=task.anchor,
+        noise_model=task.noise_model,
+        fitted_degrees_of_freedom=_degrees_of_freedom(task, p + count),
+        observed=observed,
+        prior_metrics=None if of_prior is None else of_prior.metrics,
+    )
+    return Solution(identification, linear, influence, covariances, reading, state)
 
 
-def box_of(task: Task) -> tuple[Float[AnyArray, " z"], Float[AnyArray, " z"], Float[AnyArray, " z"]]:
-    """Lower and upper bounds of all unknowns, of which the geometry has none, and their natural steps."""
-    xp, steps = namespace(task), task.observed.steps
-    endless = np.full(len(steps), np.inf)
-    lower, upper = (side[task.free] for side in (task.bounds.lower, task.bounds.upper))
-    scale = xp.concatenate([task.space.scale, xp.asarray(steps)])
-    return xp.concatenate([lower, -endless]), xp.concatenate([upper, endless]), scale
+def _degrees_of_freedom(task: Task, unknowns: int) -> float:
+    """Of a noise model: of all equations, or of poses where each has a variance of its own."""
+    if task.noise_model == "given":
+        return float("inf")
+    spare = float(task.observed.equations - unknowns)
+    if task.noise_model == "robust":
+        spare *= task.observed.q.shape[0] / task.observed.equations
+    return max(spare, 1.0)
 
 
-def losses_of(task: Task) -> list[Loss | None]:
-    """The losses of the solves, one after the other.
-
-    Twice, the second time with the weights of a nearly right arm. Far from the solution a robust loss would see nothing
-    but bad poses, so it begins where least squares ends, and one with several minima where Huber's, which has one,
-    ends.
-    """
-    if task.loss is not None:
-        return [None, Loss("huber"), task.loss, task.loss]
-    return [None] if task.needs_no_weights else [None, None]
-
-
-def rules_of(number: int, count: int) -> Rules:
-    """When one of ``count`` solves ends, the first of which has the number 1."""
-    rules = RULES if number == 1 else NEAR
-    return rules if number == count else rules._replace(rtol=_ROUGH)
-
-
-def weights(task: Task, begun: Begun, state: State, loss: Loss | None) -> Whitening:
-    """Of the next least squares."""
-    if task.needs_no_weights:
-        return Whitening((None,) * len(task.observed.layout.groups), np.zeros(0), {})
-    prior = prior_of(task)
-    if prior is None:
-        return whitening_at(task, state)
-    problem = PriorProblem(task, begun.space, prior, begun.sides, begun.steps, loss, state)
-    return whitening_at(task, state, problem.rows(problem.first_scales()))
+def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: State) -> Noise:
+    """The noise of the tips' errors by the noise model: given, or estimated."""
+    xp, whitening = namespace(linear.z), linear.whitening
+    if task.noise_model == "given":
+        assert task.noise is not None
+        return task.noise
+    if task.noise_model != "estimated":
+        return noise_from(Moments(xp.zeros(()), state.sigma**2))
+    prior = None
+    if whitening.prior is not None:
+        own = np.arange(whitening.prior.mean.shape[0])
+        squares = xp.where(influence.fixed[own], 0.0, whitening.prior.weight * linear.steps[own]) ** 2
+        prior = added_to(xp.zeros((linear.height, linear.height)), (own, own), squares)
+    robust = task.loss is not None
+    return noise_from(moments(influence, state.point.rows, state.errors, whitening, state.sigma, robust, prior))
 
 
-def prior_of(task: Task) -> ParameterPrior | None:
-    """The prior of the parameters that are free; None where nothing is known of any."""
-    if task.prior is None:
-        return None
-    return task.prior.of(task.space.names, task.bounds.space.vector()[task.free])
+def _of_rows(
+    task: Task, linear: Linearisation, influence: Influence, noise: Noise
+) -> tuple[list[Float[AnyArray, "_ _ _"]], Float[AnyArray, "h h"] | None, list[np.ndarray]]:
+    """Covariances of the whitened rows of every pose, what shared readings add to the information that these make, and
+    the number of the reading of each pose."""
+    number, groups = np.array(task.pose), task.observed.layout.groups
+    reading = [number[group.index] for group in groups]
+    if task.noise_model == "robust":
+        return alone(influence, len(groups)), None, reading
+    covariances = row_covariances(linear.point.rows, linear.errors, linear.whitening, noise)
+    rows = [influence.weighted_rows(number) for number in range(len(groups))]
+    return covariances, of_shared_readings(rows, linear.errors, linear.whitening, noise, reading), reading
 
 
-def args_of(task: Task, whitening: Whitening, loss: Loss | None, z: Float[AnyArray, " z"]) -> tuple[Args, int]:
-    """What one least squares is of, and how many unknowns it has: of z, those of components that rows are linear in
-    come last and are none, but for a robust loss."""
-    layout = task.observed.layout
-    linear = sum(count * size for count, size in layout.classes[len(layout.classes) - layout.linear :])
-    args = Args(task.space, task.observed, whitening, loss)
-    if loss is not None or not linear:
-        return args, z.shape[0]
-    return args._replace(linear=stop_gradient(z[z.shape[0] - linear :])), z.shape[0] - linear
+def _of_parameters(
+    task: Task, linear: Linearisation, influence: Influence, unknowns: UnknownsCovariance, noise: Noise
+) -> ParameterCovariance:
+    """Of all parameters, of which the scale anchor is exact."""
+    xp, free, size = namespace(linear.z), task.free, len(task.bounds.space.names)
+    p, grid = len(free), np.ix_(free, free)
+    scale = linear.steps[:p, None] * linear.steps[None, :p]
+    stated = of_stated(influence, linear.point.rows, linear.whitening)[:p, :p] * scale
+    parts = Components.of({STATED: (stated, np.inf)})
+    return ParameterCovariance(
+        set_at(xp.zeros((size, size)), grid, unknowns.head[:p, :p] * scale),
+        set_at(xp.ones(size, dtype=bool), free, influence.determined[:p]),
+        set_at(xp.zeros((size, size)), grid, influence.lost[:p, :p]),
+        noise,
+        parts and parts.wider(free, size),
+    )
 
 
-def _fit(args: Args, begun: Begun, z: Float[AnyArray, " n"], task: Task, rules: Rules) -> Fit:
-    count = z.shape[0]
-    sides, functions = (begun.sides[0][:count], begun.sides[1][:count]), (observed_rows, observed_model)
-    options = {"rules": rules, "differentiable": task.differentiable}
-    return fit(*functions, z, args, sides, begun.steps[:count], task.max_steps, **options)
+def _of_geometry(
+    linear: Linearisation, influence: Influence, covariance: UnknownsCovariance
+) -> dict[str, Float[AnyArray, "_ _"]]:
+    """Of each part; NaN for what the data leave open, such as the turn of a ball bar about itself."""
+    observed, p = linear.observed, len(linear.space.names)
+    layout, steps, height = observed.layout, observed.steps, linear.height
+    shared = slice(p, height)
+    by_class = [_known(covariance.head[shared, shared], influence.determined[shared], steps[: layout.shared])[None]]
+    first = layout.shared
+    for (count, size), matrices, opened in zip(layout.classes, covariance.components, influence.open, strict=True):
+        of_class = steps[first : first + count * size].reshape(count, size)
+        by_class.append(_known(matrices, ~opened, of_class))
+        first += count * size
+    matrices = {}
+    for name, rows in observed.positions.items():
+        number, component, first = layout.component_of(int(rows[0]))
+        own = slice(first, first + len(rows))
+        matrices[name] = by_class[1 + number][component, own, own]
+    return matrices
 
 
-def state_after(task: Task, begun: Begun, z: Float[AnyArray, " z"], point: PointRows, last: bool) -> State:
-    """At the solution of a least squares; where the noise is given, only the last scatter matters, and its iteration
-    costs as much as a few steps."""
-    known = task.noise is not None and not last
-    return state_at(task, begun.space, z, scatter_at_start(task, begun.space, z) if known else None, point=point)
+def _known(
+    matrix: Float[AnyArray, "*k g g"], known: Bool[AnyArray, "*k g"], steps: Float[np.ndarray, "*k g"]
+) -> Float[AnyArray, "*k g g"]:
+    """A covariance in natural steps as one in mm and rad, NaN for what is not known."""
+    scaled = matrix * (steps[..., None] * steps[..., None, :])
+    return namespace(matrix).where(known[..., None] & known[..., None, :], scaled, np.nan)
 
 
-def fitted_with_prior(
-    task: Task, prior: ParameterPrior, begun: Begun, state: State, z: Float[AnyArray, " z"]
-) -> tuple[Float[AnyArray, " z"], State, Fit, OfPrior]:
-    """The last least squares with a prior, whose weights agree with what it leads to."""
-    problem = PriorProblem(task, begun.space, prior, begun.sides, begun.steps, task.loss, state)
-    scales, found = fit_with_prior(problem, z)
-    z, rows = found.parameters, problem.rows(scales)
-    metrics, effective, by_scales = problem.metrics(scales, z)
-    state = state_at(task, begun.space, z, effective=effective)
-    return z, state, found, OfPrior(rows, metrics, effective, by_scales)
+def observed_metrics(
+    task: Task,
+    before: State,
+    linear: Linearisation,
+    sigma: Float[AnyArray, ""],
+    covariance: dict[str, Float[AnyArray, "_ _"]],
+    spent: Any,
+) -> ObservedMetrics:
+    """How far each observation is from its geometry; ``spent`` is how many unknowns the data determine."""
+    xp, observed = namespace(sigma), task.observed
+    squares = [xp.sum(block.white**2, axis=0) for block in linear.blocks[: len(observed.layout.groups)]]
+    weights = [
+        xp.ones(square.shape) if weight is None else weight
+        for square, weight in zip(squares, linear.weights, strict=False)
+    ]
+    rows = np.array([observation.rows for observation in observed.observations], dtype=float)
+    total = sum(xp.sum(square) for square in squares)
+    degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
+    before_and_after = (
+        xp.sqrt(observed.mean_by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in point.rows]))
+        for point in (before.point, linear.point)
+    )
+    parts = observed.split(linear.z[len(linear.space.names) :])
+    return ObservedMetrics(
+        tuple(observation.name for observation in observed.observations),
+        tuple(observation.kind for observation in observed.observations),
+        *before_and_after,
+        reduced_chi=xp.sqrt(observed.mean_by_observation(squares) / rows),
+        reduced_chi_of_all=xp.sqrt(total / degrees_of_freedom),
+        sigma=sigma,
+        geometry={name: parts[name] for name in observed.names},
+        geometry_covariance={name: covariance[name] for name in observed.names},
+        weights=tuple(observed.by_observation(weights)),
+    )
+
+
+def repeatability_of(state: State, observed: Observed, sigma: Float[AnyArray, ""] | None = None) -> Repeatability:
+    """Of the tips in sockets, NaN where there is none; ``sigma`` is the scatter of a tip coordinate as it is known."""
+    pairs = zip(observed.observations, observed.slices, strict=True)
+    slices = [rows for observation, rows in pairs if observation.kind == "socket"]
+    if not slices:
+        return no_repeatability(state.sigma)
+    tips = namespace(state.sigma).concatenate([state.point.forward.tip[:, rows] for rows in slices], axis=1)
+    metrics = repeatability(tips.T, tuple(rows.stop - rows.start for rows in slices))
+    return metrics if sigma is None else eqx.tree_at(lambda r: r.sigma, metrics, sigma)

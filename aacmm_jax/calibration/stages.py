@@ -1,6 +1,11 @@
-"""The stages of a calibration: the identification, the division by k, and the solve of everything at once."""
+"""The stages of a calibration: the identification, its division by k, and the solve of everything at once.
 
-from collections.abc import Callable
+`identified` is stage 1; `in_two_stages` divides it by k (`scale_fix`), and `jointly` solves everything that a capture
+holds in one least squares. Both return a `Calibration`, and on demand how its parameters follow errors of its poses.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,13 +20,44 @@ from ..model.observed import Observed
 from ..uncertainty.active_bounds import of_active_bounds
 from ..uncertainty.linear_propagation import covariance_with, rows_of_functions
 from ..uncertainty.linearisation import Linearisation
-from .conclusion import Solution, repeatability_of
-from .results import Calibration, ObservedMetrics
-from .scale_fix import Division, ScaleFound, divided, divided_uncertainty, measured_scale
-from .sensitivities import Sensitivities, sensitivities_of_rows, tips_of_rows
-from .solve import solve
-from .solve_state import state_at
+from .results import Calibration, Identification, ObservedMetrics
+from .scale_anchor import fixes_scale
+from .scale_fix import MeasuredScale, divided, divided_uncertainty, measured_scale
+from .solve import Solution, repeatability_of, solve
 from .task import Task
+from .weighted_least_squares import state_at
+
+_LEAST_U = 1e-9  # mm: an exact certified value would be a row of infinite weight
+
+
+class Sensitivities(NamedTuple):
+    """Derivatives of the parameters (mm and rad, in the order of ``space.names``) by errors of M poses, those of
+    sockets first, and those of lengths between sockets' means."""
+
+    tips: Float[np.ndarray, "p 3 M"]  # by displacements of the tip, mm
+    joints: Float[np.ndarray, "p n M"]  # by errors of the joints, rad (mm of prismatic ones)
+    lengths: Float[np.ndarray, "l 3 M"]  # of measured lengths by the tips, where positions of sockets are means
+
+    @classmethod
+    def of(
+        cls, linear: Linearisation, rows: Sequence[Float[AnyArray, "p _ _"]], lengths: Float[np.ndarray, "l 3 M"]
+    ) -> "Sensitivities":
+        """Of parameters that follow the whitened rows of every group so."""
+        by_readings = [error.by_readings for error in linear.errors]
+        return cls(_by_tips(linear, rows), _through(linear, rows, by_readings), lengths)
+
+
+def _by_tips(linear: Linearisation, rows: Sequence[Float[AnyArray, "q _ _"]]) -> Float[np.ndarray, "q 3 M"]:
+    return _through(linear, rows, [part.by_tip for part in linear.point.rows])
+
+
+def _through(
+    linear: Linearisation, rows: Sequence[Float[AnyArray, "q _ _"]], by: Sequence[Float[AnyArray, "_ _ _"]]
+) -> Float[np.ndarray, "q c M"]:
+    """What follows the whitened rows so, by what the residuals follow ``by``: dy = Y R dr, dr = B dc."""
+    groups = zip(rows, linear.whitening.roots, by, strict=False)
+    products = [np.einsum("qam,mab,bcm->qcm", one, np.asarray(root), part) for one, root, part in groups]
+    return np.concatenate(linear.observed.by_observation(products), axis=2)
 
 
 class Stages(NamedTuple):
@@ -37,163 +73,164 @@ class Identified(NamedTuple):
 
     task: Task
     solution: Solution
-    found: ScaleFound | None  # k, where the capture has reference lengths
+    measured: MeasuredScale | None  # k, where the capture has reference lengths
     of_bounds: Float[AnyArray, "p p"]  # part of the covariance by active bounds
+
+    @property
+    def identification(self) -> Identification:
+        """Stage 1 as users see it."""
+        return self.solution.identification
 
 
 def identified(task: Task, capture: Capture) -> Identified:
     """Stage 1 of a capture, whose lengths take no part in ``task``; with k where there are any."""
     solution = solve(task)
-    found = measured_scale(solution, capture) if capture.lengths else None
-    identification = solution.identification
+    measured = measured_scale(solution, capture) if capture.lengths else None
     of_bounds = _of_bounds(task, solution, capture)
+    identification = _with_bounds(solution.identification, of_bounds)
+    scale = None if measured is None else measured.scale
+    identification = dataclasses.replace(identification, scale=scale)
+    return Identified(task, solution._replace(identification=identification), measured, of_bounds)
+
+
+def _with_bounds(identification: Identification, of_bounds: Float[AnyArray, "p p"]) -> Identification:
     matrix = identification.parameter_covariance.matrix + of_bounds
-    identification = eqx.tree_at(lambda one: one.parameter_covariance.matrix, identification, matrix)
-    if found is not None:
-        none = lambda leaf: leaf is None  # noqa: E731
-        identification = eqx.tree_at(lambda one: one.scale, identification, found.scale, is_leaf=none)
-    return Identified(task, solution._replace(identification=identification), found, of_bounds)
+    return eqx.tree_at(lambda result: result.parameter_covariance.matrix, identification, matrix)
 
 
 def _of_bounds(task: Task, solution: Solution, capture: Capture) -> Float[AnyArray, "p p"]:
     """What active bounds add to the covariance of stage 1, in which reference lengths say what the scale is."""
     free, size = task.free, len(task.bounds.space.names)
-    scaled = task.anchor.hold is not None or capture.lengths or any(one.fixes_scale for one in capture.observations)
-    xp = namespace(solution.linear.z)
-    if not scaled and task.prior is None:
+    xp, linear = namespace(solution.linear.z), solution.linear
+    if task.anchor.hold is None and not fixes_scale(capture) and task.prior is None:
         # Nothing determines the scale: it cannot be distinguished from a near-degenerate direction.
         return xp.zeros((size, size))
-    linear = solution.linear
     active = solution.identification.active[free]
     if capture.lengths and not (xp is np and not np.any(active)):
         linear = _with_lengths(task, solution, capture)
-    added = of_active_bounds(linear, active, _reduced(task), solution.state.sigma)
+    box = Bounds(task.space, task.bounds.lower[free], task.bounds.upper[free])
+    added = of_active_bounds(linear, active, box, solution.state.sigma)
     return set_at(xp.zeros((size, size)), np.ix_(free, free), added)
-
-
-def _reduced(task: Task) -> Bounds:
-    return Bounds(task.space, task.bounds.lower[task.free], task.bounds.upper[task.free])
 
 
 def _with_lengths(task: Task, solution: Solution, capture: Capture) -> Linearisation:
     """The linearisation of stage 1 with reference lengths besides."""
-    observed, old = Observed.of(capture, task.bounds.space.base), solution.linear
-    parts = old.observed.split(old.z[len(task.free) :])
-    xp = namespace(old.z)
-    z = xp.concatenate([old.z[: len(task.free)], *(parts[name] for name in observed.blocks)])
-    noise, sigma = task.noise, solution.state.sigma
-    return Linearisation.at(observed, old.space, z, noise=noise, sigma=sigma, least=1e-9, loss=task.loss)
+    observed, old, p = Observed.of(capture, task.bounds.space.base), solution.linear, len(task.free)
+    parts = old.observed.split(old.z[p:])
+    z = namespace(old.z).concatenate([old.z[:p], *(parts[name] for name in observed.blocks)])
+    weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "loss": task.loss}
+    return Linearisation.at(observed, old.space, z, least=_LEAST_U, **weighing)
 
 
 def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     """Stage 1 divided by k; where something stands against that, it is not the result."""
-    task, solution, found, of_bounds = stage1
-    assert found is not None
-    identification, bounds, anchor, k = solution.identification, task.bounds, task.anchor, found.scale.value
-    xp = namespace(identification)
-    division = divided(anchor, bounds, identification.active, identification.parameters, k)
-    uncertainty = divided_uncertainty(solution, found, anchor, division.parameters)
-    covariance = identification.parameter_covariance._replace(
-        matrix=uncertainty.covariance + of_bounds, components=uncertainty.components
-    )
-    arm, active = bounds.space.arm(division.parameters), bounds.active(division.parameters)
-    linear = _divided_linearisation(task, solution, division)
+    task, solution, measured, of_bounds = stage1
+    assert measured is not None
+    identification, bounds = solution.identification, task.bounds
+    division = divided(task.anchor, bounds, identification.active, identification.parameters, measured.scale.value)
+    parameters = division.parameters
+    uncertainty = divided_uncertainty(solution, measured, parameters)
+    linear = _at_divided(task, solution, parameters)
     state = state_at(task, linear.space, linear.z)
     after = repeatability_of(state, task.observed, state.sigma)
-    metrics = _divided_metrics(solution, found, linear, division)
-    start = task.observed.split(task.observed.start(task.space, task.start[task.free]))
-    calibration = Calibration(
-        arm=arm,
-        parameters=division.parameters,
-        scale=found.scale,
+    result = dataclasses.replace(
+        identification,
+        arm=bounds.space.arm(parameters),
+        parameters=parameters,
         de=after.de,
         deltam=after.deltam,
-        active=active,
-        steps=identification.steps,
-        result=identification.result,
-        parameter_covariance=covariance,
-        before=identification.before,
+        active=bounds.active(parameters),
+        parameter_covariance=identification.parameter_covariance._replace(
+            matrix=uncertainty.covariance + of_bounds, components=uncertainty.components
+        ),
         after=after,
-        length_before=measured_lengths(start, capture),
-        length_after=measured_lengths(metrics.geometry, capture),
-        stage1=identification,
-        method="two-stage",
-        observed=metrics,
-        divided=xp.asarray(True),
+        observed=_divided_metrics(solution, measured, linear),
     )
+    calibration = _calibration(task, capture, identification, result, "two-stage", True)
 
     def sensitivities() -> Sensitivities:
-        return sensitivities_of_rows(linear, uncertainty.rows, _of_lengths(solution, capture))
+        return Sensitivities.of(linear, uncertainty.rows, _of_lengths(solution, capture))
 
     return Stages(calibration, sensitivities, division.stands_against)
 
 
-def _divided_linearisation(task: Task, solution: Solution, division: Division) -> Linearisation:
+def _calibration(
+    task: Task, capture: Capture, stage1: Identification, result: Identification, method: str, divided: bool
+) -> Calibration:
+    """With the fields of the last stage's result, and the measured lengths before and after."""
+    start = task.observed.split(task.observed.start(task.space, task.start[task.free]))
+    names = ("arm", "parameters", "de", "deltam", "active", "steps", "result", "parameter_covariance")
+    return Calibration(
+        **{name: getattr(result, name) for name in (*names, "before", "after", "observed")},
+        scale=stage1.scale,
+        length_before=_measured_lengths(start, capture),
+        length_after=_measured_lengths(result.observed.geometry, capture),
+        stage1=stage1,
+        method=method,
+        divided=namespace(result.parameters).asarray(divided),
+    )
+
+
+def _at_divided(task: Task, solution: Solution, parameters: Float[AnyArray, " p"]) -> Linearisation:
     """At the divided arm, with the geometry that fits it; weights are those of the last solve."""
-    xp, linear, state = namespace(division.parameters), solution.linear, solution.state
-    space = Parameters(task.bounds.space.arm(division.parameters), linear.space.names)
-    vector = division.parameters[task.free]
-    z = xp.concatenate([vector, task.observed.start(space, vector)])
-    first = Linearisation.at(task.observed, space, z, noise=task.noise, sigma=state.sigma, least=1e-9)
-    point = first.with_fitted_geometry()
-    return Linearisation.at(task.observed, space, point, noise=task.noise, sigma=state.sigma, least=1e-9)
+    names, vector = solution.linear.space.names, parameters[task.free]
+    space = Parameters(task.bounds.space.arm(parameters), names)
+    z = namespace(parameters).concatenate([vector, task.observed.start(space, vector)])
+    weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "least": _LEAST_U}
+    z = Linearisation.at(task.observed, space, z, **weighing).with_fitted_geometry()
+    return Linearisation.at(task.observed, space, z, **weighing)
 
 
-def _divided_metrics(
-    solution: Solution, found: ScaleFound, linear: Linearisation, division: Division
-) -> ObservedMetrics:
-    """Of the observations by the divided arm: p' = p / k for a position above the base, which follows k too."""
-    metrics, observed, k = solution.identification.observed, linear.observed, found.scale.value
-    xp, p = namespace(linear.z), len(linear.space.names)
-    parts = observed.split(linear.z[p:])
+def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linearisation) -> ObservedMetrics:
+    """Of the observations by the divided arm.
+
+    A position p above the base follows k too: p' = p / k, so cov p' = cov p / k^2 - c p'^T / k - p' c^T / k +
+    var k p' p'^T / k^2, with c the covariance of p / k with k.
+    """
+    metrics, observed, k = solution.identification.observed, linear.observed, measured.scale.value
+    xp, parts = namespace(linear.z), observed.split(linear.z[len(linear.space.names) :])
     # What is divided is counted from the foot of the second axis, where d_1 ends.
     can_scale = solution.identification.anchor.can_scale
     foot = xp.stack([xp.zeros(()), xp.zeros(()), linear.space.base.d[0]]) if can_scale else None
-    variance = solution.covariance_of(found.rows)[0, 0] + found.added
-    _, with_k = covariance_with(solution.influence, found.rows, solution.covariances)
-    covariances, geometry = {}, {}
+    variance = solution.covariance_of(measured.rows)[0, 0] + measured.added
+    _, with_k = covariance_with(solution.influence, measured.rows, solution.covariances)
+    covariances = {}
     for name in observed.names:
-        geometry[name], own = parts[name], metrics.geometry_covariance[name]
-        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        if foot is not None and of >= 0:
+        matrix = metrics.geometry_covariance[name]
+        number, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        if foot is not None and number >= 0:
             by_k = (parts[name] - foot) / k
-            mixed = with_k[of][component, first : first + 3][:, None] * by_k[None, :] / k
-            own = own / k**2 - mixed - mixed.T + variance * by_k[:, None] * by_k[None, :]
-        covariances[name] = own
-    groups = len(observed.layout.groups)
+            mixed = with_k[number][component, first : first + 3][:, None] * by_k[None, :] / k
+            matrix = matrix / k**2 - mixed - mixed.T + variance * by_k[:, None] * by_k[None, :]
+        covariances[name] = matrix
     squares = observed.by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in linear.point.rows])
-    white = observed.by_observation([xp.sum(block.white**2, axis=0) for block in linear.blocks[:groups]])
-    return eqx.tree_at(
-        lambda one: (one.geometry, one.geometry_covariance, one.rms_after, one.reduced_chi),
+    white = [xp.sum(rows**2, axis=0) for rows in linear.white()]
+    return dataclasses.replace(
         metrics,
-        (
-            geometry,
-            covariances,
-            xp.stack([xp.sqrt(xp.mean(square)) for square in squares]),
-            xp.stack([xp.sqrt(xp.mean(square) / 3) for square in white]),
-        ),
+        geometry={name: parts[name] for name in observed.names},
+        geometry_covariance=covariances,
+        rms_after=xp.stack([xp.sqrt(xp.mean(square)) for square in squares]),
+        reduced_chi=xp.stack([xp.sqrt(xp.mean(square) / 3) for square in white]),
     )
 
 
 def _of_lengths(solution: Solution, capture: Capture) -> Float[np.ndarray, "l 3 M"]:
     """Derivatives of the measured lengths by the tips, where the arm is given and positions are means."""
     linear, influence = solution.linear, solution.influence._replace(inverse=np.zeros_like(solution.influence.inverse))
-    observed, positions, p = linear.observed, linear.observed.positions, len(linear.space.names)
-    count = len(capture.lengths)
+    observed, p, count = linear.observed, len(linear.space.names), len(capture.lengths)
     components = [np.zeros((count, *own.shape[:2])) for own in influence.own]
-    for number, length in enumerate(capture.lengths):
-        ends = [positions[position_of(name)] for name in (length.start, length.end)]
+    for i, length in enumerate(capture.lengths):
+        ends = [observed.positions[position_of(name)] for name in (length.start, length.end)]
         between = np.asarray(linear.z[p + ends[1]] - linear.z[p + ends[0]])
         for rows, sign in zip(ends, (-1.0, 1.0), strict=True):
-            of, component, first = observed.layout.component_of(int(rows[0]))
-            components[of][number, component, first : first + 3] = sign * between / np.linalg.norm(between)
-    rows = rows_of_functions(influence, np.zeros((count, linear.height)), components)
-    return tips_of_rows(linear, rows)
+            number, component, first = observed.layout.component_of(int(rows[0]))
+            components[number][i, component, first : first + 3] = sign * between / np.linalg.norm(between)
+    return _by_tips(linear, rows_of_functions(influence, np.zeros((count, linear.height)), components))
 
 
-def measured_lengths(parts: dict[str, Any], capture: Capture) -> Float[AnyArray, " l"]:
+def _measured_lengths(parts: dict[str, Any], capture: Capture) -> Float[AnyArray, " l"]:
     """Distances between the positions at the ends of the reference lengths, mm."""
-    pairs = [(parts[position_of(one.start)], parts[position_of(one.end)]) for one in capture.lengths]
+    pairs = [(parts[position_of(length.start)], parts[position_of(length.end)]) for length in capture.lengths]
     xp = namespace(parts)
     return xp.linalg.norm(xp.stack([end - start for start, end in pairs]), axis=1) if pairs else xp.zeros(0)
 
@@ -201,46 +238,19 @@ def measured_lengths(parts: dict[str, Any], capture: Capture) -> Float[AnyArray,
 def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str) -> Stages:
     """Everything that the capture holds in one least squares; ``stage1`` is where lengths alone fix the scale."""
     near = None
-    if stage1 is not None and stage1.found is not None:
-        identification = stage1.solution.identification
-        near = divided(
-            stage1.task.anchor, task.bounds, identification.active, identification.parameters, stage1.found.scale.value
-        ).parameters
+    if stage1 is not None and stage1.measured is not None:
+        first, k = stage1.identification, stage1.measured.scale.value
+        near = divided(stage1.task.anchor, task.bounds, first.active, first.parameters, k).parameters
     solution = solve(task, near)
-    found = solution.identification
-    matrix = found.parameter_covariance.matrix + _of_bounds(task, solution, capture)
-    found = eqx.tree_at(lambda one: one.parameter_covariance.matrix, found, matrix)
-    first = found if stage1 is None else stage1.solution.identification
-    start = task.observed.split(task.observed.start(task.space, task.start[task.free]))
-    calibration = Calibration(
-        arm=found.arm,
-        parameters=found.parameters,
-        scale=first.scale,
-        de=found.de,
-        deltam=found.deltam,
-        active=found.active,
-        steps=found.steps if stage1 is None else first.steps + found.steps,
-        result=found.result,
-        parameter_covariance=found.parameter_covariance,
-        before=found.before,
-        after=found.after,
-        length_before=measured_lengths(start, capture),
-        length_after=measured_lengths(found.observed.geometry, capture),
-        stage1=first,
-        method=method,
-        observed=found.observed,
-        divided=namespace(found.parameters).asarray(False),
-    )
+    result = _with_bounds(solution.identification, _of_bounds(task, solution, capture))
+    first = result
+    if stage1 is not None:
+        first = stage1.identification
+        result = dataclasses.replace(result, steps=first.steps + result.steps)
+    calibration = _calibration(task, capture, first, result, method, False)
 
     def sensitivities() -> Sensitivities:
-        linear, influence, p = solution.linear, solution.influence, len(found.parameters)
-        free = len(linear.space.names)
-        head = np.concatenate([np.eye(free), np.zeros((free, linear.height - free))], axis=1)
-        head *= np.where(influence.fixed[:free], 0.0, linear.steps[:free])[:, None]
-        components = [np.zeros((free, *own.shape[:2])) for own in influence.own]
-        of_free = rows_of_functions(influence, head, components)
-        rows = [set_at(np.zeros((p, *one.shape[1:])), task.free, one) for one in of_free]
         none = np.zeros((0, 3, task.observed.q.shape[0]))
-        return sensitivities_of_rows(linear, rows, none)
+        return Sensitivities.of(solution.linear, solution.rows_of_parameters(), none)
 
     return Stages(calibration, sensitivities)

@@ -275,7 +275,7 @@ def compare_models(
 
     Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
     """
-    from ..data.drawing import draw_poses
+    from ..data.capture import draw_poses
     from ..files.captures import load_capture
     from ..files.compared_models import save_compared_models
     from ..files.inputs import InputFile, fingerprint

@@ -123,7 +123,7 @@ def _leaving_threads() -> Iterator[None]:
         yield
     except (KeyboardInterrupt, Stopped) as interrupt:
         from ..core._compat import end_process
-        from ..study.local_processes import THREADS
+        from ..study.executors import THREADS
 
         if not any(thread.name.startswith(THREADS) for thread in threading.enumerate()):
             raise

@@ -1,7 +1,7 @@
 from . import observations as observations
 from .capture import Capture as Capture
-from .capture import join_sessions as join_sessions
-from .capture import stack_captures as stack_captures
+from .joined_captures import join_sessions as join_sessions
+from .joined_captures import stack_captures as stack_captures
 from .noise import Noise as Noise
 from .recording import Recording as Recording
 from .reference_length import ReferenceLength as ReferenceLength

@@ -1,27 +1,25 @@
-"""Captures: joint readings taken while the tip rested in fixed sockets, and reference lengths between sockets."""
+"""Captures: joint readings taken while the tip rested in fixed sockets, reference lengths, and other observations."""
 
 import fnmatch
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..core.arguments import checked_arguments, items_of, shown
+from ..core.arguments import items_of, shown
 from ..core.arrays import Numbers, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.random_keys import random_generator
 from ..core.text import shorten
 from ..kinematics.arm import Arm, by_joint
-from .copies import NOTHING_REPEATED, Repeated, check_different, observation_without_copies, without_copies
+from .copies import NOTHING_REPEATED, Repeated, check_different, checked_visits, visits_of, without_copies
 from .observations.declared import checked_name, checked_readings
 from .observations.observation import AbstractObservation
-from .observations.socket import Socket
+from .observations.socket import Socket, sockets_of
 from .reference_length import ReferenceLength, check_temperatures
-from .visits import checked_visits, visits_of
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
 _MOST_RADIANS = 8 * np.pi
@@ -79,73 +77,41 @@ class Capture(eqx.Module):
         sessions: Iterable[str] = (),
         visits: Mapping[str, Numbers] | None = None,
     ):
-        if not isinstance(sockets, Mapping):
-            raise InputError(
-                f"the sockets are a {type(sockets).__name__}; give a dictionary of names and readings: "
-                '{"A": q}, q of shape (poses, joints).'
-            )
-        self.observations = _checked_observations(observations, sockets)
-        if not sockets and not self.observations:
-            raise InputError("a capture needs at least one socket with poses, or another observation.")
-        blocks = {
-            checked_name(name, "a socket"): checked_readings(f"socket '{name}'", angles)
-            for name, angles in sockets.items()
-        }
-        of_all = {f"socket '{name}'": block for name, block in blocks.items()}
-        of_all |= {f"observation '{observation.name}'": observation.q for observation in self.observations}
-        first, width = next((where, block.shape[-1]) for where, block in of_all.items())
-        for where, block in of_all.items():
-            if block.shape[-1] != width:
-                raise InputError(
-                    f"{where} has {block.shape[-1]} columns, but {first} has {width}; give one column a joint, "
-                    "and the temperature after them to all or to none."
-                )
-        different = {name: without_copies(block) for name, block in blocks.items()}
-        counts = {name: block.shape[0] for name, block in blocks.items()}
-        counts |= {observation.name: observation.q.shape[0] for observation in self.observations}
-        self.observations = tuple(observation_without_copies(observation) for observation in self.observations)
-        check_different(different, self.observations)
-        self.q = joined(list(different.values())) if different else jnp.zeros((0, width))
-        self.names = tuple(different)
-        self.sizes = tuple(block.shape[0] for block in different.values())
-        given = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
-        for length in given:
-            if not isinstance(length, ReferenceLength):
-                raise InputError(
-                    f"{shown(length)} is no reference length; give aj.ReferenceLength(start, end, value, u)."
-                )
-            known = (*self.names, *(o.name for o in self.observations if isinstance(o, Socket)))
-            for end in (length.start, length.end):
-                if end not in known:
-                    raise InputError(
-                        f"reference length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
-                        f"{nearest(end, known)}"
-                    )
-        self.lengths, copies = _different_lengths(given)
-        poses = dict(repeated.poses)
-        sizes = dict(zip(self.names, self.sizes, strict=True))
-        sizes |= {observation.name: observation.q.shape[0] for observation in self.observations}
-        for name, size in sizes.items():
-            poses[name] = poses.get(name, 0) + counts[name] - size
-        self.repeated = Repeated(
-            tuple((name, count) for name, count in poses.items() if count), (*repeated.lengths, *copies)
-        )
-        self.sessions = tuple(
-            dict.fromkeys(checked_name(session, "a session") for session in items_of(sessions, "sessions"))
-        )
-        for name in (*self.names, *(o.name for o in self.observations)) if self.sessions else ():
-            self.session_of(name)
-        self.visits = checked_visits(visits, blocks)
+        # Sockets are observations like any other; they alone are kept as one array, since there may be thousands.
+        seats = _checked_sockets(sockets)
+        given = (*seats, *_checked_observations(observations, sockets))
+        _check_columns(given)
+        different = [without_copies(part) for part in given]
+        check_different(different)
+        own = different[: len(sockets)]
+        self.q = joined([part.q for part in own]) if own else jnp.zeros((0, given[0].q.shape[-1]))
+        self.names = tuple(part.name for part in own)
+        self.sizes = tuple(part.q.shape[0] for part in own)
+        self.observations = tuple(different[len(sockets) :])
+        ends = [*self.names, *(part.name for part in self.observations if isinstance(part, Socket))]
+        self.lengths, copies = _different_lengths(_checked_lengths(lengths, ends))
+        left_out = {one.name: one.q.shape[0] - kept.q.shape[0] for one, kept in zip(given, different, strict=True)}
+        self.repeated = repeated.and_also(left_out, copies)
+        names = (checked_name(session, "a session") for session in items_of(sessions, "sessions"))
+        self.sessions = tuple(dict.fromkeys(names))
+        for part in different if self.sessions else ():
+            self.session_of(part.name)
+        self.visits = checked_visits(visits, seats)
+
+    @property
+    def parts(self) -> tuple[AbstractObservation, ...]:
+        """All observations, the sockets first."""
+        return (*sockets_of(self.sockets), *self.observations)
 
     def session_of(self, name: str) -> str:
         """The session of a socket or observation, by its name; `InputError` where it belongs to none."""
-        found = [session for session in self.sessions if name.startswith(f"{session}/")]
-        if not found:
+        sessions = [session for session in self.sessions if name.startswith(f"{session}/")]
+        if not sessions:
             raise InputError(
                 f"'{name}' is in none of the sessions {shorten(self.sessions)}; name it session/name, as join_sessions "
                 "does."
             )
-        return max(found, key=len)
+        return max(sessions, key=len)
 
     @property
     def columns(self) -> int:
@@ -192,21 +158,13 @@ class Capture(eqx.Module):
         only = [only] if isinstance(only, str) else only
         only = None if only is None else items_of(only, "only")
         without = [without] if isinstance(without, str) else items_of(without, "without")
-        known = [*self.names, *(observation.name for observation in self.observations)]
-        kept = known if only is None else _matching(known, only)
-        dropped = _matching(known, without)
+        names = names_in(self)
+        kept = names if only is None else _matching(names, only)
+        dropped = _matching(names, without)
         kept = [name for name in kept if name not in dropped]
         if not kept:
             raise InputError("no socket is left after the selection; widen it.")
-        sockets = self.sockets
-        lengths = [length for length in self.lengths if length.start in kept and length.end in kept]
-        repeated = Repeated(
-            tuple((name, count) for name, count in self.repeated.poses if name in kept),
-            tuple((start, end) for start, end in self.repeated.lengths if start in kept and end in kept),
-        )
-        others = [observation for observation in self.observations if observation.name in kept]
-        chosen = {name: sockets[name] for name in self.names if name in kept}
-        return Capture(chosen, lengths, others, repeated, self.sessions, visits_of(self, kept))
+        return part_of(self, kept, repeated=self.repeated.of(kept))
 
 
 def names_in(capture: Capture) -> tuple[str, ...]:
@@ -214,13 +172,52 @@ def names_in(capture: Capture) -> tuple[str, ...]:
     return (*capture.names, *(observation.name for observation in capture.observations))
 
 
-def part_of(capture: Capture, names: Collection[str]) -> Capture:
+def part_of(
+    capture: Capture,
+    names: Collection[str],
+    rows: Mapping[str, Int[np.ndarray, " k"]] | None = None,
+    repeated: Repeated = NOTHING_REPEATED,
+) -> Capture:
     """Sockets and other observations by their exact names, which `Capture.select` would take for patterns, with the
-    reference lengths between them."""
+    reference lengths between them; of those in ``rows`` only these poses."""
+    rows = rows or {}
+    parts = [part if part.name not in rows else part.select(rows[part.name]) for part in capture.parts]
+    sockets = {part.name: part.q for part in parts[: len(capture.names)] if part.name in names}
+    others = [part for part in parts[len(capture.names) :] if part.name in names]
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
-    others = [observation for observation in capture.observations if observation.name in names]
-    sockets = {name: q for name, q in capture.sockets.items() if name in names}
-    return Capture(sockets, lengths, others, sessions=capture.sessions, visits=visits_of(capture, names))
+    visits = {
+        name: visit[rows[name]] if name in rows else visit
+        for name, visit in visits_of(capture).items()
+        if name in sockets
+    }
+    return Capture(sockets, lengths, others, repeated, capture.sessions, visits)
+
+
+def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Capture]:
+    """Divide the poses of a capture at random: some to calibrate with, the others to test the result on.
+
+    Args:
+        capture: The capture.
+        count: How many poses to draw, of sockets and other observations alike.
+        seed: Of the random numbers.
+
+    Returns:
+        A capture of the drawn poses, and one of the others; each with the reference lengths whose two sockets it has.
+
+    Raises:
+        InputError: The capture is a batch, or has not more poses than these.
+    """
+    check_one_capture(capture)
+    sizes = {part.name: part.q.shape[0] for part in capture.parts}
+    total = sum(sizes.values())
+    if not 0 < count < total:
+        raise InputError(f"{count} of {total} poses cannot be drawn; give a number from 1 to {total - 1}.")
+    drawn = np.zeros(total, dtype=bool)
+    drawn[random_generator(seed).choice(total, count, replace=False)] = True
+    of_parts = dict(zip(sizes, np.split(drawn, np.cumsum(list(sizes.values()))[:-1]), strict=True))
+    rows = [{name: np.flatnonzero(part == wanted) for name, part in of_parts.items()} for wanted in (True, False)]
+    first, second = (part_of(capture, [name for name in own if len(own[name])], own) for own in rows)
+    return first, second
 
 
 def check_one_capture(capture: Capture) -> None:
@@ -245,16 +242,27 @@ def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
     chosen: set[str] = set()
     for pattern in patterns:
         if not isinstance(pattern, str):
-            raise InputError(f"a pattern is {pattern!r}; give names of sockets, or shell patterns.")
-        found = {name for name in names if name == pattern or fnmatch.fnmatchcase(name, pattern)}
-        if not found:
+            raise InputError(f"a pattern is {shown(pattern)}; give names of sockets, or shell patterns.")
+        chosen_now = {name for name in names if name == pattern or fnmatch.fnmatchcase(name, pattern)}
+        if not chosen_now:
             raise InputError(f"no socket matches '{pattern}'{nearest(pattern, names)}")
-        chosen |= found
+        chosen |= chosen_now
     return [name for name in names if name in chosen]
 
 
+def _checked_sockets(sockets: Mapping[str, Numbers]) -> tuple[Socket, ...]:
+    if not isinstance(sockets, Mapping):
+        raise InputError(
+            f"the sockets are a {type(sockets).__name__}; give a dictionary of names and readings: "
+            '{"A": q}, q of shape (poses, joints).'
+        )
+    for name in sockets:
+        checked_name(name, "a socket")
+    return sockets_of({name: checked_readings(f"socket '{name}'", q) for name, q in sockets.items()})
+
+
 def _checked_observations(
-    observations: Iterable[AbstractObservation] | AbstractObservation, sockets: Iterable[str]
+    observations: Iterable[AbstractObservation] | AbstractObservation, sockets: Collection[str]
 ) -> tuple[AbstractObservation, ...]:
     single = isinstance(observations, AbstractObservation)
     checked = (observations,) if single else tuple(items_of(observations, "observations"))
@@ -267,6 +275,39 @@ def _checked_observations(
             raise InputError(f"two observations have the name '{name}'; give each a name of its own.")
         if name in sockets:
             raise InputError(f"a socket and an observation have the name '{name}'; give each a name of its own.")
+    if not checked and not sockets:
+        raise InputError("a capture needs at least one socket with poses, or another observation.")
+    return checked
+
+
+def _check_columns(parts: Sequence[AbstractObservation]) -> None:
+    """All readings are of one arm."""
+    width = parts[0].q.shape[-1]
+    for part in parts:
+        if part.q.shape[-1] != width:
+            raise InputError(
+                f"{_described(part)} has {part.q.shape[-1]} columns, but {_described(parts[0])} has {width}; give one "
+                "column a joint, and the temperature after them to all or to none."
+            )
+
+
+def _described(part: AbstractObservation) -> str:
+    return f"{'socket' if isinstance(part, Socket) else 'observation'} '{part.name}'"
+
+
+def _checked_lengths(
+    lengths: Iterable[ReferenceLength] | ReferenceLength, sockets: Sequence[str]
+) -> tuple[ReferenceLength, ...]:
+    checked = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
+    for length in checked:
+        if not isinstance(length, ReferenceLength):
+            raise InputError(f"{shown(length)} is no reference length; give aj.ReferenceLength(start, end, value, u).")
+        for end in (length.start, length.end):
+            if end not in sockets:
+                raise InputError(
+                    f"reference length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
+                    f"{nearest(end, sockets)}"
+                )
     return checked
 
 
@@ -287,113 +328,13 @@ def _different_lengths(
     return tuple(different), tuple(copies)
 
 
-@checked_arguments
-def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) -> Capture:
-    """Join captures that one arm took in several sessions, with its probe remounted in between, or on another base.
-
-    Sockets, artefacts and stations of different sessions are different ones; what is unknown of the arm is the same.
-
-    Args:
-        captures: Name of a session -> its capture. Names of sockets and observations become ``session/name``.
-        own_probe: Whether every session after the first has a probe of its own, whose place in the last frame is
-            unknown; False where the probe stayed as it was.
-
-    Returns:
-        One capture of all sessions, to calibrate as a whole.
-
-    Raises:
-        InputError: A capture is a batch, or one has targets in more than one session.
-
-    Example:
-        >>> monday = aj.simulate(true, {"A": (400, 200, 300)}, poses=5, seed=1)
-        >>> friday = aj.simulate(true, {"A": (500, 200, 300)}, poses=5, seed=2)
-        >>> both = aj.join_sessions({"monday": monday, "friday": friday})
-        >>> print(both.names, [observation.name for observation in both.observations])
-        ('monday/A',) ['friday/A']
-    """
-    if not isinstance(captures, Mapping) or not captures:
-        raise InputError("the sessions are no dictionary; give the captures by name: {'Monday': capture, ...}.")
-    sockets: dict[str, Numbers] = {}
-    visits: dict[str, Numbers] = {}
-    lengths: list[ReferenceLength] = []
-    observations: list[AbstractObservation] = []
-    for number, (session, capture) in enumerate(captures.items()):
-        if not isinstance(capture, Capture):
-            raise InputError(f"session '{session}' is a {type(capture).__name__}; give an aj.Capture.")
-        check_one_capture(capture)
-        checked_name(session, "a session")
-        for name, readings in capture.sockets.items():
-            if number and own_probe:
-                observations.append(Socket(f"{session}/{name}", readings, target=f"probe of {session}"))
-            else:
-                sockets[f"{session}/{name}"] = readings
-        visits |= {f"{session}/{name}": rows for name, rows in visits_of(capture).items()}
-        lengths += [
-            ReferenceLength(f"{session}/{length.start}", f"{session}/{length.end}", length.value, length.u)
-            for length in capture.lengths
-        ]
-        own = f"probe of {session}" if number and own_probe else ""
-        observations += [observation.in_session(session, own) for observation in capture.observations]
-    visits = {name: rows for name, rows in visits.items() if name in sockets}
-    return Capture(sockets, lengths, observations, sessions=tuple(captures), visits=visits)
-
-
-def stack_captures(captures: Iterable[Capture]) -> Capture:
-    """Stack captures into a batch for `identify_many`.
-
-    Args:
-        captures: Captures with the same sockets, numbers of poses, joints and reference lengths.
-
-    Returns:
-        A capture whose ``q`` is ``(batch, N, n)`` and whose lengths are ``(batch,)``; rad and mm.
-
-    Raises:
-        InputError: Where there is none, one is a batch, or they differ in shape.
-
-    Example:
-        >>> drawn = [aj.simulate(true, sockets, poses=10, noise=noise, seed=seed) for seed in (1, 2, 3)]
-        >>> print(aj.stack_captures(drawn).q.shape)
-        (3, 20, 6)
-    """
-    captures = items_of(captures, "captures")
-    for capture in captures:
-        if not isinstance(capture, Capture):
-            raise InputError(f"a capture to stack is a {type(capture).__name__}; give a list of aj.Capture.")
-    if not captures:
-        raise InputError("there is no capture to stack; give at least one.")
-    for capture in captures:
-        check_one_capture(capture)
-    shapes = {
-        (c.names, c.sizes, tuple((r.start, r.end) for r in c.lengths), c.columns, _form(c.observations))
-        for c in captures
-    }
-    if len(shapes) != 1:
-        raise InputError(
-            "captures of a batch must have the same sockets, numbers of poses, joints, lengths and observations."
-        )
-    arrays = [(capture.q, capture.lengths, capture.observations) for capture in captures]
-    return eqx.tree_at(
-        lambda c: (c.q, c.lengths, c.observations),
-        captures[0],
-        jax.tree.map(lambda *leaves: np.stack(leaves) if is_concrete(*leaves) else jnp.stack(leaves), *arrays),
-    )
-
-
-def _form(observations: tuple[AbstractObservation, ...]) -> tuple[Any, ...]:
-    """What observations must share to be stacked."""
-    leaves, structure = jax.tree.flatten(observations)
-    return structure, tuple(leaf.shape for leaf in leaves)
-
-
 def check_readings(capture: Capture, arm: Arm, *, advice: str = "convert with numpy.deg2rad") -> None:
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees, with advice on them."""
     joints, columns = arm.joints, arm.columns
-    of_sockets = [(f"socket '{name}'", readings) for name, readings in capture.sockets.items()]
-    for where, readings in [*of_sockets, *((f"observation '{one.name}'", one.q) for one in capture.observations)]:
-        if not is_concrete(readings) or readings.shape[-1] not in (joints, columns):
-            continue
-        check_temperatures(where, np.asarray(readings)[..., joints:])
-        check_revolutions(where, readings, arm, advice)
+    for part in capture.parts:
+        if is_concrete(part.q) and part.q.shape[-1] in (joints, columns):
+            check_temperatures(_described(part), np.asarray(part.q)[..., joints:])
+            check_revolutions(_described(part), part.q, arm, advice)
 
 
 def check_revolutions(where: str, readings: AnyArray, arm: Arm, advice: str) -> None:

@@ -1,14 +1,13 @@
-"""Copies of data: a copy is no measurement of its own, so it counts once and is reported."""
+"""Which poses of a capture tell something of their own: copies count once, and visits were not seated anew."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Int
 
-from ..core.arrays import is_concrete
-from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray
+from ..core.arrays import Numbers, is_concrete
+from ..core.errors import InputError, nearest
 from ..core.text import pluralise, shorten
 from .observations.observation import AbstractObservation
 from .observations.socket import Socket
@@ -19,6 +18,19 @@ class Repeated(NamedTuple):
 
     poses: tuple[tuple[str, int], ...] = ()  # sockets and other observations, and the number of copies in each
     lengths: tuple[tuple[str, str], ...] = ()  # both ends of each copy
+
+    def and_also(self, poses: Mapping[str, int], lengths: Iterable[tuple[str, str]]) -> "Repeated":
+        """With other copies too: how many poses of each socket and observation, and the ends of lengths."""
+        before = dict(self.poses)
+        counts = before | {name: before.get(name, 0) + count for name, count in poses.items()}
+        return Repeated(tuple((name, count) for name, count in counts.items() if count), (*self.lengths, *lengths))
+
+    def of(self, names: Collection[str]) -> "Repeated":
+        """Those in some sockets and observations."""
+        return Repeated(
+            tuple((name, count) for name, count in self.poses if name in names),
+            tuple((start, end) for start, end in self.lengths if start in names and end in names),
+        )
 
     def sentences(self) -> list[str]:
         """What was left out, for warnings."""
@@ -40,18 +52,12 @@ class Repeated(NamedTuple):
 
 
 NOTHING_REPEATED = Repeated()
+UNKNOWN = -1  # visit
 
 
-def without_copies(block: AnyArray) -> AnyArray:
-    """The first of each pose of a socket, in their order. Only known values are compared."""
-    if not is_concrete(block):
-        return block
-    first = first_of_each(block)
-    return block if len(first) == block.shape[0] else np.asarray(block)[first]
-
-
-def observation_without_copies(observation: AbstractObservation) -> AbstractObservation:
-    """The same observation with the first of each pose; the same reading may have been measured several times."""
+def without_copies(observation: AbstractObservation) -> AbstractObservation:
+    """The same observation with the first of each pose; the same reading may have been measured several times. Only
+    known values are compared."""
     values = [getattr(observation, field) for field in observation.by_pose]
     if not is_concrete(*values):
         return observation
@@ -69,15 +75,57 @@ def first_of_each(*values: Any) -> list[int]:
     return list(first.values())
 
 
-def check_different(blocks: Mapping[str, Array | np.ndarray], observations: Iterable[AbstractObservation]) -> None:
+def check_different(observations: Iterable[AbstractObservation]) -> None:
     """Refuse two sockets, or two observations of one kind, with exactly the same poses: one file given twice."""
-    values = [(name, Socket.kind, [block]) for name, block in blocks.items()]
-    values += [(one.name, one.kind, [getattr(one, field) for field in one.by_pose]) for one in observations]
-    seen: dict[tuple[str, bytes], str] = {}
-    for name, kind, arrays in values:
-        if is_concrete(*arrays) and len(arrays[0]) > 1:
-            key = kind, b"".join(np.asarray(array).tobytes() for array in arrays)
-            twin = seen.setdefault(key, name)
-            if twin != name:
-                what = "sockets" if kind == Socket.kind else "observations"
-                raise InputError(f"{what} '{twin}' and '{name}' have exactly the same poses; is one file given twice?")
+    seen: dict[tuple[str, bytes], AbstractObservation] = {}
+    for one in observations:
+        arrays = [getattr(one, field) for field in one.by_pose]
+        if is_concrete(*arrays) and one.q.shape[0] > 1:
+            twin = seen.setdefault((one.kind, b"".join(np.asarray(array).tobytes() for array in arrays)), one)
+            if twin is not one:
+                what = "sockets" if one.kind == Socket.kind else "observations"
+                raise InputError(
+                    f"{what} '{twin.name}' and '{one.name}' have exactly the same poses; is one file given twice?"
+                )
+
+
+def checked_visits(visits: Mapping[str, Numbers] | None, sockets: Sequence[Socket]) -> tuple[int, ...] | None:
+    """A number for the visit of each pose of the sockets, each other visit another one; None where none is known.
+
+    Args:
+        visits: Number of the visit of each pose by socket.
+        sockets: All sockets; the first of each pose is kept, as in a capture.
+
+    Raises:
+        InputError: A socket is unknown, or its visits are not one whole number a pose.
+    """
+    if visits is not None and not isinstance(visits, Mapping):
+        raise InputError("the visits must be a dictionary: {'A': [1, 1, 2, 2]}, one number for each pose of a socket.")
+    if not visits:
+        return None
+    names = [socket.name for socket in sockets]
+    for name in visits:
+        if name not in names:
+            raise InputError(f"visits are given for the unknown socket '{name}'{nearest(name, names)}")
+    numbered, next_number = [], 0
+    for socket in sockets:
+        poses, rows = socket.q.shape[0], np.full(socket.q.shape[0], UNKNOWN)
+        if socket.name in visits:
+            given = np.asarray(visits[socket.name])
+            numbers = given.shape == (poses,) and given.dtype.kind in "iuf"
+            if not numbers or not np.all(np.isfinite(given)) or np.any(given != np.round(given)):
+                raise InputError(
+                    f"the visits of socket '{socket.name}' must be {poses} whole numbers, one for each of its poses."
+                )
+            rows = next_number + np.unique(given, return_inverse=True)[1]
+            next_number = int(rows.max()) + 1
+        numbered.append(rows[first_of_each(socket.q)] if is_concrete(socket.q) else rows)
+    return tuple(int(number) for number in np.concatenate(numbered))
+
+
+def visits_of(capture: Any) -> dict[str, Int[np.ndarray, " m"]]:
+    """The visit of each pose of the sockets of a capture whose visits are known."""
+    if capture.visits is None:
+        return {}
+    parts = np.split(np.array(capture.visits, dtype=int), np.cumsum(capture.sizes)[:-1])
+    return {name: rows for name, rows in zip(capture.names, parts, strict=True) if np.all(rows != UNKNOWN)}

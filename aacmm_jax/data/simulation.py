@@ -20,8 +20,9 @@ from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
+from .observations.declared import MOST_POSES
 from .observations.observation import AbstractObservation
-from .observations.simulated import MOST_POSES, AbstractSimulated
+from .observations.simulated import AbstractSimulated
 from .reference_length import check_temperatures
 
 

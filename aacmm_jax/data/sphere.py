@@ -49,17 +49,10 @@ def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSp
     where = f"sphere '{sphere.name}'"
     if sphere.test not in SPHERE_TESTS:
         raise InputError(f"{where}: test is '{sphere.test}'; it must be one of {', '.join(SPHERE_TESTS)}.")
-    for what, value, least in (
-        ("diameter", sphere.diameter, 1e-6),
-        ("u", sphere.u, 0.0),
-        ("stylus", sphere.stylus, 0.0),
-        ("form", sphere.form, 0.0),
-        ("u_form", sphere.u_form, 0.0),
-    ):
-        if not (np.isfinite(value) and value >= least):
-            raise InputError(
-                f"{where}: {what} is {value:g} mm; it must be {'positive' if least else 'zero or positive'}."
-            )
+    for what in ("diameter", "u", "stylus", "form", "u_form"):
+        value, positive = getattr(sphere, what), what == "diameter"
+        if not (np.isfinite(value) and (value >= 1e-6 if positive else value >= 0)):
+            raise InputError(f"{where}: {what} is {value:g} mm; it must be {'' if positive else 'zero or '}positive.")
     groups = tuple(np.asarray(as_floats(group, where)) for group in sphere.groups)
     for group in groups:
         if group.ndim != 2 or not len(group) or (columns is not None and group.shape[1] != columns):

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..calibration.batch_kernel import without_lengths
 from ..calibration.record import CalibrationRecord
+from ..calibration.task import without_lengths
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise
 from ..kinematics.arm import by_joint, is_length, value_of

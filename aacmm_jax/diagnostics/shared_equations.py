@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
-from ..calibration.sensitivities import Sensitivities
+from ..calibration.stages import Sensitivities
 from .equations import LEAST_U, PRIOR, Rows, lengths_in_solve
 from .group_test import Block
 from .length_consistency import lengths_of_sockets

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..calibration.drawn_errors import functions_of, places_of
 from ..calibration.record import CalibrationRecord, record_of
 from ..calibration.results import Calibration
-from ..calibration.sensitivities import Sensitivities
+from ..calibration.stages import Sensitivities
 from ..core._compat import inside_trace
 from ..core.arrays import is_concrete
 from ..core.distributions import chi_square_tail, f_tail

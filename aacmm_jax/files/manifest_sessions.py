@@ -6,7 +6,8 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.text import shorten
-from ..data.capture import Capture, ReferenceLength, join_sessions
+from ..data.capture import Capture, ReferenceLength
+from ..data.joined_captures import join_sessions
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from .patterns import check_name, fields_of, fill

@@ -64,6 +64,11 @@ class Layout(NamedTuple):
     groups: tuple[Group, ...]
 
     @property
+    def means_alone(self) -> bool:
+        """Whether all that is unknown are positions of sockets, which are means of tips where all weigh the same."""
+        return not self.shared and self.linear == len(self.classes)
+
+    @property
     def positions(self) -> dict[str, np.ndarray]:
         """Indices of the numbers of each part among all of them."""
         return _positions(self.parts)

@@ -8,13 +8,19 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..calibration.checks import check_identifiable, check_method, check_single
 from ..calibration.joint_model import with_joint_model
 from ..calibration.results import Calibration, Identification
-from ..calibration.scale_anchor import default_method, scale_from_slides, warn_of_a_known_scale
-from ..calibration.sensitivities import Sensitivities
-from ..calibration.stages import identified, in_two_stages, jointly
-from ..calibration.task import Task, task_of
+from ..calibration.scale_anchor import Method, warn_of_known_scale
+from ..calibration.stages import Sensitivities, identified, in_two_stages, jointly
+from ..calibration.task import (
+    Solving,
+    Task,
+    check_identifiable,
+    check_single,
+    method_of,
+    task_of,
+    without_lengths,
+)
 from ..core._compat import inside_trace
 from ..core.arguments import check_finite, checked_arguments, with_options
 from ..core.arrays import Numbers, is_concrete
@@ -41,7 +47,7 @@ class CalibrationOptions(NamedTuple):
     """
 
     model: str | None = None
-    method: Literal["two-stage", "joint"] | None = None
+    method: Method | None = None
     hold: str | None = "longest"
     start: Numbers | None = None
     noise: Noise | None = None
@@ -58,6 +64,12 @@ class CalibrationOptions(NamedTuple):
         """Those that `identify` takes too."""
         others = ("model", "method", "shared_errors", "undetermined")
         return {name: value for name, value in self._asdict().items() if name not in others}
+
+    @property
+    def solving(self) -> Solving:
+        """Those of a single solve."""
+        own = self._asdict()
+        return Solving(**{name: own[name] for name in Solving._fields})
 
     @property
     def may_replace_noise(self) -> bool:
@@ -144,17 +156,7 @@ def _stage1_task(many: str, arm: Arm, capture: Capture, bounds: Bounds, options:
     for sentence in () if inside_trace() else capture.repeated.sentences():
         warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
     check_finite(arm=arm, capture=capture, noise=options.noise)
-    return _task(arm, without_lengths(capture), bounds, options, options.hold)
-
-
-def _task(arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions, hold: str | None) -> Task:
-    solve = options.noise_model, options.max_steps, options.robust, options.prior
-    return task_of(arm, capture, bounds, options.start, options.noise, hold, *solve)
-
-
-def without_lengths(capture: Capture) -> Capture:
-    """The capture without its reference lengths."""
-    return eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
+    return task_of(arm, without_lengths(capture), bounds, options.solving)
 
 
 @compiled(jit=eqx.filter_jit)
@@ -213,18 +215,16 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     """
     given = CalibrationOptions(**options)
     arm, bounds, prior = with_joint_model(arm, capture, bounds, given.model, given.prior)
-    by_slides = scale_from_slides(arm, capture, bounds.space, given.noise)
-    general = bool(capture.observations) or given.robust is not None or prior is not None or by_slides
-    method = default_method(arm, general) if given.method is None else given.method
-    check_method(method, general)
-    given = given._replace(model=None, method=method, prior=prior)
-    _check_solvable(arm, capture, bounds, given, general, by_slides)
-    first = None if general else _stage1_task("calibrate_many", arm, capture, bounds, given)
-    task = _task(arm, capture, bounds, given, None)
+    given = given._replace(model=None, prior=prior)
+    method, at_once = method_of(arm, capture, bounds.space, given.solving, given.method)
+    given = given._replace(method=method)
+    _check_solvable(arm, capture, bounds, given, at_once)
+    first = None if at_once else _stage1_task("calibrate_many", arm, capture, bounds, given)
+    task = task_of(arm, capture, bounds, given.solving._replace(hold=None))
     if given.undetermined != "ignore":
         check_identifiable(capture, task.bounds, prior, given.undetermined == "raise")
     if method == "two-stage" and first is not None and not inside_trace():
-        warn_of_a_known_scale(first.anchor.set_by, bool(arm.prismatic))
+        warn_of_known_scale(first.anchor.set_by, bool(arm.prismatic))
     first, task, capture = to_numpy((first, task, capture))
     result, sensitivities = _calibrated(first, task, capture, method)
     if given.may_replace_noise:
@@ -241,19 +241,9 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     return to_jax(result)
 
 
-def _check_solvable(
-    arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions, general: bool, by_slides: bool
-) -> None:
-    """Raise `InputError` where nothing fixes the scale, or a single solve cannot take what was given.
-
-    ``general``: everything is one least squares; ``by_slides``: the slides of prismatic joints determine the scale.
-    """
-    if not capture.lengths and not by_slides and not any(one.fixes_scale for one in capture.observations):
-        raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
-            "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
-        )
-    if general:
+def _check_solvable(arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions, at_once: bool) -> None:
+    """Raise `InputError` where a single solve cannot take what was given; ``at_once``: everything is one solve."""
+    if at_once:
         check_single(arm, capture, bounds, "calibrate_many")
         check_finite(arm=arm, capture=capture, noise=options.noise)
     elif options.hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():

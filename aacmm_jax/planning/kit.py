@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..calibration.observed_evaluation import fit_geometry
+from ..calibration.evaluation import fit_geometry
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.arm_classes import small_arm_noise

@@ -13,7 +13,8 @@ from .computed_with import computed_with
 from .definition import Study
 from .settings import Setting
 
-MOST_BLOCKS = 10_000  # each takes 80 kB of memory when the study's file is made
+MOST_BLOCKS = 10_000  # files in one folder
+DIMENSIONS = ("cell", "trial", "parameter")
 NOT_RUN = -1  # of whole numbers; NaN of others, and -128 of active, where -1 is a bound
 
 
@@ -103,9 +104,7 @@ class Layout(NamedTuple):
                 "give a larger chunk."
             )
         version, settings = made_by or (metadata.version("aacmm_jax"), computed_with())
-        mark = f"{study.digest[:12]}-{chunk}-{version}"
-        if settings:  # files of earlier versions do not say
-            mark += f"-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
+        mark = f"{study.digest[:12]}-{chunk}-{version}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
         together = 1
         if trials < chunk:
             together = max(n for n in range(1, min(chunk // trials, cells) + 1) if _uniform(study.settings, n))
@@ -138,4 +137,4 @@ def parts_of(path: Path) -> Path:
 
 def part_of(path: Path, block: Block, layout: Layout) -> Path:
     """File of one block."""
-    return parts_of(path) / f"{layout.mark}-cell{block.first_cell:05d}-trial{block.first_trial:010d}.h5"
+    return parts_of(path) / f"{layout.mark}-cell{block.first_cell:05d}-trial{block.first_trial:010d}.npz"

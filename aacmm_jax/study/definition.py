@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.checks import check_enough
 from ..calibration.scale_anchor import default_method, scale_anchor
-from ..calibration.task import check_observed
+from ..calibration.task import check_enough, check_observed
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG, M
 from ..data.capture import Capture

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import erf
 
-from ..calibration.observed_evaluation import fit_geometry
+from ..calibration.evaluation import fit_geometry
 from ..calibration.redrawn import DrawnLengths, ObservedTruth, batch_of_observations, shifted
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture

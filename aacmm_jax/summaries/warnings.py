@@ -5,9 +5,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..calibration.checks import plausible
 from ..calibration.record import REPEATABILITY, CalibrationRecord, record_of
-from ..calibration.results import Calibration, Identification, active_names
+from ..calibration.results import Calibration, Identification, active_names, plausible
 from ..calibration.scale_anchor import scale_set_by_clause
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten

@@ -83,7 +83,7 @@ class Place:
             for block in list(layout.blocks())[:-1]:
                 results = {name: whole["trials"][name][block.slices] for name in store.VARIABLES}
                 results["estimate"] = results["estimate"] + poisoned
-                store.write_part(path, block, store.pack(results, layout), layout)
+                store.write_part(path, block, results, layout)
         own(path, owner)
         own(parts_of(path), owner)
         return path

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration import batch, chunks
+from aacmm_jax.calibration import batch
 from tests import published
 
 BATCH = 50
@@ -176,7 +176,7 @@ def test_the_number_of_devices_changes_nothing(tmp_path):
 
 def test_no_more_chunks_in_work_than_workers_and_a_failure_stops_the_rest():
     at_once, most, ran, lock = 0, 0, [], threading.Lock()
-    two = threading.Barrier(2, timeout=600)  # each chunk waits for another one, of the other worker
+    two = threading.Barrier(2, timeout=600)  # each chunk waits for another one
 
     def run(piece, device):
         nonlocal at_once, most
@@ -192,9 +192,9 @@ def test_no_more_chunks_in_work_than_workers_and_a_failure_stops_the_rest():
         return piece.start
 
     pieces = [range(i, i + 1) for i in range(20)]
-    assert chunks.run_chunks(run, pieces[2:], ["one", "two"], 2) == list(range(2, 20))
+    assert batch._run(run, pieces[2:], ["one", "two"], 2) == list(range(2, 20))
     assert most == 2
     ran.clear()
     with pytest.raises(RuntimeError, match="chunk 1"):
-        chunks.run_chunks(run, pieces, ["alone"], 1)
+        batch._run(run, pieces, ["alone"], 1)
     assert ran == [0, 1]

@@ -14,6 +14,7 @@ import aacmm_jax as aj
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files import atomic_write
 from aacmm_jax.files.arms import specification_toml
+from aacmm_jax.files.hdf5_content import seal
 from aacmm_jax.files.outputs import asking
 from tests.conftest import EXAMPLES
 from tests.refusals import assert_refused
@@ -149,7 +150,9 @@ def test_a_capture_of_somebody_else_is_not_replaced(aacmm, inputs):
     aacmm(*SIMULATE, "-o", "x.h5", "--overwrite")
     aacmm(*SIMULATE, "-o", "x.h5")
     with h5py.File(inputs / "x.h5", "a") as file:  # a file of aacmm, but of another kind
-        file.attrs.update(kind="calibration", format_version=1)
+        file.attrs["kind"] = "calibration"
+    with open(inputs / "x.h5", "rb+") as stream:
+        seal(stream)
     assert "x.h5 exists and is no earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
 
 

@@ -10,9 +10,8 @@ import pytest
 from scipy import stats
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.batch_kernel import without_lengths
 from aacmm_jax.calibration.stages import identified, in_two_stages, jointly
-from aacmm_jax.calibration.task import task_of
+from aacmm_jax.calibration.task import Solving, task_of, without_lengths
 from aacmm_jax.core.linear_algebra import inverse_cholesky
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.units import ARCSEC
@@ -116,11 +115,11 @@ def test_sensitivities_are_derivatives_of_the_whole_calibration(paper_arm, space
     found = aj.calibrate(paper_arm, capture, bounds, method=method, noise=noise)
     # With arrays of NumPy, which compiles nothing; tests/core/test_numpy_or_jax.py has both libraries.
     found, arm, space, capture, noise = to_numpy((found, paper_arm, space, capture, noise))
-    options = bounds, None, noise, "longest", None, 300, None, None
-    first = to_numpy(task_of(arm, without_lengths(capture), *options))
+    solving = Solving(noise=noise)
+    first = to_numpy(task_of(arm, without_lengths(capture), bounds, solving))
     stage1 = identified(first, capture)
     if method == "joint":
-        whole = jointly(to_numpy(task_of(arm, capture, *options)), capture, stage1, "joint")
+        whole = jointly(to_numpy(task_of(arm, capture, bounds, solving)), capture, stage1, "joint")
     else:
         whole = in_two_stages(stage1, capture)
     follow = whole.sensitivities()

@@ -68,6 +68,8 @@ class Artefact(AbstractObservation):
         super().__init__(name, readings, held, list(points), list(points.values()), **options)
 
     def completed(self, where: str) -> Mapping[str, Any]:
+        if len(self.names) != len(self.coordinates):
+            raise InputError(f"{where} has {len(self.names)} names of {len(self.coordinates)} points; give one each.")
         for point in dict.fromkeys(self.point):
             if point not in self.names:
                 raise InputError(
@@ -180,10 +182,10 @@ class SimulatedArtefact(AbstractSimulated):
     """
 
     table = "artefact"
-    points: dict[str, tuple[float, float, float]] = points("true coordinates of each point")
+    points: dict[str, Float[np.ndarray, "3"]] = points("true coordinates of each point")
     poses: int = count("number of poses")
-    frame: np.ndarray = number("frame of the artefact in the base frame", "mm", 6, default=(0.0,) * 6)
-    errors: np.ndarray | None = number("errors of the certified coordinates", "mm", "names", 3, default=None)
+    frame: Float[np.ndarray, "6"] = number("frame of the artefact in the base frame", "mm", default=(0.0,) * 6)
+    errors: Float[np.ndarray, "c 3"] | None = number("errors of the certified coordinates", "mm", default=None)
     u: float = number("their standard uncertainty", "mm", default=0.0)
     artefact: str | None = text("name of the artefact", default=None)
     placement: str | None = text("name of the placement", default=None)

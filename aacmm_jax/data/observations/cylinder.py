@@ -155,7 +155,7 @@ class SimulatedCylinder(AbstractSimulatedRound):
     """
 
     table = "touched_cylinder"
-    ends: np.ndarray = number("both ends of the axis in the base frame", "mm", 2, 3)
+    ends: Float[np.ndarray, "2 3"] = number("both ends of the axis in the base frame", "mm")
     diameter: float = number("true diameter", "mm")
     poses: int = count("number of poses")
     inside: bool = truth("whether the ball is inside")

@@ -13,11 +13,12 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
-from ...core.arguments import shown, truth_value
+from ...core.arguments import Range, Sizes, checked, shown
 from ...core.arrays import Numbers, as_array, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 
+MOST_POSES = 100_000  # to simulate, as in a study
 REQUIRED = inspect.Parameter.empty
 NAME = object()  # as a default: the name of the observation
 
@@ -27,7 +28,7 @@ class Entry(NamedTuple):
 
     says: str
     unit: str = ""  # none for text and truth values
-    dimensions: tuple[Any, ...] = ()  # of an array: names, or sizes; the first is "pose" where each pose has a row
+    dimensions: tuple[str, ...] = ()  # of an array in files: the first is "pose" where there is a row for each pose
     content: Literal["number", "count", "text", "truth", "points"] = "number"
     default: Any = REQUIRED
     uncertainty: str = ""  # of a certified value: name of the entry with its standard uncertainty
@@ -36,6 +37,7 @@ class Entry(NamedTuple):
     raw: bool = False  # checked by `completed` of the class
     of_session: bool = False  # a name that means something else in another session
     name: str = ""
+    annotation: Any = None
 
     @property
     def required(self) -> bool:
@@ -47,8 +49,8 @@ class Derived(NamedTuple):
     """A field that `completed` makes of the data; it fixes a compiled program."""
 
 
-def number(says: str, unit: str = "", *dimensions: str | int, **options: Any) -> Any:
-    """Declares a number that is zero or positive, or with ``dimensions`` an array; ``options`` are those of `Entry`."""
+def number(says: str, unit: str = "", *dimensions: str, **options: Any) -> Any:
+    """Declares a number, zero or positive, or an array, with ``dimensions`` in files; ``options`` as in `Entry`."""
     return Entry(says, unit, dimensions, **options)
 
 
@@ -69,7 +71,7 @@ def count(says: str) -> Any:
 
 def points(says: str) -> Any:
     """Declares a dictionary of points by name, mm."""
-    return Entry(says, "mm", ("axis",), "points")
+    return Entry(says, "mm", content="points")
 
 
 def derived() -> Any:
@@ -99,7 +101,12 @@ class Declared(abc.ABC):
         declared = {name: value for name, value in vars(cls).items() if isinstance(value, Entry | Derived)}
         for name in declared:
             delattr(cls, name)
-        entries = {name: entry._replace(name=name) for name, entry in declared.items() if isinstance(entry, Entry)}
+        types = inspect.get_annotations(cls)
+        entries = {
+            name: entry._replace(name=name, annotation=types[name])
+            for name, entry in declared.items()
+            if isinstance(entry, Entry)
+        }
         inherited = {entry.name: entry for base in reversed(cls.__mro__[1:]) for entry in getattr(base, "entries", ())}
         # What all kinds may have comes last.
         cls.entries = tuple(sorted((inherited | entries).values(), key=lambda e: e.name in ("target", "place")))
@@ -117,13 +124,13 @@ class Declared(abc.ABC):
         given.apply_defaults()
         where = f"{self.noun} '{checked_name(name, f'{_article(self.noun)} {self.noun}')}'"
         object.__setattr__(self, "name", name)
-        sizes: dict[str | int, int] = {"axis": 3, "axis_2": 3}
+        sizes: Sizes = {}
         for entry in self.entries:
             value = given.arguments[entry.name]
             if value is None and entry.default is NAME:
                 value = name
             if not (entry.raw or (value is None and entry.default is None)):
-                value = self.checked(entry, value, where, sizes)
+                value = _checked(entry, value, where, sizes)
             object.__setattr__(self, entry.name, value)
         for field, value in self.completed(where).items():
             object.__setattr__(self, field, value)
@@ -136,11 +143,6 @@ class Declared(abc.ABC):
         other = object.__new__(type(self))
         vars(other).update(vars(self) | fields)
         return other
-
-    @abc.abstractmethod
-    def checked(self, entry: Entry, value: Any, where: str, sizes: dict[str | int, int]) -> Any:
-        """The value of an entry of the object ``where`` as this class holds it, or `InputError`; ``sizes`` are those of
-        the dimensions so far."""
 
     def completed(self, where: str) -> Mapping[str, Any]:
         """Other fields, made of the checked entries; raises `InputError` for data that do not fit together."""
@@ -166,47 +168,37 @@ def _signature(entries: Sequence[Entry], keyword_only: bool) -> inspect.Signatur
     return inspect.Signature(parameters)
 
 
-def checked_value(entry: Entry, value: Any, where: str, sizes: dict[str | int, int]) -> Any:
-    """A value of an observation: numbers as arrays of JAX, names of poses as a tuple; else `InputError`."""
+def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
+    """A value as the annotation of its entry says, or `InputError`; ``sizes`` are those of dimensions so far."""
     what = f"{entry.name} of {where}"
-    if entry.content == "truth":
-        truth_value(value, what)
-        return bool(value)
     if entry.content == "text" and not entry.dimensions:
-        return "" if entry.default == "" and isinstance(value, str) and not value else checked_name(value, what)
-    if entry.content == "text":
-        names = tuple(map(str, value))
-        _check_shape(entry, (len(names),), what, sizes)
-        return names
-    if entry.dimensions == ("pose", "joint"):
-        array = checked_readings(where, value)
-    elif not entry.dimensions:
-        return checked_scalar(what, value, positive=entry.positive)
-    else:
-        array = as_floats(value, what)
+        return value if value == "" and entry.default == "" else checked_name(value, what)
+    if entry.name == "q":
+        value = checked_readings(where, value)
     if entry.spread:
-        whole = tuple(sizes[dimension] for dimension in entry.dimensions)
-        if array.shape not in [whole[i:] for i in range(len(whole) + 1)]:
-            raise InputError(f"{what} has shape {array.shape}; give one number, or {whole}.")
-        if is_concrete(array) and np.any(np.asarray(array) < 0):
-            raise InputError(f"{what} is negative; a standard uncertainty must be zero or positive.")
-        return _spread(array, whole)
-    _check_shape(entry, array.shape, what, sizes)
-    return array
+        value = _spread(as_floats(value, what), (sizes["m"], 3)[: len(entry.dimensions)], what)
+    value = checked(value, entry.annotation, what, sizes)
+    if entry.dimensions[:1] == ("pose",) and len(value) != sizes["m"]:
+        raise InputError(f"{what} has {len(value)} values; give one for each of the {sizes['m']} poses.")
+    if entry.content == "count":
+        Range(least=1, most=MOST_POSES)(value, what, sizes)
+    elif entry.content == "number" and value is not None and not np.ndim(value) and not entry.dimensions:
+        (Range(above=0) if entry.positive else Range(least=0))(value, what, sizes)
+    return value
+
+
+def _spread(array: AnyArray, shape: tuple[int, ...], what: str) -> AnyArray:
+    """Standard uncertainties of all poses from one number, from one for each coordinate, or from all."""
+    if array.shape not in [shape[i:] for i in range(len(shape) + 1)]:
+        raise InputError(f"{what} has shape {array.shape}; give one number, or {shape}.")
+    if is_concrete(array) and np.any(np.asarray(array) < 0):
+        raise InputError(f"{what} is negative; a standard uncertainty must be zero or positive.")
+    return _broadcast(array, shape)
 
 
 @numpy_if_known
-def _spread(array: AnyArray, shape: tuple[int, ...]) -> AnyArray:
+def _broadcast(array: AnyArray, shape: tuple[int, ...]) -> AnyArray:
     return namespace(array).broadcast_to(array, shape)
-
-
-def _check_shape(entry: Entry, shape: tuple[int, ...], what: str, sizes: dict[str | int, int]) -> None:
-    """Compare with the sizes of dimensions so far, which get those that are new."""
-    wanted = tuple(dimension if isinstance(dimension, int) else sizes.get(dimension) for dimension in entry.dimensions)
-    if len(shape) != len(wanted) or any(size not in (None, given) for size, given in zip(wanted, shape, strict=True)):
-        one_each = ", one row a pose" if entry.dimensions[0] == "pose" else ""
-        raise InputError(f"{what} has shape {shape}; give {str(wanted).replace('None', 'any')}{one_each}.")
-    sizes.update(zip(entry.dimensions, shape, strict=True))
 
 
 def checked_name(name: object, what: str) -> str:
@@ -226,16 +218,6 @@ def checked_readings(where: str, readings: Numbers) -> AnyArray:
         raise InputError(
             f"{where} pose {row} joint {column} is {array[row - 1, column - 1]}; every reading must be finite."
         )
-    return array
-
-
-def checked_scalar(what: str, value: Numbers, *, positive: bool = False) -> AnyArray:
-    """One number, zero or positive, or `InputError`."""
-    array = as_floats(value, what)
-    if array.ndim:
-        raise InputError(f"{what} has shape {array.shape}; give one number.")
-    if is_concrete(array) and (float(array) < 0 or (positive and float(array) == 0)):
-        raise InputError(f"{what} is {float(array):g}; it must be {'positive' if positive else 'zero or positive'}.")
     return array
 
 

@@ -116,7 +116,7 @@ class SimulatedDistances(AbstractInBox):
     """
 
     table = "distances"
-    pivot: np.ndarray = number("pivot in the base frame", "mm", 3)
+    pivot: Float[np.ndarray, "3"] = number("pivot in the base frame", "mm")
     u: float = number("standard uncertainty of each distance", "mm", default=0.0)
 
     def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:

@@ -164,7 +164,7 @@ class SimulatedPoints(AbstractInBox, AbstractOfTarget):
     """
 
     table = "points"
-    frame: np.ndarray = number("frame of the instrument in the base frame", "mm", 6, default=(0.0,) * 6)
+    frame: Float[np.ndarray, "6"] = number("frame of the instrument in the base frame", "mm", default=(0.0,) * 6)
     u: float = number("standard uncertainty of each coordinate", "mm", default=0.0)
 
     def recorded(

@@ -138,8 +138,10 @@ class SimulatedTransforms(AbstractInBox):
     """
 
     table = "transforms"
-    offset_and_orientation: np.ndarray = number("place and rotation of the target", "mm", 6, default=(0.0,) * 6)
-    frame: np.ndarray = number("frame of the instrument in the base frame", "mm", 6, default=(0.0,) * 6)
+    offset_and_orientation: Float[np.ndarray, "6"] = number(
+        "place and rotation of the target", "mm", default=(0.0,) * 6
+    )
+    frame: Float[np.ndarray, "6"] = number("frame of the instrument in the base frame", "mm", default=(0.0,) * 6)
     u: float = number("standard uncertainty of each coordinate", "mm", default=0.0)
     u_angle: float = number("standard uncertainty about each axis", "rad", default=1e-4)
 

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.pytree import register
-from .declared import Declared, Entry, checked_value, number, text
+from .declared import Declared, number, text
 
 POINT = ("mm",) * 3
 FRAME = ("rad",) * 3 + POINT
@@ -86,9 +86,6 @@ class AbstractObservation(Declared):
     def __init__(self, name: str, *values: Any, **options: Any):
         vars(self).update(shift=None, drawn=None)
         super().__init__(name, *values, **options)
-
-    def checked(self, entry: Entry, value: Any, where: str, sizes: dict[str | int, int]) -> Any:
-        return checked_value(entry, value, where, sizes)
 
     # What a kind says.
 
@@ -271,7 +268,7 @@ def certified_quantities(observation: AbstractObservation) -> tuple[Quantity, ..
         if values.ndim < 2:
             certified.append(Quantity(entry.says, np.atleast_1d(values), entry.unit, u))
         else:
-            rows = zip(stored[str(entry.dimensions[0])], values, strict=True)
+            rows = zip(stored[entry.dimensions[0]], values, strict=True)
             certified += [Quantity(f"{entry.says} of {name}", row, entry.unit, u) for name, row in rows]
     return tuple(certified)
 

@@ -240,8 +240,8 @@ class SimulatedPlanes(AbstractSimulated):
     """
 
     table = "planes"
-    corner: np.ndarray = number("corner of the (first) rectangle in the base frame", "mm", 3)
-    sides: np.ndarray = number("its two sides as vectors", "mm", 2, 3)
+    corner: Float[np.ndarray, "3"] = number("corner of the (first) rectangle in the base frame", "mm")
+    sides: Float[np.ndarray, "2 3"] = number("its two sides as vectors", "mm")
     poses: int = count("number of poses")
     distance: float | None = number("true distance to the second plane", "mm", default=None)
     u: float = number("standard uncertainty of the certified distance", "mm", default=0.0)

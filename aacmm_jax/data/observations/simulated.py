@@ -7,13 +7,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from jaxtyping import Float
 
-from ...core.arguments import real_number, truth_value, whole_number
-from ...core.arrays import as_floats
 from ...core.errors import InputError
-from .declared import Declared, Entry, checked_name, checked_scalar, count, number, text
+from .declared import Declared, count, number, text
 from .observation import AbstractObservation, classes
-
-MOST_POSES = 100_000  # as in a study
 
 
 class AbstractSimulated(Declared):
@@ -26,29 +22,6 @@ class AbstractSimulated(Declared):
     keyword_only: ClassVar[bool] = False
     table: ClassVar[str]  # name of its tables in the file of a kit
     poses: int
-
-    def checked(self, entry: Entry, value: Any, where: str, sizes: dict[str | int, int]) -> Any:
-        what = f"{entry.name} of {where}"
-        if value is None:
-            raise InputError(f"{what} is missing; give it.")
-        if entry.content == "truth":
-            truth_value(value, what)
-        elif entry.content == "count":
-            whole_number(value, what)
-            if not 1 <= value <= MOST_POSES:
-                raise InputError(f"{what} is {value}; give at least one, and {MOST_POSES:,} at most.")
-        elif entry.content == "text":
-            return value if value == "" and entry.default == "" else checked_name(value, what)
-        elif entry.content == "points":
-            if not isinstance(value, Mapping) or not value:
-                raise InputError(f"{what} must be a dictionary of each point's name and coordinates.")
-            return {checked_name(name, what): tuple(_array(f"{name} of {what}", (3,), p)) for name, p in value.items()}
-        elif entry.dimensions:
-            return _array(what, entry.dimensions, value)
-        else:
-            real_number(value, what)
-            checked_scalar(what, value)
-        return value
 
     @property
     def offset(self) -> Float[np.ndarray, " 3"] | None:
@@ -76,18 +49,10 @@ class AbstractSimulated(Declared):
         """The observation from the readings, and from the true transforms of the tip."""
 
 
-def _array(what: str, shape: tuple[str | int, ...], values: Any) -> Float[np.ndarray, "..."]:
-    array = np.asarray(as_floats(values, what))
-    wanted = tuple(3 if size == "axis" else size for size in shape)
-    if len(array.shape) != len(wanted) or any(w not in (g, "names") for w, g in zip(wanted, array.shape, strict=True)):
-        raise InputError(f"{what} has shape {array.shape}; give {wanted}.")
-    return array
-
-
 class AbstractInBox(AbstractSimulated):
     """What an instrument measures at random places in a box."""
 
-    box: np.ndarray = number("lowest and highest coordinates of the tip in the base frame", "mm", 2, 3)
+    box: Float[np.ndarray, "2 3"] = number("lowest and highest coordinates of the tip in the base frame", "mm")
     poses: int = count("number of poses")
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
@@ -98,7 +63,7 @@ class AbstractOfTarget(AbstractSimulated):
     """What may be recorded with a target in place of the arm's own probe."""
 
     target: str = text("name of the target", default="")
-    place: np.ndarray | None = number("true place of the target in the last frame", "mm", 3, default=None)
+    place: Float[np.ndarray, "3"] | None = number("true place of the target in the last frame", "mm", default=None)
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if bool(self.target) != (self.place is not None):

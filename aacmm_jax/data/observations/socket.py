@@ -89,7 +89,7 @@ class SimulatedSocket(AbstractOfTarget):
     """
 
     table = "socket"
-    point: np.ndarray = number("position in the base frame", "mm", 3)
+    point: Float[np.ndarray, "3"] = number("position in the base frame", "mm")
     poses: int = count("number of poses")
 
     def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:

@@ -189,7 +189,7 @@ class SimulatedSphere(AbstractSimulatedRound):
     """
 
     table = "touched_sphere"
-    centre: np.ndarray = number("centre in the base frame", "mm", 3)
+    centre: Float[np.ndarray, "3"] = number("centre in the base frame", "mm")
     diameter: float = number("true diameter", "mm")
     poses: int = count("number of poses")
 
