@@ -117,7 +117,7 @@ def calibrate(
     from ..summaries.calibration import calibration_summary
     from ..summaries.warnings import does_not_fit
 
-    options = CaptureOptions(
+    chosen = CaptureOptions(
         method=method,
         robust=robust,
         scale=scale,
@@ -146,8 +146,8 @@ def calibrate(
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         nominal = _with_model(recording.nominal, model)
         nominal = _bounded(nominal, (held, free), length_bound_mm, angle_bound_deg, bound or [])
-        options = options._replace(prior=_prior(nominal, prior, model))
-        record = calibrate_capture(recording._replace(nominal=nominal), **options._asdict())
+        chosen = chosen._replace(prior=_prior(nominal, prior, model))
+        record = calibrate_capture(recording._replace(nominal=nominal), **chosen._asdict())
         summary = calibration_summary(record)
         save_calibration(output, record, summary)
         if figure is not None:

@@ -28,6 +28,7 @@ from ..summaries.tables import (
     Styled,
     decimals_for,
     encoders_in_words,
+    factor_words,
     formatted,
     lengths_sentence,
     observed_words,
@@ -238,7 +239,8 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
 def _uncertainty(summary: dict[str, Any]) -> View:
     """The expanded uncertainty (95 %) over the volume, the noise that it follows from, and what the data determine."""
     part = summary["uncertainty"]
-    yield volume_table(part["volume"])
+    factors = ", ".join(filter(None, ("95 %", factor_words(part["volume"]))))
+    yield volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
     yield "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
     if part.get("tried"):
         yield tried_sentence(part["tried"])

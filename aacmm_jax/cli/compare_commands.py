@@ -63,8 +63,8 @@ def compare(
         records = [load_calibration(file) for file in files]
         created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
         labels = [str(file) for file in files]
-        options = {"level": level, "length": length_mm, "labels": labels}
-        trend = with_spinner("Comparing", lambda: _compared(records, created, options))
+        settings = {"level": level, "length": length_mm, "labels": labels}
+        trend = with_spinner("Comparing", lambda: _compared(records, created, settings))
         trend = trend._replace(dated_by_file=tuple(not records[i].recording.measured for i in trend.order))
         summary: dict[str, Any] = compared_summary(trend, labels, records[0].recording.nominal.name)
         summary["kept"], summary["failed"] = change_exceeded(trend.drifts[-1].lengths, max_length_change_mm)
@@ -80,14 +80,14 @@ def compare(
         raise typer.Exit(1)
 
 
-def _compared(records: list, created: list[str], options: dict[str, Any]) -> Any:
+def _compared(records: list, created: list[str], settings: dict[str, Any]) -> Any:
     """The trend over all files; of two, in the order in which they are named, whatever their dates."""
     from ..drift.comparison import compare, moment, trend
     from ..drift.results import Trend
 
-    labels = options["labels"]
+    labels = settings["labels"]
     if len(records) > 2:
-        by_date = trend(records, created, **options)
+        by_date = trend(records, created, **settings)
         if list(by_date.order) == sorted(by_date.order):
             return by_date
         warning = (
@@ -96,7 +96,7 @@ def _compared(records: list, created: list[str], options: dict[str, Any]) -> Any
         )
         first, *others = by_date.drifts
         return by_date._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *others))
-    drift = compare(*records, **options)
+    drift = compare(*records, **settings)
     old, new = (moment(date) for date in created)
     if new < old:
         warning = (

@@ -154,13 +154,13 @@ def _evaluated(
 def _refuse_options_of_tests(of_test: dict[str, Any], measuring_range: float | None) -> None:
     """Raise `InputError` where options are given that only acceptance tests have, and none was made."""
     influences = of_test["influences"]
-    options = {
+    of_tests = {
         "--rule": of_test["rule"] is not None,
         "--test-u-mm": of_test["u_test"] > 0 or influences.u_relative > 0,
         "--expansion": influences.artefact is not None or influences.arm is not None,
         "--range-mm": measuring_range is not None,
     }
-    given = [name for name, there in options.items() if there]
+    given = [name for name, there in of_tests.items() if there]
     if given:
         raise InputError(
             f"{shorten(given)} applies to acceptance tests only; this capture supports none, or none was requested: "

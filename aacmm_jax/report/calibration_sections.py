@@ -156,7 +156,12 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     positions |= {name: lambda i, values=values: with_u_digits(float(values[i])) for name, values in u.items()}
     every = table("All positions", range(len(volume.start)), positions)
     chart = with_table(volume_chart(volume), every)
-    blocks = [introduction, volume_table(statistics), chart, _noise_sentence(summary)]
+    blocks = [
+        introduction,
+        volume_table("Expanded uncertainty over the working volume [mm]", statistics),
+        chart,
+        _noise_sentence(summary),
+    ]
     return Section("volume", "Uncertainty over the working volume", blocks)
 
 

@@ -55,12 +55,7 @@ def evaluation_report(record: EvaluationRecord) -> Report:
     calibrated = evaluations["calibrated"]
     geometry = {} if calibrated.observed is None else calibrated.observed.geometry
     sockets = [socket_table(capture, calibrated)] if capture.names else []
-    observed = [
-        observations_table(f"{title}, RMS distance of poses from their geometry [mm]", rows)
-        for group, title in _GROUPS
-        if (rows := (summary[group] or {}).get("observations"))
-    ]
-    residuals = [*sockets, *observed, residual_chart(capture, calibrated)]
+    residuals = [*sockets, *observation_tables(summary), residual_chart(capture, calibrated)]
     view = view_of_arm(arm, capture, distances_in(capture, calibrated), geometry)
     tested = len(record.recording.spheres)
     return Report(
@@ -85,6 +80,15 @@ def evaluation_report(record: EvaluationRecord) -> Report:
         simulated=record.recording.true is not None,
         decision=overall_decision(summary),
     )
+
+
+def observation_tables(summary: dict[str, Any]) -> list[Table]:
+    """Observations besides sockets, held-out ones first."""
+    return [
+        observations_table(f"{title}, RMS distance of poses from their geometry [mm]", rows)
+        for group, title in _GROUPS
+        if (rows := (summary[group] or {}).get("observations"))
+    ]
 
 
 def points_report(record: PointsRecord) -> Report:

@@ -6,7 +6,7 @@ from typing import Any
 from ..core.units import DEG, people_read
 from .cells import Cell, Columns, Table, number, table
 from .harmonics import harmonics_by_joint
-from .tables import METRICS, decimals_for, expanded_words, factor_words, quantity_words, volume_rows
+from .tables import METRICS, decimals_for, expanded_words, quantity_words, volume_rows
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
@@ -147,13 +147,12 @@ def harmonics_table(rows: Sequence[Any]) -> Table:
     })  # fmt: skip
 
 
-def volume_table(volume: Row) -> Table:
+def volume_table(caption: str, volume: Row) -> Table:
     """Expanded uncertainty of tips and lengths over the working volume."""
     columns: Columns = {"": lambda row: row[0]}
     for i, words in enumerate(("median", "95th percentile", "largest")):
         columns[words] = lambda row, i=i: "not determined" if row[1][i] is None else with_u_digits(row[1][i])
-    factors = ", ".join(filter(None, ("95 %", factor_words(volume))))
-    return table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", volume_rows(volume), columns)
+    return table(caption, volume_rows(volume), columns)
 
 
 def agreement_tables(summary: Row) -> list[Table]:

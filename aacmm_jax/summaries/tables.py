@@ -193,7 +193,7 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
 def tried_sentence(found: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
-        f"{100 * found['tried'] / found['poses']:.2g} % of the joint space is covered by calibration poses (as near to "
-        f"one as these are to one another, {found['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
+        f"{100 * found['tried'] / found['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
+        f"one as these are to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
         "poses U is an extrapolation by the model."
     )
