@@ -6,12 +6,13 @@ A table is declared by its columns: a heading, and the key of a row or a functio
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
 
 Columns = dict[str, str | Callable[[Any], Any] | None]
 _ZERO = 1e-9  # mm: smaller numbers are rounding errors
+_MOST = 1e9  # from here on decimals mean nothing
 
 
 class Cell(NamedTuple):
@@ -29,6 +30,7 @@ class Table(NamedTuple):
     columns: tuple[str, ...]
     rows: list[list[Cell]]
     folded: bool = False  # shown on demand only, and not printed
+    keys: int = 1  # columns that a terminal repeats where it is too narrow for all
 
     @property
     def numeric(self) -> list[bool]:
@@ -39,9 +41,10 @@ class Table(NamedTuple):
 def table(
     caption: str,
     rows: Iterable[Any],
-    columns: Mapping[str, str | Callable[[Any], Any] | None],
+    columns: Mapping[str, str | Callable[[Any], Any] | None] | Sequence[str],
     *,
     folded: bool = False,
+    keys: int = 1,
 ) -> Table:
     """A table of rows by the headings of its columns.
 
@@ -49,23 +52,28 @@ def table(
         caption: Its caption.
         rows: Anything; mappings where a column is a key.
         columns: Heading -> the key of a row, or what makes a text, a number or a `Cell` of it; None: no such column.
-            Whole numbers have no decimals, others four.
+            Whole numbers have no decimals, others four. Headings alone, where each row is the cells themselves.
         folded: Whether it is shown on demand only.
+        keys: Columns that a terminal repeats where it is too narrow for all.
 
     Returns:
         The table.
     """
+    if not isinstance(columns, Mapping):
+        return Table(caption, tuple(columns), [[_cell(value) for value in row] for row in rows], folded, keys)
     read = {
         heading: (lambda row, key=column: row.get(key)) if isinstance(column, str) else column
         for heading, column in columns.items()
         if column is not None
     }
-    return Table(caption, tuple(read), [[_cell(value(row)) for value in read.values()] for row in rows], folded)
+    return Table(caption, tuple(read), [[_cell(value(row)) for value in read.values()] for row in rows], folded, keys)
 
 
 def _cell(value: Any) -> Cell:
     if isinstance(value, Cell):
         return value
+    if isinstance(value, bool):
+        return Cell("yes" if value else "no")
     return Cell(value) if isinstance(value, str) else number(value, 0 if isinstance(value, Integral) else 4)
 
 
@@ -84,6 +92,8 @@ def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> s
     sign = "+" if signed else ""
     if abs(value) < _ZERO:
         value = 0.0
+    if not abs(value) < _MOST:
+        return f"{value:{sign}.6g}".replace("-", "−")
     if value != 0 and abs(value) < 0.5 * 10**-decimals:
         return f"{value:{sign}.1e}".replace("-", "−")
     return f"{value:{sign}.{decimals}f}".replace("-", "−")

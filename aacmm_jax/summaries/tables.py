@@ -1,20 +1,13 @@
-"""Lines and tables that people read: how they are declared, and words and rows that command line and report share.
-
-It imports nothing that computes, so that ``--help`` and ``show`` are quick.
-
-Example:
-    >>> rows = [{"socket": "A", "rms_mm": 0.01234}, {"socket": "B", "rms_mm": None}]
-    >>> listed("Sockets", rows, {"socket": "socket", "RMS [mm]": "rms_mm"}).rows
-    [['A', 0.01234], ['B', None]]
-    >>> shown(0.01234), shown(None)
-    ('0.0123', '-')
-"""
+"""Words and lines that command line and report share; imports nothing that computes, for the sake of ``--help``."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..core.text import pluralise
+from ..core.units import DEG, people_read_change
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
+from .cells import format_number
 
 _MOST_DECIMALS = 6  # of a quantity that was found
 _MOST = 1e9  # from here on decimals mean nothing
@@ -40,43 +33,9 @@ class Styled(NamedTuple):
 Line = str | Styled | Sequence[str | Styled]
 
 
-class Table(NamedTuple):
-    """A table: a cell is a text, a number (of mm, with four decimals), or None for what there is not."""
-
-    title: str
-    headings: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-    left: Sequence[int] = (0,)  # columns that are set flush left
-    keys: int = 1  # columns that are repeated where a table is too wide for its page
-
-
-def listed(
-    title: str, rows: Iterable[Any], columns: Mapping[str, str | Callable[[Any], Any]], *, left: Sequence[int] = (0,)
-) -> Table:
-    """A table of rows: each column is a key of the row, or a function of the row."""
-    read = [getter if callable(getter) else lambda row, key=getter: row[key] for getter in columns.values()]
-    return Table(title, list(columns), [[cell(row) for cell in read] for row in rows], left)
-
-
-def shown(cell: Any) -> str | Styled:
-    """A cell as it is printed."""
-    if isinstance(cell, str | Styled):
-        return cell
-    if isinstance(cell, bool):
-        return "yes" if cell else "no"
-    return str(cell) if isinstance(cell, int) else formatted(cell)
-
-
 def formatted(value: float | None, decimals: int = 4) -> str:
-    """A number of mm with a fixed number of decimals, or in scientific notation if too small or too large for them."""
-    if value is None:
-        return "-"
-    if abs(value) < 1e-9:  # mm: rounding
-        value = 0.0
-    if not abs(value) < _MOST:
-        return f"{value:.6g}"
-    small = value != 0 and abs(value) < 0.5 * 10**-decimals
-    return f"{value:.1e}" if small else f"{value:.{decimals}f}"
+    """A number as in a table of the terminal."""
+    return "-" if value is None else format_number(value, decimals).replace("−", "-")
 
 
 def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:") -> list[Line]:
@@ -165,7 +124,7 @@ def volume_rows(volume: Mapping[str, Any]) -> list[tuple[str, list[float | None]
     """U over the working volume: what it is of, and its median, 95th percentile and largest value, mm."""
     length = f"{volume['length_mm']:g} mm length"
     titles = {
-        "expanded_tip": "tip position, along its worst direction: from the calibration",
+        "expanded_tip": "tip position (worst direction): from the calibration",
         "expanded_length": f"{length}: from the calibration",
         "expanded_length_reading": f"{length}: with the noise of both readings",
     }
@@ -213,4 +172,28 @@ def lengths_sentence(found: Mapping[str, Any]) -> str:
     return (
         f"Lengths tested: {found['lengths']} ({size}), {held} held out; RMS error "
         f"{two_digits(found['rms_mm'])} mm{predicted}. {untested}"
+    )
+
+
+def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Errors that poses share in words."""
+    words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
+
+    def shown(row: Mapping[str, Any]) -> str:
+        scale, unit = (1.0, "mm") if row["unit"] == "mm" else people_read_change(row["unit"])
+        sd = float(f"{row['sd'] * scale:.3g}")
+        return f"{words.get(row['kind'], row['kind'])} {sd:g} {unit}"
+
+    tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
+    functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
+    parts = [*tips, *(["functions that the model lacks: " + ", ".join(functions)] if functions else [])]
+    return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
+
+
+def tried_sentence(found: Mapping[str, Any]) -> str:
+    """How much of the volume a calibration has tried, in words."""
+    return (
+        f"{100 * found['tried'] / found['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
+        f"one as these are to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
+        "poses U is an extrapolation by the model."
     )
