@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 from ..core.errors import InputError
 from ..files.outputs import together
-from ..summaries.cells import number, table
-from ..summaries.tables import Styled, formatted, warnings_of, written_of
+from ..summaries.tables import Styled, formatted, listed, number, warnings_of, written_of
 from . import calibration_views, options
 from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View
@@ -99,7 +98,7 @@ def arm(
 
 def _template(path: Path, joints: int, as_json: bool) -> None:
     from ..files.arm_tables import arm_template
-    from ..files.atomic_write import write_text
+    from ..files.outputs import write_text
 
     with together(path):
         if os.path.lexists(path):
@@ -142,7 +141,7 @@ def survey(summary: dict[str, Any]) -> View:
         for row in summary["frames"]
     ]
     headings = ("joint", "through x [mm]", "y [mm]", "z [mm]", "direction x", "y", "z")
-    yield table("Axes at zero readings", rows, headings)
+    yield listed("Axes at zero readings", rows, headings)
     reach = summary["reach_mm"]
     yield (
         f"\nReach: {reach['nearest']:.0f} to {reach['farthest']:.0f} mm from the shoulder, on the first axis at "
@@ -172,7 +171,7 @@ def _determined(summary: dict[str, Any]) -> View:
     for i in summary["parallel"]:
         yield f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} takes the place of d_{i}."
     columns = {"data": "data", "parameters": "determined", "well": "well_determined", "scale": "scale"}
-    yield table("What data determine at their best", summary["determined"], columns)
+    yield listed("What data determine at their best", summary["determined"], columns)
     yield f"To be freed, of sockets with a length: {len(summary['free'])}: {', '.join(summary['free'])}."
     yield ["\n", Styled("Where a joint stays still in all poses")]
 
@@ -181,7 +180,7 @@ def _determined(summary: dict[str, Any]) -> View:
             return "(the tip can hardly stay in a socket then)"
         return ", ".join(row["lost"]) or "-"
 
-    yield table("", summary["still"], {"joint": "joint", "no longer determined well": lost})
+    yield listed("", summary["still"], {"joint": "joint", "no longer determined well": lost})
 
 
 def _needed(arm_class: dict[str, Any]) -> View:
@@ -197,7 +196,7 @@ def _needed(arm_class: dict[str, Any]) -> View:
         for row in arm_class["rows"]
     ]
     counts = (f"{count} poses" for count in arm_class["rows"][0]["u_mm"])
-    yield table("", rows, ("data", *counts, "enough"))
+    yield listed("", rows, ("data", *counts, "enough"))
     yield (
         f"Medians over the volume, of encoders of {arm_class['encoder_arcsec']:.3g} arcsec and a seat of "
         f"{arm_class['seating_mm']:.3g} mm ({arm_class['noise_source']}), reference lengths of "

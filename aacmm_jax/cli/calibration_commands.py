@@ -12,8 +12,7 @@ from ..core.text import number as number_of
 from ..core.units import DEG
 from ..files.outputs import reading, together
 from ..model.loss_names import LossName
-from ..summaries.cells import number, table
-from ..summaries.tables import Styled, difference_from_best, warnings_of, written_of
+from ..summaries.tables import Styled, difference_from_best, listed, number, warnings_of, written_of
 from . import options
 from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View, calibration
@@ -112,10 +111,10 @@ def calibrate(
     kinds (measured points, spheres, planes, artefacts) are solved with all else at once. Several captures are sessions
     of one arm.
     """
+    from ..diagnostics.usability import does_not_fit
     from ..files.calibrations import save_calibration
     from ..pipeline.capture_calibration import CaptureOptions, calibrate_capture
     from ..summaries.calibration import calibration_summary
-    from ..summaries.warnings import does_not_fit
 
     chosen = CaptureOptions(
         method=method,
@@ -218,7 +217,7 @@ def _bounded(
 def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
     """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
     if text is None and nominal.prior is None and model is not None and nominal.arm.corrections is not None:
-        from ..kinematics.prior_scales import default_prior
+        from ..kinematics.priors import default_prior
 
         return default_prior(nominal.arm)
     if text is None:
@@ -331,7 +330,7 @@ def compared_models(summary: dict[str, Any]) -> View:
         )
         for row in models
     ]
-    yield table(
+    yield listed(
         "RMS distance from the geometry [mm]; to best: outside, less that of the best outside, compared region by "
         "region; u: standard errors by the scatter of the regions; ratio: mean of (error / predicted standard "
         "deviation)^2 outside; evidence: its logarithm, less the largest",
@@ -342,5 +341,5 @@ def compared_models(summary: dict[str, Any]) -> View:
         (label, models[0]["regions"][i]["poses"], *(row["regions"][i]["rms"] for row in models))
         for i, label in enumerate(summary["regions"])
     ]
-    yield table("RMS error of each region [mm]", by_region, ("region", "poses", *(row["model"] for row in models)))
+    yield listed("RMS error of each region [mm]", by_region, ("region", "poses", *(row["model"] for row in models)))
     yield from written_of(summary)

@@ -6,7 +6,6 @@ from typing import Any
 
 from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read, people_read_change
-from ..summaries.cells import Table, number, table
 from ..summaries.harmonics import listed_apart
 from ..summaries.result_tables import (
     BY_CONSTRUCTION,
@@ -26,11 +25,14 @@ from ..summaries.result_tables import (
 from ..summaries.tables import (
     Line,
     Styled,
+    Table,
     decimals_for,
     encoders_in_words,
     factor_words,
     formatted,
     lengths_sentence,
+    listed,
+    number,
     observed_words,
     quantity_words,
     seat_in_words,
@@ -57,7 +59,7 @@ def arm(summary: dict[str, Any]) -> View:
         return low_high and f"{factor * low_high[0]:.0f} to {factor * low_high[1]:.0f}{unit}"
 
     beta = {"beta [deg]": lambda row: (row["beta_rad"] or 0.0) / DEG}
-    yield table(f"{summary['name']} (standard D-H)", joints, {
+    yield listed(f"{summary['name']} (standard D-H)", joints, {
         "joint": "joint",
         "alpha [deg]": lambda row: row["alpha_rad"] / DEG,
         "a [mm]": "a_mm",
@@ -86,7 +88,7 @@ def _corrections(rows: Sequence[Mapping[str, Any]]) -> View:
             (row["coefficient"], f"{scale * row['value']:.4g}", unit, row["of"])
             for row, (scale, unit) in zip(known, units, strict=True)
         ]
-        yield table("Joint corrections", cells, ("coefficient", "value", "unit", ""))
+        yield listed("Joint corrections", cells, ("coefficient", "value", "unit", ""))
     zero: dict[str, list[str]] = {}
     for row in rows:
         if row["value"] == 0 and row["of"]:  # not the direction of gravity
@@ -107,11 +109,11 @@ def capture(summary: dict[str, Any]) -> View:
     ]
     yield from warnings_of(summary)
     if summary["sockets"]:
-        yield table("", summary["sockets"], {"socket": "socket", "poses": "poses"})
+        yield listed("", summary["sockets"], {"socket": "socket", "poses": "poses"})
     if summary["observations"]:
         columns: dict[str, Any] = {key: key for key in ("observation", "kind", "target", "poses")}
         columns["unknown geometry"] = lambda row: ", ".join(row["unknowns"])
-        yield table("Other observations", summary["observations"], columns)
+        yield listed("Other observations", summary["observations"], columns)
     for row in summary["observations"]:
         stated = [f"{number['quantity']} {quantity_words(number)}" for number in (*row["certified"], *row["stated"])]
         if stated:
@@ -126,13 +128,13 @@ def capture(summary: dict[str, Any]) -> View:
 
     unit = "" if slides else " [deg]"
     ends = {f"{end}{unit}": lambda row, end=end: reading(row, end) for end in ("lowest", "highest")}
-    yield table("Readings", summary["ranges"], {"joint": "joint"} | ends)
+    yield listed("Readings", summary["ranges"], {"joint": "joint"} | ends)
     if summary["temperature_C"] is not None:
         low, high = summary["temperature_C"]
         yield f"Temperature: {low:.2f} to {high:.2f} C."
     if summary["lengths"]:
         columns = {"from": "from", "to": "to", "value [mm]": "value_mm", "u [mm]": "u_mm"}
-        yield table("Reference lengths", summary["lengths"], columns)
+        yield listed("Reference lengths", summary["lengths"], columns)
     yield from written_of(summary)
 
 
@@ -151,7 +153,7 @@ def calibration(summary: dict[str, Any]) -> View:
         yield from validation_tables(summary["cross_validation"])
     if summary.get("sessions"):
         columns = {"session": "session", "poses": "poses", "together": "rms_mm", "alone": "rms_alone_mm"}
-        yield table("Sessions, RMS distance of poses from their geometry [mm]", summary["sessions"], columns)
+        yield listed("Sessions, RMS distance of poses from their geometry [mm]", summary["sessions"], columns)
     yield from _observations(summary)
     stages = {stage: words for stage, words in STAGES.items() if stage != "stage1" or summary["method"] != "joint"}
     fixed_scale = summary["fixed_by_one_length"]
@@ -159,8 +161,8 @@ def calibration(summary: dict[str, Any]) -> View:
         yield metrics_table("On the poses it was identified from [mm]", summary, stages, fixed_scale=fixed_scale)
     if "truth" in summary:
         yield truth_table(summary["truth"])
-    listed, harmonics = listed_apart(summary["parameters"])
-    yield parameter_table("Parameters", listed)
+    apart, harmonics = listed_apart(summary["parameters"])
+    yield parameter_table("Parameters", apart)
     if harmonics:
         yield harmonics_table(harmonics)
         yield "Every coefficient: --json, or aacmm export --format csv."
@@ -233,7 +235,7 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
             rows.append((name, what, *(number(scale * x, digits, rounded=True) for x, digits in values)))
             rows.append(("", "U", *(number(u, digits) for u, digits in zip(expanded, decimals, strict=True))))
     title = "Base frame as seen from frames with known coordinates, U (95 %)"
-    return table(title, rows, ("in", "", "x", "y", "z"))
+    return listed(title, rows, ("in", "", "x", "y", "z"))
 
 
 def _uncertainty(summary: dict[str, Any]) -> View:
@@ -280,7 +282,7 @@ def demo(summary: dict[str, Any]) -> View:
         f"RMS error of {summary['checks']} lengths of {summary['check_length_mm']:g} mm [mm]": "check_rms_mm",
     }
     cells = [(text, *(summary[stage][key] for stage in STAGES)) for text, key in rows.items()]
-    yield table("Lengths and repeatability", cells, ("", *STAGES.values()))
+    yield listed("Lengths and repeatability", cells, ("", *STAGES.values()))
     yield truth_table(summary)
     yield (
         f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 sees repeatability only and leaves "
@@ -297,7 +299,7 @@ def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False) -> 
     def read(key: str) -> Any:
         return lambda row: number(row[key], decimals_for(row["error_u_mm"]))
 
-    return table("Reference lengths [mm]", rows, {
+    return listed("Reference lengths [mm]", rows, {
         "between": lambda row: f"{row['from']} - {row['to']}",
         "value": "value_mm",
         "measured": read("measured_mm"),

@@ -7,12 +7,10 @@ import typer
 
 from ..core.errors import InputError
 from ..core.units import people_read, people_read_change
-from ..files.atomic_write import write_text
 from ..files.hdf5 import read_tables
-from ..files.outputs import together
-from ..summaries.cells import Cell, Table, number, table
+from ..files.outputs import together, write_text
 from ..summaries.harmonics import listed_apart
-from ..summaries.tables import Styled, decimals_for, limits_of, warnings_of, written_of
+from ..summaries.tables import Cell, Styled, Table, decimals_for, limits_of, listed, number, warnings_of, written_of
 from . import options
 from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View
@@ -121,7 +119,7 @@ def comparison(summary: dict[str, Any]) -> View:
     yield from _parameters(summary)
     lengths = summary["lengths"]
     keys = ("rms_mm", "rms_by_chance_mm", "percentile_95_mm", "largest_mm", "mean_mm")
-    yield table(
+    yield listed(
         f"Lengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
         [["not determined" if lengths[key] is None else lengths[key] for key in keys]],
         ("RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean"),
@@ -147,7 +145,7 @@ def _parameters(summary: dict[str, Any]) -> View:
         mark = row["without"] or Cell("* beyond U" if row["moved"] else "", None, "outlier")
         rows.append((row["parameter"], unit, old, new, small_unit, change, u, mark))
     title = f"Parameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)"
-    yield table(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
+    yield listed(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
     left_out = len(summary["parameters"]) - len(names)
     if left_out > 0:
         yield f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv."
@@ -171,7 +169,7 @@ def _trend(calibrations: list[dict[str, Any]]) -> Table:
         rows.append((str(i), row["calibration"], _day(row["created"]), *cells))
     headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
     title = "Each calibration against the first (whose own error is in all of them)"
-    return table(title, rows, (*headings, "mean [um/m]"))
+    return listed(title, rows, (*headings, "mean [um/m]"))
 
 
 def _changes(calibrations: list[dict[str, Any]]) -> View:
@@ -189,7 +187,7 @@ def _changes(calibrations: list[dict[str, Any]]) -> View:
             changes = (fine * row["change"] for row in of_parameter)
             texts = (Cell(f"{x:+.1f}{marks[row['moved']]}", x) for x, row in zip(changes, of_parameter, strict=True))
             rows.append((name, unit, *texts))
-    yield table(title, rows, ("parameter", "unit", *(str(i) for i, _ in shown)))
+    yield listed(title, rows, ("parameter", "unit", *(str(i) for i, _ in shown)))
     if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
         yield "?: without an uncertainty, since it is fixed, on a bound or not determined in one of the two."
 

@@ -10,8 +10,7 @@ from ..core.errors import InputError
 from ..core.text import pluralise
 from ..files.inputs import InputFile
 from ..files.outputs import together
-from ..summaries.cells import table
-from ..summaries.tables import formatted, warnings_of, written_of
+from ..summaries.tables import formatted, listed, warnings_of, written_of
 from . import options
 from .app import app, examples, show_summary, warn_of_unusable
 from .calibration_views import View
@@ -76,9 +75,9 @@ def correct(
     reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
     """
     from ..core.numpy_or_jax import to_numpy
-    from ..files.atomic_write import write_text
     from ..files.calibrations import load_calibration
     from ..files.commanded_poses import corrected_csv, read_commanded_poses
+    from ..files.outputs import write_text
     from ..kinematics.correction import corrected_readings, readings_at_poses
     from ..summaries.correction import correction_summary
 
@@ -171,7 +170,7 @@ def corrections(summary: dict[str, Any]) -> View:
             yield f"Largest change of a {what}: {row[f'change_{unit}']:.4f} {unit} {where}."
     if missed:
         first = f", the first {_MOST_ROWS}, all by --json" if len(missed) > _MOST_ROWS else ""
-        yield table(f"Not reached{first}", missed[:_MOST_ROWS], {
+        yield listed(f"Not reached{first}", missed[:_MOST_ROWS], {
             "row": "row",
             "distance left [mm]": "distance_mm",
             "angle left [deg]": "angle_deg",

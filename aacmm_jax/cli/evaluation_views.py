@@ -3,9 +3,20 @@
 from typing import Any
 
 from ..core.text import pluralise
-from ..summaries.cells import Cell, Table, number, table
 from ..summaries.result_tables import BY_CONSTRUCTION, acceptance_tables, metrics_table, observations_table
-from ..summaries.tables import Styled, decimals_for, formatted, limits_of, verdict_of, warnings_of, written_of
+from ..summaries.tables import (
+    Cell,
+    Styled,
+    Table,
+    decimals_for,
+    formatted,
+    limits_of,
+    listed,
+    number,
+    verdict_of,
+    warnings_of,
+    written_of,
+)
 from .calibration_views import View, lengths, orientations
 
 _ARMS = {"nominal": "nominal", "calibrated": "calibrated"}
@@ -34,7 +45,7 @@ def evaluation(summary: dict[str, Any]) -> View:
         of_prediction = {} if predicted is None else {"predicted [mm]": "rms_predicted_mm"}
         if part["sockets"]:
             columns = {"socket": "socket", "poses": "poses", "DE [mm]": "de_mm", "Deltam [mm]": "deltam_mm"}
-            yield table("", part["sockets"], columns | {"RMS [mm]": "rms_mm"} | of_prediction)
+            yield listed("", part["sockets"], columns | {"RMS [mm]": "rms_mm"} | of_prediction)
         yield from _observations(part, predicted is not None)
         if part["lengths"] and predicted is not None:
             yield _predicted_lengths(part["lengths"], fitted)
@@ -55,10 +66,10 @@ def _observations(part: dict[str, Any], predicted: bool) -> View:
     numbers: dict[str, Any] = {"poses": "poses", "RMS": "rms_mm", "predicted": "rms_predicted_mm"}
     numbers["in standard deviations"] = lambda row: number(row["reduced_chi"], 2)
     if len(kinds) > 1 and rows:
-        yield table("By kind [mm]", kinds, {"kind": "kind"} | numbers)
+        yield listed("By kind [mm]", kinds, {"kind": "kind"} | numbers)
     if len(groups) > 1 and any(len(row["members"]) > 1 for row in groups):
         title = "Groups that share a length or an unknown geometry [mm]"
-        yield table(title, groups, {"group": "group"} | numbers)
+        yield listed(title, groups, {"group": "group"} | numbers)
     poses = part["predicted"]["poses"]
     if poses["rms_mm"] is not None:
         prediction = poses["rms_predicted_mm"]
@@ -79,7 +90,7 @@ def _predicted_lengths(rows: list[dict[str, Any]], fitted: bool) -> Table:
         value = None if fitted else row["error_over_expanded"]
         return number(value, 2, signed=True, mark="bad" if value is not None and abs(value) > 1 else "")
 
-    return table("Reference lengths [mm]; U: 95 %", rows, {
+    return listed("Reference lengths [mm]; U: 95 %", rows, {
         "between": lambda row: f"{row['from']} - {row['to']}",
         "value": "value_mm",
         "measured": to_u_digits("measured_mm"),
@@ -152,7 +163,7 @@ def procedure(summary: dict[str, Any]) -> View:
         name = row["name"] if other is None else bar
         rows.append((row["test"], name, row["group"], _at(row["position_mm"]), end, f"{row['poses']}{poses}"))
     headings = ("test", "name", "group", "at (x, y, z) [mm]", "to (x, y, z) [mm]", "poses")
-    yield table("", rows, headings)
+    yield listed("", rows, headings)
     yield (
         "Checked: joint limits, reach, that nothing comes below the table, and that spheres are touched from outside. "
         "Not checked: obstacles, collisions of the arm with itself, and how artefacts are mounted."

@@ -10,9 +10,8 @@ import typer
 
 from ..core.errors import InputError
 from ..core.text import printable, shorten
-from ..files.atomic_write import write_text
 from ..files.inputs import InputFile, fingerprint
-from ..files.outputs import check_kept, together
+from ..files.outputs import check_kept, together, write_text
 from . import options
 from .app import app, examples, warn_of_unusable
 from .options import option, output

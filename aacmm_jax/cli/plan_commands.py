@@ -284,7 +284,7 @@ class _Files(NamedTuple):
 
     def write(self, planned: Any, poses: Callable, manifest_text: Callable) -> str:
         """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
-        from ..files.atomic_write import write_text
+        from ..files.outputs import write_text
 
         # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
         urdf = self.urdf if self.arm.lower().endswith(".urdf") else None

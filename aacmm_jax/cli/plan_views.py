@@ -5,8 +5,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from ..core.text import pluralise
-from ..summaries.cells import Cell, number, table
-from ..summaries.tables import Line, Styled, written_of
+from ..summaries.tables import Cell, Line, Styled, listed, number, written_of
 from .calibration_views import View
 
 _PREDICTED = {
@@ -43,7 +42,7 @@ def plan(summary: dict[str, Any]) -> View:
     """Positions of the sockets, and the predicted uncertainty, compared with that of random poses."""
     sockets = pluralise(len(summary["sockets"]), "socket")
     yield [Styled(summary["arm"]), f": {summary['poses']} poses in {sockets}"]
-    yield table("", summary["sockets"], {
+    yield listed("", summary["sockets"], {
         "socket": "socket",
         **_position(),
         "poses": "poses",
@@ -65,7 +64,7 @@ def kit_plan(summary: dict[str, Any]) -> View:
         for i, place in enumerate(row["places"]):
             names = (row["observation"], row["kind"]) if i == 0 else ("", "")
             rows.append((*names, *(number(value, 0) for value in place["position_mm"]), place["poses"]))
-    yield table("", rows, ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"))
+    yield listed("", rows, ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"))
     yield "Positions are those of the points of an artefact; elsewhere the middle of the tips."
 
     def poses_without(name: str) -> int:
@@ -98,7 +97,7 @@ def _predictions(summary: dict[str, Any], random: str, others: Sequence[tuple[st
         (text, *(("not determined", "") if u is None else (2 * u["median_mm"], 2 * u["largest_mm"])))
         for text, u in (*named, *others)
     ]
-    yield table("", rows, ("", "median", "largest"))
+    yield listed("", rows, ("", "median", "largest"))
     yield _noise(summary)
     yield from _motion(summary)
 

@@ -31,7 +31,7 @@ def check_arm(specification: Any, path: Path, unit: str | None, as_json: bool) -
 
 def check_recording(specification: Any, recording: Any, manifest: Path | None) -> dict[str, Any]:
     """What a check of a recording finds, with the lines of its manifest that correct it, where it has one."""
-    from ..files.angles import positions_unit
+    from ..files.reading_checks import positions_unit
     from ..summaries.reading_check import check_capture, standing_rows
 
     check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
@@ -40,7 +40,7 @@ def check_recording(specification: Any, recording: Any, manifest: Path | None) -
     )
     summary["standing"] = standing_rows(specification.arm, recording.capture, recording.nominal)
     if manifest is not None:
-        from ..files.other_readings import compare_reading_sets, reading_sets_sentence
+        from ..files.reading_checks import compare_reading_sets, reading_sets_sentence
 
         sets = with_spinner("Calibrating", lambda: compare_reading_sets(manifest, recording))
         summary["reading_sets"] = [
@@ -52,7 +52,7 @@ def check_recording(specification: Any, recording: Any, manifest: Path | None) -
 
 
 def _summary(specification: Any, check: Any, unit: str | None, positions: str, manifest: Path | None) -> dict[str, Any]:
-    from ..files.angles import angles_toml, units_toml
+    from ..files.reading_checks import angles_toml, units_toml
     from ..summaries.reading_check import reading_check_summary
 
     best = check.best

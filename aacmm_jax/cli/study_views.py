@@ -4,8 +4,7 @@ from typing import Any
 
 from ..core.units import error_unit
 from ..study.statistics import METRICS, concise, factor_title, level_text, level_title, metric_title, shown_unit
-from ..summaries.cells import Cell, number, table
-from ..summaries.tables import Styled
+from ..summaries.tables import Cell, Styled, listed, number
 from .calibration_views import View
 
 _MOST = 40  # cells in a table
@@ -58,13 +57,13 @@ def study(summary: dict[str, Any]) -> View:
         )
         for cell in shown
     ]
-    yield table("Means over converged trials", rows, ("cell", *factors, *metrics.values()))
+    yield listed("Means over converged trials", rows, ("cell", *factors, *metrics.values()))
     for name in ("length_error", "angle_error") if len(cells) > 1 else ():
         name = name if fixed else f"{name}_stage1"
         title = metric_title(name)
         rows = [(cell["cell"], *_distribution(cell, name)) for cell in shown if name in cell["figures"]]
         if rows:
-            yield table(f"{title[0].upper()}{title[1:]}", rows, ("cell", *_DISTRIBUTION.values()))
+            yield listed(f"{title[0].upper()}{title[1:]}", rows, ("cell", *_DISTRIBUTION.values()))
     if len(cells) > len(shown):
         yield f"\n{len(cells) - len(shown)} more cells: see them with --json, or aacmm_jax.study.open_study."
     yield (
@@ -113,7 +112,7 @@ def _identified(cells: list[dict[str, Any]], factors: list[str]) -> View:
         )
         for cell, parameter in zip(cells, often, strict=True)
     ]
-    yield table("Identifications", rows, [*headings, *(["most often"] if any(often) else [])])
+    yield listed("Identifications", rows, [*headings, *(["most often"] if any(often) else [])])
     for reason, words in _FAILED.items():
         count = sum(cell["reasons"][reason] for cell in cells)
         if count:
@@ -138,14 +137,14 @@ def _distribution(cell: dict[str, Any], metric: str) -> list[Cell]:
 def _full(cell: dict[str, Any]) -> View:
     """Every metric of a cell, and every parameter's error."""
     rows = [(metric_title(name), *_distribution(cell, name)) for name in METRICS if name in cell["figures"]]
-    yield table("Metrics over converged trials", rows, ("", *_DISTRIBUTION.values()))
+    yield listed("Metrics over converged trials", rows, ("", *_DISTRIBUTION.values()))
     rows = []
     for row in cell["parameters"]:
         factor, unit = error_unit(row["unit"])
         numbers = _both(row["bias"], factor), _both(row["spread"], factor), _both(row["on_a_bound"], 100.0)
         rows.append((row["parameter"], unit, *numbers))
     headings = ("parameter", "unit", "bias", "standard deviation", "on a bound [%]")
-    yield table("Parameters: estimate less truth", rows, headings)
+    yield listed("Parameters: estimate less truth", rows, headings)
 
 
 def _written(summary: dict[str, Any]) -> View:

@@ -19,9 +19,8 @@ import numpy as np
 
 from ..core.backend import check_backend, is_from_jax
 from ..core.errors import InputError
-from .atomic_write import storable, write_atomically
 from .inputs import STREAMED, largest_file, open_input, storable_name
-from .outputs import ELSEWHERE
+from .outputs import ELSEWHERE, storable, write_atomically
 from .reader_process import damaged, read_through, start, vouch_for
 
 if TYPE_CHECKING:

@@ -8,10 +8,11 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise, shorten
+from ..diagnostics.determined import determined
+from ..diagnostics.findings import case_of
 from ..plot.lengths import length_chart
 from ..plot.residuals import arms_chart, distances_by_arm
 from ..summaries.calibration import calibration_summary
-from ..summaries.cells import Cell, format_number, number, table
 from ..summaries.observations import capture_words
 from ..summaries.result_tables import (
     agreement_tables,
@@ -21,11 +22,19 @@ from ..summaries.result_tables import (
     truth_table,
     validation_tables,
 )
-from ..summaries.tables import decimals_for, lengths_sentence, shared_sentence, two_digits
-from ..summaries.warnings import observed
+from ..summaries.tables import (
+    Cell,
+    decimals_for,
+    format_number,
+    lengths_sentence,
+    listed,
+    number,
+    shared_sentence,
+    two_digits,
+)
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
-from .elements import Block, Report, Section, with_table
+from .elements import Block, Report, Section
 from .observations import observation_tables, removed_tables
 from .tables import DRAWN, length_table
 
@@ -40,9 +49,9 @@ _OBSERVED = "Joint least squares of everything observed"
 
 def calibration_report(record: CalibrationRecord) -> Report:
     """The report, except for the origin of its file."""
-    uncertainty, observability = uncertainty_of(record), observed(record)
+    uncertainty, observability = uncertainty_of(record), case_of(record).once(determined)
     volume = volumetric_uncertainty(uncertainty)
-    summary = calibration_summary(record, observability, volume)
+    summary = calibration_summary(record, volume)
     evaluations = record.evaluations()
     capture = record.recording.capture
     joint = record.final_method == "joint"
@@ -124,7 +133,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     if capture.names or not capture.observations:
         sockets = zip(capture.names, capture.sizes, strict=True)
         columns = {"socket": lambda row: row[0], "poses": lambda row: row[1]}
-        blocks.append(table("Sockets in which the tip was seated", sockets, columns))
+        blocks.append(listed("Sockets in which the tip was seated", sockets, columns))
     blocks += observation_tables(record)
     if capture.lengths or not capture.observations:
 
@@ -136,7 +145,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
             "calibrated value [mm]": lambda length: to_u(length.value, length.u),
             "u [mm]": lambda length: to_u(length.u, length.u),
         }
-        blocks.append(table("Reference lengths", capture.lengths, columns))
+        blocks.append(listed("Reference lengths", capture.lengths, columns))
     blocks += [*removed_tables(record), _traceability(summary["scale_from"])]
     return Section("data", "What was calibrated, and from which data", blocks)
 
@@ -204,7 +213,7 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
     if not single:
         between = [(row["from"], row["to"]) for row in rows]
         expanded = np.array([row["expanded_mm"] or np.nan for row in rows])
-        block = with_table(length_chart(between, stage1 | {"calibrated": errors["calibrated"]}, expanded), block)
+        block = length_chart(between, stage1 | {"calibrated": errors["calibrated"]}, expanded)._replace(table=block)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 

@@ -4,9 +4,8 @@ from typing import Any
 
 from ..calibration.record import CalibrationRecord
 from ..diagnostics.pose_residuals import observation_residuals
-from ..summaries.cells import Table, format_number, number, table
 from ..summaries.observations import capture_observations
-from ..summaries.tables import quantity_words
+from ..summaries.tables import Table, format_number, listed, number, quantity_words
 
 
 def observation_tables(record: CalibrationRecord) -> list[Table]:
@@ -36,8 +35,8 @@ def observation_tables(record: CalibrationRecord) -> list[Table]:
         "certified value": _words,
         "u [mm]": lambda quantity: "taken as exact" if quantity["u"] == 0 else number(quantity["u"]),
     }
-    tables = [table("Observations", rows, columns)]
-    return [*tables, *([table("Certified values", certified, of_certified)] if certified else [])]
+    tables = [listed("Observations", rows, columns)]
+    return [*tables, *([listed("Certified values", certified, of_certified)] if certified else [])]
 
 
 def removed_tables(record: CalibrationRecord) -> list[Table]:
@@ -54,7 +53,7 @@ def removed_tables(record: CalibrationRecord) -> list[Table]:
         "changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
     }
     caption = "Left out, because it contradicts the rest"
-    return [table(caption, record.removed, columns)] if record.removed else []
+    return [listed(caption, record.removed, columns)] if record.removed else []
 
 
 def _words(quantity: dict[str, Any]) -> str:

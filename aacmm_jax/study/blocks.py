@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,14 +87,15 @@ class Layout(NamedTuple):
     parameters: int
     block_cells: int
     block_trials: int
-    mark: str  # in the names of the files: blocks of this study, of this size, computed by this version and with these
+    mark: str  # in the names of the files: of this study, of this size, and of what it is computed with
+    chunk: int  # trials in a block that were asked for
     computed_with: str
 
     @classmethod
-    def of(cls, study: Study, chunk: int, made_by: tuple[str, str] | None = None) -> "Layout":
+    def of(cls, study: Study, chunk: int, settings: str | None = None) -> "Layout":
         """Blocks of about ``chunk`` trials; small cells share a block where they have the same compiled program.
 
-        ``made_by`` is the version of this package, and what the numbers are computed with; by default as they are here.
+        ``settings`` is what the numbers are `computed_with`; by default as they are here.
         """
         cells, trials = len(study.cells), study.trials
         if cells * -(-trials // chunk) > MOST_BLOCKS:
@@ -103,14 +103,14 @@ class Layout(NamedTuple):
                 f"chunks of {chunk} cut {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} blocks; "
                 "give a larger chunk."
             )
-        version, settings = made_by or (metadata.version("aacmm_jax"), computed_with())
-        mark = f"{study.digest[:12]}-{chunk}-{version}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
+        settings = settings or computed_with()
+        mark = f"{study.digest[:12]}-{chunk}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
         together = 1
         if trials < chunk:
             together = max(n for n in range(1, min(chunk // trials, cells) + 1) if _uniform(study.settings, n))
         # Blocks of nearly equal size: a short last one would run the same compiled program for fewer trials.
         block_trials = -(-trials // -(-trials // chunk))
-        return cls(cells, trials, len(study.space.names), together, block_trials, mark, settings)
+        return cls(cells, trials, len(study.space.names), together, block_trials, mark, chunk, settings)
 
     def shape(self, name: str, cells: int | None = None, trials: int | None = None) -> tuple[int, ...]:
         """Shape of an array of results, of the whole study or of part of it."""

@@ -86,7 +86,7 @@ def run_study(
         chunk: Trials in a block, which is one call of `identify_many`; default 1,000 (65,536 on a GPU). It changes no
             number, and stays what it was when the file was begun.
         shards: Let workers write their blocks themselves, into ``FILE.parts`` in a folder that all of them share.
-        keep_parts: Leave the blocks in their folder at the end; the file stays virtual. For results too large to copy.
+        keep_parts: Leave the blocks in their folder at the end: for results too large to copy.
         watch: Called with a `StudyProgress` at the beginning, after every block, and when an interrupt has come.
 
     Returns:
@@ -111,7 +111,7 @@ def run_study(
     with _locked(output):
         check_ours(path)
         store.tidy(path)
-        layout, chunk, finished = _opened(study, path, chunk, executor)
+        layout, finished = _opened(study, path, chunk, executor)
         total = layout.cells * layout.trials
         if finished and not parts_of(path).is_dir():
             return Outcome(path, total, total, 0)
@@ -142,7 +142,7 @@ def run_study(
                     tell(progress := progress._replace(done=done, compiling=compiling))
             done = progress.done
             if done == total:  # interrupts are still caught: one within HDF5 could damage the file
-                store.finish(path, study, layout, chunk, keep_parts)
+                store.finish(path, study, layout, keep_parts)
         return Outcome(path, done, total, done - before)
 
 
@@ -309,18 +309,16 @@ def _locked(output: OutputFile) -> Iterator[None]:
         lock.release()
 
 
-def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> tuple[Layout, int, bool]:
-    """The layout of an existing or a new file, its chunk, and whether it is finished."""
-    from importlib import metadata
-
+def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> tuple[Layout, bool]:
+    """The layout of an existing or a new file, and whether it is finished."""
     if not path.exists():
         _interruptible(check_reach, study)
         chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
         # With what a worker computes: it may be another machine, with other devices.
         settings = computed_with() if executor is None else _result(executor.submit(computed_with), "the first task")
-        layout = Layout.of(study, chunk, (metadata.version("aacmm_jax"), settings))
-        store.create(path, study, layout, chunk)
-        return layout, chunk, False
+        layout = Layout.of(study, chunk, settings)
+        store.create(path, study, layout)
+        return layout, False
     stored = store.read(path)
     if stored.study != study:
         raise InputError(
@@ -329,17 +327,13 @@ def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | No
     store.check_parts(path, stored._replace(finished=False))
     if stored.finished and stored.parts is None:
         store.clean(path)  # left by a killed process
-        return stored.layout, stored.chunk, True
-    if chunk is not None and chunk != stored.chunk:
-        raise InputError(f"{path} was begun with chunks of {stored.chunk} trials; leave the chunk out to continue.")
-    if stored.package_version != metadata.version("aacmm_jax"):
-        raise InputError(
-            f"{path} was begun with aacmm_jax {stored.package_version}; continue with that version, or choose another "
-            "output path."
-        )
+        return stored.layout, True
+    begun = stored.layout
+    if chunk not in (None, begun.chunk):
+        raise InputError(f"{path} was begun with chunks of {begun.chunk} trials; leave the chunk out to continue.")
     if executor is None:
-        check_same(stored.computed_with, str(path), "choose another output path")
-    return stored.layout, stored.chunk, stored.finished
+        check_same(begun.computed_with, str(path), "choose another output path")
+    return begun, stored.finished
 
 
 def _difference(one: Study, other: Study) -> str:

@@ -18,11 +18,10 @@ import numpy as np
 
 from ..core._compat import named_members
 from ..core.errors import InputError
-from ..files.atomic_write import write_atomically
 from ..files.captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from ..files.hdf5 import Table, Variable, check_sense, columns, opened, read_tables, undamaged, write_tables
 from ..files.inputs import InputFile
-from ..files.outputs import ELSEWHERE
+from ..files.outputs import ELSEWHERE, write_atomically
 from ..kinematics.arm import parameter_unit
 from .blocks import DIMENSIONS, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
@@ -72,7 +71,7 @@ def finished_blocks(path: Path, layout: Layout) -> list[Block]:
     return finished
 
 
-def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
+def create(path: Path, study: Study, layout: Layout) -> None:
     """Make the file of a new study, and the folder of its blocks."""
     folder = parts_of(path)
     try:
@@ -81,7 +80,7 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
         for item in folder.glob("*.npz"):  # blocks of a study whose file was removed
             if not item.name.startswith(f"{layout.mark}-"):
                 item.unlink()
-        _write(path, study, chunk, layout, finished=False, advice=ELSEWHERE)
+        _write(path, study, layout, finished=False, advice=ELSEWHERE)
     except OSError as error:
         raise InputError(
             f"{folder} cannot be created: {(error.strerror or str(error)).lower()}; choose another output path."
@@ -92,13 +91,11 @@ def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
         raise
 
 
-def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: bool = False) -> None:
+def finish(path: Path, study: Study, layout: Layout, keep_parts: bool = False) -> None:
     """Copy all blocks into the study's file and remove their folder; with ``keep_parts``, leave them as they are."""
-    if keep_parts:
-        _write(path, study, chunk, layout, finished=True)
-        return
-    _write(path, study, chunk, layout, partial(_add_results, path, layout), finished=True)
-    clean(path)
+    _write(path, study, layout, None if keep_parts else partial(_add_results, path, layout), finished=True)
+    if not keep_parts:
+        clean(path)
 
 
 def _add_results(path: Path, layout: Layout, file: Any) -> None:
@@ -133,7 +130,6 @@ def tidy(path: Path) -> None:
 def _write(
     path: Path,
     study: Study,
-    chunk: int,
     layout: Layout,
     extend: Callable[[Any], None] | None = None,
     *,
@@ -145,7 +141,7 @@ def _write(
         "name": study.specification.name,
         "seed": study.specification.seed,
         "digest": study.digest,
-        "chunk": chunk,
+        "chunk": layout.chunk,
         "computed_with": layout.computed_with,
         "finished": int(finished),
         "parts": parts_of(path).name if extend is None else None,
@@ -189,16 +185,9 @@ class StoredStudy(NamedTuple):
     """What a study's file contains, without the results."""
 
     study: Study
-    chunk: int
+    layout: Layout  # how it is cut into blocks
     finished: bool
     parts: str | None  # folder of the blocks, where the results are in it
-    package_version: str
-    computed_with: str  # see `computed_with`
-
-    @property
-    def layout(self) -> Layout:
-        """How it is cut into blocks."""
-        return Layout.of(self.study, self.chunk, (self.package_version, self.computed_with))
 
 
 def read(path: Path) -> StoredStudy:
@@ -210,9 +199,8 @@ def read(path: Path) -> StoredStudy:
         study = Study(specification, nominal, recording_of(path, stored) if "capture" in stored.tables else None)
         different = study.digest != attributes["digest"]
         check_sense(path, {"its specification does not match its results": different})
-        finished, parts = bool(attributes["finished"]), attributes.get("parts")
-        made_by = attributes["package_version"], attributes["computed_with"]
-        return StoredStudy(study, attributes["chunk"], finished, parts, *made_by)
+        layout = Layout.of(study, attributes["chunk"], attributes["computed_with"])
+        return StoredStudy(study, layout, bool(attributes["finished"]), attributes.get("parts"))
 
 
 def check_parts(path: Path, stored: StoredStudy) -> None:

@@ -4,9 +4,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.units import DEG, people_read
-from .cells import Cell, Columns, Table, number, table
 from .harmonics import harmonics_by_joint
-from .tables import METRICS, decimals_for, expanded_words, quantity_words, volume_rows
+from .tables import (
+    METRICS,
+    Cell,
+    Columns,
+    Table,
+    decimals_for,
+    expanded_words,
+    listed,
+    number,
+    quantity_words,
+    volume_rows,
+)
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
@@ -44,14 +54,14 @@ def metrics_table(
 
     rows = [(key, title) for key, title in METRICS if key in summary[next(iter(stages))]]
     columns = {words: lambda row, stage=stage: value(stage, row[0]) for stage, words in stages.items()}
-    return table(caption, rows, {"": lambda row: row[1]} | columns)
+    return listed(caption, rows, {"": lambda row: row[1]} | columns)
 
 
 def truth_table(truth: Row, stages: Mapping[str, str] = STAGES) -> Table:
     """Errors of parameters against the true arm of a simulation."""
     columns: Columns = {"": lambda key: _TRUTH[key][0]}
     columns |= {words: lambda key, s=stage: _TRUTH[key][1] * truth[s][key] for stage, words in stages.items()}
-    return table("Against the true arm of the simulation", _TRUTH, columns)
+    return listed("Against the true arm of the simulation", _TRUTH, columns)
 
 
 def validation_tables(summary: Row) -> list[Table]:
@@ -75,8 +85,8 @@ def validation_tables(summary: Row) -> list[Table]:
         "by chance [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
         "": state,
     }
-    found = table(caption, pooled, ("", "residual", "predicted by u"))
-    return [found, *([table("Groups held out [mm]", rows, groups)] if rows else [])]
+    found = listed(caption, pooled, ("", "residual", "predicted by u"))
+    return [found, *([listed("Groups held out [mm]", rows, groups)] if rows else [])]
 
 
 def prior_table(rows: Rows) -> Table:
@@ -88,7 +98,7 @@ def prior_table(rows: Rows) -> Table:
             return "0: not supported by the data, so exact"
         return f"{row['sd'] * scale:.3g} {unit}".strip()
 
-    return table("Priors of the parameters, and effective parameters", rows, {
+    return listed("Priors of the parameters, and effective parameters", rows, {
         "group": "group",
         "prior": lambda row: "learned" if row["learned"] else "given",
         "standard deviation": deviation,
@@ -122,7 +132,7 @@ def parameter_table(caption: str, rows: Rows) -> Table:
         u = row["expanded"]
         return number(scale * row["nominal"], max(decimals_for(None if u is None else scale * u), 4))
 
-    return table(caption, rows, {
+    return listed(caption, rows, {
         "parameter": "parameter",
         "unit": lambda row: people_read(row["unit"])[1],
         "calibrated": lambda row: _value(row, row["calibrated"], row["expanded"]),
@@ -135,7 +145,7 @@ def parameter_table(caption: str, rows: Rows) -> Table:
 
 def harmonics_table(rows: Sequence[Any]) -> Table:
     """Coefficients of harmonics, joint by joint: their RMS over a revolution, and the largest."""
-    return table("Harmonics of the joints", harmonics_by_joint(rows), {
+    return listed("Harmonics of the joints", harmonics_by_joint(rows), {
         "joint": "joint",
         "coefficients": "coefficients",
         "orders": "orders",
@@ -152,7 +162,7 @@ def volume_table(caption: str, volume: Row) -> Table:
     columns: Columns = {"": lambda row: row[0]}
     for i, words in enumerate(("median", "95th percentile", "largest")):
         columns[words] = lambda row, i=i: "not determined" if row[1][i] is None else with_u_digits(row[1][i])
-    return table(caption, volume_rows(volume), columns)
+    return listed(caption, volume_rows(volume), columns)
 
 
 def agreement_tables(summary: Row) -> list[Table]:
@@ -166,7 +176,7 @@ def agreement_tables(summary: Row) -> list[Table]:
         "calibrated, in standard deviations": lambda row: number(row["reduced_chi"], 2),
     }
     by_kind, by_observation = (
-        table(f"RMS residuals by {first}", summary[f"{first}s"], {first: first, second: second} | columns)
+        listed(f"RMS residuals by {first}", summary[f"{first}s"], {first: first, second: second} | columns)
         for first, second in (("kind", "observations"), ("observation", "kind"))
     )
     # Where each kind was observed once, both say the same.
@@ -182,7 +192,7 @@ def other_poses_table(others: Row) -> Table:
     """How the calibrated arm agrees with poses that it was not calibrated with."""
     caption = f"Other poses, drawn at random and not calibrated with: {others['poses']}, RMS {others['rms_mm']:.4f} mm"
     columns: Columns = {"observation": "observation", "poses": "poses", "RMS [mm]": "rms_mm", "RMS [deg]": _in_degrees}
-    return table(caption, others["observations"], columns)
+    return listed(caption, others["observations"], columns)
 
 
 def weights_table(summary: Row, most: int | None = None) -> Table:
@@ -195,7 +205,7 @@ def weights_table(summary: Row, most: int | None = None) -> Table:
         "residual in standard deviations": lambda row: number(row["normalised"], 1),
     }
     caption = f"Poses that the robust loss ({summary['robust']}) took half of their weight from or more, and why"
-    return table(caption, summary["less_weight"][:most], columns)
+    return listed(caption, summary["less_weight"][:most], columns)
 
 
 def geometry_table(parts: Rows, coverage: float) -> Table:
@@ -209,7 +219,7 @@ def geometry_table(parts: Rows, coverage: float) -> Table:
             errors = [abs(value - stated) for _, (value, stated) in zip(quantity["values"], pairs, strict=False)]
             rows.append(quantity | {"part": part["part"], "difference": max(errors) if errors else ""})
     certified = any(part["certified"] is not None for part in parts)
-    return table("Geometry found", rows, {
+    return listed("Geometry found", rows, {
         "part": "part",
         "quantity": "quantity",
         "value": lambda row: quantity_words(row, u=False, coverage=coverage),
@@ -220,7 +230,7 @@ def geometry_table(parts: Rows, coverage: float) -> Table:
 
 def observations_table(caption: str, rows: Rows) -> Table:
     """Observations besides sockets in an evaluation; of held-out ones, what the calibration predicts too."""
-    return table(caption, rows, {
+    return listed(caption, rows, {
         "observation": "observation",
         "kind": "kind",
         "poses": "poses",
@@ -262,4 +272,4 @@ def acceptance_tables(tests: Rows) -> list[Table]:
         "worst at": "where",
         "what it is": "what",
     }
-    return [table(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
+    return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]

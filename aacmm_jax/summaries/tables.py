@@ -1,16 +1,28 @@
-"""Words and lines that command line and report share; imports nothing that computes, for the sake of ``--help``."""
+"""Lines and tables that people read: how they are declared, and words and rows that command line and report share.
+
+It imports nothing that computes, so that ``--help`` and ``show`` are quick.
+
+Example:
+    >>> rows = [{"socket": "A", "rms_mm": 0.01234}, {"socket": "B", "rms_mm": None}]
+    >>> listed("Sockets", rows, {"socket": "socket", "RMS [mm]": "rms_mm"}).rows
+    [['A', 0.01234], ['B', None]]
+    >>> formatted(0.01234), formatted(None)
+    ('0.0123', '-')
+"""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Integral
 from typing import Any, NamedTuple
 
 from ..core.text import pluralise
 from ..core.units import DEG, people_read_change
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .cells import format_number
 
 _MOST_DECIMALS = 6  # of a quantity that was found
 _MOST = 1e9  # from here on decimals mean nothing
+_ZERO = 1e-9  # mm: smaller numbers are rounding errors
+STYLES = {"good": "green", "unsure": "yellow", "bad": "red", "outlier": "red"}  # of marks on the terminal
 
 # Repeatability and errors of lengths, by their keys in a summary.
 METRICS = (
@@ -30,11 +42,96 @@ class Styled(NamedTuple):
     style: str = "bold"
 
 
+class Cell(NamedTuple):
+    """A number that is shown with decimals of its own, or a text that is marked."""
+
+    text: str
+    value: float | None = None  # what a column is sorted by; None: the text
+    mark: str = ""  # "good", "bad", "unsure", "outlier"
+
+
 Line = str | Styled | Sequence[str | Styled]
+Columns = Mapping[str, str | Callable[[Any], Any] | None]
+
+
+class Table(NamedTuple):
+    """A table: a cell is a text, a number (of mm, with four decimals), a `Cell`, or None for what there is not."""
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    keys: int = 1  # columns that a terminal repeats where it is too narrow for all
+    folded: bool = False  # a page shows it on demand only, and does not print it
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """All cells as a page shows them."""
+        return [[_cell(cell) for cell in row] for row in self.rows]
+
+
+def listed(
+    title: str,
+    rows: Iterable[Any],
+    columns: Columns | Sequence[str],
+    *,
+    folded: bool = False,
+    keys: int = 1,
+) -> Table:
+    """A table of rows: each column is a key of the row, or a function of the row; None: there is no such column.
+
+    With headings alone, each row is its cells.
+    """
+    if not isinstance(columns, Mapping):
+        return Table(title, columns, list(rows), keys, folded)
+    read = {
+        heading: getter if callable(getter) else lambda row, key=getter: row.get(key)
+        for heading, getter in columns.items()
+        if getter is not None
+    }
+    return Table(title, list(read), [[cell(row) for cell in read.values()] for row in rows], keys, folded)
+
+
+def by_columns(title: str, columns: Mapping[str, Iterable[Any]]) -> Table:
+    """A table of columns that are known as a whole: heading -> the cells from above."""
+    return Table(title, list(columns), list(zip(*columns.values(), strict=True)))
+
+
+def _cell(cell: Any) -> Cell:
+    if isinstance(cell, Cell):
+        return cell
+    if isinstance(cell, bool):
+        return Cell("yes" if cell else "no")
+    return Cell(cell) if isinstance(cell, str) else number(cell, 0 if isinstance(cell, Integral) else 4)
+
+
+def number(
+    value: float | None, decimals: int = 4, *, signed: bool = False, mark: str = "", rounded: bool = False
+) -> Cell:
+    """A cell with a number; a dash for None and NaN. ``rounded``: to these decimals of its U, even to 0."""
+    if value is None or not math.isfinite(value):
+        return Cell("–" if value is None or math.isnan(value) else "not determined", None, mark)
+    shown = round(value, decimals) if rounded else value
+    return Cell(format_number(shown, decimals, signed=signed), float(value), mark)
+
+
+def numbers(values: Iterable[float], decimals: int = 4) -> list[Cell]:
+    """A cell for each number of an array."""
+    return [number(float(value), decimals) for value in values]
+
+
+def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> str:
+    """A number with a fixed number of decimals, or in powers of ten if these would not show it; with a true minus."""
+    sign = "+" if signed else ""
+    if abs(value) < _ZERO:
+        value = 0.0
+    if not abs(value) < _MOST:
+        return f"{value:{sign}.6g}".replace("-", "−")
+    small = value != 0 and abs(value) < 0.5 * 10**-decimals
+    return (f"{value:{sign}.1e}" if small else f"{value:{sign}.{decimals}f}").replace("-", "−")
 
 
 def formatted(value: float | None, decimals: int = 4) -> str:
-    """A number as in a table of the terminal."""
+    """A number in a line of the terminal."""
     return "-" if value is None else format_number(value, decimals).replace("−", "-")
 
 
@@ -46,8 +143,7 @@ def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:") -> list[Line
 def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
     """What a result is good for, in one line."""
     verdict = summary.get("verdict")
-    style = {"good": "green", "unsure": "yellow", "bad": "red"}
-    return [Styled(verdict["says"], style.get(verdict["mark"], "bold"))] if verdict else []
+    return [Styled(verdict["says"], STYLES.get(verdict["mark"], "bold"))] if verdict else []
 
 
 def limits_of(summary: Mapping[str, Any]) -> list[Line]:

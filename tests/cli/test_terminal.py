@@ -5,6 +5,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+from aacmm_jax.summaries.cells import table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
@@ -17,7 +18,6 @@ from aacmm_jax.cli.app import app, examples
 from aacmm_jax.cli.display import display, new_console, print_table
 from aacmm_jax.cli.options import length_option
 from aacmm_jax.summaries.calibration import calibration_summary
-from aacmm_jax.summaries.cells import table
 from aacmm_jax.summaries.tables import formatted, observed_words
 from tests.example_counts import example_count
 from tests.refusals import assert_refused

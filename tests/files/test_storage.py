@@ -117,7 +117,7 @@ BAD = {
         ["'angle' is no array"],
     ),
     "no partner": (remove("nominal_arm/highest"), ["damaged", "make it again"]),
-    "not finite": (replace("nominal_arm/alpha", [0.0, np.nan, 0.0]), ["alpha holds a value that is not finite"]),
+    "not finite": (replace("nominal_arm/alpha", [0.0, np.nan, 0.0]), ["alpha[1] is nan; give finite numbers"]),
 }
 
 

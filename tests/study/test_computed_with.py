@@ -1,7 +1,6 @@
 """What a study's numbers depend on besides the study is kept, and nothing else continues it."""
 
 import json
-from importlib import metadata
 
 import h5py
 import jax
@@ -59,8 +58,8 @@ def test_the_difference_is_named(case):
 def test_what_was_begun_otherwise_is_read_but_not_continued(study, tmp_path):
     settings = json.dumps(json.loads(computed_with()) | {"XLA_FLAGS": "--xla_a=1"}, sort_keys=True)
     message = r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, and here is no XLA_FLAGS"
-    layout = Layout.of(study, 16, (metadata.version("aacmm_jax"), settings))
-    store.create(tmp_path / "s.h5", study, layout, 16)
+    layout = Layout.of(study, 16, settings)
+    store.create(tmp_path / "s.h5", study, layout)
     with pytest.raises(aj.InputError, match=message):
         aj.study.run_study(study, tmp_path / "s.h5")
     found = aj.study.Results.of(tmp_path / "s.h5")

@@ -83,7 +83,7 @@ def test_what_others_could_have_written_is_refused(case, home, study, tmp_path):
 def test_nobody_else_may_write_into_a_new_folder(study, tmp_path, umask):
     former = os.umask(umask)
     try:
-        store.create(tmp_path / "s.h5", study, Layout.of(study, 16), 16)
+        store.create(tmp_path / "s.h5", study, Layout.of(study, 16))
     finally:
         os.umask(former)
     assert parts_of(tmp_path / "s.h5").stat().st_mode & 0o777 == 0o755 & ~umask
@@ -120,7 +120,7 @@ def test_a_folder_that_another_user_made_first_is_left_as_it_is(study, tmp_path)
     parts.mkdir()
     (parts / "old.npz").touch()
     give(parts)
-    for check in (check_ours, lambda path: store.create(path, study, Layout.of(study, 16), 16)):
+    for check in (check_ours, lambda path: store.create(path, study, Layout.of(study, 16))):
         with pytest.raises(aj.InputError, match=r"s\.h5\.parts belongs to nobody"):
             check(tmp_path / "s.h5")
     assert os.listdir(parts) == ["old.npz"]

@@ -23,7 +23,7 @@ from .small_study import CHUNK, ROOT, command, interrupted_at, same, until_parts
 def written_in_blocks(home, study, path, chunk):
     """A study with the results of the one that was run, each block in a file."""
     layout = Layout.of(study, chunk)
-    store.create(path, study, layout, chunk)
+    store.create(path, study, layout)
     with h5py.File(home / "whole.h5") as whole:
         for block in layout.blocks():
             results = {name: whole["trials"][name][block.slices] for name in store.VARIABLES}
@@ -112,13 +112,13 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
         ({"trials": 61}, "holds another study .trials differs."),
         ({"chunk": 20}, "was begun with chunks of 16 trials; leave the chunk out"),
         ({"chunk": 0}, "chunk is 0; give a whole number of at least 1"),
-        ({"version": "9.9"}, "was begun with aacmm_jax .*; continue with that version"),
+        ({"version": "9.9"}, "was begun with aacmm_jax .*, and here is aacmm_jax 9.9, .*; install aacmm_jax"),
     ],
     ids=str,
 )
 def test_what_a_file_was_begun_with_stays(study, tmp_path, change, message, monkeypatch):
     path = tmp_path / "s.h5"
-    store.create(path, study, Layout.of(study, 16), 16)
+    store.create(path, study, Layout.of(study, 16))
     change = dict(change)
     options = {"chunk": change.pop("chunk")} if "chunk" in change else {}
     if "version" in change:
@@ -141,7 +141,7 @@ def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
 
 def test_results_without_their_parts_are_missed(home, study, tmp_path):
     path = tmp_path / "s.h5"
-    store.create(path, study, Layout.of(study, 16), 16)
+    store.create(path, study, Layout.of(study, 16))
     for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
         path = path.rename(tmp_path / "t.h5")
         with pytest.raises(
@@ -235,9 +235,7 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, tmp_path):
         "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2); "
         "os.execv(sys.executable, [sys.executable, '-m', 'aacmm_jax', *sys.argv[2:]])"
     )
-    store.create(
-        path, aj.study.read_study(home / "spec.toml"), Layout.of(aj.study.read_study(home / "spec.toml"), 16), 16
-    )
+    store.create(path, aj.study.read_study(home / "spec.toml"), Layout.of(aj.study.read_study(home / "spec.toml"), 16))
     for limit, what in (
         (10_000, "cell00000-trial0000000000.npz cannot"),
         ((home / "whole.h5").stat().st_size - 10_000, "s.h5 cannot"),
