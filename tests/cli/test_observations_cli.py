@@ -273,7 +273,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate tracker.h5 -o x.h5 --without 'no*'", ["no socket matches"]),
         ("evaluate c.h5 few.h5", ["sphere 'ball' has 2 touches"]),
         ("evaluate c.h5 monday.h5 --acceptance din", ["'din'", "jjf, asme, iso"]),
-        ("export n.h5 --format dcc", ["a certificate states a scale that is traceable"]),
+        ("export n.h5 --format dcc", ["the scale is not traceable (--scale nominal)"]),
     ],
 )
 def test_what_cannot_take_observations_says_so(aacmm, folder, calibrated, command, parts):

@@ -5,7 +5,6 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from aacmm_jax.summaries.cells import table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
@@ -18,7 +17,7 @@ from aacmm_jax.cli.app import app, examples
 from aacmm_jax.cli.display import display, new_console, print_table
 from aacmm_jax.cli.options import length_option
 from aacmm_jax.summaries.calibration import calibration_summary
-from aacmm_jax.summaries.tables import formatted, observed_words
+from aacmm_jax.summaries.tables import formatted, listed, observed_words
 from tests.example_counts import example_count
 from tests.refusals import assert_refused
 
@@ -73,7 +72,7 @@ def test_nothing_in_a_table_is_cut(columns, keys, data):
     count = data.draw(st.integers(keys + 1, 8))
     rows = data.draw(st.lists(st.lists(texts, min_size=count, max_size=count), min_size=1, max_size=4))
     stream = io.StringIO()
-    print_table(Console(file=stream, width=columns, highlight=False), table("", rows[1:], rows[0], keys=keys))
+    print_table(Console(file=stream, width=columns, highlight=False), listed("", rows[1:], rows[0], keys=keys))
     lines = stream.getvalue().splitlines()
     printed = [word for line in lines for word in line.split()]
     assert all(word in printed for row in rows for cell in row for word in cell.split())
