@@ -135,8 +135,8 @@ def _orientations_lacking(measured: Measured) -> str:
         means = (
             unit_rows(np.array([directions.mean(axis=0) for directions in groups])) if test == "articulation" else []
         )
-        for one, other in itertools.combinations(means, 2):
-            if one @ other > math.cos(_LEAST_TURN):
+        for mean, other in itertools.combinations(means, 2):
+            if mean @ other > math.cos(_LEAST_TURN):
                 return f"The orientations of the probe must differ; on sphere '{name}' two are nearly the same."
     return ""
 

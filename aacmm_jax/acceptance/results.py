@@ -48,7 +48,7 @@ class MetricValue(NamedTuple):
 
 def metric_value(where: str, value: float, *u: float) -> MetricValue:
     """A value whose standard uncertainty combines the independent contributions ``u``, mm."""
-    return MetricValue(where, value, COVERAGE_FACTOR * math.sqrt(sum(own**2 for own in u)))
+    return MetricValue(where, value, COVERAGE_FACTOR * math.sqrt(sum(part**2 for part in u)))
 
 
 class Metric(NamedTuple):
@@ -68,10 +68,10 @@ class Metric(NamedTuple):
     def worst(self) -> MetricValue:
         """The value with the worst decision and, of several, farthest beyond its limit; the largest without limits."""
 
-        def badness(found: MetricValue) -> tuple[int, float]:
-            if found.limit is None or found.decision is None:
-                return 0, abs(found.value)
-            return -DECISIONS.index(found.decision), abs(found.value) - found.limit
+        def badness(value: MetricValue) -> tuple[int, float]:
+            if value.limit is None or value.decision is None:
+                return 0, abs(value.value)
+            return -DECISIONS.index(value.decision), abs(value.value) - value.limit
 
         return max(self.values, key=badness)
 
@@ -83,12 +83,12 @@ class Metric(NamedTuple):
     @property
     def decision(self) -> Decision | None:
         """The worst decision of all values; None without limits."""
-        return worst([found.decision for found in self.values if found.decision is not None])
+        return worst([value.decision for value in self.values if value.decision is not None])
 
     @property
     def failing(self) -> int:
         """How many values fail."""
-        return sum(found.decision == "fails" for found in self.values)
+        return sum(value.decision == "fails" for value in self.values)
 
 
 class AcceptanceTest(NamedTuple):

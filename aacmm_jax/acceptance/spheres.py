@@ -75,8 +75,8 @@ def fit_sphere(points: Numbers) -> FittedSphere:
 
     guess = np.append(start[:3], radius)
     solve: Any = optimize.least_squares
-    found = solve(residuals, guess, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    return FittedSphere(middle + size * found.x[:3], float(size * found.x[3]), size * found.fun)
+    solution = solve(residuals, guess, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return FittedSphere(middle + size * solution.x[:3], float(size * solution.x[3]), size * solution.fun)
 
 
 def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -108,8 +108,8 @@ def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
     for point in (given - middle) / size:
         if all(np.linalg.norm(point - other) > _COINCIDENT for other in apart):
             apart.append(point)
-    found: Any = miniball.get_bounding_ball(np.array(apart), rng=np.random.default_rng(0))
-    centre = middle + size * found[0]
+    ball: Any = miniball.get_bounding_ball(np.array(apart), rng=np.random.default_rng(0))
+    centre = middle + size * ball[0]
     return centre, float(np.linalg.norm(given - centre, axis=1).max())
 
 
