@@ -97,7 +97,7 @@ class AcceptanceTest(NamedTuple):
     Example:
         >>> tests = aj.acceptance.run(aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal)))
         >>> print([test.called for test in tests])
-        ['after JJF 1408-2013', 'after ASME B89.4.22-2004', 'after ASME B89.4.22-2004', 'after ISO 10360-12:2016']
+        ['based on JJF 1408-2013', 'based on ASME B89.4.22-2004', 'based on ASME B89.4.22-2004', 'based on ISO 10360-12:2016']
     """
 
     standard: str  # a key of `acceptance.standards.EDITIONS`
@@ -113,8 +113,8 @@ class AcceptanceTest(NamedTuple):
 
     @property
     def called(self) -> str:
-        """The standard's edition; "after" it if something that the standard requires is missing."""
-        return EDITIONS[self.standard] if not self.missing else f"after {EDITIONS[self.standard]}"
+        """The standard's edition; "based on" it if something that the standard requires is missing."""
+        return EDITIONS[self.standard] if not self.missing else f"based on {EDITIONS[self.standard]}"
 
     def symbol(self, metric: Metric) -> str:
         """The standard's symbol of a metric; its plain name if there is none, or the test is not complete."""
