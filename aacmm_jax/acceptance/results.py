@@ -96,8 +96,8 @@ class AcceptanceTest(NamedTuple):
 
     Example:
         >>> tests = aj.acceptance.run(aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal)))
-        >>> print([test.called for test in tests])
-        ['based on JJF 1408-2013', 'based on ASME B89.4.22-2004', 'based on ASME B89.4.22-2004', 'based on ISO 10360-12:2016']
+        >>> print([test.called for test in tests[:2]])
+        ['based on JJF 1408-2013', 'based on ASME B89.4.22-2004']
     """
 
     standard: str  # a key of `acceptance.standards.EDITIONS`

@@ -19,7 +19,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "summaries/compared_models.py": ("_warnings",),
     "summaries/correction.py": ("correction_summary",),
     "cli/compare_commands.py": ("_compared",),
-    "drift/comparison.py": ("_warnings", "_common_poses", "_other_arm"),
+    "drift/comparison.py": ("_warnings",),
     "data/copies.py": ("sentences",),
     "uncertainty/identifiability.py": ("sentences",),
     "uncertainty/correction_limits.py": ("by_more_sockets",),
