@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..core.arrays import Numbers
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
 from .geometry import LEAST_SPREAD, LEFT_OR_RIGHT, elbow_sides, least_turn
@@ -45,7 +45,7 @@ from .requirements import (
     touches,
 )
 from .results import Measured, Metric, metric_value, percent
-from .spheres import errors_named, points_of, size_error
+from .spheres import points_of, size_error
 from .standards import ASME_B89_4_22
 
 ZONES = {"near": (0.0, 0.2), "middle": (0.2, 0.8), "far": (0.8, 1.0)}  # fractions of the reach
@@ -88,7 +88,7 @@ def _diameter_metrics(measured: Measured, influences: Influences) -> list[Metric
     values = []
     for sphere in spheres_for(measured, "effective-diameter"):
         for number, group in enumerate(sphere.groups, start=1):
-            with errors_named(sphere, number):
+            with naming(f"sphere '{sphere.name}', group {number}"):
                 error = size_error(group, sphere.diameter, sphere.stylus) + influences.correction(sphere.diameter)
             u = influences.u_of(sphere.diameter)
             values.append(metric_value(f"{sphere.name}, repeat {number}", error, sphere.u, u))

@@ -1,7 +1,5 @@
 """Spheres: fitted by least squares, and the smallest around points; and what the tests of touched spheres share."""
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +7,6 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
-from ..data.sphere import ProbedSphere
 
 EXACT_POINTS = 4  # a sphere goes through so many points exactly, so they have no form error
 _COINCIDENT = 1e-7  # distance of two points, relative to the extent of all, below which they count as one
@@ -144,13 +141,3 @@ def points_of(points: Numbers, what: str) -> Float[np.ndarray, "m 3"]:
     if array.ndim != 2 or array.shape[1] != 3 or not len(array):
         raise InputError(f"{what} have shape {array.shape}; give (x, y, z) in mm, one row per point, at least one row.")
     return array
-
-
-@contextlib.contextmanager
-def errors_named(sphere: ProbedSphere, group: int | None = None) -> Iterator[None]:
-    """Add the sphere, and which of its groups, to the text of an `InputError`."""
-    try:
-        yield
-    except InputError as error:
-        where = f"sphere '{sphere.name}'" + ("" if group is None else f", group {group}")
-        raise InputError(f"{where}: {error}") from error
