@@ -13,8 +13,7 @@ from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
-from ..plot.acceptance import metrics_chart
-from ..plot.lengths import reading_errors_chart
+from ..plot.lengths import metrics_chart, reading_errors_chart
 from ..plot.residuals import arms_chart, distances_in
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
