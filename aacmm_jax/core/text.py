@@ -53,7 +53,7 @@ def in_short(sentence: str) -> str:
 
     Names without blanks are cut first, so that what the sentence says of them remains.
     """
-    sentence = _LONG_NAME.sub(lambda found: _middle_out(found[0], _LONGEST_NAME), sentence)
+    sentence = _LONG_NAME.sub(lambda name: _middle_out(name[0], _LONGEST_NAME), sentence)
     return _middle_out(sentence, _LONGEST_SENTENCE)
 
 
@@ -83,6 +83,12 @@ def _not_calculated(cell: object) -> object:
 def shorten(items: Sequence[str], most: int = 5) -> str:
     """The first items of a list, and how many more there are."""
     return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
+
+
+def listed(items: Iterable[str]) -> str:
+    """Different items in words: "a, b and c"."""
+    *first, last = dict.fromkeys(items)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def common_labels(groups: Sequence[Sequence[str]]) -> list[str]:

@@ -23,7 +23,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "data/copies.py": ("sentences",),
     "uncertainty/identifiability.py": ("sentences",),
     "uncertainty/correction_limits.py": ("by_more_sockets",),
-    "calibration/scale_anchor.py": ("warn_of_a_known_scale",),
+    "calibration/scale_anchor.py": ("warn_of_known_scale",),
     "acceptance/record.py": ("evaluation_of", "unstated_uncertainty_warning", "SIMULATED"),
     "acceptance/procedure_items.py": ("socket_in_zone",),
     "report/study.py": ("_warnings",),
