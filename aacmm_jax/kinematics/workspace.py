@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import in_chunks, to_numpy
 from .arm import Arm, joint_limits
@@ -177,8 +178,7 @@ def search_region(
 ) -> SearchRegion:
     """The region ``margin`` (rad, or m of prismatic joints) inside the joint limits (default: the arm's own), ``above``
     (mm) the table, within the cones of approach and clear of the cell's obstacles."""
-    if seed < 0:
-        raise InputError(f"seed is {seed}; give zero or a positive number.")
+    checked(seed, Annotated[int, Range(least=0)], "seed")
     allowed = np.asarray(joint_limits(arm, limits))
     margins = margin * reading_units(arm.geometry)
     if not (math.isfinite(margin) and margin >= 0 and np.all(margins < (allowed[:, 1] - allowed[:, 0]) / 2)):
