@@ -93,11 +93,13 @@ def _extreme_distance(arm: Arm, shoulder: Float[np.ndarray, " 3"], *, farthest: 
                 q[:, joint] = reading
                 continue
             axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
+            # tip(t) = origin + (tip - origin) cos t + ..., so that s . tip varies as cosine cos t + sine sin t.
             offset, across = origin - shoulder, np.cross(axis, tip - origin)
             along = np.cross(across, axis)
             cosine, sine = sign * np.sum(offset * along, axis=1), sign * np.sum(offset * across, axis=1)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
+            # The angle of the maximum, by whole revolutions within the limits if one is; else the better limit.
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
             at_low, at_high = (
                 cosine * np.cos(end) + sine * np.sin(end) for end in (low - q[:, joint], high - q[:, joint])
