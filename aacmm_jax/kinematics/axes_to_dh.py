@@ -216,7 +216,7 @@ def _to_axis(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"],
         if abs(beta) < _NO_ANGLE:
             beta = 0.0
     else:
-        # The common normal ends on the next axis at the point nearest to z: there its part across z is normal to the axis.
+        # The common normal ends on the next axis at the point that is nearest to z.
         foot = point - (point[:2] @ direction[:2]) / sine**2 * direction
         normal = np.array([-direction[1], direction[0]]) / sine
         d, a = float(foot[2]), float(foot[:2] @ normal)
