@@ -253,8 +253,11 @@ def decided(decision: str | None, failing: int = 0, parts: int = 1) -> Cell:
     return Cell(_SIGNS[decision] + count, None, MARKS[decision])
 
 
-def acceptance_tables(tests: Rows) -> list[Table]:
-    """The metrics of each acceptance test, with their limits and decisions where there are any."""
+def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
+    """The metrics of each acceptance test, with their limits and decisions where there are any.
+
+    ``brief``: without the decisions of the nominal arm, and without what each metric is.
+    """
     metrics = [metric for test in tests for metric in test["figures"]]
     limited = any(metric["limit_mm"] is not None for metric in metrics)
     nominal = any(metric["as_found_mm"] is not None for metric in metrics)
@@ -262,16 +265,18 @@ def acceptance_tables(tests: Rows) -> list[Table]:
     # Decisions first: on a telephone, what stands behind them is off the screen.
     columns: Columns = {
         "metric": "symbol",
-        f"decision, {value}" if nominal else "decision": (
+        f"decision, {value}" if nominal and not brief else "decision": (
             (lambda row: decided(row["decision"], row["failing"], len(row["parts"]))) if limited else None
         ),
-        "decision, nominal": (lambda row: decided(row["as_found_decision"])) if limited and nominal else None,
+        "decision, nominal": (
+            (lambda row: decided(row["as_found_decision"])) if limited and nominal and not brief else None
+        ),
         value: lambda row: number(row["value_mm"], decimals_for(row["expanded_mm"])),
         "U (k = 2)": lambda row: stated_expanded(row["expanded_mm"]),
         "MPE": "limit_mm" if limited else None,
         "nominal": (lambda row: number(row["as_found_mm"], decimals_for(row["expanded_mm"]))) if nominal else None,
         "worst at": "where",
-        "what it is": "what",
+        "what it is": None if brief else "what",
     }
     return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
 
