@@ -124,7 +124,7 @@ def _acceptance(summary: dict[str, Any]) -> View:
         yield "No acceptance test applies: there is no socket with several poses, no length and no sphere for it."
         return
     yield "\nAcceptance tests, single readings"
-    for test, metrics in zip(tests, acceptance_tables(tests), strict=True):
+    for test, metrics in zip(tests, acceptance_tables(tests, brief=True), strict=True):
         yield metrics
         if test["missing"]:
             yield "Not the full procedure:"

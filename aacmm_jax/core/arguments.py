@@ -193,7 +193,10 @@ def checked(value: Any, annotation: Any, what: str, sizes: Sizes | None = None) 
 
     ``sizes`` holds the sizes of dimensions by name; those that this value determines are added.
     """
-    check = _check_of(annotation)
+    try:
+        check = _known_check(annotation)
+    except TypeError:  # names in a dictionary, say, cannot be looked up
+        check = _check_of(annotation)
     return value if check is None else check(value, what, {} if sizes is None else sizes)
 
 
@@ -239,6 +242,9 @@ def _check_of(annotation: Any) -> Check | None:
     if _is_array(annotation) or _is_class(annotation):
         return _of_alternatives((annotation,))
     return _SCALARS.get(annotation) if isinstance(annotation, type) else None
+
+
+_known_check = cache(_check_of)  # of a value that is checked again and again: 0.1 ms each
 
 
 def _is_array(annotation: Any) -> bool:

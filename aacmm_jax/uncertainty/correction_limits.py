@@ -43,15 +43,15 @@ def why_undetermined(
         for name in chief:
             if name in terms and causes.get(name, "") != "line":  # which says more than that it is nearly constant
                 causes[name] = _cause(arm, q, terms[name], names, sockets) or causes.get(name, "")
-    found: dict[tuple[str, int], list[str]] = {}
+    names_by_cause: dict[tuple[str, int], list[str]] = {}
     for name, cause in causes.items():
-        found.setdefault((cause, terms[name].joint), []).append(name)
+        names_by_cause.setdefault((cause, terms[name].joint), []).append(name)
     sentences = tuple(
         _SENTENCES[cause].format(names=listed(names), joint=joint, travel=_travel(arm, q, joint), poses=_poses(q))
-        for (cause, joint), names in found.items()
+        for (cause, joint), names in names_by_cause.items()
         if cause
     )
-    unexplained = [name for (cause, _), names in found.items() if not cause for name in names]
+    unexplained = [name for (cause, _), names in names_by_cause.items() if not cause for name in names]
     return sentences, tuple(dict.fromkeys(unexplained))
 
 
