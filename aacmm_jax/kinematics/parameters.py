@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arguments import NotNegative, Range, checked_arguments
+from ..core.arguments import NOT_EMPTY, NotNegative, Range, checked_arguments, checked_fields
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
@@ -59,14 +59,11 @@ class Parameters(eqx.Module):
     """
 
     base: Arm
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Annotated[tuple[str, ...], NOT_EMPTY] = eqx.field(static=True)
 
     def __check_init__(self):
-        if not isinstance(self.base, Arm) or not isinstance(self.names, tuple) or not self.names:
-            raise InputError("Parameters takes an arm and a tuple of the names of its free parameters, at least one.")
-        _indices(self.base, self.names)
-        if len(set(self.names)) != len(self.names):
-            _unique_names(self.base, self.names, "names")
+        checked_fields(self)
+        _unique_names(self.base, self.names, "names")
 
     @classmethod
     @checked_arguments
@@ -230,10 +227,10 @@ def _indices(arm: Arm, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     names = (names,) if isinstance(names, str) else tuple(names)
-    for name in names:
-        locate(arm, name)
-        if names.count(name) > 1:
-            raise InputError(f"parameter '{name}' is named twice in {what}; name it once.")
+    _indices(arm, names)
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"parameter '{twice}' is named twice in {what}; name it once.")
     return names
 
 

@@ -25,7 +25,6 @@ from .computed_with import check_same, computed_with
 from .configuration_pool import check_reach
 from .definition import Study
 from .executors import THREADS, available_cores
-from .parts_folder import check_ours
 from .settings import Setting
 from .trials import run_block
 
@@ -109,7 +108,7 @@ def run_study(
     if executor is not None:
         _check_executor(executor)
     with _locked(output):
-        check_ours(path)
+        store.check_ours(path)
         store.tidy(path)
         layout, finished = _opened(study, path, chunk, executor)
         total = layout.cells * layout.trials
@@ -338,10 +337,10 @@ def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | No
 
 def _difference(one: Study, other: Study) -> str:
     """The first key in which two studies differ, in words."""
-    known, asked = (s.specification.model_dump(exclude={"name", "arm"}) for s in (one, other))
+    begun, asked = (s.specification.model_dump(exclude={"name", "arm"}) for s in (one, other))
     for table, value in asked.items():
-        if value != known[table]:
-            both = isinstance(value, dict) and isinstance(known[table], dict)
-            inner = [key for key in value if known[table].get(key) != value[key]] if both else []
+        if value != begun[table]:
+            both = isinstance(value, dict) and isinstance(begun[table], dict)
+            inner = [key for key in value if begun[table].get(key) != value[key]] if both else []
             return f"{table}{'.' + inner[0] if inner else ''} differs"
     return "its arm or its capture differs"

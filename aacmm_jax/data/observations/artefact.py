@@ -122,6 +122,8 @@ class Artefact(AbstractObservation):
             coordinates = unknowns[self.shape]
         p = coordinates.shape[1]
         held = coordinates.reshape(-1, 3, p)[owner, :, np.arange(m) if p > 1 else 0].T
+        # t - (R x + o) with the placement's R and o. On a platform, t - (R_i (R x + o) + o_i), so that derivatives by
+        # the placement are turned by R_i, and those by the coordinates x are -R_i R.
         points, by_frame, rotation = placed(unknowns[self.frame], held)
         by_unknowns = {}
         if self.index is not None:
@@ -134,12 +136,7 @@ class Artefact(AbstractObservation):
             chosen = xp.asarray((owner[None, :] == np.arange(len(self.names))[:, None]).astype(float))
             by_point = -chosen[:, None, None, :] * rotation.swapaxes(0, 1)[None]
             by_unknowns[self.shape] = by_point.reshape(-1, 3, m)
-        return Rows(
-            values=tips.position - points,
-            by_tip=each_pose(xp.asarray(np.eye(3)), m),
-            by_unknowns=by_unknowns,
-            measured=no_covariance(3, m),
-        )
+        return Rows(tips.position - points, each_pose(xp.asarray(np.eye(3)), m), by_unknowns, no_covariance(3, m))
 
 
 class SimulatedArtefact(AbstractSimulated):
