@@ -11,7 +11,7 @@ from ..data.capture import Capture
 from ..diagnostics.pose_residuals import distances_of, observation_residuals
 from ..model.metrics import pose_outliers
 from ..plot.charts import Chart
-from ..plot.residuals import Groups, Marked, distances_in, pose_chart
+from ..plot.residuals import Groups, distances_in, pose_chart
 from ..summaries.observations import capture_observations
 from ..summaries.result_tables import BY_CONSTRUCTION, with_u_digits
 from ..summaries.tables import (
@@ -26,7 +26,7 @@ from ..summaries.tables import (
     quantity_words,
 )
 
-DRAWN, _LISTED = 1000, 400  # most poses in a chart, and in its table
+DRAWN = 1000  # most poses in a chart
 
 
 def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
@@ -51,25 +51,7 @@ def residual_chart(capture: Capture, evaluation: Evaluation) -> Chart:
     far = pose_outliers(np.concatenate(distances_of(capture, evaluation)), groups.sizes)[0]
     says = "far from its socket" if groups.word == "socket" else "far from its geometry"
     title = "Residuals of the calibrated arm"
-    chart = pose_chart("residuals", title, groups, {"calibrated": distances}, far=(says, far), most=DRAWN)
-    return chart._replace(table=pose_table(groups, distances, "mm", (says, far)))
-
-
-def pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked | None = None) -> Table:
-    """The residual of every pose, or of those of very many that have the largest; and which are marked, and why."""
-    chosen, caption = np.arange(len(residuals)), "Every pose"
-    if len(chosen) > _LISTED:
-        chosen = np.argsort(-np.nan_to_num(residuals))[:_LISTED]
-        caption = f"The {_LISTED} farthest of {len(residuals)} poses"
-    columns: dict[str, Any] = {
-        groups.word: [groups.names[i] for i in groups.owner[chosen]],
-        "pose": groups.numbers[chosen].tolist(),
-        f"calibrated [{unit}]": numbers(residuals[chosen], 5),
-    }
-    if far is not None:
-        says, marked = Cell(far[0], None, "outlier"), np.isin(chosen, far[1])
-        columns["marked"] = [says if mark else "" for mark in marked]
-    return by_columns(caption, columns)
+    return pose_chart("residuals", title, groups, {"calibrated": distances}, far=(says, far), most=DRAWN)
 
 
 def length_table(
