@@ -432,7 +432,7 @@ def test_an_evaluation_report_decides(written):
     assert "✓ conforms" in text  # Deltam of 5 mm
     assert "Fails: E_Uni is over its limit." in text
     assert "This was not the full procedure" in text
-    assert "after ISO 10360-12:2016" in text
+    assert "based on ISO 10360-12:2016" in text
 
 
 def test_observations_of_an_evaluation_stand_beside_their_prediction():
