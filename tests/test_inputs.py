@@ -100,9 +100,9 @@ def test_angles(given, sockets, parts):
         ),
         (lambda q: aj.Capture({"plate": q}).select("palte"), ["'palte'", "did you mean 'plate'?"]),
         (lambda q: aj.Capture({"plate": q}).select(without="p*"), ["no socket is left", "widen"]),
-        (lambda q: aj.scale_from_lengths(measured=[200.0, -1.0], nominal=200.0), ["measured holds -1 mm", "positive"]),
-        (lambda q: aj.scale_from_lengths(measured=[200.0], nominal=[1.0, 2.0]), ["(2,)", "(1,)", "one each"]),
-        (lambda q: aj.scale_from_lengths(measured=[], nominal=200.0), ["measured", "at least one length"]),
+        (lambda q: aj.scale_from_lengths(measured=[200.0, -1.0], nominal=200.0), ["measured[1] is -1 mm", "positive"]),
+        (lambda q: aj.scale_from_lengths(measured=[200.0], nominal=[1.0, 2.0]), ["(2,)", "(1,)", "one number"]),
+        (lambda q: aj.scale_from_lengths(measured=[], nominal=200.0), ["measured", "at least one"]),
     ],
     ids=[
         *("zero", "negative", "nan", "two values", "negative u", "same socket", "misspelt socket", "unknown socket"),

@@ -161,19 +161,18 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
     """Of a calibration; ``u`` are those of its reference lengths, mm."""
     shared, arm = to_numpy(result.shared), result.arm
 
-    def with_shared(draw: Callable) -> Callable:
-        """Drawn with errors that poses share: ``draw(count, random, level, these)``."""
-
-        def drawn(count: int, random: np.random.Generator, level: Any) -> tuple[Capture, Float[np.ndarray, "t k"]]:
-            alike = None if shared is None else draw_shared(shared, arm, capture, count, random)
-            coefficients = np.zeros((count, 0)) if alike is None else alike.coefficients
-            return draw(count, random, level, alike), coefficients
-
-        return drawn
+    def alike(count: int, random: np.random.Generator) -> tuple[DrawnErrors | None, Float[np.ndarray, "t k"]]:
+        errors = draw_shared(shared, arm, capture, count, random)
+        return errors, np.zeros((count, 0)) if errors is None else errors.coefficients
 
     if result.method == "joint":
         truth = truth_of(result, capture)
-        return Trials(truth.size, with_shared(lambda *given: truth.drawn(given[0], noise, *given[1:])))
+
+        def drawn_observations(count: int, random: np.random.Generator, level: Any) -> Any:
+            errors, coefficients = alike(count, random)
+            return truth.drawn(count, noise, random, level, errors), coefficients
+
+        return Trials(truth.size, drawn_observations)
     # Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move.
     exact = project_to_centroids(arm, capture)
     by_joints = np.asarray(arm.jacobian(exact, [f"q_{i}" for i in range(1, arm.joints + 1)]))
@@ -182,17 +181,17 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
     first, ends, tips = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]]), capture.ends(), arm.position(exact)
     true_lengths = np.linalg.norm(np.asarray(tips)[first[ends[:, 0]]] - np.asarray(tips)[first[ends[:, 1]]], axis=1)
 
-    def drawn(count: int, random: np.random.Generator, level: Any, alike: DrawnErrors | None) -> Capture:
+    def drawn(count: int, random: np.random.Generator, level: Any) -> Any:
         seats = float(noise.seating) * level * random.normal(size=(count, len(exact), 3))
+        errors, coefficients = alike(count, random)
+        seats = seats if errors is None else seats + errors.tips
         read = noise.of_columns(arm.geometry.kinds, arm.joints, exact.shape[1])
         readings = exact + read * level * random.normal(size=(count, *exact.shape))
         readings[..., : arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
-        if alike is not None:
-            readings[..., : arm.joints] += np.einsum("Nic,tNc->tNi", moves, alike.tips)
-            readings += alike.joints
-        return batch_of_captures(capture, readings, _around(true_lengths, u, count, random))
+        readings += 0.0 if errors is None else errors.joints
+        return batch_of_captures(capture, readings, _around(true_lengths, u, count, random)), coefficients
 
-    return Trials(exact.size, with_shared(drawn))
+    return Trials(exact.size, drawn)
 
 
 def _around(
