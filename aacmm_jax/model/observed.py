@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from ..core.pytree import pytree, static
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.measured_points import AbstractMeasured
@@ -24,6 +24,7 @@ from ..data.observations.socket import position_of, sockets_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import ForwardPass, Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
+from ..solver.arrow import split
 from .layout import Group, Layout, layout_of, unknowns_of
 from .socket_sums import means_over_sockets
 
@@ -58,7 +59,7 @@ class Observed:
         observations = to_numpy((*sockets_of(capture.sockets), *capture.observations))
         q = xp.concatenate([observation.q for observation in observations])
         known = capture.lengths if lengths else ()
-        ends = tuple((position_of(length.start), position_of(length.end)) for length in known)
+        ends = ends_of(capture) if lengths else ()
         layout = layout_of(observations, ends)
         return cls(
             observations=observations,
@@ -137,6 +138,28 @@ class Observed:
             first += len(units)
         return found
 
+    def distances(
+        self, geometry: Float[AnyArray, " g"], ends: Sequence[tuple[str, str]]
+    ) -> tuple[Float[AnyArray, " l"], Float[AnyArray, "l g"]]:
+        """Distances between the positions with these names, mm, and their derivatives by the numbers of the geometry:
+        the unit vector at the end, and its opposite at the start."""
+        xp = namespace(geometry)
+        index = np.array([[self.positions[name] for name in pair] for pair in ends], dtype=int).reshape(-1, 2, 3)
+        between = geometry[index[:, 1]] - geometry[index[:, 0]]
+        sizes = xp.sqrt(xp.sum(between**2, axis=1))
+        units, rows = between / sizes[:, None], np.arange(len(index))[:, None]
+        pull = set_at(xp.zeros((len(index), len(geometry))), (rows, index[:, 0]), -units)
+        return sizes, set_at(pull, (rows, index[:, 1]), units)
+
+    def by_unknowns(
+        self, derivatives: Float[AnyArray, "q g"], parameters: int
+    ) -> tuple[Float[AnyArray, "q h"], list[Float[AnyArray, "q _ _"]]]:
+        """Derivatives by the geometry as those by the head, with so many parameters, and by components; natural
+        steps."""
+        xp = namespace(derivatives)
+        head, components = split(derivatives * self.steps, self.layout.shared, self.layout.classes)
+        return xp.concatenate([xp.zeros((len(derivatives), parameters)), head], axis=1), components
+
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         """Parts that have certified values: the values and their standard uncertainties."""
         found: dict[str, Any] = {}
@@ -198,6 +221,11 @@ class Observed:
                 found[number] = values[..., first : first + count]
                 first += count
         return found
+
+
+def ends_of(capture: Capture) -> tuple[tuple[str, str], ...]:
+    """Names of the positions at the ends of a capture's reference lengths."""
+    return tuple((position_of(length.start), position_of(length.end)) for length in capture.lengths)
 
 
 def _stacks(observations: tuple[AbstractObservation, ...], layout: Layout) -> tuple[AbstractObservation, ...]:
