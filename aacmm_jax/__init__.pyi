@@ -40,6 +40,7 @@ from .kinematics.parameters import perturbed_arm as perturbed_arm
 from .kinematics.priors import Prior as Prior
 from .model.scale import fix_scale as fix_scale
 from .model.scale import scale_from_lengths as scale_from_lengths
+from .pipeline.capture_calibration import calibrate_capture as calibrate_capture
 from .pipeline.cross_validation import cross_validate as cross_validate
 from .pipeline.model_ladder import compare_models as compare_models
 from .pipeline.single import calibrate as calibrate

@@ -22,7 +22,7 @@ from model_warnings import PAPER, Errors, Trials, bending, eccentric, geared
 import aacmm_jax as aj
 from aacmm_jax.data.capture import draw_poses
 from aacmm_jax.kinematics.arm import correction_names
-from aacmm_jax.kinematics.prior_scales import default_prior
+from aacmm_jax.kinematics.priors import default_prior
 from aacmm_jax.uncertainty.volume import sample_lengths
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

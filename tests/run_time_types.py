@@ -30,7 +30,9 @@ _jaxtyped = jaxtyping.jaxtyped
 
 
 def _resolved(annotation: Any, names: dict[str, Any]) -> Any:
-    """What an annotation means; anything, where it names what only pyright imports."""
+    """What an annotation means; anything, where it names what only pyright imports, or the class of a method."""
+    if "typing.Self" in str(annotation):
+        return Any
     try:
         return get_type_hints(SimpleNamespace(__annotations__={"it": annotation}), names, include_extras=True)["it"]
     except Exception:

@@ -116,12 +116,12 @@ def test_lengths_and_sockets(given, call, parts):
 @pytest.mark.parametrize(
     ("changes", "parts"),
     [
-        ({"a": [1.0, 2.0]}, ["a has shape (2,)", "6 joints", "one value per joint"]),
-        ({"alpha": 1.5}, ["alpha", "one value per joint"]),
+        ({"a": [1.0, 2.0]}, ["a has shape (2,)", "give (..., joints) with 6 joints"]),
+        ({"alpha": 1.5}, ["alpha has shape ()", "give (..., joints)"]),
         ({"d": [[1.0], [1.0, 2.0]]}, ["d has rows of unequal length"]),
         ({"d": ["one"] * 6}, ["d must be real numbers", "text"]),
-        ({"d": [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]}, ["d holds a value that is not finite"]),
-        ({"probe": [0.0, 102.0]}, ["probe has shape (2,)", "three coordinates"]),
+        ({"d": [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]}, ["d[2] is inf; give finite numbers"]),
+        ({"probe": [0.0, 102.0]}, ["probe has shape (2,)", "give (..., 3)"]),
         ({"alpha": np.zeros((3, 6)), "a": np.zeros((2, 6))}, ["(3,), (2,)", "make them alike"]),
         ({"limits": [(-1, 1)] * 3 + [(1, -1)] + [(-1, 1)] * 2}, ["joint 4", "1 to -1 rad", "lower below the upper"]),
         ({"limits": [(-1, np.inf)] + [(-1, 1)] * 5}, ["joint 1", "inf rad", "finite"]),
@@ -153,7 +153,7 @@ def test_arm(paper_arm, changes, parts):
             lambda x: aj.Bounds.around(x.arm, x.space, override={"d_1": 60}),
             ["'d_1' is held, not free", "such as 'alpha_1'"],
         ),
-        (lambda x: aj.Bounds.around(x.arm, x.space, length=-1.0), ["half-width of a_1 is -1", "zero or a positive"]),
+        (lambda x: aj.Bounds.around(x.arm, x.space, length=-1.0), ["length is -1", "zero or positive"]),
         (lambda x: aj.Bounds.around(x.arm, x.space, override={"d_3": np.nan}), ["override['d_3'] is nan"]),
         (
             lambda x: aj.Bounds(x.space, x.start, shifted(x, a_2=-1.5)),
@@ -337,9 +337,7 @@ def test_simulation(paper_arm, arguments, parts):
 
 
 def test_deviation_and_batch(given):
-    assert_refused(
-        lambda: aj.perturbed_arm(given.space, length=-1.0, angle=0.0), "free length is -1", "zero or positive"
-    )
+    assert_refused(lambda: aj.perturbed_arm(given.space, length=-1.0, angle=0.0), "length is -1", "zero or positive")
     batch = changed_arm(given.arm, a=np.zeros((2, 6)))
     assert_refused(lambda: aj.simulate(batch, {"A": (400, 200, 300)}), "one arm, not a batch")
 

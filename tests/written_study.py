@@ -11,8 +11,8 @@ from aacmm_jax.study.blocks import VARIABLES, Layout
 
 def write_study(path: Path, study: "aj.study.Study") -> None:
     """Write a finished study: results of the right kind, drawn at random about the nominal arm."""
-    layout, chunk, random = Layout.of(study, 1000), 1000, np.random.default_rng(0)
-    store.create(path, study, layout, chunk)
+    layout, random = Layout.of(study, 1000), np.random.default_rng(0)
+    store.create(path, study, layout)
     nominal, steps = np.asarray(study.space.vector()), np.asarray(study.space.scale)
     counts = {"converged": 1, "reason": 0, "steps": 12, "truth_inside": 1, "active": 0}
     for block in layout.blocks():
@@ -24,5 +24,5 @@ def write_study(path: Path, study: "aj.study.Study") -> None:
         results["k"] = results["scale"] = 1 + 1e-5 * random.normal(size=shapes["k"])
         results["true"] = nominal + 0.1 * steps * random.normal(size=shapes["true"])
         results["estimate"] = results["true"] + 0.001 * steps * random.normal(size=shapes["true"])
-        store.write_part(path, block, store.pack(results, layout), layout)
-    store.finish(path, study, layout, chunk)
+        store.write_part(path, block, results, layout)
+    store.finish(path, study, layout)

@@ -3,8 +3,9 @@
 import math
 import re
 from collections.abc import Collection, Mapping
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, get_args
 
+from ..core.arguments import Range, checked, checked_arguments
 from ..core.errors import InputError, nearest
 from ..core.text import number
 
@@ -25,6 +26,7 @@ COVERAGE_FACTOR = 2.0  # of every U of a test value
 GUARD_FACTOR = 1.65  # one-sided, 95 %, of a normal distribution: the guard band of 2017 is this times u
 _PROBABILITY, _RATIO = 0.95, 4.0
 MOST, LEAST_DIVISOR = 1e6, 1e-3  # of a limit in mm, and of its divisor
+_Millimetres = Annotated[float, Range(least=0, unit="mm")]
 _ROUNDING = 1e-9  # relative to the limit: decimal numbers that equal a limit on paper must equal it in binary
 _LIMIT = re.compile(r"\s*(?P<fixed>[^+/LlKk]+?)\s*(?:\+\s*[Ll]\s*/\s*(?P<divisor>.+?))?\s*")
 
@@ -49,7 +51,8 @@ class Limit(NamedTuple):
         return f"{self.fixed:g}" + ("" if math.isinf(self.divisor) else f" + L/{self.divisor:g}")
 
 
-def decide(error: float, limit: float, expanded: float = 0.0, rule: Rule = "iso-2017") -> Decision:
+@checked_arguments
+def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule: Rule = "iso-2017") -> Decision:
     """Decide whether an error keeps a limit.
 
     With u = U / 2, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is within the limit, or
@@ -75,19 +78,8 @@ def decide(error: float, limit: float, expanded: float = 0.0, rule: Rule = "iso-
         >>> print(aj.acceptance.decide(0.048, limit=0.050, expanded=0.010))
         undecided
     """
-    try:
-        error, limit, expanded = float(error), float(limit), float(expanded)
-    except (TypeError, ValueError) as wrong:
-        raise InputError(
-            f"error, limit and expanded uncertainty are {error!r}, {limit!r}, {expanded!r}; give numbers of mm."
-        ) from wrong
-    for what, value in (("limit", limit), ("expanded uncertainty", expanded)):
-        if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"the {what} is {value:g} mm; it must be zero or positive.")
-    if math.isnan(error):
-        raise InputError("the error is not a number, so nothing can be decided; give the measured error.")
     error, slack = abs(error), _ROUNDING * max(limit, expanded)
-    if checked_rule(rule) == "simple":
+    if rule == "simple":
         if limit + slack < _RATIO * expanded:
             return "undecided"
         return "conforms" if error <= limit + slack else "fails"
@@ -107,10 +99,8 @@ def _within(error: float, limit: float, u: float) -> float:
 
 
 def checked_rule(rule: str) -> Rule:
-    """A decision rule, or `InputError` for a name that is none."""
-    if rule not in RULES:
-        raise InputError(f"rule is {rule!r}; it must be one of {', '.join(RULES)}.")
-    return rule
+    """A decision rule, or `InputError` for another name."""
+    return checked(rule, Rule, "rule")
 
 
 def worst(decisions: list[Decision]) -> Decision | None:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
@@ -18,7 +19,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach, arm_reach, search_region
 from . import asme_b89_4_22, iso_10360_12
 from .procedure_items import PlannedSphere, ProcedureItem, ProcedureRegion
-from .standards import PLANNED, Planned
+from .standards import Planned
 
 # The tests of touched spheres: as an item names them, and as a manifest does.
 TOUCHED: dict[str, SphereTest] = {
@@ -55,15 +56,16 @@ class Procedure(NamedTuple):
         return sum(len(item.q) for item in (*self.sockets, *self.touches))
 
 
+@checked_arguments
 def plan_procedure(
     arm: Arm,
     standard: Planned,
     *,
     above: float = 0.0,
     margin: float = math.radians(5),
-    diameter: float = 25.0,
-    stylus: float = 6.0,
-    bars: Sequence[float] | None = None,
+    diameter: Annotated[float, Range(above=0, unit="mm")] = 25.0,
+    stylus: Annotated[float, Range(least=0, unit="mm")] = 6.0,
+    bars: Sequence[Annotated[float, Range(above=0, unit="mm")]] | None = None,
     measuring_range: float | None = None,
     seed: int = 0,
 ) -> Procedure:
@@ -94,14 +96,8 @@ def plan_procedure(
         >>> print(procedure.poses, "poses,", len(procedure.lengths), "bars")
         97 poses, 20 bars
     """
-    if standard not in PLANNED:
-        raise InputError(f"acceptance is '{standard}'; it must be {' or '.join(PLANNED)}.")
     if not is_single(arm):
         raise InputError("plan_procedure takes one arm, not a batch; give one of its arms.")
-    if not (diameter > 0 and stylus >= 0 and math.isfinite(diameter + stylus)):
-        raise InputError(
-            f"a sphere of {diameter:g} mm and a stylus of {stylus:g} mm are impossible; give a positive diameter."
-        )
     search = search_region(arm, None, margin, above, seed)
     reach = arm_reach(arm)
     if reach.radius < 10 * diameter:
@@ -115,25 +111,24 @@ def plan_procedure(
             f"a measuring range of {size:g} mm does not suit a reach of {reach.radius:.0f} mm; give a diameter in mm."
         )
     default = rules.default_bars(size)
-    lengths = default if bars is None else sorted(float(bar) for bar in bars)
-    if len(lengths) != len(default) or not all(math.isfinite(bar) and bar > 0 for bar in lengths):
-        raise InputError(
-            f"{len(lengths)} bars are given, but {standard} takes {len(default)} positive lengths; give as many."
-        )
+    lengths = default if bars is None else sorted(map(float, bars))
+    if len(lengths) != len(default):
+        raise InputError(f"{len(lengths)} bars are given, but {standard} takes {len(default)}; give as many.")
     unsuitable = [] if bars is None else rules.unsuitable_bars(size, lengths)
     items = rules.procedure_items(ProcedureRegion(search, reach._replace(radius=size / 2)), diameter, stylus, lengths)
     items = items._replace(left_out=[*unsuitable, *items.left_out])
     return Procedure(arm, standard, reach, size, measuring_range is not None, *map(tuple, items))
 
 
+@checked_arguments
 def simulate_procedure(
     procedure: Procedure,
     nominal: ArmSpecification,
     true: ArmSpecification,
     *,
     noise: Noise | None = None,
-    u_length: float = 0.0,
-    u_diameter: float = 0.0,
+    u_length: Annotated[float, Range(least=0, unit="mm")] = 0.0,
+    u_diameter: Annotated[float, Range(least=0, unit="mm")] = 0.0,
     seed: int = 0,
 ) -> Recording:
     """Simulate a planned acceptance test as a true arm would record it.
@@ -160,9 +155,6 @@ def simulate_procedure(
         >>> print(len(recorded.capture.q), len(recorded.spheres))
         70 1
     """
-    for what, value in (("u_length", u_length), ("u_diameter", u_diameter)):
-        if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"{what} is {value:g} mm; it must be zero or positive.")
     noise = Noise() if noise is None else noise
     scatter = np.asarray(noise.of_readings(true.arm.geometry.kinds))
     random = np.random.default_rng(seed)

@@ -148,7 +148,6 @@ def evaluation_of(
     u_test: float = 0.0,
     maxima: Mapping[str, float] | None = None,
     standards: Iterable[str] | None = None,
-    calibration_warnings: Iterable[str] = (),
     influences: Influences = NO_INFLUENCES,
     rule: Rule | None = None,
 ) -> EvaluationRecord:
@@ -165,8 +164,6 @@ def evaluation_of(
         maxima: Limits of the quantities in `MAXIMA`, mm.
         standards: Standards whose acceptance tests are run: "jjf", "asme", "iso". Default: those whose procedure the
             recording was made for. Tests with a limit are run in any case.
-        calibration_warnings: What should be read about the calibration before its numbers (`warnings_of`); the
-            evaluation keeps it.
         influences: What else adds uncertainty: in proportion to a length, and thermal expansion.
         rule: Decision rule, a key of `RULES`; by default that of each standard.
 
@@ -216,7 +213,6 @@ def evaluation_of(
         maxima=dict(maxima or {}),
         standards=made_for(recording) if standards is None else checked_standards(standards),
         uncertainty=uncertainty_of(record),
-        calibration_warnings=tuple(calibration_warnings),
         influences=influences,
         rule=rule,
     )

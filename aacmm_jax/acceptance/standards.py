@@ -1,10 +1,12 @@
 """The standards that the acceptance tests follow: names, editions, symbols of their metrics, and decision rules."""
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from ..core.errors import InputError
-from .decision import Rule
+
+if TYPE_CHECKING:
+    from .decision import Rule
 
 JJF_1408, ASME_B89_4_22, ISO_10360_12 = "JJF 1408", "ASME B89.4.22", "ISO 10360-12"
 EDITIONS = {JJF_1408: "JJF 1408-2013", ASME_B89_4_22: "ASME B89.4.22-2004", ISO_10360_12: "ISO 10360-12:2016"}
@@ -27,7 +29,7 @@ SYMBOLS = {
 }
 # Decision rules where none is asked for. ISO 10360 names ISO 14253-1 as its default (public forewords of ISO 10360-8);
 # for JJF 1408 it is our choice. That ASME B89.4.22 is judged by simple acceptance is background knowledge.
-DEFAULT_RULES: dict[str, Rule] = {JJF_1408: "iso-2017", ASME_B89_4_22: "simple", ISO_10360_12: "iso-2017"}
+DEFAULT_RULES: dict[str, "Rule"] = {JJF_1408: "iso-2017", ASME_B89_4_22: "simple", ISO_10360_12: "iso-2017"}
 
 
 def checked_standards(names: Iterable[str]) -> tuple[Standard, ...]:

@@ -8,8 +8,7 @@ from ..data.capture import Capture
 from ..kinematics.arm import DOWN, Arm, correction_names, without_corrections
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import Bounds, Parameters, based_on
-from ..kinematics.prior_scales import default_prior
-from ..kinematics.priors import Prior
+from ..kinematics.priors import Prior, default_prior
 from ..uncertainty.target_parameters import determined_parameters
 
 

@@ -1,51 +1,44 @@
-"""Acceptance tests in a certificate: as found and as left, with limits and the conformity of each value beside it."""
+"""Acceptance tests in a certificate: nominal and calibrated, with limits and the conformity of each value beside it."""
 
+from collections.abc import Iterator
 from xml.etree.ElementTree import Element
 
 from ..acceptance.decision import COVERAGE_FACTOR, RULES, Decision, worst
 from ..acceptance.record import EvaluationRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
-from .xml_elements import MILLIMETRE, add, add_english, add_real, add_software, add_text
+from .xml_elements import MILLIMETRE, element, english, equipment_quantity, method, named, real, software, text
 
 _STAGES = {"nominal": ("as found", "beforeAdjustment"), "calibrated": ("as left", "afterAdjustment")}
 _DECIMALS = 5  # of values without an uncertainty, mm
 
 
-def add_acceptance(parent: Element, record: EvaluationRecord) -> None:
-    """Add the measurement results of the acceptance tests of an evaluation, if it has any."""
+def acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
+    """The measurement results of the acceptance tests of an evaluation, if it has any."""
+    which = "." if record.independent else ", as far as there are any: here there are none."
     for stage, tests in record.acceptance().items():
         if not tests:
             continue
         name, status = _STAGES[stage]
-        result = add(parent, "measurementResult")
-        add_english(result, "name", f"Acceptance tests, {name}")
-        add_english(
-            result,
-            "description",
-            "Of single readings in poses that the calibration has not used"
-            + ("." if record.independent else ", as far as there are any: here there are none."),
+        formulas = "Formulas and requirements as secondary sources state them."
+        contributions = "Contributions of the tester alone (ISO 14253-5), combined as independent ones."
+        data = element("data", english("text", _influences(record)))
+        condition = named("influenceCondition", "Uncertainty of the test", element("status", status), data)
+        editions = dict.fromkeys(test.called for test in tests)
+        evaluation = "Evaluation of the uncertainty of the tests"
+        yield named(
+            "measurementResult",
+            f"Acceptance tests, {name}",
+            element(
+                "usedMethods",
+                (method("Acceptance tests", formulas, edition) for edition in editions),
+                method(evaluation, contributions, "JCGM 100:2008", of_uncertainty=True),
+            ),
+            software("usedSoftware"),
+            _artefacts(record),
+            element("influenceConditions", condition),
+            element("results", (_test(test, judged=record.recording.true is None) for test in tests)),
+            says=f"Of single readings in poses that the calibration has not used{which}",
         )
-        methods = add(result, "usedMethods")
-        for edition in dict.fromkeys(test.called for test in tests):
-            method = add(methods, "usedMethod")
-            add_english(method, "name", "Acceptance tests")
-            add_english(method, "description", "Formulas and requirements as secondary sources state them.")
-            add(method, "norm", edition)
-        method = add(methods, "usedMethod", ref_type="basic_methodMeasurementUncertainty")
-        add_english(method, "name", "Evaluation of the uncertainty of the tests")
-        add_english(
-            method, "description", "Contributions of the tester alone (ISO 14253-5), combined as independent ones."
-        )
-        add(method, "norm", "JCGM 100:2008")
-        add_software(result, "usedSoftware")
-        _add_artefacts(result, record)
-        condition = add(add(result, "influenceConditions"), "influenceCondition")
-        add_english(condition, "name", "Uncertainty of the test")
-        add(condition, "status", status)
-        add_english(add(condition, "data"), "text", _influences(record))
-        results = add(result, "results")
-        for test in tests:
-            _add_test(results, test, judged=record.recording.true is None)
 
 
 def overall(record: EvaluationRecord) -> Decision | None:
@@ -67,61 +60,48 @@ def _influences(record: EvaluationRecord) -> str:
     return "; ".join(parts) + ". The arm's own scatter is what is tested."
 
 
-def _add_artefacts(result: Element, record: EvaluationRecord) -> None:
+def _artefacts(record: EvaluationRecord) -> Element | None:
     """The lengths and spheres that were measured, with the uncertainties of their own certificates."""
     lengths = [record.recording.capture.lengths[i] for i in record.held_out_lengths()]
-    found = {f"Length {x.start} - {x.end}": (float(x.value), float(x.u)) for x in lengths}
-    found |= {f"Diameter of sphere {sphere.name}": (sphere.diameter, sphere.u) for sphere in record.recording.spheres}
-    if not found:
-        return
-    equipment = add(add(result, "measuringEquipments"), "measuringEquipment")
-    add_english(equipment, "name", "Artefacts of the tests")
-    quantities = add(equipment, "measuringEquipmentQuantities")
-    for name, (value, u) in found.items():
-        quantity = add(quantities, "measuringEquipmentQuantity")
-        add_text(quantity, "name", name)
-        if u == 0:
-            add_english(quantity, "description", "Taken as exact")
-        add_real(quantity, value, MILLIMETRE, u or None)
+    values = {f"Length {x.start} - {x.end}": (float(x.value), float(x.u)) for x in lengths}
+    values |= {f"Diameter of sphere {sphere.name}": (sphere.diameter, sphere.u) for sphere in record.recording.spheres}
+    if not values:
+        return None
+    quantities = (equipment_quantity(name, value, MILLIMETRE, u) for name, (value, u) in values.items())
+    quantities = element("measuringEquipmentQuantities", quantities)
+    return element("measuringEquipments", named("measuringEquipment", "Artefacts of the tests", quantities))
 
 
-def _add_test(results: Element, test: AcceptanceTest, judged: bool) -> None:
+def _test(test: AcceptanceTest, judged: bool) -> Element:
     """One test; ``judged``: with the conformity of values with limits, which no simulated arm has."""
-    result = add(results, "result")
-    add_english(result, "name", f"{test.called}: {test.title}")
     lacking = f"Not the full procedure. {' '.join(test.missing)}" if test.missing else "The full procedure."
-    add_english(
-        result,
-        "description",
-        f"{lacking} Expanded uncertainties have the coverage factor {COVERAGE_FACTOR:g}.",
-    )
-    data = add(result, "data")
+    lists = []
     for metric in test.metrics:
-        rows = add(data, "list")
-        add_english(rows, "name", test.symbol(metric))
-        add_english(rows, "description", METRICS[metric.name])
-        for number, value in enumerate(metric.values, start=1):
-            _add_value(rows, test, metric, f"{number}: {value.where}", value, judged)
+        values = (
+            _value(test, metric, f"{number}: {value.where}", value, judged)
+            for number, value in enumerate(metric.values, start=1)
+        )
+        lists.append(named("list", test.symbol(metric), values, says=METRICS[metric.name]))
+    says = f"{lacking} Expanded uncertainties have the coverage factor {COVERAGE_FACTOR:g}."
+    return named("result", f"{test.called}: {test.title}", element("data", lists), says=says)
 
 
-def _add_value(
-    rows: Element, test: AcceptanceTest, metric: Metric, name: str, found: MetricValue, judged: bool
-) -> None:
+def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, judged: bool) -> Element:
     """A value; where it has a limit, its conformity stands beside it, with the rule and the limit."""
-    quantity = add(rows, "quantity", ref_type="basic_measurementError")
-    add_text(quantity, "name", name)
-    u = found.expanded / COVERAGE_FACTOR
-    add_real(quantity, found.value, MILLIMETRE, u or None, COVERAGE_FACTOR, _DECIMALS)
-    if not judged or found.decision is None or found.limit is None:
-        return
-    meta = add(add(quantity, "measurementMetaData"), "metaData")
-    add_english(meta, "name", f"Conformity of {test.symbol(metric)}")
-    add(meta, "norm", RULES[test.rule])
-    add_english(meta, "declaration", f"|value| against the maximum permissible error: {found.decision}.")
-    add(meta, "conformity", _conformity(found, found.limit))
-    limit = add(add(meta, "data"), "quantity")
-    add_english(limit, "name", "Maximum permissible error")
-    add_real(limit, found.limit, MILLIMETRE)
+    u, meta = value.expanded / COVERAGE_FACTOR, None
+    if judged and value.decision is not None and value.limit is not None:
+        limit = named("quantity", "Maximum permissible error", real(value.limit, MILLIMETRE))
+        meta = named(
+            "metaData",
+            f"Conformity of {test.symbol(metric)}",
+            element("norm", RULES[test.rule]),
+            english("declaration", f"|value| against the maximum permissible error: {value.decision}."),
+            element("conformity", _conformity(value, value.limit)),
+            element("data", limit),
+        )
+    measured = real(value.value, MILLIMETRE, u or None, COVERAGE_FACTOR, _DECIMALS)
+    meta = None if meta is None else element("measurementMetaData", meta)
+    return element("quantity", text("name", name), measured, meta, ref_type="basic_measurementError")
 
 
 def _conformity(found: MetricValue, limit: float) -> str:

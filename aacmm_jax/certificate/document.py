@@ -2,31 +2,21 @@
 
 import datetime
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from xml.etree.ElementTree import Element
 
 from ..acceptance.record import EvaluationRecord, same_arm
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
+from ..data.observations.observation import certified_quantities
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
 from ..summaries.contradictions import removals
 from ..summaries.observations import scale_sources
 from ..summaries.warnings import of_calibration
-from .acceptance_results import add_acceptance, overall
-from .measurement_results import add_results, uncertainty_statement
-from .observation_results import texts_of
-from .xml_elements import (
-    DCC,
-    SI,
-    XSI,
-    add,
-    add_contact,
-    add_english,
-    add_identifications,
-    add_software,
-    add_text,
-    xml_text,
-)
+from . import xml_elements as xml
+from .acceptance_results import acceptance_results, overall
+from .measurement_results import results_of, uncertainty_statement
+from .xml_elements import element, english, named, optional, text
 
 VERSION = "3.3.0"
 
@@ -74,8 +64,8 @@ def dcc_xml(
         )
     if record.method == REPEATABILITY:
         raise InputError(
-            "a certificate states a scale that is traceable, but this calibration took that of the nominal arm "
-            "(--scale nominal); calibrate with a reference length, or with another observation that fixes the scale."
+            "a certificate cannot be issued: the scale is not traceable (--scale nominal); calibrate with a reference "
+            "length, or with another observation that fixes the scale."
         )
     if not record.plausible_scale:
         raise InputError(
@@ -83,20 +73,25 @@ def dcc_xml(
             "calibrate again."
         )
     _check_evaluation(record, administrative_data, evaluation)
-    _check_texts(record, sources, command)
-    root = Element("dcc:digitalCalibrationCertificate")
-    for name, value in (("xmlns:dcc", DCC), ("xmlns:si", SI), ("xmlns:xsi", XSI)):
-        root.set(name, value)
-    root.set("xsi:schemaLocation", f"{DCC} {DCC}/v{VERSION}/dcc.xsd")
-    root.set("schemaVersion", VERSION)
+    for what, words in _given_texts(record, evaluation, sources, command):
+        held_by_xml(words, what if what == "the command" else f"the name of {what} {words!r}")
     day = _day(record.recording.measured or created)
-    identifier = _add_administrative(add(root, "administrativeData"), record, administrative_data, day, sources)
-    results = add(root, "measurementResults")
-    add_results(results, record, administrative_data, command)
-    if evaluation is not None:
-        add_acceptance(results, evaluation)
-    identifier.text = administrative_data.certificate.number or str(uuid.uuid5(uuid.NAMESPACE_URL, xml_text(root)))
-    return xml_text(root)
+    root = element(
+        "digitalCalibrationCertificate",
+        _administrative(record, administrative_data, day, sources),
+        element(
+            "measurementResults",
+            results_of(record, administrative_data, command),
+            None if evaluation is None else acceptance_results(evaluation),
+        ),
+    )
+    for name, value in (("xmlns:dcc", xml.DCC), ("xmlns:si", xml.SI), ("xmlns:xsi", xml.XSI)):
+        root.set(name, value)
+    root.set("xsi:schemaLocation", f"{xml.DCC} {xml.DCC}/v{VERSION}/dcc.xsd")
+    root.set("schemaVersion", VERSION)
+    number = administrative_data.certificate.number or str(uuid.uuid5(uuid.NAMESPACE_URL, xml.xml_text(root)))
+    next(root.iter("dcc:uniqueIdentifier")).text = number
+    return xml.xml_text(root)
 
 
 def _check_evaluation(
@@ -114,28 +109,26 @@ def _check_evaluation(
         return
     if not same_arm(record.calibrated.arm, evaluation.calibrated.arm):
         raise InputError("the evaluation is of another calibration; evaluate this one.")
-    for name in evaluation.recording.capture.names:
-        held_by_xml(name, f"the name of socket {name!r}")
-    for sphere in evaluation.recording.spheres:
-        held_by_xml(sphere.name, f"the name of sphere {sphere.name!r}")
     simulated |= evaluation.recording.true is not None
     check_conformity(administrative_data, simulated=simulated, decision=overall(evaluation), tested=True)
 
 
-def _check_texts(record: CalibrationRecord, sources: Sequence[str], command: str) -> None:
-    for name in record.recording.capture.names:
-        held_by_xml(name, f"the name of socket {name!r}")
+def _given_texts(
+    record: CalibrationRecord, evaluation: EvaluationRecord | None, sources: Sequence[str], command: str
+) -> Iterator[tuple[str, str]]:
+    """Every text that people gave besides the administrative data, and what it is the name of."""
+    recordings = [record.recording] + ([] if evaluation is None else [evaluation.recording])
+    for recording in recordings:
+        yield from (("socket", name) for name in recording.capture.names)
+        yield from (("sphere", sphere.name) for sphere in recording.spheres)
     for observation in record.recording.capture.observations:
-        for text in texts_of(observation):
-            held_by_xml(text, f"{text!r} of observation {observation.name!r}")
-        held_by_xml(observation.target, f"the name of target {observation.target!r}")
+        yield from (("observation", observation.name), ("target", observation.target))
+        yield from (("a certified value,", quantity.says) for quantity in certified_quantities(observation))
     for removed in record.removed:
-        for name in (removed.group, *removed.members):
-            held_by_xml(name, f"the name of {name!r}, which was left out")
-    held_by_xml(record.recording.nominal.name, f"the name of arm {record.recording.nominal.name!r}")
-    for source in sources:
-        held_by_xml(source, f"the name of file {source!r}")
-    held_by_xml(command, "the command")
+        yield from (("what was left out,", name) for name in (removed.group, *removed.members))
+    yield "arm", record.recording.nominal.name
+    yield from (("file", source) for source in sources)
+    yield "the command", command
 
 
 def _day(created: str) -> datetime.date:
@@ -147,32 +140,48 @@ def _day(created: str) -> datetime.date:
         ) from error
 
 
-def _add_administrative(
-    parent: Element, record: CalibrationRecord, given: AdministrativeData, day: datetime.date, sources: Sequence[str]
+def _administrative(
+    record: CalibrationRecord, given: AdministrativeData, day: datetime.date, sources: Sequence[str]
 ) -> Element:
-    """Fill in the administrative data; returns the element for the unique identifier, still empty."""
-    add_software(parent, "dccSoftware")
-    identifier = _add_core(add(parent, "coreData"), given, day)
-    item = add(add(parent, "items"), "item")
+    """The administrative data, with the unique identifier still empty."""
     name = given.item.name or record.recording.nominal.name or "articulated-arm coordinate measuring machine"
-    add_text(item, "name", name)
-    if given.item.manufacturer is not None:
-        add_text(add(item, "manufacturer"), "name", given.item.manufacturer)
-    if given.item.model is not None:
-        add(item, "model", given.item.model)
+    maker = given.item.manufacturer
     serial = ("manufacturer", given.item.serial_number or NOT_STATED, "Serial number")
-    add_identifications(item, [serial, ("customer", given.item.customer_number, "Customer's number")])
-    laboratory = add(parent, "calibrationLaboratory")
-    if given.laboratory.code is not None:
-        add(laboratory, "calibrationLaboratoryCode", given.laboratory.code)
-    add_contact(laboratory, "contact", given.laboratory)
-    _add_persons(add(parent, "respPersons"), given)
-    add_contact(parent, "customer", given.customer)
-    _add_statements(add(parent, "statements"), record, given, sources)
-    return identifier
+    persons = [
+        element(
+            "respPerson",
+            element("person", text("name", person.name)),
+            optional("role", person.role),
+            element("mainSigner", "true" if person.main_signer else "false"),
+        )
+        for person in given.person
+    ]
+    return element(
+        "administrativeData",
+        xml.software("dccSoftware"),
+        _core(given, day),
+        element(
+            "items",
+            element(
+                "item",
+                text("name", name),
+                None if maker is None else element("manufacturer", text("name", maker)),
+                optional("model", given.item.model),
+                xml.identifications(serial, ("customer", given.item.customer_number, "Customer's number")),
+            ),
+        ),
+        element(
+            "calibrationLaboratory",
+            optional("calibrationLaboratoryCode", given.laboratory.code),
+            xml.contact("contact", given.laboratory),
+        ),
+        element("respPersons", persons or element("respPerson", named("person", NOT_STATED))),
+        xml.contact("customer", given.customer),
+        element("statements", _statements(record, given, sources)),
+    )
 
 
-def _add_core(core: Element, administrative_data: AdministrativeData, day: datetime.date) -> Element:
+def _core(administrative_data: AdministrativeData, day: datetime.date) -> Element:
     given = administrative_data.certificate
     begin = given.begin or given.end or day
     end = given.end or max(day, begin)
@@ -185,56 +194,40 @@ def _add_core(core: Element, administrative_data: AdministrativeData, day: datet
         raise InputError(
             f"certificate.issued is {given.issued}, before the calibration ended on {end}; correct it, or state end."
         )
-    add(core, "countryCodeISO3166_1", administrative_data.country)
-    add(core, "usedLangCodeISO639_1", "en")
-    add(core, "mandatoryLangCodeISO639_1", "en")
-    identifier = add(core, "uniqueIdentifier")
-    if given.received is not None:
-        add(core, "receiptDate", given.received.isoformat())
-    add(core, "beginPerformanceDate", begin.isoformat())
-    add(core, "endPerformanceDate", end.isoformat())
-    add(core, "performanceLocation", given.place)
-    if given.issued is not None:
-        add(core, "issueDate", given.issued.isoformat())
-    return identifier
+    return element(
+        "coreData",
+        element("countryCodeISO3166_1", administrative_data.country),
+        element("usedLangCodeISO639_1", "en"),
+        element("mandatoryLangCodeISO639_1", "en"),
+        element("uniqueIdentifier"),
+        optional("receiptDate", given.received and given.received.isoformat()),
+        element("beginPerformanceDate", begin.isoformat()),
+        element("endPerformanceDate", end.isoformat()),
+        element("performanceLocation", given.place),
+        optional("issueDate", given.issued and given.issued.isoformat()),
+    )
 
 
-def _add_persons(parent: Element, given: AdministrativeData) -> None:
-    for person in given.person:
-        element = add(parent, "respPerson")
-        add_text(add(element, "person"), "name", person.name)
-        if person.role is not None:
-            add(element, "role", person.role)
-        add(element, "mainSigner", "true" if person.main_signer else "false")
-    if not given.person:
-        add_english(add(add(parent, "respPerson"), "person"), "name", NOT_STATED)
-
-
-def _add_statements(
-    parent: Element, record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str]
-) -> None:
+def _statements(record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str]) -> Iterator[Element]:
     if record.recording.true is not None:
-        _add_statement(parent, "Simulation", "The readings are simulated, so this is no certificate of a real arm.")
-    _add_statement(parent, "Scale", _scale(record))
-    _add_statement(parent, "Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
+        yield _statement("Simulation", "The readings are simulated, so this is no certificate of a real arm.")
+    yield _statement("Scale", _scale(record))
+    yield _statement("Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
-        _add_statement(parent, "Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
-    for sentence, removed in zip(removals(record), record.removed, strict=True):
-        all_of_it = f"{sentence} Sockets and observations left out: {', '.join(removed.members)}."
-        _add_statement(parent, "Data left out", all_of_it)
-    for sentence in of_calibration(record):
-        if sentence not in removals(record):
-            _add_statement(parent, "Warning", sentence)
+        yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
+    left_out = removals(record)
+    for sentence, removed in zip(left_out, record.removed, strict=True):
+        members = f"Sockets and observations left out: {', '.join(removed.members)}."
+        yield _statement("Data left out", f"{sentence} {members}")
+    yield from (_statement("Warning", words) for words in of_calibration(record) if words not in left_out)
     if sources:
-        _add_statement(parent, "Files", ", ".join(sources))
+        yield _statement("Files", ", ".join(sources))
     if given.conformity is not None:
-        conformity = given.conformity
-        statement = _add_statement(parent, "Conformity", conformity.decision_rule, norm=conformity.specification)
-        add(statement, "conformity", conformity.verdict)
+        stated = given.conformity
+        verdict = element("conformity", stated.verdict)
+        yield _statement("Conformity", stated.decision_rule, verdict, norm=stated.specification)
     if given.certificate.remarks is not None:
-        statement = add(parent, "statement")
-        add_english(statement, "name", "Remarks")
-        add_text(statement, "declaration", given.certificate.remarks)
+        yield named("statement", "Remarks", text("declaration", given.certificate.remarks))
 
 
 def _scale(record: CalibrationRecord) -> str:
@@ -250,10 +243,5 @@ def _scale(record: CalibrationRecord) -> str:
     )
 
 
-def _add_statement(parent: Element, name: str, text: str, *, norm: str | None = None) -> Element:
-    statement = add(parent, "statement")
-    add_english(statement, "name", name)
-    if norm is not None:
-        add(statement, "norm", norm)
-    add_english(statement, "declaration", text)
-    return statement
+def _statement(name: str, words: str, verdict: Element | None = None, *, norm: str | None = None) -> Element:
+    return named("statement", name, optional("norm", norm), english("declaration", words), verdict)

@@ -1,7 +1,7 @@
-"""The measurement results of a certificate: the same readings as found (nominal arm) and as left (calibrated arm)."""
+"""The measurement results of a certificate: the same readings by the nominal and by the calibrated parameters."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
@@ -10,40 +10,29 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..data.capture import ReferenceLength
-from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals
+from ..data.observations.observation import Quantity, certified_quantities
+from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import Arm, parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
 from ..summaries.calibration import prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .observation_results import add_observation_equipment, add_observations
-from .xml_elements import (
-    CELSIUS,
-    LEVEL,
-    MILLIMETRE,
-    ONE,
-    RADIAN,
-    add,
-    add_english,
-    add_identifications,
-    add_real,
-    add_row,
-    add_software,
-    add_text,
-    decimals_of,
-)
+from . import xml_elements as xml
+from .xml_elements import LEVEL, MILLIMETRE, ONE, RADIAN, element, english, named, optional, real, text
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
 _METRICS = {
-    "DE": "Mean distance of the tip from its mean position in the socket",
-    "Deltam": "Largest half range of a coordinate of the tip in a socket",
-    "RMS": "Root mean square distance of the tip from its mean position in the socket",
+    "DE": ("de", "Mean distance of the tip from its mean position in the socket"),
+    "Deltam": ("deltam", "Largest half range of a coordinate of the tip in a socket"),
+    "RMS": ("rms", "Root mean square distance of the tip from its mean position in the socket"),
 }
-
-
-_DECIMALS = 5  # of mm without an uncertainty
+_FIXED_SCALE = (
+    "This length fixed the scale, so that the arm measures it as calibrated by construction; no error was measured."
+)
+_DECIMALS = {MILLIMETRE: 5, ONE: 3, RADIAN: 8}  # of what has no uncertainty
 _SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared as one
+_D_SI = {"mm": MILLIMETRE, "rad": RADIAN, "m": r"\metre", "kN": r"\kilo\newton", "K": r"\kelvin"}
 
 
 class _Stage(NamedTuple):
@@ -52,24 +41,29 @@ class _Stage(NamedTuple):
     description: str
     arm: Arm
     evaluation: Evaluation
+    left: bool  # of the calibrated arm
 
 
-_D_SI = {"mm": MILLIMETRE, "rad": RADIAN, "m": r"\metre", "kN": r"\kilo\newton", "K": r"\kelvin"}
-
-
-def add_results(
-    parent: Element, record: CalibrationRecord, administrative_data: AdministrativeData, command: str
-) -> None:
-    """Add both measurement results of a calibration."""
+def results_of(record: CalibrationRecord, given: AdministrativeData, command: str) -> Iterator[Element]:
+    """Both measurement results of a calibration."""
     evaluations, residuals = record.evaluations(), observation_residuals(record)
-    found = "The readings, evaluated with the nominal parameters, those before the calibration."
-    left = "The same readings, evaluated with the calibrated parameters, which were identified from them."
+    before = "The readings, evaluated with the nominal parameters, those before the calibration."
+    after = "The same readings, evaluated with the calibrated parameters, which were identified from them."
+    nominal, calibrated = record.recording.nominal.arm, record.calibrated.arm
     for stage in (
-        _Stage("As found", "beforeAdjustment", found, record.recording.nominal.arm, evaluations["nominal"]),
-        _Stage("As left", "afterAdjustment", left, record.calibrated.arm, evaluations["calibrated"]),
+        _Stage("As found", "beforeAdjustment", before, nominal, evaluations["nominal"], False),
+        _Stage("As left", "afterAdjustment", after, calibrated, evaluations["calibrated"], True),
     ):
-        measurement = add(parent, "measurementResult")
-        _add_measurement(measurement, record, administrative_data, stage, command, residuals)
+        yield named(
+            "measurementResult",
+            stage.name,
+            _methods(record, residuals),
+            xml.software("usedSoftware", command),
+            element("measuringEquipments", _equipment(record, given.reference, residuals)),
+            element("influenceConditions", _temperature(given, stage)),
+            element("results", _results(record, stage, residuals)),
+            says=stage.description,
+        )
 
 
 def uncertainty_statement(record: CalibrationRecord) -> str:
@@ -98,43 +92,7 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
     )
 
 
-def _add_measurement(
-    measurement: Element,
-    record: CalibrationRecord,
-    given: AdministrativeData,
-    stage: _Stage,
-    command: str,
-    residuals: tuple[ObservationResiduals, ...],
-) -> None:
-    add_english(measurement, "name", stage.name)
-    add_english(measurement, "description", stage.description)
-    capture = record.recording.capture
-    lengths = capture.lengths
-    _add_methods(add(measurement, "usedMethods"), record, residuals)
-    add_software(measurement, "usedSoftware", command)
-    equipments = add(measurement, "measuringEquipments")
-    _add_references(equipments, given.reference)
-    if lengths:
-        _add_length_equipment(equipments, lengths, any_artefact_stated=bool(given.reference))
-    add_observation_equipment(equipments, residuals, any_artefact_stated=bool(given.reference))
-    _add_conditions(add(measurement, "influenceConditions"), given, stage)
-    results = add(measurement, "results")
-    uncertainty = uncertainty_of(record)
-    _add_repeatability(results, stage)
-    left = stage.name == "As left"
-    if lengths:
-        _add_lengths(results, lengths, stage, uncertainty, fixed_scale=left and record.fixed_by_one_length)
-    if not record.sockets_alone:
-        data = _add_result(results, "Observations", "Distances of the tip from the geometry of each observation.")
-        add_observations(data, residuals, distances_of(capture, stage.evaluation), left)
-    _add_parameters(results, record, stage, uncertainty)
-    if left:
-        _add_covariance(results, record)
-    if left and not math.isnan(record.k):
-        _add_scale(results, record, uncertainty)
-
-
-def _add_methods(parent: Element, record: CalibrationRecord, residuals: tuple[ObservationResiduals, ...]) -> None:
+def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, ...]) -> Element:
     capture = record.recording.capture
     poses = f"Number of sockets in which the tip was seated: {len(capture.sizes)}; of poses: {sum(capture.sizes)}; of "
     lengths = f"reference lengths between sockets: {len(capture.lengths)}"
@@ -160,71 +118,122 @@ def _add_methods(parent: Element, record: CalibrationRecord, residuals: tuple[Ob
         words += (
             f" Left out, because they contradict the rest by an F test: {groups}; see the statements on data left out."
         )
-    method = add(parent, "usedMethod")
-    add_english(method, "name", "Identification of Denavit-Hartenberg parameters")
-    add_english(method, "description", words)
-    method = add(parent, "usedMethod", ref_type="basic_methodMeasurementUncertainty")
-    add_english(method, "name", "Evaluation of measurement uncertainty")
-    add_english(method, "description", uncertainty_statement(record))
-    add(method, "norm", "JCGM 100:2008")
+    statement = uncertainty_statement(record)
+    return element(
+        "usedMethods",
+        xml.method("Identification of Denavit-Hartenberg parameters", words),
+        xml.method("Evaluation of measurement uncertainty", statement, "JCGM 100:2008", of_uncertainty=True),
+    )
 
 
-def _add_references(parent: Element, references: Sequence[Reference]) -> None:
+def _equipment(
+    record: CalibrationRecord, references: Sequence[Reference], residuals: tuple[ObservationResiduals, ...]
+) -> Iterator[Element]:
+    """The reference artefacts, the reference lengths, and the artefacts and instruments behind observations, with
+    certified values and uncertainties as they were given."""
     for reference in references:
-        equipment = add(parent, "measuringEquipment")
-        add_text(equipment, "name", reference.name)
-        if reference.manufacturer is not None:
-            add_text(add(equipment, "manufacturer"), "name", reference.manufacturer)
-        if reference.model is not None:
-            add(equipment, "model", reference.model)
-        serial = ("manufacturer", reference.serial_number, "Serial number")
-        certificate = ("other", reference.certificate_number, "Number of its calibration certificate")
-        add_identifications(equipment, [serial, certificate])
+        maker = reference.manufacturer
+        yield element(
+            "measuringEquipment",
+            text("name", reference.name),
+            None if maker is None else element("manufacturer", text("name", maker)),
+            optional("model", reference.model),
+            xml.identifications(
+                ("manufacturer", reference.serial_number, "Serial number"),
+                ("other", reference.certificate_number, "Number of its calibration certificate"),
+            ),
+        )
+    lengths = record.recording.capture.lengths
+    if lengths:
+        named_lengths = ((_length_name(i, length), length) for i, length in enumerate(lengths, start=1))
+        quantities = (
+            xml.equipment_quantity(name, float(length.value), MILLIMETRE, float(length.u))
+            for name, length in named_lengths
+        )
+        quantities = element("measuringEquipmentQuantities", quantities)
+        unknown = "" if references else f"Artefact: {NOT_STATED}"
+        yield named("measuringEquipment", "Reference lengths", quantities, says=unknown)
+    # Observations with the same certified values are of one artefact in several placements, which is named once.
+    equipment: dict[tuple, tuple[list[str], str, list[Quantity]]] = {}
+    for part in residuals:
+        observation, measured = part.observation, _measured(part)
+        certified = list(certified_quantities(observation))
+        key = tuple((quantity.says, *np.asarray(quantity.values).tolist(), quantity.u) for quantity in certified)
+        if certified or measured:
+            where = (observation.kind, *(key if certified and not measured else (observation.name,)))
+            names, _, _ = equipment.setdefault(where, ([], observation.kind, [*certified, *measured]))
+            names.append(observation.name)
+    unknown = "" if references else f"; artefact or instrument: {NOT_STATED}"
+    for names, kind, quantities in equipment.values():
+        yield element(
+            "measuringEquipment",
+            text("name", ", ".join(names)),
+            english("description", f"Kind of observation: {kind}{unknown}"),
+            element("measuringEquipmentQuantities", map(_numbers_of, quantities)),
+        )
 
 
-def _add_length_equipment(parent: Element, lengths: Sequence[ReferenceLength], any_artefact_stated: bool) -> None:
-    equipment = add(parent, "measuringEquipment")
-    add_english(equipment, "name", "Reference lengths")
-    if not any_artefact_stated:
-        add_english(equipment, "description", f"Artefact: {NOT_STATED}")
-    quantities = add(equipment, "measuringEquipmentQuantities")
-    for number, length in enumerate(lengths, start=1):
-        quantity = add(quantities, "measuringEquipmentQuantity")
-        add_text(quantity, "name", _length_name(number, length))
-        add_real(quantity, float(length.value), MILLIMETRE, float(length.u))
+def _measured(part: ObservationResiduals) -> list[Quantity]:
+    """The standard uncertainties of what an instrument measured, as they were given."""
+    stated = {
+        "standard uncertainty of a measured coordinate or distance": (part.u or None, "mm"),
+        "standard uncertainty of a measured orientation about each axis": (part.u_angle, "rad"),
+    }
+    return [Quantity(says, np.array([u]), unit) for says, (u, unit) in stated.items() if u is not None]
 
 
-def _add_conditions(parent: Element, given: AdministrativeData, stage: _Stage) -> None:
-    condition = add(parent, "influenceCondition")
-    add_english(condition, "name", "Ambient temperature")
-    add(condition, "status", stage.status)
-    data = add(condition, "data")
-    if given.certificate.temperature_celsius is None:
-        add_english(data, "text", NOT_STATED)
-        return
-    quantity = add(data, "quantity")
-    add_english(quantity, "name", "Ambient temperature")
-    add_real(quantity, given.certificate.temperature_celsius, CELSIUS, given.certificate.temperature_u_celsius)
+def _numbers_of(quantity: Quantity) -> list[Element]:
+    """A quantity, with each of its numbers on its own."""
+    count = len(quantity.values)
+    labels = [""] if count == 1 else [f", {axis}" for axis in ("xyz" if count == 3 else range(1, count + 1))]
+    return [
+        xml.equipment_quantity(quantity.says + label, float(value), _in_d_si(quantity.unit), quantity.u)
+        for label, value in zip(labels, quantity.values, strict=True)
+    ]
 
 
-def _add_result(parent: Element, name: str, description: str) -> Element:
-    result = add(parent, "result")
-    add_english(result, "name", name)
-    add_english(result, "description", description)
-    return add(result, "data")
+def _temperature(given: AdministrativeData, stage: _Stage) -> Element:
+    name, celsius = "Ambient temperature", given.certificate.temperature_celsius
+    data = english("text", NOT_STATED)
+    if celsius is not None:
+        data = named("quantity", name, real(celsius, xml.CELSIUS, given.certificate.temperature_u_celsius))
+    return named("influenceCondition", name, element("status", stage.status), element("data", data))
 
 
-def _add_repeatability(results: Element, stage: _Stage) -> None:
-    found = stage.evaluation.repeatability
-    metrics = {"DE": float(found.de), "Deltam": float(found.deltam), "RMS": float(found.rms)}
-    if not all(map(math.isfinite, metrics.values())):  # one pose in every socket
-        return
-    data = _add_result(results, "Repeatability", "Over all sockets with more than one pose.")
-    for name, value in metrics.items():
-        quantity = add(data, "quantity")
-        add_english(quantity, "name", name)
-        add_english(quantity, "description", _METRICS[name])
-        add_real(quantity, value, MILLIMETRE, decimals=_DECIMALS)
+def _results(
+    record: CalibrationRecord, stage: _Stage, residuals: tuple[ObservationResiduals, ...]
+) -> Iterator[Element | None]:
+    uncertainty = uncertainty_of(record)
+    yield _repeatability(stage)
+    if record.recording.capture.lengths:
+        yield _lengths(record, stage, uncertainty)
+    if not record.sockets_alone:
+        distances = distances_of(record.recording.capture, stage.evaluation)
+        rows = (
+            _observation(number, part, of_arm, stage.left)
+            for number, (part, of_arm) in enumerate(zip(residuals, distances, strict=True), start=1)
+        )
+        yield _result("Observations", "Distances of the tip from the geometry of each observation.", rows)
+    yield _parameters(record, stage, uncertainty)
+    if stage.left:
+        yield _covariance(record)
+        yield None if math.isnan(record.k) else _scale(record, uncertainty)
+
+
+def _result(name: str, description: str, *data: Element | Iterator[Element]) -> Element:
+    return named("result", name, element("data", *data), says=description)
+
+
+def _repeatability(stage: _Stage) -> Element | None:
+    """Metrics of repeatability; none where every socket has one pose."""
+    values = {name: float(getattr(stage.evaluation.repeatability, key)) for name, (key, _) in _METRICS.items()}
+    if not all(map(math.isfinite, values.values())):
+        return None
+    quantities = (
+        named("quantity", name, real(value, MILLIMETRE, decimals=_DECIMALS[MILLIMETRE]), says=_METRICS[name][1])
+        for name, value in values.items()
+    )
+    return _result("Repeatability", "Over all sockets with more than one pose.", quantities)
 
 
 def _length_name(number: int, length: ReferenceLength) -> str:
@@ -232,97 +241,103 @@ def _length_name(number: int, length: ReferenceLength) -> str:
     return f"{number}: {length.start} - {length.end}"
 
 
-def _add_lengths(
-    results: Element, lengths: Sequence[ReferenceLength], stage: _Stage, uncertainty: Uncertainty, fixed_scale: bool
-) -> None:
-    data = _add_result(
-        results,
-        "Reference lengths",
-        "An error is the measured value minus the calibrated one; its uncertainty is that of the calibrated value and "
-        "of the scatter of the poses at both ends.",
-    )
+def _lengths(record: CalibrationRecord, stage: _Stage, uncertainty: Uncertainty) -> Element:
+    """Value, measured value and error of each length; of one that fixed the scale the value alone."""
+    lengths, fixed_scale = record.recording.capture.lengths, stage.left and record.fixed_by_one_length
     columns = [np.asarray(column) for column in (stage.evaluation.measured, stage.evaluation.error, stage.evaluation.u)]
     stated = np.array([float(length.u) for length in lengths])
     columns.append(uncertainty.expanded_by_scatter(columns[2], stated, LEVEL))
-    for number, (length, measured, error, error_u, expanded) in enumerate(zip(lengths, *columns, strict=True), start=1):
-        factor = float(expanded / error_u) if _is_known(float(error_u)) else None
-        row = add(data, "list")
-        add_text(row, "name", _length_name(number, length))
-        decimals = decimals_of(float(expanded)) if factor is not None else _DECIMALS
+    rows = []
+    for number, (length, *values) in enumerate(zip(lengths, *columns, strict=True), start=1):
+        measured, error, u, expanded = map(float, values)
+        factor = expanded / u if _is_known(u) else None
+        decimals = _DECIMALS[MILLIMETRE] if factor is None else xml.decimals_of(expanded)
         # The reference has the uncertainty of its own certificate, not that of this calibration's coverage factor.
-        values = [
-            ("calibrated value", "basic_referenceValue", length.value, float(length.u), None),
-            ("measured value", "basic_measuredValue", measured, math.nan, decimals),
-            ("error", "basic_measurementError", error, float(error_u), decimals),
-        ]
+        exact, construction = "" if length.u else "Taken as exact", None
+        reference = real(float(length.value), MILLIMETRE, float(length.u) or None)
+        quantities = [named("quantity", "calibrated value", reference, says=exact, ref_type="basic_referenceValue")]
         if fixed_scale:
-            add_english(
-                row,
-                "description",
-                "This length fixed the scale, so that the arm measures it as calibrated by construction; no error was "
-                "measured.",
-            )
-            values = values[:1]
-        for name, ref_type, value, u, digits in values:
-            quantity = add(row, "quantity", ref_type=ref_type)
-            add_english(quantity, "name", name)
-            if name == "calibrated value" and u == 0:
-                add_english(quantity, "description", "Taken as exact")
-            scale = None if digits is None else factor
-            add_real(quantity, float(value), MILLIMETRE, u if _is_known(u) else None, scale, digits)
+            construction = english("description", _FIXED_SCALE)
+        else:
+            by_arm = real(measured, MILLIMETRE, decimals=decimals)
+            of_error = real(error, MILLIMETRE, u if _is_known(u) else None, factor, decimals)
+            quantities += [
+                named("quantity", "measured value", by_arm, ref_type="basic_measuredValue"),
+                named("quantity", "error", of_error, ref_type="basic_measurementError"),
+            ]
+        rows.append(element("list", text("name", _length_name(number, length)), construction, quantities))
+    return _result(
+        "Reference lengths",
+        "An error is the measured value minus the calibrated one; its uncertainty is that of the calibrated value and "
+        "of the scatter of the poses at both ends.",
+        *rows,
+    )
 
 
-def _add_parameters(results: Element, record: CalibrationRecord, stage: _Stage, uncertainty: Uncertainty) -> None:
-    data = _add_result(
-        results,
-        "Denavit-Hartenberg parameters",
-        "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
-        "last frame."
-        + (
-            ""
-            if stage.arm.corrections is None
-            else " To theta (d of a prismatic joint) each joint correction adds its "
-            "coefficient times a known function of the readings; gravity is its direction in the base frame."
+def _observation(number: int, part: ObservationResiduals, distances: np.ndarray, left: bool) -> Element:
+    """Residuals of an observation: in mm, and of the calibrated arm (``left``) in standard deviations too."""
+    values = [("RMS residual", rms(part.distance if left else distances), MILLIMETRE)]
+    if left:
+        values.append(("RMS residual in standard deviations", rms(part.normalised), ONE))
+        if part.angle is not None:
+            values.append(("RMS residual of the orientation", rms(part.angle), RADIAN))
+    target = f", tip: {part.observation.target}" if part.observation.target else ""
+    return element(
+        "list",
+        text("name", f"{number}: {part.observation.name}"),  # numbered, since names may contain anything
+        text("description", f"{part.observation.kind}{target}; {len(part.distance)} poses"),
+        (
+            named("quantity", name, real(value, unit, decimals=_DECIMALS[unit]))
+            for name, value, unit in values
+            if math.isfinite(value)
         ),
     )
+
+
+def _parameters(record: CalibrationRecord, stage: _Stage, uncertainty: Uncertainty) -> Element:
     factors = dict(zip(record.names, map(float, uncertainty.factor(LEVEL)), strict=True))
+    quantities = []
     for name, value in _values(stage.arm).items():
-        note, u = "", None
-        factor = factors.get(name)
-        if stage.name == "As left":
-            note, u = _note_and_uncertainty(record, name)
-        quantity = add(data, "quantity")
-        add_english(quantity, "name", name)
-        if note:
-            add_english(quantity, "description", note)
-        add_real(quantity, value, _in_d_si(parameter_unit(stage.arm, name)), u, factor)
+        note, u = _note_and_uncertainty(record, name) if stage.left else ("", None)
+        measured = real(value, _in_d_si(parameter_unit(stage.arm, name)), u, factors.get(name))
+        quantities.append(named("quantity", name, measured, says=note))
+    corrections = (
+        " To theta (d of a prismatic joint) each joint correction adds its coefficient times a known function of the "
+        "readings; gravity is its direction in the base frame."
+    )
+    return _result(
+        "Denavit-Hartenberg parameters",
+        "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
+        "last frame." + ("" if stage.arm.corrections is None else corrections),
+        *quantities,
+    )
 
 
 def _in_d_si(unit: str) -> str:
     """A unit such as "rad/(kN m)" in D-SI, with factors below the stroke as negative powers."""
     above, _, below = unit.partition("/")
     factors = [] if above == "1" else [_D_SI[above]]
-    return "".join([*factors, *(_D_SI[one] + r"\tothe{-1}" for one in below.strip("()").split())]) or ONE
+    return "".join([*factors, *(_D_SI[factor] + r"\tothe{-1}" for factor in below.strip("()").split())]) or ONE
 
 
-def _add_covariance(results: Element, record: CalibrationRecord) -> None:
+def _covariance(record: CalibrationRecord) -> Element | None:
     """The covariance matrix of the parameters that have an uncertainty of their own, a row each."""
-    own = [i for i, name in enumerate(record.names) if _note_and_uncertainty(record, name)[1] is not None]
-    if not own:
-        return
-    data = _add_result(
-        results,
+    index = [i for i, name in enumerate(record.names) if _note_and_uncertainty(record, name)[1] is not None]
+    if not index:
+        return None
+    units = [_in_d_si(parameter_unit(record.calibrated.arm, record.names[i])) for i in index]
+    covariance = np.asarray(record.covariance)[np.ix_(index, index)]
+    rows = []
+    for i, values, unit in zip(index, covariance.tolist(), units, strict=True):
+        products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
+        rows.append(xml.table_row(record.names[i], values, products))
+    return _result(
         "Covariance matrix",
         "Of the parameters with an uncertainty of their own, a row each, columns in the same order. The diagonal has "
         "the squares of the standard uncertainties. Expanded uncertainties elsewhere are rounded; what is computed of "
         "several parameters needs this table.",
+        named("list", "Covariance", rows),
     )
-    table = add(data, "list")
-    add_english(table, "name", "Covariance")
-    units = [_in_d_si(parameter_unit(record.calibrated.arm, record.names[i])) for i in own]
-    for row, unit in zip(own, units, strict=True):
-        products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
-        add_row(table, record.names[row], np.asarray(record.covariance)[row, own].tolist(), products)
 
 
 def _values(arm: Arm) -> dict[str, float]:
@@ -345,12 +360,11 @@ def _note_and_uncertainty(record: CalibrationRecord, name: str) -> tuple[str, fl
     return "", u
 
 
-def _add_scale(results: Element, record: CalibrationRecord, uncertainty: Uncertainty) -> None:
-    description = "Reference lengths as the arm measured them before its scale was set, over their calibrated values."
-    quantity = add(_add_result(results, "Scale", description), "quantity")
-    add_english(quantity, "name", "k")
+def _scale(record: CalibrationRecord, uncertainty: Uncertainty) -> Element:
     u = record.u_k if _is_known(record.u_k) else None
-    add_real(quantity, record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
+    k = real(record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
+    description = "Reference lengths as the arm measured them before its scale was set, over their calibrated values."
+    return _result("Scale", description, named("quantity", "k", k))
 
 
 def _is_known(u: float) -> bool:

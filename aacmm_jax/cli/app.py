@@ -1,12 +1,13 @@
-"""What all commands share: the application, common arguments and options, checks, and how results are printed."""
+"""What all commands share: the application, how options are declared, options of several commands, and printing."""
 
 import contextlib
 import csv
+import inspect
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, get_args, get_type_hints
+from typing import Any, NoReturn, get_args
 
 import typer
 import typer.core
@@ -14,6 +15,7 @@ import typer.core
 from ..core.backend import prepare_command
 from ..core.errors import InputError
 from ..core.text import in_short, is_control, is_number, number, printable, quoted
+from ..core.x64 import LARGEST_INTEGER
 
 
 class _Commands(typer.core.TyperGroup):
@@ -52,97 +54,61 @@ app = typer.Typer(
     "aacmm did not write. Start with: aacmm demo",
 )
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, and nothing else.")]
 
-Only = Annotated[
-    list[str] | None,
-    typer.Option("--only", metavar="PATTERN", help="Use only the sockets that match this shell pattern; repeatable."),
-]
+def argument(metavar: str, help: str, default: Any = ...) -> Any:
+    """An argument of a command, as the default of the function's parameter."""
+    return typer.Argument(default, metavar=metavar, help=help)
 
-Without = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--without", metavar="PATTERN", help="Leave out the sockets that match this shell pattern; repeatable."
-    ),
-]
 
-KEPT = " An existing file that aacmm did not write is kept unless --overwrite."  # of what -o names
+def option(metavar: str | None, help: str, *names: str, default: Any = None, **limits: Any) -> Any:
+    """An option of a command: the word for its value (None: its choices), what it does, and its names if they are not
+    the parameter's."""
+    return typer.Option(default, *names, metavar=metavar, help=help, **limits)
 
-CaptureOutput = Annotated[
-    Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Capture to write (HDF5)." + KEPT)
-]
 
-NominalArm = Annotated[
-    str,
-    typer.Argument(
-        metavar="ARM",
-        help="Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.",
-    ),
-]
+def flag(name: str, help: str) -> Any:
+    """An option without a value."""
+    return typer.Option(False, name, help=help)
 
-BaseLink = Annotated[
-    str | None,
-    typer.Option("--base", metavar="LINK", help="Of a URDF: the link that does not move. Default: its root."),
-]
 
-TipLink = Annotated[
-    str | None,
-    typer.Option(
-        "--tip", metavar="LINK", help="Of a URDF: the link at the end. Default: the only one with no link after it."
-    ),
-]
+def output(metavar: str, help: str, default: Any = ...) -> Any:
+    """The option -o."""
+    kept = " An existing file that aacmm did not write is kept unless --overwrite."
+    return option(metavar, help + kept, "--output", "-o", default=default)
 
-EncoderNoise = Annotated[
-    float, typer.Option("--encoder-arcsec", min=0, metavar="ARCSEC", help="Standard deviation of a joint reading.")
-]
 
-KnownEncoderNoise = Annotated[
-    float | None,
-    typer.Option(
-        "--encoder-arcsec",
-        min=0,
-        metavar="ARCSEC",
-        help="Known standard deviation of a joint reading, for the weights. Default: estimated.",
-    ),
-]
+def seed(of: str) -> Any:
+    """The option --seed."""
+    return option("N", f"Seed of {of}.", default=0, min=0, max=LARGEST_INTEGER)
 
-KnownSeatingNoise = Annotated[
-    float | None,
-    typer.Option(
-        "--seating-mm",
-        min=0,
-        metavar="MM",
-        help="Known standard deviation of the tip in its socket, for each coordinate. Default: estimated.",
-    ),
-]
 
-LinearEncoderNoise = Annotated[
-    float | None,
-    typer.Option(
-        "--linear-encoder-mm",
-        min=0,
-        metavar="MM",
-        help="The same of prismatic joints. Default: what the other encoders are at a distance of 1 m.",
-    ),
-]
-
-SeatingNoise = Annotated[
-    float,
-    typer.Option(
-        "--seating-mm", min=0, metavar="MM", help="Standard deviation of the tip in its socket, for each coordinate."
-    ),
-]
-
-ReferenceLengths = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--length",
-        metavar="A,B[,U]",
-        help="Reference length between two sockets, u in mm; repeatable. Quote a name with a comma: '\"a, b\",C'.",
-    ),
-]
-
-CalibrationFile = Annotated[Path, typer.Argument(metavar="CALIBRATION.h5", help="Calibration, written by calibrate.")]
+JSON = flag("--json", "Print one JSON object on standard output, and nothing else.")
+ONLY = option("PATTERN", "Use only the sockets that match this shell pattern; repeatable.")
+WITHOUT = option("PATTERN", "Leave out the sockets that match this shell pattern; repeatable.")
+CAPTURE_OUTPUT = output("FILE.h5", "Capture to write (HDF5).")
+NOMINAL_ARM = argument(
+    "ARM", "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm."
+)
+BASE_LINK = option("LINK", "Link of a URDF that does not move. Default: its root.", "--base")
+TIP_LINK = option("LINK", "Link at the end of a URDF. Default: the only one with no link after it.", "--tip")
+_ENCODER = "the standard deviation of a joint reading"
+_SEATING = "the standard deviation of the tip in its socket, for each coordinate"
+_ESTIMATED, _OF_CLASS = "Default: estimated.", "Default: the arm file's [noise], or that of the arm's class."
+ENCODER_NOISE = option("ARCSEC", f"Set {_ENCODER}.", default=0.0, min=0)
+SEATING_NOISE = option("MM", f"Set {_SEATING}.", default=0.0, min=0)
+KNOWN_ENCODER_NOISE = option("ARCSEC", f"State {_ENCODER}, for the weights. {_ESTIMATED}", min=0)
+KNOWN_SEATING_NOISE = option("MM", f"State {_SEATING}. {_ESTIMATED}", min=0)
+USUAL_ENCODER_NOISE = option("ARCSEC", f"Assume {_ENCODER}. {_OF_CLASS}", min=0)
+USUAL_SEATING_NOISE = option("MM", f"Assume {_SEATING}. {_OF_CLASS}", min=0)
+LINEAR_ENCODER_NOISE = option(
+    "MM", "Do the same for prismatic joints. Default: what the other encoders are at a distance of 1 m.", min=0
+)
+REFERENCE_LENGTHS = option(
+    "A,B[,U]",
+    "Reference length between two sockets, u in mm; repeatable. Quote a name with a comma: '\"a, b\",C'.",
+    "--length",
+)
+CALIBRATION_FILE = argument("CALIBRATION.h5", "Calibration, written by calibrate.")
 
 
 def examples(*commands: str) -> str:
@@ -163,9 +129,7 @@ def _version(wanted: bool) -> bool:
 
 @app.callback()
 def prepare(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     """Calibrate articulated-arm coordinate measuring machines and other serial arms."""
 
@@ -188,12 +152,14 @@ def with_spinner(what: str, work: Callable[[], Any]) -> Any:
         return work()
 
 
-def show_summary(summary: dict[str, Any], as_json: bool, display: Callable[[dict[str, Any]], None]) -> None:
-    """Print a summary as JSON, or with the function that prints it for people."""
+def show_summary(summary: dict[str, Any], as_json: bool, view: Callable[[dict[str, Any]], Iterable]) -> None:
+    """Print a summary as JSON, or what people see of it."""
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
-    else:
-        display(_printable(summary))
+        return
+    from .display import display
+
+    display(view(_printable(summary)))
 
 
 def _printable(item: Any) -> Any:
@@ -211,13 +177,12 @@ def check_numbers(arguments: Sequence[str]) -> None:
     if command is None:
         return
     numeric = set()
-    for name, hint in get_type_hints(command, include_extras=True).items():
-        inner = {kind for part in (hint, *get_args(hint)) for kind in (part, *get_args(part))}
-        if inner & {int, float} or any({int, float} & set(get_args(kind)) for kind in inner):
-            named = [text for item in inner for text in getattr(item, "param_decls", None) or ()]
-            numeric |= set(named or [f"--{name.replace('_', '-')}"])
-    for option, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        name, equals, value = option.partition("=")
+    for name, parameter in inspect.signature(command).parameters.items():
+        kinds = {parameter.annotation, *get_args(parameter.annotation)}
+        if {int, float} & {kind for outer in kinds for kind in (outer, *get_args(outer))}:
+            numeric |= set(parameter.default.param_decls or [f"--{name.replace('_', '-')}"])
+    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
         value = value if equals else following
         if name in numeric and _is_pythons(value) and not (is_number(value) and math.isfinite(float(value))):
             raise InputError(f"{name} {quoted(value)} is not a finite number; write plain decimal digits.")
@@ -233,6 +198,19 @@ def _is_pythons(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def numbers_option(name: str, text: str, form: str, count: int | None = None) -> tuple[float, ...]:
+    """Finite numbers that an option lists, separated by commas."""
+    try:
+        values = tuple(number(part.strip()) for part in text.split(","))
+    except ValueError:
+        bad_option(name, text, form)
+    if count not in (None, len(values)):
+        bad_option(name, text, form)
+    if not all(map(math.isfinite, values)):
+        raise InputError(f"{name} '{text}' holds a value that is not finite; give finite numbers.")
+    return values
 
 
 def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
@@ -269,16 +247,16 @@ def length_option(text: str) -> tuple:
         bad_option("--length", text, "A,B or A,B,U with u in mm")
 
 
+def bad_option(option: str, text: str, form: str) -> NoReturn:
+    """Refuse the value of an option."""
+    raise InputError(f"{option} '{text}' is not of the form {form}.")
+
+
 def warn_of_unusable(calibration: Path, record: Any) -> None:
     """Say on standard error that a calibration did not converge, or ended with a residual that no arm has."""
     if not record.converged or record.implausible_residual:
         reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
         typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
-
-
-def bad_option(option: str, text: str, form: str) -> NoReturn:
-    """Refuse the value of an option."""
-    raise InputError(f"{option} '{text}' is not of the form {form}.")
 
 
 class Stopped(Exception):

@@ -2,15 +2,28 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-import typer
+from typing import Any, Literal
 
 from ..core.errors import InputError
-from ..core.text import number
 from ..files.outputs import together
-from .app import BaseLink, Json, TipLink, app, bad_option, examples, show_summary, with_spinner
-from .plan_options import PlanEncoderNoise, PlanSeatingNoise, assumed_noise
+from ..summaries.tables import Styled, Table, formatted, listed, warnings_of, written_of
+from . import calibration_views
+from .app import (
+    BASE_LINK,
+    JSON,
+    TIP_LINK,
+    USUAL_ENCODER_NOISE,
+    USUAL_SEATING_NOISE,
+    app,
+    argument,
+    examples,
+    numbers_option,
+    option,
+    show_summary,
+    with_spinner,
+)
+from .calibration_views import View
+from .plan_assumptions import assumed_noise
 
 
 @app.command(
@@ -22,56 +35,30 @@ from .plan_options import PlanEncoderNoise, PlanSeatingNoise, assumed_noise
     )
 )
 def arm(
-    file: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="ARM",
-            help="A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.",
-        ),
-    ] = None,
-    new: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.toml", help="Write a template of an arm file, with every key explained. Overwrites nothing."
-        ),
-    ] = None,
-    joints: Annotated[
-        int | None, typer.Option(min=1, max=20, metavar="N", help="Of the template: number of joints. Default 6.")
-    ] = None,
-    check: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="POSES",
-            help="Compare readings with the arm: a manifest (TOML), a capture (HDF5), or a table (CSV) with columns "
-            "q_1, q_2, ... and, where the tip was, x, y, z (mm, or as the header says) with or without qw, qx, qy, qz "
-            "or rx, ry, rz; without positions its poses are of one socket, or of those that a column socket names.",
-        ),
-    ] = None,
-    unit: Annotated[
-        Literal["deg", "rad"] | None,
-        typer.Option(help="Of readings in a table; without it, and a header that says it, taken by their size."),
-    ] = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.png", help="Picture of the arm at zero readings, and of its reach (.png, .svg, .pdf)."
-        ),
-    ] = None,
-    encoder_arcsec: PlanEncoderNoise = None,
-    seating_mm: PlanSeatingNoise = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MODEL", help="What its joints do besides their readings, as for calibrate: gravity,harmonics=1."
-        ),
-    ] = None,
-    base: BaseLink = None,
-    tip: TipLink = None,
-    probe: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y,Z", help="Of a URDF or kinematics.yaml: a tool's tip in the last link, mm."),
-    ] = None,
-    as_json: Json = False,
+    file: str | None = argument(
+        "ARM", "A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", None
+    ),
+    new: Path | None = option(
+        "FILE.toml", "Write a template of an arm file, with every key explained. Overwrites nothing."
+    ),
+    joints: int | None = option("N", "Number of joints of the template. Default: 6.", min=1, max=20),
+    check: Path | None = option(
+        "POSES",
+        "Compare readings with the arm: a manifest (TOML), a capture (HDF5), or a table (CSV) with columns q_1, q_2, "
+        "... and, where the tip was, x, y, z (mm, or as the header says) with or without qw, qx, qy, qz or rx, ry, rz; "
+        "without positions its poses are of one socket, or of those that a column socket names.",
+    ),
+    unit: Literal["deg", "rad"] | None = option(
+        None, "Unit of the readings in a table. Default: as its header says, else by their size."
+    ),
+    figure: Path | None = option("FILE.png", "Draw the arm at zero readings, and its reach (.png, .svg, .pdf)."),
+    encoder_arcsec: float | None = USUAL_ENCODER_NOISE,
+    seating_mm: float | None = USUAL_SEATING_NOISE,
+    model: str | None = option("MODEL", "Model of the joints, as for calibrate: gravity,harmonics=1."),
+    base: str | None = BASE_LINK,
+    tip: str | None = TIP_LINK,
+    probe: str | None = option("X,Y,Z", "Tip of a tool in the last link of a URDF or kinematics.yaml, mm."),
+    as_json: bool = JSON,
 ) -> None:
     """Look at an arm before its first calibration.
 
@@ -98,7 +85,8 @@ def arm(
 
         check_format(figure)
     with together(figure):
-        specification = load_specification(file, base=base, tip=tip, probe=_probe(probe))
+        tool = None if probe is None else numbers_option("--probe", probe, "X,Y,Z in mm", 3)
+        specification = load_specification(file, base=base, tip=tip, probe=tool)
     if check is not None:
         if figure is not None or encoder_arcsec is not None or seating_mm is not None:
             raise InputError("--check compares readings alone; leave out --figure, --encoder-arcsec and --seating-mm.")
@@ -116,32 +104,24 @@ def arm(
         specification = with_model(specification, model)
     with together(figure):
         usual = assumed_noise(file, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm, None))
-    _survey(specification, figure, usual, model, as_json)
+    summary = _surveyed(specification, figure, usual, model)
+    show_summary(summary, as_json, survey)
 
 
 def _template(path: Path, joints: int, as_json: bool) -> None:
     from ..files.arm_tables import arm_template
-    from ..files.atomic_write import write_text
+    from ..files.outputs import write_text
 
     with together(path):
         if os.path.lexists(path):
             raise InputError(f"{path} exists; give another name, or remove it.")
         write_text(path, arm_template(joints))
     summary = {"kind": "arm template", "joints": joints, "written": str(path)}
-    show_summary(
-        summary, as_json, lambda shown: typer.echo(f"Written: {shown['written']}. Look at it: aacmm arm {path}")
-    )
+    show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. Look at it: aacmm arm {path}"])
 
 
-def _survey(
-    specification: Any,
-    figure: Path | None,
-    usual: Any,
-    model: str | None,
-    as_json: bool,
-) -> None:
+def _surveyed(specification: Any, figure: Path | None, usual: Any, model: str | None) -> dict[str, Any]:
     from ..summaries.arm_survey import arm_survey
-    from . import arm_display
 
     base = None
     if specification.urdf is not None:
@@ -149,9 +129,7 @@ def _survey(
 
         base = urdf_chain(specification.urdf).base
     with together(figure):
-        summary = with_spinner("Looking at the arm", lambda: arm_survey(
-            specification, usual, base=base, model=model
-        ))  # fmt: skip
+        summary = with_spinner("Looking at the arm", lambda: arm_survey(specification, usual, base=base, model=model))
         if base is not None:
             summary["urdf"]["first_frame_in_base_mm"] = base.tolist()
         if figure is not None:
@@ -159,14 +137,85 @@ def _survey(
 
             save_arm_figure(specification.arm, figure, title=specification.name, base=base)
             summary["written"] = str(figure)
-    show_summary(summary, as_json, arm_display.survey)
+    return summary
 
 
-def _probe(text: str | None) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        x, y, z = (number(part.strip()) for part in text.split(","))
-    except ValueError:
-        bad_option("--probe", text, "X,Y,Z in mm")
-    return x, y, z
+def survey(summary: dict[str, Any]) -> View:
+    """An arm before its first calibration."""
+    yield from calibration_views.arm(summary)
+    yield from warnings_of(summary)
+    rows = [
+        (
+            "tip" if row["joint"] is None else row["joint"],
+            *(formatted(x, 3) for x in row["origin_mm"]),
+            *(f"{round(x, 4) + 0.0:.4f}" for x in row["axis"]),
+        )
+        for row in summary["frames"]
+    ]
+    headings = ("joint", "through x [mm]", "y [mm]", "z [mm]", "direction x", "y", "z")
+    yield Table("\nAxes at zero readings", headings, rows)
+    reach = summary["reach_mm"]
+    yield (
+        f"\nReach: {reach['nearest']:.0f} to {reach['farthest']:.0f} mm from the shoulder, on the first axis at "
+        f"({', '.join(f'{x:.0f}' for x in reach['shoulder'])}) mm (self-collision is not considered). "
+        f"The links together measure {reach['links']:.0f} mm."
+    )
+    if summary["determined"]:
+        yield from _determined(summary)
+    for arm_class in summary["needed"]:
+        yield from _needed(arm_class)
+    if summary["needed"]:
+        yield f"\n{summary['advice']}"
+    yield from written_of(summary)
+
+
+def _determined(summary: dict[str, Any]) -> View:
+    """What data can and cannot determine of the arm."""
+    yield ["\n", Styled("Redundant"), f", whatever is recorded ({summary['parameters']} parameters in all):"]
+    yield from (f"  {text}" for text in summary["redundant"])
+    if summary["weak"]:
+        yield [Styled("Hardly determined"), ", even by poses all over the workspace:"]
+        yield from (f"  {text}" for text in summary["weak"])
+    why = [text for row in summary["determined"][1:2] for text in row["corrections"]]
+    if summary["corrections_left_out"] or why:
+        yield [Styled("Joint corrections"), ":"]
+        yield from (f"  {text}" for text in (*summary["corrections_left_out"], *why))
+    for i in summary["parallel"]:
+        yield f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} takes the place of d_{i}."
+    columns = {"data": "data", "parameters": "determined", "well": "well_determined", "scale": "scale"}
+    yield listed("\nWhat data determine at their best", summary["determined"], columns)
+    yield f"To be freed, of sockets with a length: {len(summary['free'])}: {', '.join(summary['free'])}."
+    yield ["\n", Styled("Where a joint stays still in all poses")]
+
+    def lost(row: dict[str, Any]) -> str:
+        if row["lost"] is None:
+            return "(the tip can hardly stay in a socket then)"
+        return ", ".join(row["lost"]) or "-"
+
+    yield listed("", summary["still"], {"joint": "joint", "no longer determined well": lost}, left=(0, 1))
+
+
+def _needed(arm_class: dict[str, Any]) -> View:
+    """What a first capture with so many poses reaches."""
+    title = "U of a length that a calibration from random poses adds"
+    yield ["\n", Styled(title), f" [mm, k = 2]: {arm_class['class']}"]
+    rows = [
+        (
+            row["data"],
+            *(None if u is None else 2 * u for u in row["u_mm"].values()),
+            row["enough_poses"] or None,
+        )
+        for row in arm_class["rows"]
+    ]
+    counts = (f"{count} poses" for count in arm_class["rows"][0]["u_mm"])
+    yield Table("", ("data", *counts, "enough"), rows)
+    yield (
+        f"Medians over the volume, of encoders of {arm_class['encoder_arcsec']:.3g} arcsec and a seat of "
+        f"{arm_class['seating_mm']:.3g} mm ({arm_class['noise_source']}), reference lengths of "
+        f"u = {arm_class['u_length_mm']:g} mm, and a tracker of u = {arm_class['u_tracker_mm']:g} mm in each "
+        "coordinate. Two sockets and a reference length are as good as a ball bar in one place."
+    )
+    yield (
+        "Enough: poses from which on this is less than the noise of the readings themselves, "
+        f"{formatted(2 * arm_class['u_reading_mm'])} mm."
+    )

@@ -1,15 +1,20 @@
 """The command ``compare``."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from ..core.errors import InputError
-from ..files.atomic_write import write_text
-from ..files.hdf5 import need, read_tables
-from ..files.outputs import together
-from .app import Json, app, examples, show_summary, with_spinner
+from ..core.units import people_read, people_read_change
+from ..files.hdf5 import read_tables
+from ..files.outputs import together, write_text
+from ..summaries.harmonics import listed_apart
+from ..summaries.tables import Styled, Table, decimals_for, limits_of, warnings_of, written_of
+from .app import JSON, app, argument, examples, option, show_summary, with_spinner
+from .calibration_views import View
+
+_COLUMNS = 9  # calibrations side by side
 
 
 @app.command(
@@ -19,40 +24,23 @@ from .app import Json, app, examples, show_summary, with_spinner
     )
 )
 def compare(
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="OLD.h5 NEW.h5 [MORE.h5 ...]",
-            help="Calibrations of one arm, written by calibrate: two in this order; more than two are ordered by date.",
-        ),
-    ],
-    level: Annotated[
-        float, typer.Option(metavar="P", help="Coverage probability of the expanded uncertainties.")
-    ] = 0.95,
-    length_mm: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM",
-            help="Length whose change is computed all over the volume. Default 300, or half a small arm's reach.",
-        ),
-    ] = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Plot the changes, over time for three calibrations or more: PNG, SVG or PDF by the name.",
-        ),
-    ] = None,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", metavar="FILE", help="Write every parameter of every calibration.")
-    ] = None,
-    max_length_change_mm: Annotated[
-        float | None,
-        typer.Option(
-            min=0, metavar="MM", help="Exit code 1 where a length changes by more than this from the first to the last."
-        ),
-    ] = None,
-    as_json: Json = False,
+    files: list[Path] = argument(
+        "OLD.h5 NEW.h5 [MORE.h5 ...]",
+        "Calibrations of one arm, written by calibrate: two in this order; more than two are ordered by date.",
+    ),
+    level: float = option("P", "Coverage probability of the expanded uncertainties.", default=0.95),
+    length_mm: float | None = option(
+        "MM",
+        "Compute the change of this length all over the volume. Default: 300, or half a small arm's reach.",
+    ),
+    figure: Path | None = option(
+        "FILE", "Plot the changes, over time for three calibrations or more: PNG, SVG or PDF by the name."
+    ),
+    csv: Path | None = option("FILE", "Write every parameter of every calibration."),
+    max_length_change_mm: float | None = option(
+        "MM", "Exit code 1 where a length changes by more than this from the first to the last.", min=0
+    ),
+    as_json: bool = JSON,
 ) -> None:
     """Compare calibrations of one arm.
 
@@ -60,7 +48,6 @@ def compare(
     """
     from ..files.calibrations import load_calibration
     from ..summaries.drift import change_exceeded, compared_summary, drift_csv
-    from . import compare_display
 
     if len(files) < 2:
         raise InputError(f"{files[0]} alone cannot be compared; name at least two calibrations.")
@@ -72,53 +59,134 @@ def compare(
         records = [load_calibration(file) for file in files]
         created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
         labels = [str(file) for file in files]
-        found = with_spinner("Comparing", lambda: _compared(records, created, labels, level, length_mm))
-        found = found._replace(dated_by_file=tuple(not records[i].recording.measured for i in found.order))
-        summary: dict[str, Any] = compared_summary(found, labels, records[0].recording.nominal.name)
-        summary["kept"], summary["failed"] = change_exceeded(found.drifts[-1].lengths, max_length_change_mm)
-        written = []
+        options = {"level": level, "length": length_mm, "labels": labels}
+        trend = with_spinner("Comparing", lambda: _compared(records, created, options))
+        trend = trend._replace(dated_by_file=tuple(not records[i].recording.measured for i in trend.order))
+        summary: dict[str, Any] = compared_summary(trend, labels, records[0].recording.nominal.name)
+        summary["kept"], summary["failed"] = change_exceeded(trend.drifts[-1].lengths, max_length_change_mm)
         if figure is not None:
             from ..plot import save_drift_trend
 
-            save_drift_trend(found, figure)
-            written.append(str(figure))
+            save_drift_trend(trend, figure)
         if csv is not None:
-            write_text(csv, drift_csv(found, labels))
-            written.append(str(csv))
-    show_summary(summary | ({"written": ", ".join(written)} if written else {}), as_json, compare_display.comparison)
+            write_text(csv, drift_csv(trend, labels))
+    written = [str(path) for path in (figure, csv) if path is not None]
+    show_summary(summary | ({"written": ", ".join(written)} if written else {}), as_json, comparison)
     if summary["failed"]:
         raise typer.Exit(1)
 
 
-def _compared(records: list, created: list[str], labels: list[str], level: float, length: float | None) -> Any:
+def _compared(records: list, created: list[str], options: dict[str, Any]) -> Any:
     """The trend over all files; of two, in the order in which they are named, whatever their dates."""
     from ..drift.comparison import compare, moment, trend
     from ..drift.results import Trend
 
+    labels = options["labels"]
     if len(records) > 2:
-        found = trend(records, created, level=level, length=length, labels=labels)
-        if list(found.order) != sorted(found.order):
-            warning = (
-                f"Ordered by date, not as named: {', '.join(labels[i] for i in found.order)}. The date is when the "
-                "poses were measured, where the manifest states it, and otherwise when the file was made."
-            )
-            first = found.drifts[0]
-            found = found._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *found.drifts[1:]))
-        return found
-    drift = compare(*records, level=level, length=length, labels=labels)
-    dates = tuple(moment(date) for date in created)
-    if dates[1] < dates[0]:
+        by_date = trend(records, created, **options)
+        if list(by_date.order) == sorted(by_date.order):
+            return by_date
         warning = (
-            f"{labels[1]} was made before {labels[0]} ({dates[1]:%Y-%m-%d %H:%M} and {dates[0]:%Y-%m-%d %H:%M}): "
-            "is the order right?"
+            f"Ordered by date, not as named: {', '.join(labels[i] for i in by_date.order)}. The date is when the poses "
+            "were measured, where the manifest states it, and otherwise when the file was made."
+        )
+        first, *others = by_date.drifts
+        return by_date._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *others))
+    drift = compare(*records, **options)
+    old, new = (moment(date) for date in created)
+    if new < old:
+        warning = (
+            f"{labels[1]} was made before {labels[0]} ({new:%Y-%m-%d %H:%M} and {old:%Y-%m-%d %H:%M}): is the order "
+            "right?"
         )
         drift = drift._replace(warnings=(*drift.warnings, warning))
-    return Trend(dates, (0, 1), (drift,))
+    return Trend((old, new), (0, 1), (drift,))
 
 
 def _created(file: Path) -> str:
     """When a calibration's file was made."""
+    return read_tables(file, ("calibration",)).attributes["created"]
 
-    attributes = read_tables(file, ("calibration",)).attributes
-    need(file, attributes, "created", of="attribute")
-    return attributes["created"]
+
+def comparison(summary: dict[str, Any]) -> View:
+    """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
+    new, old = (f"{summary[which]} ({_day(summary[f'{which}_created'])})" for which in ("new", "old"))
+    yield [Styled(summary["arm"]), f": {new} against {old}"]
+    yield from warnings_of(summary)
+    yield from summary["findings"]
+    yield from _parameters(summary)
+    lengths = summary["lengths"]
+    keys = ("rms_mm", "rms_by_chance_mm", "percentile_95_mm", "largest_mm", "mean_mm")
+    yield Table(
+        f"\nLengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
+        ("RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean"),
+        [["not determined" if lengths[key] is None else lengths[key] for key in keys]],
+    )
+    if len(summary["trend"]) > 2:
+        yield _trend(summary["trend"])
+        yield from _changes(summary["trend"])
+    yield from limits_of(summary)
+    yield from written_of(summary)
+
+
+def _parameters(summary: dict[str, Any]) -> View:
+    """Values to the digits that the uncertainty of their change allows, changes in small units: um, arcsec."""
+    names, rows = _listed([summary["parameters"]]), []
+    for row in (row for row in summary["parameters"] if row["parameter"] in names):
+        (factor, unit), (fine, small_unit) = people_read(row["unit"]), people_read_change(row["unit"])
+        expanded = row["expanded"]
+        decimals = decimals_for(None if expanded is None else factor * expanded, 5)
+        small = decimals_for(None if expanded is None else fine * expanded, 2)
+        old, new = (f"{factor * row[which]:.{decimals}f}" for which in ("old", "new"))
+        change = f"{fine * row['change']:+.{small}f}"
+        u = "-" if expanded is None else f"{fine * expanded:.{small}f}"
+        mark = row["without"] or (Styled("* beyond U") if row["moved"] else "")
+        rows.append((row["parameter"], unit, old, new, small_unit, change, u, mark))
+    title = f"\nParameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)"
+    yield Table(title, ("parameter", "unit", "old", "new", "unit", "change", "U", ""), rows)
+    left_out = len(summary["parameters"]) - len(names)
+    if left_out > 0:
+        yield f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv."
+
+
+def _listed(tables: list[list[dict[str, Any]]]) -> set[str]:
+    """Names of the parameters to print: of hundreds of harmonics, those that moved."""
+    moved = {row["parameter"] for rows in tables for row in rows if row["moved"]}
+    return moved | {row["parameter"] for row in listed_apart(tables[0])[0]}
+
+
+def _trend(calibrations: list[dict[str, Any]]) -> Table:
+    rows = []
+    for number, row in enumerate(calibrations, start=1):
+        cells: list[Any] = [None] * 6
+        if number > 1:
+            lengths, p = row["lengths"], row["p"]
+            probability = "-" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
+            numbers = (lengths[key] for key in ("rms_mm", "rms_by_chance_mm", "largest_mm"))
+            cells = [row["moved"], probability, *numbers, f"{lengths['mean_um_per_m']:+.1f}"]
+        rows.append((number, row["calibration"], _day(row["created"]), *cells))
+    headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
+    title = "\nEach calibration against the first (whose own error is in all of them)"
+    return Table(title, (*headings, "mean [um/m]"), rows, left=(0, 1))
+
+
+def _changes(calibrations: list[dict[str, Any]]) -> View:
+    """Change of every parameter from the first calibration; of many calibrations, the last ones."""
+    shown = list(enumerate(calibrations, start=1))[1:][-_COLUMNS:]
+    title = "\nChange from the first calibration (*: beyond its uncertainty)"
+    if len(calibrations) - 1 > len(shown):
+        title += f", the last {_COLUMNS}; --csv and --json have all"
+    names, rows = _listed([row["parameters"] for _, row in shown]), []
+    marks = {True: "*", False: " ", None: "?"}
+    for of_parameter in zip(*(row["parameters"] for _, row in shown), strict=True):
+        name = of_parameter[0]["parameter"]
+        if name in names:
+            fine, unit = people_read_change(of_parameter[0]["unit"])
+            rows.append((name, unit, *(f"{fine * row['change']:+.1f}{marks[row['moved']]}" for row in of_parameter)))
+    yield Table(title, ("parameter", "unit", *(str(number) for number, _ in shown)), rows)
+    if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
+        yield "?: without an uncertainty, since it is fixed, on a bound or not determined in one of the two."
+
+
+def _day(moment: str) -> str:
+    return moment[:10]

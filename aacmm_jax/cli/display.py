@@ -1,61 +1,64 @@
-"""What the terminal output of all commands shares: the console, tables that fit it, numbers, warnings, verdicts."""
+"""Prints the lines and tables of a view on a terminal of any width (`summaries.tables` declares them)."""
 
 import os
-from typing import Any
+from collections.abc import Iterable
 
 from rich.cells import cell_len
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
+
+from ..summaries.tables import Line, Styled, Table, shown
 
 _DEFAULT = 110  # columns of what is not a terminal, where COLUMNS does not say
 _LEAST = 20  # columns: fewer than these cannot be meant
-_MOST = 1e9  # from here on decimals say nothing
 _GAP = 2  # between columns
 _LONGEST_WORD = 24  # a longer one (a path) is broken over lines
 
 
 def new_console() -> Console:
     """Standard output, as wide as the terminal or as COLUMNS says."""
-    console = Console(highlight=False, emoji=False)  # a name with ":art:" in it is not to become a picture
+    console = Console(highlight=False, emoji=False)
     if console.width < _LEAST or (not console.is_terminal and not os.environ.get("COLUMNS", "").isdigit()):
         console.width = _DEFAULT
     return console
 
 
-def new_table(title: str, *columns: str) -> Table:
-    """A table without lines; the first column is set flush left, the others flush right."""
-    table = Table(title=escape(title) or None, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    for number, column in enumerate(columns):
-        table.add_column(escape(column), justify="left" if number == 0 else "right")
-    return table
+def display(view: Iterable[Line | Table]) -> None:
+    """Print a view; markup in its texts is shown as it is."""
+    console = new_console()
+    for part in view:
+        if isinstance(part, Table):
+            print_table(console, part)
+        else:
+            parts = (part,) if isinstance(part, str | Styled) else part
+            console.print(Text.assemble(*parts))
 
 
-def print_table(console: Console, table: Table, keys: int = 1) -> None:
+def print_table(console: Console, table: Table) -> None:
     """Print a table so that nothing in it is cut off.
 
     Cells wrap between words where the console is narrow. Where even that is not enough, the columns are printed in
     several blocks, each of which begins with the first ``keys`` columns.
     """
-
-    def plain(cell: object) -> str:
-        return Text.from_markup(str(cell), emoji=False).plain
-
-    texts = [[plain(cell) for cell in (column.header, *column.cells)] for column in table.columns]
-    natural = [max((cell_len(line) for cell in cells for line in cell.split("\n")), default=0) for cells in texts]
+    rows = [[Text(heading) for heading in table.headings]]
+    rows += [[Text.assemble(shown(cell)) for cell in row] for row in table.rows]
+    columns = list(zip(*rows, strict=True))
+    texts = [[cell.plain for cell in column] for column in columns]
+    natural = [max(cell_len(line) for cell in cells for line in cell.split("\n")) for cells in texts]
     words = [max((cell_len(word) for cell in cells for word in cell.split()), default=0) for cells in texts]
     least = [min(word, _LONGEST_WORD) for word in words]
-    for number, block in enumerate(_blocks(least, console.width, keys)):
+    left = {number % len(columns) for number in table.left}
+    for number, block in enumerate(_blocks(least, console.width, table.keys)):
         widths = _fitted([natural[i] for i in block], [least[i] for i in block], console.width)
-        part = Table(title=table.title if number == 0 else None, title_justify="left", title_style="bold", box=None)
+        title = Text(table.title) if table.title and number == 0 else None
+        part = RichTable(title=title, title_justify="left", title_style="bold", box=None)
         part.pad_edge, part.padding = False, (0, _GAP, 0, 0)
         for i, width in zip(block, widths, strict=True):
-            column = table.columns[i]
-            part.add_column(column.header, justify=column.justify, width=width, overflow="fold")
-        cells = [list(table.columns[i].cells) for i in block]
-        for row in zip(*cells, strict=True):
-            part.add_row(*row)
+            justify = "left" if i in left else "right"
+            part.add_column(columns[i][0], justify=justify, width=width, overflow="fold")
+        for row in rows[1:]:
+            part.add_row(*(row[i] for i in block))
         console.print(part, no_wrap=False)
 
 
@@ -79,43 +82,3 @@ def _fitted(natural: list[int], least: list[int], available: int) -> list[int]:
             break
         widths[max(wider, key=lambda i: widths[i])] -= 1
     return widths
-
-
-def formatted(value: float | None, decimals: int = 4) -> str:
-    """A number of mm with a fixed number of decimals, or in scientific notation if too small or too large for them."""
-    if value is None:
-        return "-"
-    if abs(value) < 1e-9:  # mm: rounding
-        value = 0.0
-    if not abs(value) < _MOST:
-        return f"{value:.6g}"
-    small = value != 0 and abs(value) < 0.5 * 10**-decimals
-    return f"{value:.1e}" if small else f"{value:.{decimals}f}"
-
-
-def print_warnings(console: Console, summary: dict[str, Any]) -> None:
-    """What a user should know before the numbers."""
-    for warning in summary["warnings"]:
-        console.print(f"[yellow]Warning:[/yellow] {escape(warning)}")
-
-
-def print_verdict(console: Console, summary: dict[str, Any]) -> None:
-    """What a result is good for, in one line; summaries of earlier versions have none."""
-    verdict = summary.get("verdict")
-    if verdict:
-        style = {"good": "green", "unsure": "yellow", "bad": "red"}.get(verdict["mark"], "bold")
-        console.print(f"[{style}]{escape(verdict['says'])}[/]")
-
-
-def print_verdicts(console: Console, summary: dict[str, Any]) -> None:
-    """Limits that are kept, and limits that are exceeded."""
-    for sentence in summary["kept"]:
-        console.print(f"[green]Passed:[/green] {escape(sentence)}")
-    for sentence in summary["failed"]:
-        console.print(f"[red]Failed:[/red] {escape(sentence)}")
-
-
-def print_written(console: Console, summary: dict[str, Any]) -> None:
-    """The file that was written, where there is one."""
-    if "written" in summary:
-        console.print(f"\nWritten: {escape(summary['written'])}")

@@ -1,47 +1,53 @@
 """The command ``plan``."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import typer
 
 from ..core.errors import InputError
 from ..core.text import number
 from ..core.units import DEG
-from ..core.x64 import LARGEST_INTEGER
 from ..files.outputs import together
 from .app import (
-    KEPT,
-    BaseLink,
-    Json,
-    LinearEncoderNoise,
-    NominalArm,
-    ReferenceLengths,
-    TipLink,
+    BASE_LINK,
+    JSON,
+    LINEAR_ENCODER_NOISE,
+    NOMINAL_ARM,
+    REFERENCE_LENGTHS,
+    TIP_LINK,
+    USUAL_ENCODER_NOISE,
+    USUAL_SEATING_NOISE,
     app,
+    bad_option,
     examples,
+    flag,
     length_option,
     names_option,
+    option,
+    output,
+    seed,
     show_summary,
     sockets_option,
     with_spinner,
 )
-from .plan_options import (
-    CONTEXT,
-    CellFile,
-    Collisions,
-    ConeAngles,
-    LinkRadius,
-    Normals,
-    PlanEncoderNoise,
-    PlanSeatingNoise,
-    RetractDistance,
-    ToolAxis,
-    check_options,
-    planned_arm,
-)
+from .plan_assumptions import planned_arm
+
+_CONTEXT: Any = typer.Context.__base__  # what Typer passes: its own class is a subclass that nothing is of
+_SOCKETS, _FARTHEST = 4, 0.95
+
+# Options that each way of planning takes besides those of all: of a calibration with sockets, of one with a kit, and
+# of an acceptance test.
+_OF_ALL = {"arm", "output", "manifest", "base", "tip", "seed", "as_json", "angles", "margin_deg", "above_mm"}
+_OF_CALIBRATIONS = {
+    *("poses", "model", "held", "encoder_arcsec", "linear_encoder_mm", "seating_mm", "tool_axis", "retract_mm", "cell"),
+    *("collisions", "link_radius_mm", "unconstrained", "criterion", "region", "candidates", "check_length_mm"),
+    "farthest",
+}
+_OF_SOCKETS = {"sockets", "socket", "length", "length_mm", "u_mm", "cone_deg", "normal"}
+_OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
 
 
 @app.command(
@@ -56,206 +62,143 @@ from .plan_options import (
     )
 )
 def plan(
-    context: CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
-    arm: NominalArm,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE.csv",
-            help="Plan to write: one row a pose, in the order to take them." + KEPT,
-        ),
-    ],
-    poses: Annotated[
-        int, typer.Option(min=2, max=10_000, metavar="N", help="Number of poses, all sockets together.")
-    ] = 30,
-    sockets: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=1000,
-            metavar="N",
-            help="Number of sockets to position, in pairs at the ends of the reference length. Default 4.",
-        ),
-    ] = None,
-    socket: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=X,Y,Z", help="Instead: a socket at a given position, mm; repeatable."),
-    ] = None,
-    length: ReferenceLengths = None,
-    length_mm: Annotated[
-        str, typer.Option(metavar="L[:M]", help="Reference length to position; of a range, the best length is chosen.")
-    ] = "500",
-    u_mm: Annotated[
-        float, typer.Option(metavar="MM", help="Standard uncertainty of the reference length to position.")
-    ] = 0.002,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MODEL",
-            help="What the joints do besides their readings, as for calibrate: the poses determine its coefficients "
-            "too.",
-        ),
-    ] = None,
-    held: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAMES",
-            help="Parameters that are fixed, as for calibrate, separated by commas; replaces the list in the arm's "
-            "file.",
-        ),
-    ] = None,
-    encoder_arcsec: PlanEncoderNoise = None,
-    linear_encoder_mm: LinearEncoderNoise = None,
-    seating_mm: PlanSeatingNoise = None,
-    cone_deg: ConeAngles = None,
-    normal: Normals = None,
-    tool_axis: ToolAxis = "z",
-    retract_mm: RetractDistance = None,
-    cell: CellFile = None,
-    collisions: Collisions = False,
-    link_radius_mm: LinkRadius = None,
-    unconstrained: Annotated[
-        bool, typer.Option("--unconstrained", help="Predict also without cones, obstacles and approach points.")
-    ] = False,
-    angles: Annotated[
-        Literal["deg", "rad"], typer.Option(help="Unit of the joint readings in the plan and its manifest.")
-    ] = "deg",
-    criterion: Annotated[
-        Literal["length", "A", "D", "E"],
-        typer.Option(
-            help="What is minimised: the largest uncertainty of a length in the volume, or A, D or E of the parameters."
-        ),
-    ] = "length",
-    region: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="AXIS=LOW:HIGH",
-            help="Where sockets may be: range of x, y, z or distance from the base, mm; repeatable. Default z=0:.",
-        ),
-    ] = None,
-    margin_deg: Annotated[
-        float, typer.Option(min=0, metavar="DEG", help="Smallest distance of a joint from its limits.")
-    ] = 5.0,
-    above_mm: Annotated[
-        float,
-        typer.Option(metavar="MM", help="Height of the table in the base frame: every joint and tip stays above it."),
-    ] = 0.0,
-    candidates: Annotated[
-        int, typer.Option(min=100, max=1_000_000, metavar="N", help="Number of poses to choose from.")
-    ] = 3000,
-    check_length_mm: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM",
-            help="Length whose uncertainty is predicted all over the volume. Default 300, or half a small arm's reach.",
-        ),
-    ] = None,
-    farthest: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PART",
-            help="Largest distance of what is placed from the shoulder, part of the reach. Default 0.95.",
-        ),
-    ] = None,
-    kit: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.toml",
-            help="Instead of sockets: artefacts to place and instruments at hand, with their uncertainties.",
-        ),
-    ] = None,
-    acceptance: Annotated[
-        Literal["asme", "iso"] | None,
-        typer.Option(help="Instead: the poses of an acceptance test, by ASME B89.4.22 or ISO 10360-12."),
-    ] = None,
-    sphere_mm: Annotated[
-        float, typer.Option(metavar="MM", help="Of an acceptance test: diameter of the sphere.")
-    ] = 25.0,
-    stylus_mm: Annotated[
-        float, typer.Option(min=0, metavar="MM", help="Of an acceptance test: diameter of the probe's ball.")
-    ] = 6.0,
-    bar_mm: Annotated[
-        list[float] | None,
-        typer.Option(
-            metavar="MM",
-            help="Of an acceptance test: length of a bar that is available; twice for asme, five times for iso.",
-        ),
-    ] = None,
-    range_mm: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            metavar="MM",
-            help="Of an acceptance test: measuring range that the maker states, a diameter. Default: twice the reach.",
-        ),
-    ] = None,
-    manifest: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.toml", help="Manifest to write, for the import of the readings once they are recorded."
-        ),
-    ] = None,
-    base: BaseLink = None,
-    tip: TipLink = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_INTEGER, metavar="N", help="Seed of the random choices.")] = 0,
-    as_json: Json = False,
+    context: _CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
+    arm: str = NOMINAL_ARM,
+    output: Path = output("FILE.csv", "Plan to write: one row a pose, in the order to take them."),
+    poses: int = option("N", "Number of poses, all sockets together.", default=30, min=2, max=10_000),
+    sockets: int | None = option(
+        "N",
+        f"Position this many sockets, in pairs at the ends of the reference length. Default: {_SOCKETS}.",
+        min=1,
+        max=1000,
+    ),
+    socket: list[str] | None = option("NAME=X,Y,Z", "Use a socket at this given position instead, mm; repeatable."),
+    length: list[str] | None = REFERENCE_LENGTHS,
+    length_mm: str = option(
+        "L[:M]", "Reference length to position; of a range, the best length is chosen.", default="500"
+    ),
+    u_mm: float = option("MM", "Standard uncertainty of the reference length to position.", default=0.002),
+    model: str | None = option(
+        "MODEL", "Model of the joints, as for calibrate: the poses determine its coefficients too."
+    ),
+    held: str | None = option(
+        "NAMES",
+        "Fix these parameters, as for calibrate, separated by commas. Default: the list in the arm's file.",
+    ),
+    encoder_arcsec: float | None = USUAL_ENCODER_NOISE,
+    linear_encoder_mm: float | None = LINEAR_ENCODER_NOISE,
+    seating_mm: float | None = USUAL_SEATING_NOISE,
+    cone_deg: list[str] | None = option(
+        "[NAME=]DEG",
+        "Largest tilt of the tool from the normal of a socket (of all, or of one by name); 180 for any direction. "
+        "Default: 60 for robots, any for measuring arms. With --kit: half_angle_deg in its tables.",
+    ),
+    normal: list[str] | None = option(
+        "[NAME=]X,Y,Z", "Direction out of a socket (of all, or of one by name). Default: 0,0,1."
+    ),
+    tool_axis: str = option(
+        "AXIS",
+        "Axis of the last frame that points from the tool into a socket: x, y, z, -x, -y or -z.",
+        default="z",
+    ),
+    retract_mm: float | None = option(
+        "MM",
+        "Distance of the approach point of each pose along the socket's normal; 0 for none. Default: 50 for robots, 0 "
+        "for measuring arms.",
+        min=0,
+    ),
+    cell: Path | None = option("FILE.toml", "Keep the arm clear of the boxes, walls and posts in this file."),
+    collisions: bool = flag(
+        "--collisions",
+        "Keep the arm's body (collision shapes of its URDF, else capsules along its links) clear of itself and of the "
+        "table. Implied by --cell and --link-radius-mm.",
+    ),
+    link_radius_mm: float | None = option("MM", "Take capsules of this radius as the arm's body.", min=0),
+    unconstrained: bool = flag("--unconstrained", "Predict also without cones, obstacles and approach points."),
+    angles: Literal["deg", "rad"] = option(
+        None, "Unit of the joint readings in the plan and its manifest.", default="deg"
+    ),
+    criterion: Literal["length", "A", "D", "E"] = option(
+        None,
+        "Minimise the largest uncertainty of a length in the volume, or A, D or E of the parameters.",
+        default="length",
+    ),
+    region: list[str] | None = option(
+        "AXIS=LOW:HIGH",
+        "Place sockets in this range of x, y, z or distance from the base, mm; repeatable. Default: z=0:.",
+    ),
+    margin_deg: float = option("DEG", "Keep joints at least this far from their limits.", default=5.0, min=0),
+    above_mm: float = option(
+        "MM", "Height of the table in the base frame: every joint and tip stays above it.", default=0.0
+    ),
+    candidates: int = option("N", "Number of poses to choose from.", default=3000, min=100, max=1_000_000),
+    check_length_mm: float | None = option(
+        "MM",
+        "Predict the uncertainty of this length all over the volume. Default: 300, or half a small arm's reach.",
+    ),
+    farthest: float | None = option(
+        "PART",
+        f"Largest distance of what is placed from the shoulder, part of the reach. Default: {_FARTHEST}.",
+    ),
+    kit: Path | None = option(
+        "FILE.toml", "Place these artefacts and use these instruments, with their uncertainties, instead of sockets."
+    ),
+    acceptance: Literal["asme", "iso"] | None = option(
+        None, "Plan the poses of an acceptance test instead, by ASME B89.4.22 or ISO 10360-12."
+    ),
+    sphere_mm: float = option("MM", "Diameter of the sphere of an acceptance test.", default=25.0),
+    stylus_mm: float = option("MM", "Diameter of the probe's ball in an acceptance test.", default=6.0, min=0),
+    bar_mm: list[float] | None = option(
+        "MM", "Length of an available bar for an acceptance test; twice for asme, five times for iso."
+    ),
+    range_mm: float | None = option(
+        "MM",
+        "Measuring range that the maker states, a diameter, for an acceptance test. Default: twice the reach.",
+        min=0,
+    ),
+    manifest: Path | None = option(
+        "FILE.toml", "Write a manifest, for the import of the readings once they are recorded."
+    ),
+    base: str | None = BASE_LINK,
+    tip: str | None = TIP_LINK,
+    seed: int = seed("the random choices"),
+    as_json: bool = JSON,
 ) -> None:
     """Choose the poses to take, before measuring.
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
-    from ..files.arms import load_specification
-    from ..files.plans import kit_csv, kit_manifest, plan_csv, plan_manifest
-    from ..planning.design import plan as run
-    from ..summaries.planning import kit_plan_summary, plan_summary
-    from . import acceptance_display, plan_display
+    from ..files.plans import kit_csv, kit_manifest, plan_csv, plan_manifest, procedure_csv, procedure_manifest
+    from ..summaries.planning import kit_plan_summary, plan_summary, procedure_summary
+    from . import evaluation_views, plan_views
 
+    links = {"base": base, "tip": tip}
     with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
-        specification = load_specification(arm, base=base, tip=tip)
-    if held is not None:
-        fixed = names_option(held)
-        specification = specification._replace(
-            held=fixed, free=tuple(name for name in specification.free if name not in fixed)
-        )
-    if model is not None:
-        from ..files.joint_models import with_model
-
-        specification = with_model(specification, model)
-    if socket and sockets is not None:
-        raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
-    if length and not socket:
-        raise InputError(
-            "--length is between sockets of --socket; to have a reference length positioned, use --length-mm."
-        )
-    check_options(context, kit is not None, acceptance is not None)
-    if region and socket:
-        raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
+        specification = _specification(arm, links, held, model)
+    _check_options(context, kit is not None, acceptance is not None)
+    files = _Files(output, manifest, arm, specification.urdf, angles)
     if acceptance is not None:
-        options = {
-            "above": above_mm,
-            "margin": margin_deg * DEG,
-            "diameter": sphere_mm,
-            "stylus": stylus_mm,
-            "seed": seed,
-            "bars": bar_mm or None,
-            "measuring_range": range_mm,
-        }
-        show_summary(
-            _procedure(specification, arm, acceptance, output, manifest, options, angles),
-            as_json,
-            acceptance_display.procedure,
-        )
+        from ..acceptance.procedure import plan_procedure
+
+        planned = with_spinner("Planning", lambda: plan_procedure(
+            specification.arm, acceptance, above=above_mm, margin=margin_deg * DEG, diameter=sphere_mm,
+            stylus=stylus_mm, seed=seed, bars=bar_mm or None, measuring_range=range_mm,
+        ))  # fmt: skip
+        summary = procedure_summary(planned, specification.name)
+        summary["written"] = files.write(planned, procedure_csv, procedure_manifest)
+        show_summary(summary, as_json, evaluation_views.procedure)
         return
-    axes = [_axis(text) for text in region or ()]
-    if len(dict(axes)) < len(axes):
-        raise InputError("an axis is named twice in --region; give each one range.")
-    points = sockets_option(socket)
+    points = _given_sockets(socket, sockets, length, region)
+    names = list(points) or [chr(ord("A") + i) for i in range(min(sockets or _SOCKETS, 26))]
+    with together(output, manifest):
+        assumed = planned_arm(
+            arm, links, (encoder_arcsec, seating_mm, linear_encoder_mm), (cone_deg, normal), tool_axis, retract_mm,
+            (cell, collisions, link_radius_mm), names,
+        )  # fmt: skip
     shared: dict[str, Any] = {
         "poses": poses,
-        "region": dict(axes) if axes else None,
-        "farthest": 0.95 if farthest is None else farthest,
+        "region": _region(region),
+        "farthest": _FARTHEST if farthest is None else farthest,
         "space": specification.space(),
         "criterion": criterion,
         "margin": margin_deg * DEG,
@@ -264,85 +207,116 @@ def plan(
         "check_length": check_length_mm,
         "unconstrained": unconstrained,
         "seed": seed,
+        **assumed.options,
     }
-    names = list(points) or [chr(ord("A") + i) for i in range(4 if sockets is None else min(sockets, 26))]
-    with together(output, manifest):
-        assumed = planned_arm(
-            arm, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm, linear_encoder_mm), (cone_deg, normal),
-            tool_axis, retract_mm, (cell, collisions, link_radius_mm), names,
-        )  # fmt: skip
-    shared |= assumed.options
     stated = {"noise_source": assumed.noise_source, "notes": list(assumed.notes), "angles": angles, "model": model}
-    urdf = specification.urdf if _is_urdf(arm) else None
     if kit is not None:
-        from ..files.kits import read_kit
-        from ..planning.kit import plan_kit
-
-        with together(output, manifest):
-            things = read_kit(kit)
-        with plan_display.progress() as report_progress:
-            planned = plan_kit(specification.arm, things, **shared, progress=report_progress)
-        text = kit_csv(planned, angles)
-        written = _written(output, text, manifest, lambda name: kit_manifest(planned, name, urdf, angles), arm)
-        summary = kit_plan_summary(planned, specification.name) | stated | {"written": written}
-        show_summary(summary, as_json, plan_display.kit_plan)
+        planned = _planned_kit(specification.arm, kit, output, manifest, shared)
+        summary = kit_plan_summary(planned, specification.name) | stated
+        summary["written"] = files.write(planned, kit_csv, kit_manifest)
+        show_summary(summary, as_json, plan_views.kit_plan)
         return
-    with plan_display.progress() as report_progress:
-        found = run(
+    from ..planning.design import plan as run
+
+    with plan_views.progress() as report_progress:
+        planned = run(
             specification.arm,
-            sockets=points or (4 if sockets is None else sockets),
-            length=_range("--length-mm", length_mm),
+            sockets=points or sockets or _SOCKETS,
+            length=_range(length_mm),
             u=u_mm,
             lengths=[length_option(text) for text in length or ()],
             cone=assumed.cone,
             **shared,
             progress=report_progress,
         )
-    text = plan_csv(found, angles)
-    written = _written(output, text, manifest, lambda name: plan_manifest(found, name, urdf, angles), arm)
-    summary: dict[str, Any] = plan_summary(found, specification.name) | stated | {"written": written}
-    show_summary(summary, as_json, plan_display.plan)
+    summary = plan_summary(planned, specification.name) | stated
+    summary["written"] = files.write(planned, plan_csv, plan_manifest)
+    show_summary(summary, as_json, plan_views.plan)
 
 
-def _procedure(
-    specification: Any,
-    arm: str,
-    standard: Any,
-    output: Path,
-    manifest: Path | None,
-    options: dict[str, Any],
-    angles: Any,
-) -> dict[str, Any]:
-    """Plan an acceptance test and write it."""
-    from ..acceptance.procedure import plan_procedure
-    from ..files.plans import procedure_csv, procedure_manifest
-    from ..summaries.planning import procedure_summary
+def _specification(arm: str, links: Mapping[str, Any], held: str | None, model: str | None) -> Any:
+    from ..files.arms import load_specification
 
-    found = with_spinner("Planning", lambda: plan_procedure(specification.arm, standard, **options))
-    urdf = specification.urdf if _is_urdf(arm) else None
-    text = procedure_csv(found, angles)
-    written = _written(output, text, manifest, lambda name: procedure_manifest(found, name, urdf, angles), arm)
-    return procedure_summary(found, specification.name) | {"written": written}
+    specification = load_specification(arm, **links)
+    if held is not None:
+        fixed = names_option(held)
+        free = tuple(name for name in specification.free if name not in fixed)
+        specification = specification._replace(held=fixed, free=free)
+    if model is None:
+        return specification
+    from ..files.joint_models import with_model
+
+    return with_model(specification, model)
 
 
-def _is_urdf(arm: str) -> bool:
-    """Whether a manifest names the links with the arm; an arm file (TOML) names those of its URDF itself."""
-    return arm.lower().endswith(".urdf")
+def _check_options(context: Any, kit: bool, acceptance: bool) -> None:
+    """Refuse options that the way of planning would ignore."""
+    taken = _OF_ACCEPTANCE if acceptance else _OF_CALIBRATIONS | ({"kit"} if kit else _OF_SOCKETS)
+    sources = {name: context.get_parameter_source(name) for name in context.params if name not in _OF_ALL | taken}
+    ignored = [
+        f"--{name.replace('_', '-')}" for name, source in sources.items() if source and source.name == "COMMANDLINE"
+    ]
+    if not ignored:
+        return
+    listed = " and ".join([", ".join(ignored[:-1]), ignored[-1]] if len(ignored) > 1 else ignored)
+    if acceptance:
+        raise InputError(f"--acceptance has its own poses, sockets and bars and ignores {listed}; leave out {listed}.")
+    if kit:
+        raise InputError(f"--kit names what is used and where it is, and ignores {listed}; leave out {listed}.")
+    raise InputError(f"{listed} {'is' if len(ignored) == 1 else 'are'} for acceptance tests; give --acceptance too.")
 
 
-def _written(output: Path, poses: str, manifest: Path | None, manifest_text: Callable[[str], str], arm: str) -> str:
-    """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
-    from ..files.atomic_write import write_text
+def _given_sockets(
+    socket: list[str] | None, sockets: int | None, length: list[str] | None, region: list[str] | None
+) -> dict[str, tuple[float, ...]]:
+    """The sockets whose positions are given, if any."""
+    if socket and sockets is not None:
+        raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
+    if length and not socket:
+        raise InputError(
+            "--length is between sockets of --socket; to have a reference length positioned, use --length-mm."
+        )
+    if region and socket:
+        raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
+    return sockets_option(socket)
+
+
+def _planned_kit(arm: Any, kit: Path, output: Path, manifest: Path | None, options: Mapping[str, Any]) -> Any:
+    from ..files.kits import read_kit
+    from ..planning.kit import plan_kit
+    from .plan_views import progress
 
     with together(output, manifest):
-        write_text(output, poses)
-        if manifest is None:
-            return str(output)
-        write_text(manifest, manifest_text(_arm_for(manifest, arm)))
-        return f"{output}, {manifest}"
+        things = read_kit(kit)
+    with progress() as report_progress:
+        return plan_kit(arm, things, **options, progress=report_progress)
 
 
-def _arm_for(manifest: Path, arm: str) -> str:
+class _Files(NamedTuple):
+    """Where a plan and its manifest are written."""
+
+    output: Path
+    manifest: Path | None
+    arm: str
+    urdf: Any  # of the arm
+    angles: Any
+
+    def write(self, planned: Any, poses: Callable, manifest_text: Callable) -> str:
+        """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
+        from ..files.outputs import write_text
+
+        # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
+        urdf = self.urdf if self.arm.lower().endswith(".urdf") else None
+        text = poses(planned, self.angles)
+        with together(self.output, self.manifest):
+            write_text(self.output, text)
+            if self.manifest is None:
+                return str(self.output)
+            write_text(self.manifest, manifest_text(planned, arm_for(self.manifest, self.arm), urdf, self.angles))
+            return f"{self.output}, {self.manifest}"
+
+
+def arm_for(manifest: Path, arm: str) -> str:
     """An arm as a manifest names it: a shipped name, or the path of a file, relative to the manifest if it can be."""
     if not os.path.isfile(arm):
         return arm
@@ -352,20 +326,26 @@ def _arm_for(manifest: Path, arm: str) -> str:
         return Path(arm).absolute().as_posix()
 
 
-def _range(option: str, text: str) -> tuple[float, float]:
+def _range(text: str) -> tuple[float, float]:
     low, colon, high = text.partition(":")
     try:
         return number(low.strip()), number((high if colon else low).strip())
-    except ValueError as error:
-        raise InputError(f"{option} '{text}' is not of the form L or L:M, in mm.") from error
+    except ValueError:
+        bad_option("--length-mm", text, "L or L:M, in mm")
 
 
-def _axis(text: str) -> tuple[str, tuple[float, float]]:
-    axis, _, values = text.partition("=")
-    low, colon, high = values.partition(":")
-    try:
-        if not colon:
-            raise ValueError
-        return axis, (number(low.strip() or "-inf"), number(high.strip() or "inf"))
-    except ValueError as error:
-        raise InputError(f"--region '{text}' is not of the form AXIS=LOW:HIGH, in mm; for example z=0:800.") from error
+def _region(texts: Sequence[str] | None) -> dict[str, tuple[float, float]] | None:
+    """Ranges of coordinates, from ``AXIS=LOW:HIGH``."""
+    region: dict[str, tuple[float, float]] = {}
+    for text in texts or ():
+        axis, _, values = text.partition("=")
+        low, colon, high = values.partition(":")
+        if axis in region:
+            raise InputError("an axis is named twice in --region; give each one range.")
+        try:
+            if not colon:
+                raise ValueError
+            region[axis] = number(low.strip() or "-inf"), number(high.strip() or "inf")
+        except ValueError:
+            bad_option("--region", text, "AXIS=LOW:HIGH, in mm; for example z=0:800")
+    return region or None

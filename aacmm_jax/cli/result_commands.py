@@ -1,47 +1,46 @@
-"""What is done with results: ``evaluate``, ``report``, ``export``, ``show``."""
+"""What is done with results: ``evaluate``, ``report``, ``show``."""
 
-import math
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import typer
 
 from ..core.errors import InputError
-from ..core.text import printable
-from ..files.atomic_write import write_text
+from ..core.text import shorten
 from ..files.hdf5 import read_summary
-from ..files.inputs import InputFile
-from ..files.outputs import check_kept, together
+from ..files.inputs import InputFile, fingerprint
+from ..files.outputs import together
 from ..files.sense import check_shown
 from .app import (
-    KEPT,
-    BaseLink,
-    CalibrationFile,
-    Json,
-    Only,
-    TipLink,
-    Without,
+    BASE_LINK,
+    JSON,
+    ONLY,
+    TIP_LINK,
+    WITHOUT,
     app,
+    argument,
     examples,
+    option,
+    output,
     prepare_jax,
     show_summary,
-    warn_of_unusable,
     with_spinner,
 )
-from .evaluations import certificate, evaluated, evaluated_points
-from .export_formats import exported
 
 _ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
-_FORMATS = {".urdf": "urdf", ".json": "json", ".csv": "csv", ".yaml": "ur", ".yml": "ur", ".py": "python"}
-_OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
-
-About = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE.toml", help="Administrative data of a certificate: laboratory, customer, item, persons, dates."
+ABOUT = option("FILE.toml", "Administrative data of a certificate: laboratory, customer, item, persons, dates.")
+# How each kind of file is read, its summary, and what people see of it: functions by module, imported when needed.
+_KINDS = {
+    "capture": ("captures.load_capture", "calibration.capture_summary", "calibration_views.capture"),
+    "calibration": (
+        "calibrations.load_calibration",
+        "calibration.calibration_summary",
+        "calibration_views.calibration",
     ),
-]
+    "evaluation": ("evaluations.load_evaluation", "evaluation.evaluation_summary", "evaluation_views.evaluation"),
+    "points": ("evaluations.load_points", "evaluation.points_summary", "evaluation_views.points"),
+}
 
 
 @app.command(
@@ -51,74 +50,46 @@ About = Annotated[
     )
 )
 def evaluate(
-    calibration: Annotated[
-        Path,
-        typer.Argument(
-            metavar="CALIBRATION.h5", help="Calibration, written by calibrate; or, alone, a manifest of points (TOML)."
-        ),
-    ],
-    capture: Annotated[
-        Path | None, typer.Argument(metavar="CAPTURE.h5", help="Capture, written by import or simulate.")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="FILE.h5", help="Evaluation to write (HDF5), for aacmm report." + KEPT),
-    ] = None,
-    only: Only = None,
-    without: Without = None,
-    mpe: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=A[+L/K]",
-            help="Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where "
-            "one is not met by the decision rule.",
-        ),
-    ] = None,
-    acceptance: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="[jjf|asme|iso]",
-            help="Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; repeatable. Default: those of "
-            "the standard that the capture was made for, of --mpe, and of all for a manifest of points.",
-        ),
-    ] = None,
-    test_u_mm: Annotated[
-        str,
-        typer.Option(
-            metavar="A[+L/K]",
-            help="Standard uncertainty that seat and fixture add to every test value (L: the length).",
-        ),
-    ] = "0",
-    expansion: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="OF=C,U,T,U",
-            help="Thermal expansion of the artefact or the arm in an acceptance test: coefficient in 1e-6/K, "
-            "temperature in C, each with its standard uncertainty; 'artefact=11.5,1,20.8,0.2'. Lengths are corrected. "
-            "Of the arm only where it does not compensate its own.",
-        ),
-    ] = None,
-    rule: Annotated[
-        Literal["iso-2017", "iso-2013", "simple"] | None,
-        typer.Option(
-            help="Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance "
-            "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017."
-        ),
-    ] = None,
-    range_mm: Annotated[
-        float | None,
-        typer.Option(min=0, metavar="MM", help="Measuring range that the maker states, a diameter; else of the files."),
-    ] = None,
-    max_rms_mm: Annotated[
-        float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where the RMS distance is larger.")
-    ] = None,
-    max_deltam_mm: Annotated[
-        float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where Deltam is larger.")
-    ] = None,
-    max_length_error_mm: Annotated[
-        float | None, typer.Option(min=0, metavar="MM", help="Exit code 1 where the error of any length is larger.")
-    ] = None,
-    as_json: Json = False,
+    calibration: Path = argument(
+        "CALIBRATION.h5", "Calibration, written by calibrate; or, alone, a manifest of points (TOML)."
+    ),
+    capture: Path | None = argument("CAPTURE.h5", "Capture, written by import or simulate.", None),
+    output: Path | None = output("FILE.h5", "Evaluation to write (HDF5), for aacmm report.", None),
+    only: list[str] | None = ONLY,
+    without: list[str] | None = WITHOUT,
+    mpe: list[str] | None = option(
+        "NAME=A[+L/K]",
+        "Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where one is not "
+        "met by the decision rule.",
+    ),
+    acceptance: list[str] | None = option(
+        "[jjf|asme|iso]",
+        "Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; repeatable. Default: those of the "
+        "standard that the capture was made for, of --mpe, and of all for a manifest of points.",
+    ),
+    test_u_mm: str = option(
+        "A[+L/K]",
+        "Standard uncertainty that seat and fixture add to every test value (L: the length).",
+        default="0",
+    ),
+    expansion: list[str] | None = option(
+        "OF=C,U,T,U",
+        "Thermal expansion of the artefact or the arm in an acceptance test: coefficient in 1e-6/K, temperature in C, "
+        "each with its standard uncertainty; 'artefact=11.5,1,20.8,0.2'. Lengths are corrected. Give it for the arm "
+        "only where the arm does not compensate its own expansion.",
+    ),
+    rule: Literal["iso-2017", "iso-2013", "simple"] | None = option(
+        None,
+        "Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance "
+        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017.",
+    ),
+    range_mm: float | None = option(
+        "MM", "Measuring range that the maker states, a diameter. Default: that of the files.", min=0
+    ),
+    max_rms_mm: float | None = option("MM", "Exit code 1 where the RMS distance is larger.", min=0),
+    max_deltam_mm: float | None = option("MM", "Exit code 1 where Deltam is larger.", min=0),
+    max_length_error_mm: float | None = option("MM", "Exit code 1 where the error of any length is larger.", min=0),
+    as_json: bool = JSON,
 ) -> None:
     """Test a calibration on a capture that it has not seen.
 
@@ -128,7 +99,7 @@ def evaluate(
     from ..acceptance.decision import limit_of_text, read_limits
     from ..acceptance.influences import Influences, read_expansions
     from ..acceptance.results import METRICS
-    from . import acceptance_display
+    from . import evaluation_views
 
     u_test, bodies = limit_of_text(test_u_mm, f"--test-u-mm {test_u_mm}"), read_expansions(expansion or [])
     of_test = {
@@ -145,37 +116,106 @@ def evaluate(
                 "a manifest of points takes no --max-..., --only and --without; name a calibration and a capture for "
                 "these options."
             )
-        summary = evaluated_points(calibration, output, acceptance, range_mm, of_test)
-        show_summary(summary, as_json, acceptance_display.points)
+        summary = _evaluated_points(calibration, output, acceptance, range_mm, of_test)
+        show_summary(summary, as_json, evaluation_views.points)
     else:
         of_test |= {"maxima": maxima, "standards": acceptance}
-        summary = evaluated(calibration, capture, output, (only, without), range_mm, of_test)
-        show_summary(summary, as_json, acceptance_display.evaluation)
+        summary = _evaluated(calibration, capture, output, (only, without), range_mm, of_test)
+        show_summary(summary, as_json, evaluation_views.evaluation)
     undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
     if summary["failed"] or undecided:
         raise typer.Exit(1)
 
 
+def _evaluated(
+    calibration: Path,
+    capture: Path,
+    output: Path | None,
+    choice: tuple,
+    measuring_range: float | None,
+    of_test: dict[str, Any],
+) -> dict[str, Any]:
+    """Evaluate a calibration on a capture; the summary."""
+    from ..acceptance.record import evaluation_of
+    from ..files.calibrations import load_calibration
+    from ..files.captures import load_capture
+    from ..files.evaluations import save_evaluation
+    from ..summaries.evaluation import evaluation_summary
+    from ..summaries.warnings import of_calibration
+
+    with together(output):
+        read = InputFile(calibration), InputFile(capture)
+        record, recording = load_calibration(read[0]), load_capture(read[1])
+        recording = recording._replace(
+            capture=recording.capture.select(choice[0] or None, choice[1] or ()),
+            sources=(*map(fingerprint, read), *recording.sources),
+            measuring_range=measuring_range or recording.measuring_range,
+        )
+        stored = read_summary(read[0], ("calibration",))[1]
+        warnings = of_calibration(record) if stored is None else stored["warnings"]
+        evaluation = evaluation_of(record, recording, **of_test)._replace(calibration_warnings=tuple(warnings))
+        summary = with_spinner("Evaluating", lambda: evaluation_summary(evaluation))
+        if not summary["acceptance"]:
+            _refuse_options_of_tests(of_test, measuring_range)
+        if output is not None:
+            save_evaluation(output, evaluation, summary)
+            summary["written"] = str(output)
+    return summary
+
+
+def _refuse_options_of_tests(of_test: dict[str, Any], measuring_range: float | None) -> None:
+    """Raise `InputError` where options are given that only acceptance tests have, and none was made."""
+    influences = of_test["influences"]
+    options = {
+        "--rule": of_test["rule"] is not None,
+        "--test-u-mm": of_test["u_test"] > 0 or influences.u_relative > 0,
+        "--expansion": influences.artefact is not None or influences.arm is not None,
+        "--range-mm": measuring_range is not None,
+    }
+    given = [name for name, there in options.items() if there]
+    if given:
+        raise InputError(
+            f"{shorten(given)} applies to acceptance tests only; this capture supports none, or none was requested: "
+            "name them with --acceptance, or leave the option out."
+        )
+
+
+def _evaluated_points(
+    manifest: Path,
+    output: Path | None,
+    standards: list[str] | None,
+    measuring_range: float | None,
+    of_test: dict[str, Any],
+) -> dict[str, Any]:
+    """Run the acceptance tests of a manifest of points; the summary."""
+    from ..acceptance.record import PointsRecord
+    from ..acceptance.standards import STANDARDS, checked_standards
+    from ..files.evaluations import save_points
+    from ..files.points import read_points
+    from ..summaries.evaluation import points_summary
+
+    if manifest.suffix != ".toml":
+        raise InputError(
+            f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
+        )
+    with together(output):
+        chosen = checked_standards(STANDARDS if standards is None else standards)
+        measured = read_points(manifest)
+        measured = measured._replace(measuring_range=measuring_range or measured.measuring_range)
+        record = PointsRecord(measured, standards=chosen, **of_test)
+        summary = points_summary(record)
+        if output is not None:
+            save_points(output, record, summary)
+            summary["written"] = str(output)
+    return summary
+
+
 @app.command(epilog=examples("aacmm report calibration.h5 -o report.html"))
 def report(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE.h5",
-            help="Calibration, evaluation (evaluate -o), study or compared models (compare-models -o).",
-        ),
-    ],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE.html",
-            help="Report to write: one HTML file that needs no network connection." + KEPT,
-        ),
-    ],
-    about: About = None,
-    as_json: Json = False,
+    file: Path = argument("FILE.h5", "File to report: a calibration, evaluation, study or model comparison."),
+    output: Path = output("FILE.html", "Report to write: one HTML file that needs no network connection."),
+    about: Path | None = ABOUT,
+    as_json: bool = JSON,
 ) -> None:
     """Write a report of a result as one HTML file.
 
@@ -183,120 +223,26 @@ def report(
     """
     from ..files.administrative_data import read_administrative_data
     from ..report import write_report
-    from . import acceptance_display
+    from . import evaluation_views
 
     with together(output):
         stated = None if about is None else read_administrative_data(about)
         summary = with_spinner("Writing the report", lambda: write_report(file, output, stated))
-    show_summary(summary, as_json, acceptance_display.report)
-
-
-@app.command(
-    epilog=examples(
-        "aacmm export calibration.h5 --format toml -o arm.toml",
-        "aacmm export calibration.h5 -o robot.urdf",
-        "aacmm export calibration.h5 --format table --convention craig --units m-rad",
-        "aacmm export calibration.h5 --format dcc --evaluation tests.h5 --about laboratory.toml -o certificate.xml",
-    )
-)
-def export(
-    calibration: CalibrationFile,
-    form: Annotated[
-        Literal["toml", "json", "csv", "dcc", "urdf", "table", "offsets", "ur", "python"] | None,
-        typer.Option(
-            "--format",
-            help="toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML); "
-            "urdf: the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: zero offsets "
-            "of the joints alone, refitted; ur: kinematics.yaml of Universal Robots; python: a program that needs only "
-            "NumPy. Default: by the name of the output (.urdf, .json, .csv, .yaml, .py), else toml.",
-        ),
-    ] = None,
-    which: Annotated[
-        Literal["calibrated", "nominal", "true"] | None,
-        typer.Option(
-            "--arm",
-            help="Which arm to write with --format toml, urdf, table, ur or python; a simulation has a true one. "
-            "Default: calibrated.",
-        ),
-    ] = None,
-    convention: Annotated[
-        Literal["standard", "craig"] | None, typer.Option(help="Of --format table. Default: standard.")
-    ] = None,
-    units: Annotated[
-        Literal["mm-deg", "m-rad"] | None, typer.Option(help="Of --format table. Default: mm-deg.")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help="File to write. Default: standard output." + KEPT,
-        ),
-    ] = None,
-    about: About = None,
-    evaluation: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.h5",
-            help="Of --format dcc: an evaluation (aacmm evaluate -o) of this calibration, whose acceptance tests are "
-            "added.",
-        ),
-    ] = None,
-) -> None:
-    """Write a calibration for other programs or controllers."""
-    written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
-    if (about is not None or evaluation is not None) and written_as != "dcc":
-        raise InputError("--about and --evaluation are for certificates; give them with --format dcc.")
-    if which is not None and written_as not in _OF_ONE_ARM:
-        raise InputError(
-            f"--arm is for --format {', '.join(_OF_ONE_ARM)}; leave it out, as {written_as} holds what it needs."
-        )
-    if (convention is not None or units is not None) and written_as != "table":
-        raise InputError("--convention and --units are for tables; give them with --format table.")
-    from ..files.calibrations import load_calibration
-
-    with together(output):
-        record = load_calibration(read := InputFile(calibration))
-        arms = {"calibrated": record.calibrated, "nominal": record.recording.nominal, "true": record.recording.true}
-        specification = arms[which or "calibrated"]
-        if specification is None:
-            raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
-        warn_of_unusable(calibration, record)
-        source = ""
-        if which in (None, "calibrated"):
-            scale = "" if math.isnan(record.k) else f", k = {record.k:.8f}"
-            source = f"calibrated from {len(record.recording.capture.readings)} poses, {record.method}{scale}"
-        if written_as == "dcc":
-            text, notes = certificate(read, record, about, evaluation), ()
-        else:
-            text, notes = exported(record, specification, written_as, source, convention, units)
-        if output is not None:
-            if written_as == "urdf" and (original := record.recording.nominal.urdf) and text != original.text:
-                check_kept(output, original.text)
-            write_text(output, text)
-    typer.echo(text, nl=False) if output is None else typer.echo(f"Written: {output}")
-    for note in notes:
-        typer.echo(printable(note), err=output is None)
+    show_summary(summary, as_json, evaluation_views.report)
 
 
 @app.command(epilog=examples("aacmm show calibration.h5", "aacmm show panda"))
 def show(
-    file: Annotated[
-        str,
-        typer.Argument(
-            metavar="FILE",
-            help="Capture, calibration, evaluation, study or compared models (HDF5), or an arm: a TOML file, a URDF, a "
-            "kinematics.yaml or a shipped name.",
-        ),
-    ],
-    cell: Annotated[int | None, typer.Option(min=1, metavar="N", help="Of a study: show this cell in full.")] = None,
-    figures: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Of a study: write its figures (PNG) to this folder.")
-    ] = None,
-    base: BaseLink = None,
-    tip: TipLink = None,
-    as_json: Json = False,
+    file: str = argument(
+        "FILE",
+        "File to show: a capture, calibration, evaluation, study or model comparison (HDF5), or an arm: a TOML file, a "
+        "URDF, a kinematics.yaml or a shipped name.",
+    ),
+    cell: int | None = option("N", "Show this cell of a study in full.", min=1),
+    figures: Path | None = option("FOLDER", "Write the figures of a study (PNG) to this folder."),
+    base: str | None = BASE_LINK,
+    tip: str | None = TIP_LINK,
+    as_json: bool = JSON,
 ) -> None:
     """Print the content of a file."""
     path = Path(file)
@@ -315,29 +261,36 @@ def show(
         return
     if cell is not None or figures is not None:
         raise InputError(f"{file} holds a {kind}; --cell and --figures are for studies.")
-    from . import acceptance_display, calibration_display
-    from .models_command import display as display_models
+    if kind == "model comparison":  # whose tables hold all of it
+        from ..files.compared_models import load_compared_models
+        from .calibration_commands import compared_models
 
+        prepare_jax()
+        show_summary(dict(load_compared_models(path)), as_json, compared_models)
+        return
     if kind == "evaluation" and attributes.get("of") == "points":
         kind = "points"
-    display = {
-        "capture": calibration_display.capture,
-        "calibration": calibration_display.calibration,
-        "evaluation": acceptance_display.evaluation,
-        "points": acceptance_display.points,
-        "model comparison": display_models,
-    }[kind]
-    if summary is None or kind == "model comparison":  # whose tables hold all of it
-        summary = _summary_of(path, kind)
+    load, summarise, view = _KINDS[kind]
+    if summary is None:  # of a file that was written through Python, or by another version
+        prepare_jax()
+        summary = _imported("summaries", summarise)(_imported("files", load)(path))
     else:
         check_shown(path, attributes["kind"], summary)
-    show_summary(summary, as_json, display)
+    show_summary(summary, as_json, _imported("cli", view))
+
+
+def _imported(folder: str, name: str) -> Any:
+    """A function of a module that is imported only now."""
+    from importlib import import_module
+
+    module, _, function = name.partition(".")
+    return getattr(import_module(f"...{folder}.{module}", __name__), function)
 
 
 def _show_arm(file: str, base: str | None, tip: str | None, as_json: bool) -> None:
     from ..files.arms import load_specification
     from ..summaries.calibration import arm_summary
-    from . import calibration_display
+    from . import calibration_views
 
     prepare_jax()
     specification = load_specification(file, base=base, tip=tip)
@@ -346,24 +299,4 @@ def _show_arm(file: str, base: str | None, tip: str | None, as_json: bool) -> No
         from ..files.urdf import urdf_chain
 
         summary["urdf"]["first_frame_in_base_mm"] = urdf_chain(specification.urdf).base.tolist()
-    show_summary(summary, as_json, calibration_display.arm)
-
-
-def _summary_of(file: Path, kind: str) -> dict[str, Any]:
-    """The summary of a file that holds none: one written through Python, or by another version."""
-    from ..files.calibrations import load_calibration
-    from ..files.captures import load_capture
-    from ..files.compared_models import load_compared_models
-    from ..files.evaluations import load_evaluation, load_points
-    from ..summaries.calibration import calibration_summary, capture_summary
-    from ..summaries.evaluation import evaluation_summary, points_summary
-
-    load, summarise = {
-        "capture": (load_capture, capture_summary),
-        "calibration": (load_calibration, calibration_summary),
-        "evaluation": (load_evaluation, evaluation_summary),
-        "points": (load_points, points_summary),
-        "model comparison": (load_compared_models, dict),
-    }[kind]
-    prepare_jax()
-    return summarise(load(file))
+    show_summary(summary, as_json, calibration_views.arm)

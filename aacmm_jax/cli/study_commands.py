@@ -8,14 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from ..core.errors import InputError
 from ..files.outputs import together
 from . import INTERRUPTED, INTERRUPTED_SENTENCE
-from .app import KEPT, Json, Stopped, app, examples, show_summary, with_spinner
+from .app import JSON, Stopped, app, argument, examples, flag, option, output, show_summary, with_spinner
 
 
 @app.command(
@@ -26,49 +24,28 @@ from .app import KEPT, Json, Stopped, app, examples, show_summary, with_spinner
     )
 )
 def study(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE.h5", help="Study to write, or to continue (HDF5)." + KEPT)
-    ],
-    specification: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="SPEC.toml", help="Specification: a TOML file, or the name of a study that ships with aacmm."
-        ),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in the output file.")] = False,
-    trials: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Trials in each cell, instead of the specification's.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, metavar="N", help="Seed, instead of the specification's.")] = None,
-    chunk: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Trials computed at a time; no result depends on it. Default 1000."),
-    ] = None,
-    dask: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Run on a Dask cluster: the address of its scheduler. tcp:// trusts everybody who can reach its port, "
-            "who can run programs with your rights; tls:// asks for certificates (see docs/scaling.md). 'local' is for "
-            "processes on this machine, which open no port.",
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Threads, or processes of --dask local. Default: one a core.")
-    ] = None,
-    shards: Annotated[
-        bool,
-        typer.Option(
-            "--shards", help="Dask workers write their trials themselves, to the output's folder, which they share."
-        ),
-    ] = False,
-    keep_parts: Annotated[
-        bool,
-        typer.Option(
-            "--keep-parts", help="Leave the workers' files in their folder at the end: for results too large to copy."
-        ),
-    ] = False,
-    as_json: Json = False,
+    output: Path = output("FILE.h5", "Study to write, or to continue (HDF5)."),
+    specification: str | None = argument(
+        "SPEC.toml", "Specification: a TOML file, or the name of a study that ships with aacmm.", None
+    ),
+    resume: bool = flag("--resume", "Continue the study in the output file."),
+    trials: int | None = option("N", "Trials in each cell. Default: as the specification says.", min=1),
+    seed: int | None = option("N", "Seed. Default: as the specification says.", min=0),
+    chunk: int | None = option("N", "Trials computed at a time; no result depends on it. Default: 1000.", min=1),
+    dask: str | None = option(
+        "ADDRESS",
+        "Run on a Dask cluster: the address of its scheduler. tcp:// trusts everybody who can reach its port, who can "
+        "run programs with your rights; tls:// asks for certificates (see docs/scaling.md). 'local' is for processes "
+        "on this machine, which open no port.",
+    ),
+    workers: int | None = option("N", "Threads, or processes of --dask local. Default: one a core.", min=1),
+    shards: bool = flag(
+        "--shards", "Dask workers write their trials themselves, to the output's folder, which they share."
+    ),
+    keep_parts: bool = flag(
+        "--keep-parts", "Leave the workers' files in their folder at the end: for results too large to copy."
+    ),
+    as_json: bool = JSON,
 ) -> None:
     """Run a Monte Carlo study of simulated calibrations.
 
@@ -103,7 +80,7 @@ def study(
             "trials_this_run": outcome.ran,
             "finished": outcome.finished,
         }
-        show_summary(summary, as_json, lambda _: _ended(outcome, output))
+        show_summary(summary, as_json, _ended)
         if not outcome.finished:
             raise Stopped(
                 f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. "
@@ -145,7 +122,7 @@ def _leaving_threads() -> Iterator[None]:
         yield
     except (KeyboardInterrupt, Stopped) as interrupt:
         from ..core._compat import end_process
-        from ..study.local_processes import THREADS
+        from ..study.executors import THREADS
 
         if not any(thread.name.startswith(THREADS) for thread in threading.enumerate()):
             raise
@@ -191,10 +168,12 @@ def _progress_display() -> Iterator[Any]:
         yield show
 
 
-def _ended(outcome: Any, output: Path) -> None:
-    if outcome.finished:
-        ran = f"{outcome.ran:,} trials run" if outcome.ran else "nothing was left to run"
-        print(f"Written: {output} ({outcome.total:,} trials, {ran}).\nSee it with: aacmm show {output}")
+def _ended(summary: dict[str, Any]) -> list[str]:
+    if not summary["finished"]:
+        return []
+    ran = f"{summary['trials_this_run']:,} trials run" if summary["trials_this_run"] else "nothing was left to run"
+    written = summary["written"]
+    return [f"Written: {written} ({summary['trials']:,} trials, {ran}).", f"See it with: aacmm show {written}"]
 
 
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
@@ -202,7 +181,7 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
     from ..plot import save_study_figures
     from ..study.results import Results
     from ..study.statistics import study_summary
-    from . import study_display
+    from . import study_views
 
     results = Results.of(file)
     if cell is not None and cell > len(results.study.cells):
@@ -212,4 +191,4 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
         with together():
             paths = with_spinner("Drawing", lambda: save_study_figures(results, figures))
         summary["figures_written"] = [str(path) for path in paths]
-    show_summary(summary, as_json, study_display.study if cell is None else study_display.one_cell)
+    show_summary(summary, as_json, study_views.study if cell is None else study_views.one_cell)

@@ -17,14 +17,15 @@ rest: it converts lists to arrays, compares shapes across arguments, and raises 
     ): ...
 
     sphere("S", [[0.1, 0.2]], diameter=-1)  # diameter of sphere 'S' is -1 mm; it must be positive.
-    sphere("S", [[0.1, 0.2]], [1, 2], diameter=9)  # u of sphere 'S' has shape (2,); give one number, or (1,).
+    sphere("S", [[0.1, 0.2]], [1, 2], diameter=9)
+    # u of sphere 'S' has shape (2,); give one number, or (poses,) with 1 pose.
     sphere("S", [[0.1, 0.2]], diameter=9, method="jiont")  # method of sphere 'S' is 'jiont'; did you mean 'joint'?
 
 | annotation | what passes, and what the function gets |
 |---|---|
 | ``int``, ``float``, ``bool``, ``str`` | such a value as it is; a ``float`` may be an integer or a scalar array |
 | a class of this package | an instance |
-| `Float` of `AnyArray` | finite real numbers as float64: NumPy's stay NumPy's. Of `np.ndarray`: always NumPy's |
+| `Float` of `AnyArray` | finite real numbers as float64: NumPy's stay NumPy's. Of one library: always that one's |
 | `Literal`, ``Annotated[str, OneOf(names)]`` | one of the names; the sentence has the nearest |
 | ``Sequence[X]``, ``Iterable[X]``, ``tuple[X, ...]`` | a tuple, each item checked as X; a string is no list |
 | ``Mapping[str, X]`` | a dictionary, each value checked as X |
@@ -47,11 +48,13 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, overload
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
 from .arrays import as_array, is_concrete
 from .errors import InputError, nearest
+from .text import pluralise
 
 Function = TypeVar("Function", bound=Callable)
 Sizes = dict[str, int]  # of dimensions, by name
@@ -60,19 +63,21 @@ Check = Callable[..., Any]
 
 
 class Range(NamedTuple):
-    """A rule: every number is finite and in this range."""
+    """A rule: every number is in this range, and finite."""
 
     least: float = -math.inf
     most: float = math.inf
     above: float = -math.inf
     below: float = math.inf
     unit: str = ""
+    infinite: bool = False  # whether infinite numbers pass as well
 
     def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
         """The value, or `InputError`."""
         if is_concrete(value):
             x = np.asarray(value, dtype=float)
-            inside = (self.least <= x) & (x <= self.most) & (self.above < x) & (x < self.below) & np.isfinite(x)
+            inside = (self.least <= x) & (x <= self.most) & (self.above < x) & (self.infinite | (x < self.below))
+            inside &= np.isfinite(x) | (self.infinite & ~np.isnan(x))
             _check_each(x, inside, what, f"it must be {self._in_words()}", f" {self.unit}" if self.unit else "")
         return value
 
@@ -267,7 +272,8 @@ def _of_alternatives(annotations: Sequence[Any]) -> Check | None:
     ]
     if arrays:
         shapes = tuple(dict.fromkeys(array.dim_str for array in arrays))
-        checks.append(_ArrayCheck(shapes, all(array.array_type is np.ndarray for array in arrays)))
+        libraries = {np if array.array_type is np.ndarray else jnp for array in arrays}
+        checks.append(_ArrayCheck(shapes, libraries.pop() if len(libraries) == 1 else None))
     if classes:
         wanted = " or ".join(_with_article(kind.__name__) for kind in classes)
         checks.append(_passing(lambda value: isinstance(value, classes), wanted))
@@ -312,11 +318,11 @@ class _ArrayCheck(NamedTuple):
     """Real numbers of one of some shapes, each as jaxtyping writes it: names, sizes, ``*name`` and ``...``."""
 
     shapes: tuple[str, ...]
-    always_numpy: bool
+    library: Any  # that its result is of: numpy, jax.numpy, or None for that of the value
     finite: bool = True
 
     def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
-        array = as_array(value, what, like=np.zeros(0))
+        array = as_array(value, what, like=() if self.library is jnp else np.zeros(0))
         for shape in self.shapes:
             named = _sizes_by_name(shape.split(), array.shape, sizes)
             if named is not None:
@@ -330,7 +336,7 @@ class _ArrayCheck(NamedTuple):
         numbers = np.asarray(array)
         if self.finite:
             _check_each(numbers, np.isfinite(numbers), what, "give finite numbers", dimensions=shape.split())
-        return numbers if self.always_numpy else array
+        return numbers if self.library is np else array
 
 
 def _item(what: str, *index: Any) -> str:
@@ -355,8 +361,10 @@ def _sizes_by_name(names: Sequence[str], shape: tuple[int, ...], sizes: Sizes) -
 
 
 def _shape_in_words(names: Sequence[str], sizes: Sizes) -> str:
-    values = [str(sizes.get(name, name)) for name in names]
-    return f"({', '.join(values)}{',' if len(values) == 1 else ''})" if values else "one number"
+    if not names:
+        return "one number"
+    counts = [pluralise(sizes[name], name.removesuffix("s")) for name in names if name in sizes]
+    return f"({', '.join(names)}{',' if len(names) == 1 else ''}){' with ' * bool(counts)}{', '.join(counts)}"
 
 
 def _check_each(

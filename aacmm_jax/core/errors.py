@@ -1,7 +1,8 @@
 """The exception and the warning of the package, and a hint for misspelt words."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from .text import in_short, quoted
 
@@ -41,6 +42,15 @@ class IdentifiabilityWarning(UserWarning):
         >>> print(str(caught[0].message).partition(";")[0])
         No measurement of this kind can separate: d_1 (changes nothing that is measured)
     """
+
+
+@contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Have an `InputError` begin with where it is: a file, or a key of a specification."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def nearest(word: str, known: Iterable[str], most: int = 12) -> str:

@@ -30,7 +30,7 @@ from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
 from ..kinematics.corrections.kinds import coefficient_of, shared_model
 from ..kinematics.parameters import ArmSpecification
-from ..kinematics.prior_scales import default_prior
+from ..kinematics.priors import default_prior
 from ..uncertainty.covariance import DISAGREEMENT
 from ..uncertainty.degrees_of_freedom import Law
 from ..uncertainty.shared_errors import SharedErrors

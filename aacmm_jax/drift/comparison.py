@@ -1,13 +1,14 @@
 """Calibrations of one arm compared: parameters that changed beyond their uncertainty, and the effect on lengths."""
 
 import datetime
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, correction_names, parameter_names, parameter_unit, value_of
@@ -17,14 +18,16 @@ from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
 from .statistics import FIXED, ON_BOUND, joint_test, length_change
 
+_Level = Annotated[float, Range(above=0, below=1)]
 _PAIR = ("the old calibration", "the new calibration")
 
 
+@checked_arguments
 def compare(
     old: CalibrationRecord,
     new: CalibrationRecord,
     *,
-    level: float = 0.95,
+    level: _Level = 0.95,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
@@ -60,15 +63,16 @@ def compare(
         >>> print(changed.sentences()[0][:60])
         Probe remounted: a change of the probe alone (probe_x by -0.
     """
-    _check([old, new], level, labels)
+    _check_arms([old, new], labels)
     return _compared(old, new, _names([old, new]), level, _lengths(old, points, length, seed), labels)
 
 
+@checked_arguments
 def trend(
     records: Sequence[CalibrationRecord],
     dates: Sequence[datetime.datetime | str],
     *,
-    level: float = 0.95,
+    level: _Level = 0.95,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
@@ -108,7 +112,7 @@ def trend(
     sorted_records = [records[i] for i in order]
     names = [f"calibration {number} ({moments[i]:%Y-%m-%d})" for number, i in enumerate(order, start=1)]
     names = names if labels is None else [labels[i] for i in order]
-    _check(sorted_records, level, names)
+    _check_arms(sorted_records, names)
     lengths = _lengths(sorted_records[0], points, length, seed)
     drifts = [
         _compared(sorted_records[0], record, _names(sorted_records), level, lengths, (names[0], name))
@@ -128,16 +132,17 @@ def _compared(
     """``lengths``: their length, and the configurations at both ends."""
     arms = old.calibrated.arm, new.calibrated.arm
     before, after = (_values(arm, names) for arm in arms)
-    reasons = _reasons(old, new, names)
-    known = np.array([not reason for reason in reasons])
-    both = [uncertainty_of(record) for record in (old, new)]
-    law = both[0].law.joined(both[1].law)
-    parts = np.concatenate([_parts(uncertainty, names) for uncertainty in both], axis=1)
-    parts = np.where(known[:, None], parts, 0.0)
-    u = np.where(known, np.sqrt(parts.sum(axis=1)), np.nan)
+    reasons = tuple(_why_open((old, new), name) for name in names)
+    certain = np.array([not reason for reason in reasons])
+    uncertainties = [uncertainty_of(record) for record in (old, new)]
+    law = uncertainties[0].law.joined(uncertainties[1].law)
+    parts = np.concatenate([_parts(uncertainty, names) for uncertainty in uncertainties], axis=1)
+    parts = np.where(certain[:, None], parts, 0.0)
+    u = np.where(certain, np.sqrt(parts.sum(axis=1)), np.nan)
     return Drift(
         names=names,
-        units=tuple(_unit(arms, name) for name in names),
+        # One of the arms may lack a coefficient.
+        units=tuple(parameter_unit(arms[name not in correction_names(arms[0])], name) for name in names),
         old=before,
         new=after,
         u=u,
@@ -154,13 +159,8 @@ def _compared(
 def _values(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
     """Values of parameters; coefficients of corrections that the arm lacks are 0."""
     down: dict[str, float] = dict(zip(("gravity_x", "gravity_y", "gravity_z"), DOWN, strict=True))
-    known = {*parameter_names(arm), *(f"beta_{i}" for i in range(1, arm.joints + 1) if arm.beta is not None)}
-    return np.array([float(value_of(arm, name)) if name in known else down.get(name, 0.0) for name in names])
-
-
-def _unit(arms: tuple[Arm, Arm], name: str) -> str:
-    """The unit of a parameter that one of two arms may lack."""
-    return parameter_unit(next((arm for arm in arms if name in correction_names(arm)), arms[0]), name)
+    present = {*parameter_names(arm), *(f"beta_{i}" for i in range(1, arm.joints + 1) if arm.beta is not None)}
+    return np.array([float(value_of(arm, name)) if name in present else down.get(name, 0.0) for name in names])
 
 
 def _names(records: Sequence[CalibrationRecord]) -> tuple[str, ...]:
@@ -176,45 +176,32 @@ def _lengths(
     return (length, *sample_lengths(arm, points, length=length, seed=seed))
 
 
-def _reasons(old: CalibrationRecord, new: CalibrationRecord, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Why the change of each parameter has no uncertainty; empty if it has one."""
-    found = []
-    for one, two in ((_reason(old, name), _reason(new, name)) for name in names):
-        parts = [f"{one} in both"] if one == two else [f"{one} in the old one", f"{two} in the new one"]
-        found.append(" and ".join(part for part, reason in zip(parts, (one, two), strict=False) if reason))
-    return tuple(found)
-
-
-def _reason(record: CalibrationRecord, name: str) -> str:
-    if name not in record.names:
-        return FIXED
-    i = record.names.index(name)
-    if record.active[i]:
-        return ON_BOUND
-    known = record.determined[i] and record.open[i, i] < 1e-6 and np.isfinite(record.covariance[i, i])
-    return "" if known else "left open by the data"
+def _why_open(records: Sequence[CalibrationRecord], name: str) -> str:
+    """Why the change of a parameter has no uncertainty; empty if it has one."""
+    reasons = []
+    for record in records:
+        i = record.names.index(name) if name in record.names else None
+        if i is None:
+            reasons.append(FIXED)
+        elif record.active[i]:
+            reasons.append(ON_BOUND)
+        else:
+            closed = record.determined[i] and record.open[i, i] < 1e-6 and np.isfinite(record.covariance[i, i])
+            reasons.append("" if closed else "left open by the data")
+    if reasons[0] == reasons[1]:
+        return f"{reasons[0]} in both" if reasons[0] else ""
+    places = zip(reasons, ("old", "new"), strict=True)
+    return " and ".join(f"{reason} in the {which} one" for reason, which in places if reason)
 
 
 def _parts(uncertainty: Uncertainty, names: tuple[str, ...]) -> Float[np.ndarray, "p c"]:
     """Variances of parameters in the order of ``names``, part by part; 0 for fixed ones."""
-    index = {name: i for i, name in enumerate(uncertainty.names)}
-    slopes = np.zeros((len(names), len(uncertainty.names)))
-    for row, name in zip(slopes, names, strict=True):
-        if name in index:
-            row[index[name]] = 1.0
-    return np.asarray(uncertainty.parts(slopes))
+    slopes = np.array([[float(name == other) for other in uncertainty.names] for name in names])
+    return np.asarray(uncertainty.parts(slopes.reshape(len(names), -1)))
 
 
-def _check(records: Sequence[Any], level: float, labels: Sequence[str]) -> None:
-    """Raise `InputError` for what cannot be compared."""
-    if not 0 < level < 1:
-        raise InputError(f"level is {level:g}; give a number between 0 and 1, for example 0.95.")
-    for record in records:
-        if not isinstance(record, CalibrationRecord):
-            raise InputError(
-                f"a {type(record).__name__} cannot be compared; give records, from aj.files.load_calibration or "
-                "aj.calibration.record_of."
-            )
+def _check_arms(records: Sequence[CalibrationRecord], labels: Sequence[str]) -> None:
+    """Refuse calibrations of arms with different numbers of joints."""
     arms = [record.recording.nominal for record in records]
     for arm, label in zip(arms, labels, strict=True):
         if arm.arm.joints != arms[0].arm.joints:
@@ -227,63 +214,49 @@ def _check(records: Sequence[Any], level: float, labels: Sequence[str]) -> None:
 def moment(date: datetime.datetime | str) -> datetime.datetime:
     """A date with its time zone, UTC by default. Raises `InputError` for a text that is not a date."""
     try:
-        found = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
+        time = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
     except ValueError as error:
         raise InputError(f"'{date}' is not a date; give it like 2026-03-01 or 2026-03-01T12:00:00+00:00.") from error
-    return found if found.tzinfo else found.replace(tzinfo=datetime.UTC)
+    return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
 
 
-def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> list[str]:
+def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> Iterator[str]:
     """What makes a comparison doubtful, the most serious first."""
-    found = []
     for record, label in zip((old, new), labels, strict=True):
         if not record.converged:
-            found.append(f"Failed: {label}. {record.reason} Its changes mean nothing.")
+            yield f"Failed: {label}. {record.reason} Its changes mean nothing."
         elif not record.plausible_scale:
-            found.append(f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm.")
-    found += [sentence for sentence in (_common_poses(old, new, labels), _other_arm(old, new, labels)) if sentence]
+            yield f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm."
+    poses = [{row.tobytes() for row in np.asarray(record.recording.capture.readings)} for record in (old, new)]
+    if poses[0] == poses[1]:
+        values = [_values(record.calibrated.arm, old.names) for record in (old, new)]
+        same = old.names == new.names and np.array_equal(values[0], values[1])
+        what = "are one and the same calibration" if same else "are of the same capture"
+        yield f"Not independent: {labels[0]} and {labels[1]} {what}, so drift cannot be seen."
+    elif common := len(poses[0] & poses[1]):
+        yield (
+            f"Not independent: {labels[0]} and {labels[1]} share {common} of {len(poses[1])} poses, so the "
+            "uncertainties of the changes are wrong."
+        )
+    nominal = [record.recording.nominal for record in (old, new)]
+    names = tuple(dict.fromkeys(name for specification in nominal for name in parameter_names(specification.arm)))
+    values = zip(names, *(_values(specification.arm, names) for specification in nominal), strict=True)
+    differing = [name for name, before, after in values if before != after]
+    if differing:
+        arms = [f"'{specification.name}' of {label}" for specification, label in zip(nominal, labels, strict=True)]
+        yield (
+            f"The nominal arms differ in {shorten(differing)} ({', '.join(arms)}): is it the same arm? Differences of "
+            "fixed parameters count as drift."
+        )
     if old.final_method != new.final_method:
-        found.append(
+        yield (
             f"Different methods: {labels[0]} is {old.final_method}, {labels[1]} {new.final_method}; "
             "this is part of the change."
         )
-    for one, other, label in ((old, new, labels[0]), (new, old, labels[1])):
-        alone = [name for name in one.names if name not in other.names]
+    for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
+        alone = [name for name in record.names if name not in other.names]
         if alone:
-            found.append(
+            yield (
                 f"Free in {label} only: {shorten(alone)}. Other parameters may compensate for them in the other one; "
                 "lengths can still be compared."
             )
-    return found
-
-
-def _common_poses(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> str:
-    """A sentence on poses that both calibrations use, which makes them dependent; empty if there are none."""
-    rows = [{row.tobytes() for row in np.asarray(record.recording.capture.readings)} for record in (old, new)]
-    common = len(rows[0] & rows[1])
-    if not common:
-        return ""
-    if rows[0] == rows[1]:
-        both = [_values(record.calibrated.arm, old.names) for record in (old, new)]
-        same = old.names == new.names and np.array_equal(both[0], both[1])
-        what = "are one and the same calibration" if same else "are of the same capture"
-        return f"Not independent: {labels[0]} and {labels[1]} {what}, so this says nothing about drift."
-    return (
-        f"Not independent: {labels[0]} and {labels[1]} share {common} of {len(rows[1])} poses, so the uncertainties of "
-        "the changes are wrong."
-    )
-
-
-def _other_arm(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> str:
-    """A sentence on different nominal arms; empty if they are equal."""
-    nominal = [record.recording.nominal for record in (old, new)]
-    names = tuple(dict.fromkeys(name for specification in nominal for name in parameter_names(specification.arm)))
-    values = [_values(specification.arm, names) for specification in nominal]
-    other = [name for name, one, two in zip(names, *values, strict=True) if one != two]
-    if not other:
-        return ""
-    one, two = (f"'{specification.name}' of {label}" for specification, label in zip(nominal, labels, strict=True))
-    return (
-        f"The nominal arms differ in {shorten(other)} ({one}, {two}): is it the same arm? Differences of fixed "
-        "parameters count as drift."
-    )

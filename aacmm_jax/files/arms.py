@@ -18,9 +18,8 @@ from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
 from ..uncertainty.target_parameters import determined_parameters
 from .arm_tables import ArmFile, NoiseTable
-from .atomic_write import storable, write_text
 from .corrections import corrections_toml
-from .outputs import as_path
+from .outputs import as_path, storable, write_text
 from .priors import prior_toml
 from .toml import read_toml
 from .ur_kinematics import read_ur_kinematics
@@ -276,12 +275,7 @@ def _arm_of_rows(model: ArmFile) -> Arm:
 
 
 def with_parameters(specification: ArmSpecification, capture: Capture | None = None) -> ArmSpecification:
-    """The same with the parameters for an arm whose file proposes none.
-
-    Args:
-        specification: As of `read_arm`.
-        capture: What was observed; by default tips in sockets.
-    """
+    """The same with the parameters for an arm whose file proposes none; by default for tips in sockets."""
     try:
         space = determined_parameters(specification.arm, capture)
     except InputError:  # an arm of one or two joints, which has one configuration for each position of the tip

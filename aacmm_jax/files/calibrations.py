@@ -1,51 +1,68 @@
-"""Calibrations in HDF5: the capture, the arms of each stage, parameters with their covariance, and cross-validation."""
+"""Calibrations in HDF5: the capture, the arms of each stage, parameters with their covariance, and what tests them."""
 
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.left_out import CrossValidation, LeftOut
-from ..calibration.record import CalibrationRecord
-from ..calibration.results import NoisyEncoder
-from ..core.errors import InputError
+from ..calibration.record import CalibrationRecord, OtherPoses, Removed
+from ..calibration.results import NoisyEncoder, ObservedMetrics, PriorMetrics
+from ..data.capture import Capture
 from ..kinematics.arm import parameter_unit
+from ..model.observed import Observed
 from ..uncertainty.covariance import NOISE_MODELS
-from .calibration_observations import observed_of, observed_tables, other_poses_of, removed_of
-from .calibration_prior import prior_metrics_of, prior_tables
-from .calibration_shared import component_tables, components_of, shared_errors_of, shared_tables
-from .captures import (
-    arm_table,
-    linear_encoder_attribute,
-    noise_of_attributes,
-    recording_attributes,
-    recording_of,
-    recording_tables,
-    specification_of,
-)
-from .hdf5 import (
-    Stored,
-    Table,
-    Variable,
-    axes,
-    check_sense,
-    columns,
-    names_in,
-    need,
-    read_tables,
-    undamaged,
-    write_tables,
-)
-from .sense import check_calibration
+from ..uncertainty.degrees_of_freedom import Components
+from ..uncertainty.shared_errors import SharedErrors
+from . import schema
+from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
+from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
+from .records import record_in, rows_in, rows_table, table_of, values_in
+from .sense import read_checked
 
-# Of cross-validation; earlier files have none.
-_DEGREES_OF_FREEDOM = {
-    "rms_degrees_of_freedom": "effective degrees of freedom of rms_predicted",
-    "length_degrees_of_freedom": "effective degrees of freedom of length_u",
-    "noise_degrees_of_freedom": "degrees of freedom of the noise behind both",
+# Records within the record that are a table each: their fields, and of many in rows, the dimension.
+_RECORDS: dict[str, tuple[str, type, schema.Fields, str]] = {
+    "others": ("other_poses", OtherPoses, schema.OTHER_POSES, ""),
+    "prior": ("prior", PriorMetrics, schema.PRIOR, ""),
+    "shared": ("shared_errors", SharedErrors, schema.SHARED_ERRORS, ""),
+    "components": ("components", Components, schema.COMPONENTS, ""),
+    "removed": ("removed", Removed, schema.REMOVED, "removed_group"),
+    "noisy_encoders": ("noisy_encoders", NoisyEncoder, schema.NOISY_ENCODERS, "noisy_encoder"),
 }
+
+
+class _Agreement(NamedTuple):
+    """One observation of `ObservedMetrics`."""
+
+    name: str
+    kind: str
+    rms_before: float
+    rms_after: float
+    reduced_chi: float
+    weights: np.ndarray
+
+
+class _GeometryNumber(NamedTuple):
+    """One number of the geometry that was found."""
+
+    part: str
+    unit: str
+    value: float
+    covariance: np.ndarray  # with the numbers of its part
+
+
+class _Sampled(NamedTuple):
+    """Columns of a Monte Carlo simulation."""
+
+    quantity: np.ndarray
+    estimate: np.ndarray
+    u: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    linear_u: np.ndarray
+    agrees: np.ndarray
 
 
 def save_calibration(
@@ -66,48 +83,22 @@ def save_calibration(
         >>> print(aj.files.load_calibration("calibration.h5").names == record.names)
         True
     """
-    tables = recording_tables(record.recording)
-    tables["stage1_arm"] = arm_table(record.stage1)
-    tables["calibrated_arm"] = arm_table(record.calibrated)
-    tables["parameters"] = _parameter_table(record)
-    evaluations = record.evaluations()
-    tables["sockets"] = _socket_table(record, evaluations)
-    reference = tables["reference"].variables
-    for stage, evaluation in evaluations.items():
-        reference[f"measured_{stage}"] = Variable(
-            ("length",), np.asarray(evaluation.measured), "mm", f"length as the {stage} arm measures it"
-        )
-    if record.validation is not None:
-        tables["cross_validation"] = _validation_table(record)
-    if record.sampled is not None:
-        tables["monte_carlo"] = _sampled_table(record)
-    if record.noisy_encoders:
-        tables["noisy_encoders"] = _noisy_table(record)
-    tables |= observed_tables(record) | prior_tables(record) | shared_tables(record.shared)
-    tables |= component_tables(record.components)
-    attributes = recording_attributes(record.recording) | {
-        "robust": record.robust,
-        "sampled_says": record.sampled_says,
-        "method": record.method,
-        "held": list(record.held) or "",
-        "hold": record.hold,
-        "scale_set_by": list(record.scale_set_by) or "",
-        "scale_k": record.k,
-        "scale_u": record.u_k,
-        "scale_surplus": record.surplus_k,
-        "encoder_arcsec": np.asarray(record.noise.encoder_arcsec),
-        "linear_encoder_mm": linear_encoder_attribute(record.noise),
-        "seating_mm": float(record.noise.seating),
-        "form": record.noise_model,
-        "freedom": record.degrees_of_freedom,
-        "misfit": record.reduced_chi,
-        "steps": record.steps,
-        "converged": record.converged,
-        "reason": record.reason,
-        "divided": record.divided,
-        "against_division": list(record.against_division) or "",
+    tables, evaluations = recording_tables(record.recording), record.evaluations()
+    measured = {
+        f"measured_{stage}": (np.asarray(evaluation.measured), "mm", f"length as the {stage} arm measures it")
+        for stage, evaluation in evaluations.items()
     }
-    write_tables(path, "calibration", tables, attributes, summary=summary)
+    tables["reference"] = Table(tables["reference"].variables | columns("length", **measured))
+    tables |= {"stage1_arm": arm_table(record.stage1), "calibrated_arm": arm_table(record.calibrated)}
+    tables["parameters"] = _parameter_table(record)
+    tables["sockets"] = _socket_table(record.recording.capture, evaluations)
+    if record.validation is not None:
+        tables["cross_validation"] = rows_table("group", record.validation.groups, schema.LEFT_OUT)
+    if record.sampled is not None:
+        tables["monte_carlo"] = table_of(_Sampled(**record.sampled), schema.SAMPLED)
+    tables |= _observed_tables(record.observed, Observed.of(record.recording.capture, None).blocks)
+    tables |= tables_of_records(record, _RECORDS)
+    write_tables(path, "calibration", tables, recording_attributes(record.recording), summary=summary)
 
 
 def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
@@ -120,7 +111,7 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
         The record, with arrays in mm and rad.
 
     Raises:
-        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by another version.
 
     Example:
         >>> aj.files.save_calibration("calibration.h5", record)
@@ -128,215 +119,115 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
         >>> print(loaded.calibrated.arm.position(q).round(3))
         [  36.875  104.896 -111.419]
     """
-    stored = read_tables(path, ("calibration",))
-    need(path, stored.tables, "stage1_arm", "calibrated_arm", "parameters")
     with undamaged(path):
-        record = _record(path, stored)
-        check_calibration(path, stored)
+        stored = read_checked(path, ("calibration",))
+        tables, recording = stored.tables, recording_of(path, stored)
+        sampled, groups = tables.get("monte_carlo"), tables.get("cross_validation")
+        table = tables["parameters"]
+        record = CalibrationRecord(
+            recording=recording,
+            stage1=specification_of(path, stored, "stage1_arm"),
+            calibrated=specification_of(path, stored, "calibrated_arm"),
+            observed=_observed_of(path, stored, recording.capture),
+            sampled=None if sampled is None else {name: sampled[name] for name in schema.SAMPLED},
+            validation=None if groups is None else CrossValidation(rows_in(LeftOut, schema.LEFT_OUT, "group", groups)),
+            **records_of_tables(stored, _RECORDS),
+            **values_in(CalibrationRecord, schema.CALIBRATION, table, table.attributes),
+        )
         check_sense(path, {"the noise model is unknown": record.noise_model not in NOISE_MODELS})
         return record
 
 
-def _record(path: str | os.PathLike, stored: Stored) -> CalibrationRecord:
-    table, attributes = stored.tables["parameters"], stored.attributes
-    if "observed" not in stored.tables:
-        raise InputError(
-            f"{path} is from an earlier version, which did not store residuals and positions of sockets; calibrate "
-            "again from its capture."
-        )
-    entries = ("parameter", "lower", "upper", "active_stage1", "active", "covariance", "determined", "open")
-    need(path, table, *entries, of="entry")
-    recording, names = recording_of(path, stored), tuple(str(name) for name in table["parameter"])
-    return CalibrationRecord(
-        recording=recording,
-        stage1=specification_of(path, stored, "stage1_arm"),
-        calibrated=specification_of(path, stored, "calibrated_arm"),
-        names=names,
-        held=names_in(attributes.get("held")),
-        hold=attributes.get("hold"),
-        scale_set_by=names_in(attributes.get("scale_set_by")),
-        lower=table["lower"],
-        upper=table["upper"],
-        active_stage1=table["active_stage1"],
-        active=table["active"],
-        covariance=table["covariance"],
-        determined=table["determined"].astype(bool),
-        open=table["open"],
-        noise=noise_of_attributes(attributes),
-        noise_model=attributes["form"],
-        degrees_of_freedom=float(attributes["freedom"]),
-        reduced_chi=attributes.get("misfit"),
-        k=attributes["scale_k"],
-        u_k=attributes["scale_u"],
-        method=attributes["method"],
-        steps=attributes["steps"],
-        converged=bool(attributes["converged"]),
-        reason=attributes["reason"],
-        observed=observed_of(path, stored, recording.capture),
-        # Of versions before 5 only joint solves are read.
-        divided=bool(attributes.get("divided", False)),
-        against_division=names_in(attributes.get("against_division")),
-        validation=_validation_of(stored),
-        sampled=stored.tables.get("monte_carlo"),
-        sampled_says=attributes.get("sampled_says"),
-        robust=attributes.get("robust"),
-        others=other_poses_of(stored),
-        removed=removed_of(stored),
-        prior=prior_metrics_of(stored),
-        noisy_encoders=_noisy_of(stored),
-        shared=shared_errors_of(stored),
-        components=components_of(stored),
-        surplus_k=float(attributes.get("scale_surplus", 0.0)),
-    )
+def tables_of_records(record: Any, kinds: Mapping[str, tuple[str, type, schema.Fields, str]]) -> dict[str, Table]:
+    """Tables of the records within a record, those that there are."""
+    present = {field: getattr(record, field) for field in kinds if getattr(record, field)}
+    return {
+        kinds[field][0]: rows_table(kinds[field][3], value, kinds[field][2])
+        if kinds[field][3]
+        else table_of(value, kinds[field][2])
+        for field, value in present.items()
+    }
+
+
+def records_of_tables(stored: Stored, kinds: Mapping[str, tuple[str, type, schema.Fields, str]]) -> dict[str, Any]:
+    """What `tables_of_records` stored, by field."""
+    return {
+        field: rows_in(cls, fields, dimension, stored.tables.get(name))
+        if dimension
+        else record_in(cls, fields, stored.tables.get(name))
+        for field, (name, cls, fields, dimension) in kinds.items()
+    }
 
 
 def _parameter_table(record: CalibrationRecord) -> Table:
-    names = list(record.names)
-    units = [parameter_unit(record.calibrated.arm, name) for name in names]
-    both, square = "see unit", ("parameter", "parameter_2")
-    variables = columns("parameter", parameter=(names, "", "free parameter"))
-    variables |= columns("parameter_2", parameter_2=(names, "", "free parameter, second axis of the covariance"))
-    variables |= columns(
-        "parameter",
-        unit=(units, "", "unit of the parameter"),
-        lower=(record.lower, both, "lower bound of the identification"),
-        upper=(record.upper, both, "upper bound of the identification"),
-        u=(np.sqrt(np.diag(record.covariance)), both, "standard uncertainty"),
-        active_stage1=(record.active_stage1, "1", "-1 on the lower bound, +1 on the upper, in stage 1"),
-        active=(record.active, "1", "-1 on the lower bound, +1 on the upper"),
-        determined=(record.determined.astype(np.int8), "1", "0: only a combination is determined"),
-    )
-    variables["open"] = Variable(square, record.open, "1", "projector onto what is not determined, in mm and mrad")
-    variables["covariance"] = Variable(square, record.covariance, "products of units", "covariance")
-    for stage, vector in record.vectors().items():
-        variables[stage] = Variable(("parameter",), vector, both, f"value in the {stage} arm")
-    return Table(variables)
-
-
-def _noisy_table(record: CalibrationRecord) -> Table:
-    both, of = "rad, or mm of a prismatic joint", record.noisy_encoders
-    return Table(
-        columns(
-            "noisy_encoder",
-            noisy_encoder=([one.joint for one in of], "1", "joint whose encoder is noisier than expected"),
-            expected=([one.expected for one in of], both, "standard deviation as given, or as that of the others"),
-            found=([one.found for one in of], both, "standard deviation, estimated"),
-            u=([one.u for one in of], both, "its standard uncertainty"),
-            probability=([one.probability for one in of], "1", "of such residuals, were the noise as expected"),
-        )
-    )
-
-
-def _noisy_of(stored: Stored) -> tuple[NoisyEncoder, ...]:
-    table = stored.tables.get("noisy_encoders")
-    if table is None:
-        return ()
-    rows = zip(*(table[name] for name in ("noisy_encoder", "expected", "found", "u", "probability")), strict=True)
-    return tuple(NoisyEncoder(int(joint), *map(float, numbers)) for joint, *numbers in rows)
-
-
-def _validation_table(record: CalibrationRecord) -> Table:
-    assert record.validation is not None
-    groups = record.validation.groups
-    sockets = [(number, name) for number, group in enumerate(groups) for name in group.sockets]
-    number = np.concatenate([np.full(len(group.length_error), i) for i, group in enumerate(groups)])
-    errors, u = (np.concatenate([getattr(group, key) for group in groups]) for key in ("length_error", "length_u"))
-    by_group = columns(
-        "group",
-        group=([", ".join(group.sockets) for group in groups], "", "sockets left out together, as a label"),
-        poses=([group.poses for group in groups], "1", "poses in sockets with more than one"),
-        rms=([group.rms for group in groups], "mm", "RMS distance from the centroid, found"),
-        rms_predicted=([group.rms_predicted for group in groups], "mm", "the same, predicted"),
-        converged=([int(group.converged) for group in groups], "1", "1: the others converged"),
-        rms_degrees_of_freedom=(
-            [group.degrees_of_freedom[0] for group in groups],
-            "1",
-            "effective degrees of freedom of rms_predicted",
-        ),
-        length_degrees_of_freedom=(
-            [group.degrees_of_freedom[1] for group in groups],
-            "1",
-            "effective degrees of freedom of length_u",
-        ),
-        noise_degrees_of_freedom=(
-            [group.noise_degrees_of_freedom for group in groups],
-            "1",
-            "degrees of freedom of the noise behind both",
-        ),
-    )
-    by_socket = columns(
-        "left_out_socket",
-        left_out_socket=([name for _, name in sockets], "", "sockets left out, one after the other"),
-        socket_number=([i for i, _ in sockets], "1", "which group a socket is of, from 0"),
-    )
-    by_length = columns(
-        "left_out_length",
-        left_out_length=(np.arange(len(number)), "1", "lengths left out, one after the other"),
-        number=(number, "1", "which group a length is of, from 0"),
-        length_error=(errors, "mm", "error of a length left out"),
-        length_u=(u, "mm", "its standard uncertainty, predicted"),
-    )
-    return Table(by_group | by_socket | by_length)
-
-
-def _validation_of(stored: Stored) -> CrossValidation | None:
-    table = stored.tables.get("cross_validation")
-    if table is None:
-        return None
-    groups = []
-    for i, label in enumerate(table["group"]):
-        of = table["number"] == i
-        # Files of version 0.1 and before have the sockets in the label only.
-        names = table["left_out_socket"][table["socket_number"] == i] if "left_out_socket" in table else names_in(label)
-        groups.append(
-            LeftOut(
-                sockets=tuple(map(str, names)),
-                poses=int(table["poses"][i]),
-                rms=float(table["rms"][i]),
-                rms_predicted=float(table["rms_predicted"][i]),
-                length_error=table["length_error"][of],
-                length_u=table["length_u"][of],
-                converged=bool(table["converged"][i]),
-                **{name: float(table[name][i]) for name in _DEGREES_OF_FREEDOM if name in table},
-            )
-        )
-    return CrossValidation(tuple(groups))
-
-
-def _sampled_table(record: CalibrationRecord) -> Table:
-    assert record.sampled is not None
-    texts = {
-        "estimate": "value of the calibration",
-        "u": "standard uncertainty by Monte Carlo",
-        "low": "lower end of the Monte Carlo interval",
-        "high": "upper end of the Monte Carlo interval",
-        "linear_u": "standard uncertainty by the law of propagation",
+    table = table_of(record, schema.CALIBRATION)
+    units = [parameter_unit(record.calibrated.arm, name) for name in record.names]
+    derived = {
+        "unit": (units, "", "unit of the parameter"),
+        "u": (np.sqrt(np.diag(record.covariance)), "see unit", "standard uncertainty"),
     }
-    quantities = [str(x) for x in record.sampled["quantity"]]
-    values = {name: (record.sampled[name], "mm or rad; 1 for k", text) for name, text in texts.items()}
-    agrees = np.asarray(record.sampled["agrees"], dtype=np.int8)
-    return Table(
-        columns(
-            "quantity",
-            quantity=(quantities, "", "parameter, k or length"),
-            **values,
-            agrees=(agrees, "1", "1: the linear interval is within the tolerance of JCGM 101"),
-        )
+    derived |= {stage: (vector, "see unit", f"value in the {stage} arm") for stage, vector in record.vectors().items()}
+    return Table(table.variables | columns("parameter", **derived), table.attributes)
+
+
+def _socket_table(capture: Capture, evaluations: Mapping[str, Evaluation]) -> Table:
+    """For other programs: what the arms of all stages do in every socket."""
+    variables = columns(
+        "socket", socket=(capture.names, "", "socket"), poses=(np.array(capture.sizes), "1", "number of poses")
     )
-
-
-def _socket_table(record: CalibrationRecord, evaluations: Mapping[str, Evaluation]) -> Table:
-    capture = record.recording.capture
-    variables = columns("socket", socket=(list(capture.names), "", "socket")) | axes("axis of the base frame")
-    variables |= columns("socket", poses=(list(capture.sizes), "1", "number of poses"))
     for stage, evaluation in evaluations.items():
         metrics = evaluation.repeatability
-        for name, values, text in (
+        for name, values, says in (
             ("de", metrics.socket_de, "mean distance from the centroid"),
             ("deltam", metrics.socket_deltam, "largest half range"),
             ("rms", metrics.socket_rms, "root mean square distance from the centroid"),
         ):
-            variables[f"{name}_{stage}"] = Variable(("socket",), np.asarray(values), "mm", f"{text}, {stage} arm")
-        if stage == "calibrated":
-            variables["centroid"] = Variable(("socket", "axis"), np.asarray(metrics.centroids), "mm", "socket position")
-    return Table(variables)
+            variables |= columns("socket", **{f"{name}_{stage}": (np.asarray(values), "mm", f"{says}, {stage} arm")})
+    centroids = np.asarray(evaluations["calibrated"].repeatability.centroids)
+    return Table(variables | {"centroid": Variable(("socket", "axis"), centroids, "mm", "socket position")})
+
+
+def _observed_tables(observed: ObservedMetrics, units: Mapping[str, tuple[str, ...]]) -> dict[str, Table]:
+    columns_of_all = (observed.names, observed.kinds, observed.rms_before, observed.rms_after, observed.reduced_chi)
+    table = rows_table("observation", map(_Agreement, *columns_of_all, observed.weights), schema.OBSERVED)
+    attributes = {"sigma_mm": float(observed.sigma), "reduced_chi_of_all": float(observed.reduced_chi_of_all)}
+    numbers = [
+        _GeometryNumber(name, units[name][i], float(value), np.asarray(observed.geometry_covariance[name])[i])
+        for name, values in observed.geometry.items()
+        for i, value in enumerate(values)
+    ]
+    geometry = rows_table("number", numbers, schema.GEOMETRY)
+    return {"observed": table._replace(attributes=attributes), "geometry": geometry}
+
+
+def _observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> ObservedMetrics:
+    """How sockets and other observations of a file agree with its arm."""
+    table: StoredTable = stored.tables["observed"]
+    geometry = stored.tables["geometry"]
+    rows = rows_in(_Agreement, schema.OBSERVED, "observation", table)
+    numbers = rows_in(_GeometryNumber, schema.GEOMETRY, "number", geometry)
+    parts = {name: [number for number in numbers if number.part == name] for name in dict.fromkeys(geometry["part"])}
+    expected = (*capture.names, *(observation.name for observation in capture.observations))
+    sizes = {name: len(units) for name, units in Observed.of(capture, None).blocks.items()}
+    square = all(len(number.covariance) == len(part) for part in parts.values() for number in part)
+    check_sense(
+        path,
+        {
+            "its results are of other observations": tuple(row.name for row in rows) != expected,
+            "its geometry is that of other observations": {name: len(part) for name, part in parts.items()} != sizes,
+            "the covariance of its geometry has another size": not square,
+            "a weight is above 1": np.any(table["weights"] > 1),
+        },
+    )
+    return ObservedMetrics(
+        names=expected,
+        kinds=tuple(row.kind for row in rows),
+        rms_before=table["rms_before"],
+        rms_after=table["rms_after"],
+        reduced_chi=table["reduced_chi"],
+        reduced_chi_of_all=np.asarray(table.attributes["reduced_chi_of_all"]),
+        sigma=np.asarray(table.attributes["sigma_mm"]),
+        geometry={name: np.array([number.value for number in part]) for name, part in parts.items()},
+        geometry_covariance={name: np.array([number.covariance for number in part]) for name, part in parts.items()},
+        weights=tuple(row.weights for row in rows),
+    )

@@ -6,41 +6,29 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import InputError
+from ..core.errors import naming
 from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
 from ..data.copies import UNKNOWN, Repeated
-from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.arm import Arm, readings_unit
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
+from ..kinematics.priors import Prior
 from .corrections import corrected_of, correction_variables
-from .hdf5 import (
-    Stored,
-    Table,
-    Variable,
-    axes,
-    check_sense,
-    columns,
-    names_in,
-    need,
-    numbering,
-    read_tables,
-    undamaged,
-    write_tables,
-)
+from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .observations import observation_tables, observations_of
-from .prior_attributes import attributes_of_prior, prior_of_attributes
-from .sense import check_recording
+from .records import record_in, row_values, rows_table, table_of, values_in
+from .schema import LENGTHS, RECORDING, SPECIFICATION, SPHERES, USUAL_NOISE
+from .sense import read_checked
 from .temperatures import reading_variables, readings_of
 
-_KINDS = {
-    "alpha": "link twist",
-    "a": "link length",
-    "d": "link offset",
-    "theta": "joint zero offset",
-    "beta": "Hayati's angle",
+_GEOMETRY = {
+    "alpha": ("rad", "link twist"),
+    "a": ("mm", "link length"),
+    "d": ("mm", "link offset"),
+    "theta": ("rad", "joint zero offset"),
+    "beta": ("rad", "Hayati's angle"),
 }
 
 
@@ -73,66 +61,20 @@ def load_capture(path: str | os.PathLike) -> Recording:
         The recording, in mm and rad.
 
     Raises:
-        InputError: the file does not exist, is damaged, is not of this kind, or was written by a newer version.
+        InputError: the file does not exist, is damaged, is not of this kind, or was written by another version.
 
     Example:
         >>> aj.files.save_capture("capture.h5", recording)
         >>> print(aj.files.load_capture("capture.h5").capture.sizes)
         (40, 10)
     """
-    stored = read_tables(path, ("capture", "calibration"))
     with undamaged(path):
-        return recording_of(path, stored)
+        return recording_of(path, read_checked(path, ("capture", "calibration")))
 
 
-def recording_attributes(recording: Recording) -> dict[str, Any]:
+def recording_attributes(recording: Recording) -> Mapping[str, Any]:
     """Root attributes of a file that holds a recording."""
-    return {
-        "seed": recording.seed,
-        "sources": list(recording.sources) or None,
-        "measured": recording.measured or None,
-        "acceptance": list(recording.acceptance) or None,
-        "measuring_range_mm": recording.measuring_range,
-        **_attributes_of_usual(recording.usual),
-    }
-
-
-def _attributes_of_usual(usual: ArmNoise | None) -> dict[str, Any]:
-    """Of the noise that the nominal arm's file states."""
-    if usual is None:
-        return {}
-    return {
-        "usual_class": usual.arm_class,
-        "usual_source": usual.source,
-        "usual_encoder_arcsec": np.asarray(usual.noise.encoder_arcsec),
-        "usual_linear_encoder_mm": linear_encoder_attribute(usual.noise),
-        "usual_seating_mm": float(usual.noise.seating),
-    }
-
-
-def _usual_of(attributes: Mapping[str, Any]) -> ArmNoise | None:
-    """What `_attributes_of_usual` wrote; earlier files have none."""
-    if "usual_class" not in attributes:
-        return None
-    # A calibration has a noise of its own beside it.
-    own = {name.removeprefix("usual_"): value for name, value in attributes.items() if name.startswith("usual_")}
-    noise = noise_of_attributes(own)
-    return ArmNoise(attributes["usual_class"], noise, attributes.get("usual_source", ""))
-
-
-def linear_encoder_attribute(noise: Noise) -> Any:
-    """Standard deviation of the readings of prismatic joints, mm; None where it follows from the others."""
-    return None if noise.linear_encoder is None else np.asarray(noise.linear_encoder)
-
-
-def noise_of_attributes(attributes: Mapping[str, Any]) -> Noise:
-    """The noise of ``encoder_arcsec``, ``linear_encoder_mm`` and ``seating_mm``."""
-    linear = attributes.get("linear_encoder_mm")  # files of version 2 and before have none
-    return Noise(
-        encoder_arcsec=np.squeeze(np.atleast_1d(attributes.get("encoder_arcsec", 0.0))),
-        seating=attributes.get("seating_mm", 0.0),
-        linear_encoder=None if linear is None else np.squeeze(np.atleast_1d(linear)),
-    )
+    return table_of(recording, RECORDING).attributes
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
@@ -140,26 +82,23 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     capture, arm = recording.capture, recording.nominal.arm
     unit = readings_unit(arm)
     check_one_capture(capture)
-    owner = [capture.names[i] for i in capture.owner]
-    poses, lengths = capture.repeated
+    poses = reading_variables("angle", np.asarray(capture.q), arm.joints, unit)
+    poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket that held the tip"))
+    if capture.visits is not None:
+        visits = np.array(capture.visits)
+        poses |= columns("pose", visit=(visits, "1", "number of the visit to the socket; -1 unknown"))
+    # Copies that were left out: poses by socket, and lengths by their ends.
+    (sockets, counts), (starts, ends) = (tuple(zip(*rows, strict=True)) or ((), ()) for rows in capture.repeated)
+    attributes = {
+        "sessions": capture.sessions or None,
+        "repeated_sockets": sockets or None,
+        "repeated_poses": counts or None,
+        "repeated_starts": starts or None,
+        "repeated_ends": ends or None,
+    }
     tables = {
-        "capture": Table(
-            numbering("pose", len(owner))
-            | reading_variables("angle", np.asarray(capture.q), arm.joints, unit)
-            | columns("pose", socket=(owner, "", "socket that held the tip"))
-            | _visits_of(capture),
-            {
-                "repeated_sockets": [n for n, _ in poses] or None,
-                "repeated_poses": [n for _, n in poses] or None,
-                "sessions": list(capture.sessions) or None,
-            },
-        ),
-        "reference": reference_table(capture.lengths)._replace(
-            attributes={
-                "repeated_start": [a for a, _ in lengths] or None,
-                "repeated_end": [b for _, b in lengths] or None,
-            }
-        ),
+        "capture": Table(poses, attributes),
+        "reference": rows_table("length", capture.lengths, LENGTHS),
         "nominal_arm": arm_table(recording.nominal),
     }
     if recording.nominal.urdf is not None:
@@ -168,27 +107,51 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
         tables["sphere"] = sphere_table(recording.spheres, unit=unit, joints=arm.joints)
+    if recording.usual is not None:
+        tables["usual_noise"] = table_of(recording.usual, USUAL_NOISE)
     return tables | observation_tables(capture.observations, arm.joints, unit)
 
 
-def reference_table(lengths: Sequence[ReferenceLength]) -> Table:
-    """Reference lengths, one row each."""
-    rows = columns(
-        "length",
-        start=([length.start for length in lengths], "", "socket at one end"),
-        end=([length.end for length in lengths], "", "socket at the other end"),
-        value=([float(length.value) for length in lengths], "mm", "calibrated length"),
-        u=([float(length.u) for length in lengths], "mm", "standard uncertainty"),
+def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
+    """The recording that a file's tables hold."""
+    poses, nominal = stored.tables["capture"], specification_of(path, stored, "nominal_arm")
+    q, owner = readings_of(poses, "angle"), np.asarray(poses["socket"]).astype(str)
+    names = list(dict.fromkeys(owner.tolist()))
+    visits = poses.get("visit")
+    if visits is not None:
+        visits = {name: visits[owner == name] for name in names if np.all(visits[owner == name] != UNKNOWN)}
+    given = poses.attributes
+    repeated = Repeated(
+        tuple(zip(given.get("repeated_sockets", ()), given.get("repeated_poses", ()), strict=True)),
+        tuple(zip(given.get("repeated_starts", ()), given.get("repeated_ends", ()), strict=True)),
     )
-    return Table(numbering("length", len(lengths), "reference length number") | rows)
+    true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
+    with naming(path):
+        capture = Capture(
+            {name: q[owner == name] for name in names},
+            lengths_of(stored),
+            observations_of(path, stored),
+            repeated=repeated,
+            sessions=given.get("sessions") or (),
+            visits=visits,
+        )
+        spheres = tuple(checked_sphere(sphere, capture.columns) for sphere in spheres_of(stored))
+        check_readings(capture, nominal.arm, advice='import them with unit = "deg" in [angles] of the manifest')
+    return Recording(
+        capture,
+        nominal._replace(urdf=_urdf_of(stored.tables.get("urdf"))),
+        true,
+        spheres=spheres,
+        usual=record_in(ArmNoise, USUAL_NOISE, stored.tables.get("usual_noise")),
+        **values_in(Recording, RECORDING, stored.tables, stored.attributes),
+    )
 
 
-def lengths_of(path: str | os.PathLike, stored: Stored) -> list[ReferenceLength]:
+def lengths_of(stored: Stored) -> tuple[ReferenceLength, ...]:
     """The reference lengths that a file holds."""
     table = stored.tables["reference"]
-    need(path, table, "start", "end", "value", "u", of="entry")
-    rows = zip(table["start"], table["end"], table["value"], table["u"], strict=True)
-    return [ReferenceLength(str(start), str(end), float(value), float(u)) for start, end, value, u in rows]
+    columns = (table[name].tolist() for name in LENGTHS)
+    return tuple(ReferenceLength(*row) for row in zip(*columns, strict=True))
 
 
 def sphere_table(
@@ -201,199 +164,90 @@ def sphere_table(
     rows = [
         (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
     ]
-    variables = columns(
-        "touch",
-        sphere=([sphere.name for sphere, *_ in rows], "", "reference sphere"),
-        test=([sphere.test for sphere, *_ in rows], "", "acceptance test that the sphere was touched for"),
-        group=([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist"),
-        diameter=([sphere.diameter for sphere, *_ in rows], "mm", "calibrated diameter"),
-        u=([sphere.u for sphere, *_ in rows], "mm", "standard uncertainty of the diameter"),
-        stylus=([sphere.stylus for sphere, *_ in rows], "mm", "diameter of the probe's ball"),
-        form=([sphere.form for sphere, *_ in rows], "mm", "calibrated form error"),
-        u_form=([sphere.u_form for sphere, *_ in rows], "mm", "standard uncertainty of the form error"),
+    variables = rows_table("touch", (sphere for sphere, *_ in rows), SPHERES).variables | columns(
+        "touch", group=([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist")
     )
-    variables |= numbering("touch", len(rows))
     values = np.array([touched for *_, touched in rows])
     if points:
-        return Table(
-            variables | axes() | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")}
-        )
+        return Table(variables | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")})
     return Table(variables | reading_variables("angle", values, joints or values.shape[1], unit, "touch"))
 
 
-def spheres_of(path: str | os.PathLike, stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
+def spheres_of(stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
     """The touched spheres that a file holds, by their ``angle`` or ``position``."""
     table = stored.tables.get("sphere")
     if table is None:
         return ()
-    need(path, table, "sphere", "test", "group", "diameter", "u", "stylus", "form", entry, of="entry")
-    touched = readings_of(table, entry)
+    touched, groups = readings_of(table, entry), table["group"]
     keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
-    found = []
-    for name, test in dict.fromkeys(keys):
-        rows = np.array([key == (name, test) for key in keys])
-        first = int(rows.argmax())
-        groups = tuple(touched[rows & (table["group"] == number)] for number in np.unique(table["group"][rows]))
-        numbers = (float(table[what][first]) for what in ("diameter", "u", "stylus", "form"))
-        u_form = float(table["u_form"][first]) if "u_form" in table else 0.0  # files of earlier versions have none
-        found.append(ProbedSphere(str(name), test, groups, *numbers)._replace(u_form=u_form))
-    return tuple(found)
-
-
-def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
-    """The recording that a file's tables hold."""
-    need(path, stored.tables, "capture", "reference", "nominal_arm")
-    poses = stored.tables["capture"]
-    need(path, poses, "angle", "socket", of="entry")
-    q = readings_of(poses, "angle")
-    owner = np.asarray(poses["socket"]).astype(str)
-    names = list(dict.fromkeys(owner.tolist()))
-    try:
-        sockets = {name: q[owner == name] for name in names}
-        capture = Capture(
-            sockets,
-            lengths_of(path, stored),
-            observations_of(path, stored),
-            repeated=_repeated_of(stored),
-            sessions=stored.table_attributes["capture"].get("sessions") or (),
-            visits=_known_visits(poses, owner),
-        )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
-    try:
-        spheres = tuple(checked_sphere(sphere, capture.columns) for sphere in spheres_of(path, stored))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    sources = tuple(stored.attributes.get("sources") or ())
-    attributes = stored.attributes
-    nominal = specification_of(path, stored, "nominal_arm")._replace(urdf=_urdf_of(path, stored))
-    check_recording(path, stored)
-    try:
-        check_readings(capture, nominal.arm, advice='import them with unit = "deg" in [angles] of the manifest')
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return Recording(
-        capture,
-        nominal,
-        true,
-        attributes.get("seed"),
-        spheres,
-        sources,
-        attributes.get("measured", ""),
-        names_in(attributes.get("acceptance")),
-        attributes.get("measuring_range_mm"),
-        _usual_of(attributes),
-    )
-
-
-def _visits_of(capture: Capture) -> dict[str, Variable]:
-    """The visit of each pose, where some are known."""
-    if capture.visits is None:
-        return {}
-    return columns("pose", visit=(np.array(capture.visits), "1", "number of the visit to the socket; -1 unknown"))
-
-
-def _known_visits(poses: Mapping[str, np.ndarray], owner: np.ndarray) -> dict[str, np.ndarray] | None:
-    """Visits by socket; files of earlier versions have none."""
-    if "visit" not in poses:
-        return None
-    visits = np.asarray(poses["visit"])
-    known = [name for name in dict.fromkeys(owner.tolist()) if np.all(visits[owner == name] != UNKNOWN)]
-    return {name: visits[owner == name] for name in known}
-
-
-def _repeated_of(stored: Stored) -> Repeated:
-    """Copies that were left out before the file was written; files of version 0.1 do not say."""
-    poses, lengths = (stored.table_attributes[table] for table in ("capture", "reference"))
-    return Repeated(
-        tuple(zip(poses.get("repeated_sockets", ()), poses.get("repeated_poses", ()), strict=True)),
-        tuple(zip(lengths.get("repeated_start", ()), lengths.get("repeated_end", ()), strict=True)),
-    )
+    spheres = []
+    for key in dict.fromkeys(keys):
+        rows = np.array([other == key for other in keys])
+        values = row_values(ProbedSphere, SPHERES, "touch", table, int(rows.argmax()))
+        members = tuple(touched[rows & (groups == number)] for number in np.unique(groups[rows]))
+        spheres.append(ProbedSphere(groups=members, **values))
+    return tuple(spheres)
 
 
 def _urdf_table(source: UrdfSource) -> Table:
     """The text of the URDF that the nominal arm was read from, so that an export does not need the file."""
     lines = source.text.splitlines(keepends=True)
-    variables = numbering("urdf_line", len(lines))
-    variables |= columns("urdf_line", text=(lines, "", "line of the URDF, with its end"))
+    variables = columns("urdf_line", text=(lines, "", "line of the URDF, with its end"))
     return Table(variables, {"base": source.base, "tip": source.tip})
 
 
-def _urdf_of(path: str | os.PathLike, stored: Stored) -> UrdfSource | None:
-    table = stored.tables.get("urdf")
+def _urdf_of(table: StoredTable | None) -> UrdfSource | None:
     if table is None:
         return None
-    need(path, table, "text", of="entry")
-    attributes = stored.table_attributes["urdf"]
-    return UrdfSource("".join(map(str, table["text"])), attributes["base"], attributes["tip"])
+    return UrdfSource("".join(map(str, table["text"])), table.attributes["base"], table.attributes["tip"])
 
 
 def arm_table(specification: ArmSpecification) -> Table:
     """An arm as a table over ``joint``, with its proposed identification in attributes."""
     arm = single(specification.arm)
-    variables = numbering("joint", arm.joints) | axes("axis of the last frame")
-    variables |= columns("axis", probe=(np.asarray(arm.probe), "mm", "tip in the last frame"))
-    for kind, long_name in _KINDS.items():
+    variables = columns("axis", probe=(np.asarray(arm.probe), "mm", "tip in the last frame"))
+    for kind, (unit, says) in _GEOMETRY.items():
         values = getattr(arm, kind)
         if values is not None:
-            unit = "mm" if kind in ("a", "d") else "rad"
-            variables[kind] = Variable(("joint",), np.asarray(values), unit, long_name)
+            variables |= columns("joint", **{kind: (np.asarray(values), unit, says)})
     variables |= correction_variables(arm)
     if arm.limits is not None:
-        for side, name in enumerate(("lowest", "highest")):
-            values = [limit[side] for limit in arm.limits]
-            variables[name] = Variable(("joint",), values, readings_unit(arm), f"{name} reading of the joint")
-    attributes: dict[str, Any] = {
-        "name": specification.name,
-        "prismatic": list(arm.prismatic) or None,
-        "thermometer": arm.thermometer or None,
-        "half_width_length_mm": specification.length,
-        "half_width_angle_rad": specification.angle,
-        "override_names": list(specification.override) or None,
-        "override_half_widths": [float(width) for width in specification.override.values()] or None,
-        "held": None if specification.held is None else list(specification.held) or "",
-        "free": list(specification.free) or None,
-        **attributes_of_prior(specification.prior),
-    }
-    return Table(variables, attributes)
+        for name, values in zip(("lowest", "highest"), np.transpose(arm.limits), strict=True):
+            variables |= columns("joint", **{name: (values, readings_unit(arm), f"{name} reading of the joint")})
+    attributes = {"prismatic": arm.prismatic or None, "thermometer": arm.thermometer or None}
+    prior = specification.prior
+    if prior is not None:
+        # Without a standard deviation a group is learned, or nothing is known of it.
+        attributes |= {
+            "prior_groups": prior.groups,
+            "prior_sd": [float(prior.sd[group]) if group in prior.sd else np.inf for group in prior.groups],
+            "prior_learned": [group for group, learned in zip(prior.groups, prior.learned, strict=True) if learned],
+            "prior_mean_of": tuple(prior.mean),
+            "prior_mean": [float(value) for value in prior.mean.values()],
+        }
+    return Table(variables, attributes | dict(table_of(specification, SPECIFICATION).attributes))
 
 
-def specification_of(path: str | os.PathLike, stored: Stored, table: str) -> ArmSpecification:
+def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmSpecification:
     """The arm that a table holds."""
-    arrays: Mapping[str, np.ndarray] = stored.tables[table]
-    attributes = stored.table_attributes[table]
-    need(path, arrays, "alpha", "a", "d", "theta", "probe", of="entry")
-    limits = None
-    if "lowest" in arrays:
-        limits = list(zip(arrays["lowest"].tolist(), arrays["highest"].tolist(), strict=True))
-    held = attributes.get("held")
-    try:
+    table = stored.tables[name]
+    attributes, limits = table.attributes, None
+    if "lowest" in table:
+        limits = list(zip(table["lowest"].tolist(), table["highest"].tolist(), strict=True))
+    with naming(path):
         arm = Arm(
-            alpha=arrays["alpha"],
-            a=arrays["a"],
-            d=arrays["d"],
-            theta=arrays["theta"],
-            beta=arrays.get("beta"),
-            probe=arrays["probe"],
+            **{kind: table.get(kind) if kind == "beta" else table[kind] for kind in (*_GEOMETRY, "probe")},
             limits=limits,
-            prismatic=[int(joint) for joint in np.atleast_1d(attributes.get("prismatic", ()))],
+            prismatic=list(attributes.get("prismatic", ())),
             thermometer=bool(attributes.get("thermometer", False)),
         )
-        arm = corrected_of(path, arm, arrays)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    widths = attributes.get("override_half_widths") or []
-    widths = [attributes.get("half_width_length_mm", 10.0), attributes.get("half_width_angle_rad", 0.0175), *widths]
+        arm = corrected_of(arm, table)
+    proposed = values_in(ArmSpecification, SPECIFICATION, table, attributes)
+    widths = (proposed["length"], proposed["angle"], *proposed["override"].values())
     check_sense(path, {"a half-width is not positive and finite": not all(0 < width < np.inf for width in widths)})
-    override = zip(attributes.get("override_names") or [], attributes.get("override_half_widths") or [], strict=True)
-    return ArmSpecification(
-        arm=arm,
-        name=attributes.get("name", ""),
-        held=None if held is None else names_in(held),
-        length=attributes.get("half_width_length_mm", 10.0),
-        angle=attributes.get("half_width_angle_rad", 0.0175),
-        override=dict(override),
-        free=names_in(attributes.get("free")),
-        prior=prior_of_attributes(attributes),
-    )
+    prior = None
+    if "prior_groups" in attributes:
+        sd = dict(zip(attributes["prior_groups"], attributes["prior_sd"], strict=True))
+        mean = dict(zip(attributes["prior_mean_of"], attributes["prior_mean"], strict=True))
+        prior = Prior(sd, mean=mean, learn=tuple(attributes["prior_learned"]))
+    return ArmSpecification(arm=arm, prior=prior, **proposed)

@@ -1,18 +1,33 @@
-"""Cells as TOML: the obstacles about an arm and the radii of its links; and the body of an arm from its file."""
+"""Cells as TOML: the obstacles about an arm and the radii of its links; and the body of an arm from its file.
 
+The collision shapes of a URDF are each within one capsule; of meshes, the vertices alone are read.
+"""
+
+import math
 import os
+import re
+from itertools import combinations, product
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
+from jaxtyping import Float, Int
 from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat
 
 from ..core.errors import InputError
-from ..kinematics.body import Body, body_along_links
+from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
+from ..kinematics.body import Body, body_along_links, segment_distance
 from ..kinematics.collisions import Box, Cell, HalfSpace, Obstacle, Post, check_obstacle
+from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import total_link_length
 from .arms import load_specification, urdf_folder
+from .inputs import InputFile
 from .toml import Strict, read_toml
-from .urdf_shapes import urdf_body
+from .urdf import urdf_chain
+from .urdf_text import UrdfShape, collision_shapes
 
+_CENTRING = 60  # steps to the middle of the smallest circle
+_HEADER, _TRIANGLE = 84, 50  # bytes of a binary STL: before the triangles, and of each
 _SLENDER = 0.05  # radius of a link where none is stated, of all links' length
 
 _Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
@@ -111,12 +126,14 @@ def load_cell(
 
 
 def _obstacles(content: Any) -> tuple[Obstacle, ...]:
-    found: list[Obstacle] = [HalfSpace(row.name, tuple(row.normal), tuple(row.point)) for row in content.half_space]
-    found += [Box(row.name, tuple(row.centre), tuple(row.size), tuple(row.rotation)) for row in content.box]
-    found += [Post(row.name, tuple(row.start), tuple(row.end), row.radius) for row in content.capsule]
-    for obstacle in found:
+    obstacles = (
+        *(HalfSpace(row.name, tuple(row.normal), tuple(row.point)) for row in content.half_space),
+        *(Box(row.name, tuple(row.centre), tuple(row.size), tuple(row.rotation)) for row in content.box),
+        *(Post(row.name, tuple(row.start), tuple(row.end), row.radius) for row in content.capsule),
+    )
+    for obstacle in obstacles:
         check_obstacle(obstacle)
-    return tuple(found)
+    return obstacles
 
 
 def _body(
@@ -125,10 +142,213 @@ def _body(
     specification = load_specification(source, base=base, tip=tip)
     slender = _SLENDER * total_link_length(specification.arm)
     if radius is None and specification.urdf is not None:
-        found = urdf_body(specification, urdf_folder(source), slender)
-        if found is not None:
-            return found
+        body = urdf_body(specification, urdf_folder(source), slender)
+        if body is not None:
+            return body
     notes = ()
     if radius is None:
         notes = (f"links are taken as {slender:.0f} mm in radius, 5 % of their length; state their radius.",)
     return body_along_links(specification.arm, slender if radius is None else radius, tool_radius), notes
+
+
+class UrdfBody(NamedTuple):
+    """An arm's body, and what of it is not from the file's shapes, in sentences."""
+
+    body: Body
+    notes: tuple[str, ...]
+
+
+class _Row(NamedTuple):
+    """One capsule, as the columns of a `Body`."""
+
+    name: str
+    start_frame: int
+    start: Float[np.ndarray, " 3"]
+    end_frame: int
+    end: Float[np.ndarray, " 3"]
+    radius: float
+
+
+def urdf_body(specification: ArmSpecification, folder: Path, radius: float) -> UrdfBody | None:
+    """Capsules about the collision shapes of the links between base and tip; side branches at reading 0.
+
+    Boxes, cylinders, spheres and the vertices of meshes (STL, OBJ) are each within one capsule. Links whose meshes are
+    not at hand have capsules about the lengths of their D-H row instead, and so has a probe beyond the tip.
+
+    Args:
+        specification: The arm as `read_urdf` gave it.
+        folder: The folder of the URDF, for its meshes.
+        radius: Radius where shapes are missing, mm.
+
+    Returns:
+        The body; None where the URDF has no collision shapes on these links.
+
+    Raises:
+        InputError: The arm is not from a URDF, or a shape cannot be read.
+
+    Example:
+        >>> from pathlib import Path
+        >>> robot = aj.files.load_specification("robot.urdf")
+        >>> body = aj.files.urdf_body(robot, Path("."), 40.0).body
+        >>> print(body.names, body.radius.round(1), "mm")
+        ('shoulder', 'upper_arm', 'forearm') [60.  56.6 42.4] mm
+    """
+    if specification.urdf is None:
+        raise InputError("this arm was not read from a URDF, so it has no collision shapes; give radii of its links.")
+    chain, shapes = urdf_chain(specification.urdf), collision_shapes(specification.urdf.text)
+    frames = dh_frames(geometry_of(chain.arm), chain.base)
+    rows: list[_Row] = []
+    missing: dict[int, str] = {}
+    for number, link, link_frame in chain.carried_links(specification.urdf.base):
+        for count, shape in enumerate(shapes.get(link, ()), start=1):
+            capsule = _capsule(shape, inverse(frames[number]) @ link_frame @ shape.origin, folder)
+            if capsule is None:
+                missing[number] = link
+                continue
+            start, end, width = capsule
+            name = f"{link}/{count}" if len(shapes[link]) > 1 else link
+            rows.append(_Row(name, number, start, number, end, width))
+    if not rows and not missing:
+        return None
+    simple, with_shape = body_along_links(specification.arm, radius), {row.end_frame for row in rows}
+    tool = np.linalg.norm(np.asarray(specification.arm.probe) - np.asarray(chain.arm.probe)) > 0
+    rows = [row for row in rows if not any(_holds(other, row) for other in rows)]
+    for row in map(_Row._make, zip(*simple[:-1], strict=True)):
+        if (row.name == "probe" and tool) or (row.end_frame in missing and row.end_frame not in with_shape):
+            rows.append(row)
+    rows.sort(key=lambda row: row.end_frame)
+    notes = []
+    for partly, instead in (
+        (False, "capsules about their D-H rows are used"),
+        (True, "their joints' other shapes are used alone"),
+    ):
+        if links := [link for frame, link in missing.items() if (frame in with_shape) == partly]:
+            notes.append(f"meshes of {', '.join(links)} are not at hand as STL or OBJ; {instead}.")
+    names, *columns = zip(*rows, strict=True)
+    return UrdfBody(Body(names, *map(np.array, columns), pairs=_pairs(rows, simple)), tuple(notes))
+
+
+def _pairs(rows: list[_Row], simple: Body) -> Int[np.ndarray, "m 2"]:
+    """The capsules that may not touch: not of one or successive links, of which those without a shape do not count."""
+    rank = np.unique([row.end_frame for row in rows], return_inverse=True)[1]
+    checked = {frozenset((simple.names[i], simple.names[j])) for i, j in simple.pairs}
+    pairs = []
+    for i, j in combinations(range(len(rows)), 2):
+        names = {rows[i].name, rows[j].name}
+        if rank[j] - rank[i] > 1 and (not names <= set(simple.names) or names in checked):
+            pairs.append((i, j))
+    return np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def _holds(outer: _Row, inner: _Row) -> bool:
+    """Whether a capsule of a frame holds another one, as the cylinder of a capsule the balls at its ends."""
+    if outer is inner or outer.end_frame != inner.end_frame or outer.radius < inner.radius:
+        return False
+    start, end = outer.start[:, None], outer.end[:, None]
+    gaps = [segment_distance(start, end, point[:, None], point[:, None])[0] for point in (inner.start, inner.end)]
+    return bool(max(gaps) + inner.radius <= outer.radius + 1e-6)
+
+
+def _capsule(shape: UrdfShape, frame: Transform, folder: Path) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """The capsule that holds a shape in a frame, mm; None for a mesh that is not at hand."""
+    if shape.kind == "sphere":
+        return frame[:3, 3], frame[:3, 3], shape.size[0]
+    if shape.kind == "mesh":
+        path = mesh_path(shape.file, folder)
+        if path is None or path.suffix.lower() not in (".stl", ".obj"):
+            return None
+        points = mesh_vertices(path) * np.asarray(shape.size)
+    elif shape.kind == "box":
+        points = np.array(list(product((-0.5, 0.5), repeat=3))) * np.asarray(shape.size)
+    else:
+        radius, length = shape.size
+        half = length / 2 * frame[:3, 2] if length > radius else np.zeros(3)  # a disc is better held by a ball
+        return frame[:3, 3] - half, frame[:3, 3] + half, radius if length > radius else math.hypot(radius, length / 2)
+    return bounding_capsule(points @ frame[:3, :3].T + frame[:3, 3])
+
+
+def bounding_capsule(points: Float[np.ndarray, "m 3"]) -> tuple[np.ndarray, np.ndarray, float]:
+    """A capsule of small volume that holds the points: ends of its segment, and its radius.
+
+    Along each principal axis and each coordinate axis, the smallest circle that holds the points seen along it gives
+    the radius, and the caps are put as far in as the points allow; the axis with the smallest volume is taken.
+    """
+    centred = points - points.mean(axis=0)
+    axes = np.concatenate([np.linalg.eigh(centred.T @ centred)[1].T, np.eye(3)])
+    capsules = (_capsule_along(points, axis) for axis in axes)
+
+    def volume(capsule: tuple) -> float:
+        start, end, radius = capsule
+        return radius**2 * (np.linalg.norm(end - start) + 4 / 3 * radius)
+
+    return min(capsules, key=volume)
+
+
+def _capsule_along(points: Float[np.ndarray, "m 3"], axis: Float[np.ndarray, " 3"]) -> tuple:
+    along = points @ axis
+    flat = points - along[:, None] * axis
+    middle = (flat.min(axis=0) + flat.max(axis=0)) / 2
+    middle = middle - (middle @ axis) * axis
+    best, radius = middle, np.linalg.norm(flat - middle, axis=1).max()
+    for step in range(_CENTRING):  # Badoiu and Clarkson 2003: towards the farthest point by 1 / (i + 2) of the way
+        farthest = flat[np.argmax(np.sum((flat - middle) ** 2, axis=1))]
+        middle = middle + (farthest - middle) / (step + 2)
+        reach = np.linalg.norm(flat - middle, axis=1).max()
+        if reach < radius:
+            best, radius = middle, reach
+    inside = np.sqrt(np.maximum(radius**2 - np.sum((flat - best) ** 2, axis=1), 0.0))
+    low, high = np.min(along + inside), np.max(along - inside)
+    if low > high:  # a ball holds them all
+        low = high = (low + high) / 2
+        radius = np.linalg.norm(points - (best + low * axis), axis=1).max()
+    return best + low * axis, best + high * axis, float(radius)
+
+
+def mesh_path(file: str, folder: Path) -> Path | None:
+    """The file that a URDF in a folder names, or None where it is not at hand.
+
+    ``package://NAME/...`` is looked for beside the folder and its parents, as packages are laid out.
+    """
+    if file.startswith("package://"):
+        package, _, rest = file.removeprefix("package://").partition("/")
+        whole = folder.absolute()
+        tried = [place for parent in (whole, *whole.parents) for place in (parent / package / rest,)]
+        tried += [parent / rest for parent in (whole, *whole.parents) if parent.name == package]
+    else:
+        # In a URL, a slash stands before the letter of a drive: file:///C:/arm.stl.
+        tried = [folder / re.sub(r"^/(?=[A-Za-z]:)", "", file.removeprefix("file://"))]
+    return next((path for path in tried if path.is_file()), None)
+
+
+def mesh_vertices(path: str | os.PathLike) -> Float[np.ndarray, "m 3"]:
+    """The vertices of an STL (binary or text) or OBJ file, in the file's own unit.
+
+    Raises:
+        InputError: It is of another format, or holds no vertices.
+    """
+    content, suffix = InputFile(path).content, os.path.splitext(os.fspath(path))[1].lower()
+    try:
+        if suffix == ".obj":
+            vertices = _numbers_after(content, b"v")
+        elif suffix == ".stl":
+            vertices = _of_stl(content)
+        else:
+            raise InputError(f"{path} is neither STL nor OBJ; export the mesh as one of them.")
+    except ValueError as error:
+        raise InputError(f"{path} has a vertex that is not three numbers; export the mesh again.") from error
+    if not len(vertices) or not np.all(np.isfinite(vertices)):
+        raise InputError(f"{path} has no vertices, or some that are not finite; export the mesh again.")
+    return np.unique(vertices, axis=0)
+
+
+def _of_stl(content: bytes) -> Float[np.ndarray, "m 3"]:
+    count = int.from_bytes(content[_HEADER - 4 : _HEADER], "little")
+    if len(content) == _HEADER + count * _TRIANGLE:  # also of binary files whose header begins with "solid"
+        triangles = np.frombuffer(content, dtype=np.uint8, offset=_HEADER).reshape(count, _TRIANGLE)
+        return triangles[:, 12:48].copy().view("<f4").reshape(-1, 3).astype(float)
+    return _numbers_after(content, b"vertex")
+
+
+def _numbers_after(content: bytes, word: bytes) -> Float[np.ndarray, "m 3"]:
+    rows = (line.split() for line in content.splitlines())
+    return np.array([[float(x) for x in row[1:4]] for row in rows if row and row[0] == word]).reshape(-1, 3)

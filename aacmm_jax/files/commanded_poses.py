@@ -18,6 +18,7 @@ from .table_columns import columns_of_joints, find_named, position_columns, read
 from .temperatures import TEMPERATURE
 from .text_table import TextTable
 
+Columns = tuple[list[int], str | None]  # columns of a quantity, from 0, and the unit that the header states
 _ANGLES = {"deg": DEG, "rad": 1.0}
 _QUATERNION, _ROTATION = ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
 _OPTION = "--columns {}"
@@ -53,27 +54,17 @@ def read_commanded_poses(
     ``unit`` unless the header says it), and the readings to begin with in columns as above, or ``near``. A column
     temperature_C is the arm's.
 
-    Args:
-        path: The table (CSV or other text).
-        arm: The nominal arm; readings of its prismatic joints are in mm.
-        unit: ``"deg"`` or ``"rad"`` of the others; needed where the header does not say it.
-        near: Readings to begin with, in ``unit``, where the table has none.
-        columns: Columns of the joint readings, by name, shell pattern or number from 1, where their names say nothing.
-        length_unit: Unit of positions whose header states none; by default mm.
-
-    Raises:
-        InputError: Columns are missing, or a unit is missing or differs.
+    ``unit``, deg or rad, is that of revolute joints where the header does not say it, and of ``near``; ``length_unit``
+    that of positions whose header states none, by default mm. Raises `InputError`.
     """
     table, joints = TextTable(path), arm.joints
     orientation = _orientation(table)
     picked = _reading_columns(path, table, joints, alone=orientation is None, wanted=columns)
-    stated, linear = header_units(table, picked, arm, unit) if picked else (None, None)
+    header, linear = header_units(table, picked, arm, unit) if picked else (None, None)
     if linear not in (None, "mm"):
         raise InputError(f"{path} states {linear} for readings of prismatic joints; convert them to mm.")
-    if stated is not None and (stated not in _ANGLES or unit not in (None, stated)):
-        raise InputError(f"{path} states {stated} for joint readings; give them in deg or rad, and leave out --unit.")
-    found = stated or unit
-    if found is None:
+    unit = _angle_unit(path, header, unit)
+    if unit is None:
         raise InputError(f"{path} does not say the unit of joint readings; give --unit deg or --unit rad.")
     if picked and near is not None:
         raise InputError(f"{path} has joint readings in each row; leave out --near.")
@@ -81,11 +72,11 @@ def read_commanded_poses(
         raise InputError(f"{path} has no joint readings to begin with; add columns q_1 to q_{joints}, or give --near.")
     if near is not None and len(near) != joints:
         raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
-    poses = None if orientation is None else _poses(path, table, _ANGLES[found], length_unit)
+    poses = None if orientation is None else _poses(path, table, _ANGLES[unit], length_unit)
     readings = table.numbers(picked) if near is None else np.tile(near, (table.length, 1))
     temperature = table.numbers(table.pick([TEMPERATURE]))[:, 0] if table.has([TEMPERATURE]) else None
-    q = np.array(by_joint(arm, _ANGLES[found], 1.0)) * readings
-    return CommandedPoses(q, poses, found, arm, table, tuple(picked), temperature)
+    q = np.array(by_joint(arm, _ANGLES[unit], 1.0)) * readings
+    return CommandedPoses(q, poses, unit, arm, table, tuple(picked), temperature)
 
 
 class KnownPoses(NamedTuple):
@@ -105,59 +96,37 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
 
     Readings are in columns named as for `read_commanded_poses`; positions in x, y, z or px, py, pz,
     perhaps with an orientation. Without positions all poses are of one socket, or of those that a column ``socket``
-    names. A table without header has a column for each joint, and after them perhaps x, y and z.
-
-    Args:
-        path: The table (CSV or other text).
-        joints: Number of joints.
-        unit: ``"deg"`` or ``"rad"``; without it and a header that says it, readings up to a revolution are in rad.
-
-    Raises:
-        InputError: Columns are missing, or units differ.
+    names. A table without header has a column for each joint, and after them perhaps x, y and z. Where neither ``unit``
+    (deg or rad) nor the header says it, readings up to a revolution are in rad. Raises `InputError`.
     """
     table = TextTable(path)
-    point: list[int] = []
-    length: str = "mm"
-    orientation = None
+    position, orientation = position_columns(table), _orientation(table)
     if not table.header and table.width in (joints, joints + 3):
-        picked, point = list(range(joints)), list(range(joints, table.width))
+        picked, after = list(range(joints)), list(range(joints, table.width))
+        position, orientation = (after, None) if after else None, None
     else:
         picked = _reading_columns(path, table, joints, alone=True)
-        orientation, position = _orientation(table), position_columns(table)
-        if position is not None:
-            point, length = position[0], position[1] or "mm"
-    header = table.unit(picked, unit)
-    if header is not None and (header not in _ANGLES or unit not in (None, header)):
-        raise InputError(f"{path} states {header} for joint readings; give them in deg or rad, and leave out --unit.")
+    header = _angle_unit(path, table.unit(picked, unit), unit)
     readings = table.numbers(picked)
-    found = header or unit or ("deg" if np.abs(readings).max() > 2 * np.pi else "rad")
-    if length not in LENGTH_UNITS:
-        raise InputError(f"{path} states positions in {length}; give one of {', '.join(LENGTH_UNITS)}.")
-    rotations = None
-    if orientation is not None:
-        rotations = _poses(path, table, _ANGLES[found])[:, :3, :3]
-    named = table.has(["socket"]) if table.header else False
+    angle = header or ("deg" if np.abs(readings).max() > 2 * np.pi else "rad")
+    poses = None if position is None and orientation is None else _poses(path, table, _ANGLES[angle], None, position)
+    named = bool(table.header) and table.has(["socket"])
     sockets = tuple(table.texts("socket")) if named else ("A",) * table.length
     return KnownPoses(
-        _ANGLES[found] * readings,
-        found,
-        (header or unit) is not None,
-        LENGTH_UNITS[length] * table.numbers(point) if point else None,
-        rotations,
-        None if point else sockets,
-        length,
+        _ANGLES[angle] * readings,
+        angle,
+        header is not None,
+        None if poses is None else poses[:, :3, 3],
+        None if poses is None or orientation is None else poses[:, :3, :3],
+        sockets if poses is None else None,
+        "mm" if position is None else position[1] or "mm",
     )
 
 
 def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> str:
     """The table with corrected readings in place of those commanded, or after the other columns, in the same unit.
 
-    The readings of rows that are not reached are left empty, so that nobody sends an arm there by mistake.
-
-    Args:
-        commanded: What was read.
-        q: Corrected readings, rad and mm.
-        reached: Which rows have some.
+    The readings (rad and mm) of rows that are not ``reached`` are left empty, so that nobody sends an arm there.
     """
     table, arm = commanded.table, commanded.arm
     rows = (q / np.array(by_joint(arm, _ANGLES[commanded.unit], 1.0))).T
@@ -166,16 +135,15 @@ def corrected_csv(commanded: CommandedPoses, q: Float[np.ndarray, "N n"], reache
     header, joint_of = table.header, {column: i for i, column in enumerate(commanded.columns)}
     columns: list[tuple[str, Sequence[str]]] = []
     for i in range(table.width):
-        if i in joint_of:
-            columns.append((header[i] if header else names[joint_of[i]], cells[joint_of[i]]))
-        else:
-            columns.append((header[i] if header else f"column_{i + 1}", list(table.texts(i + 1))))
+        joint = joint_of.get(i)
+        name = header[i] if header else f"column_{i + 1}" if joint is None else names[joint]
+        columns.append((name, list(table.texts(i + 1)) if joint is None else cells[joint]))
     if not commanded.columns:
         columns += zip(names, cells, strict=True)
     return csv_text([[name for name, _ in columns], *zip(*(column for _, column in columns), strict=True)])
 
 
-def _orientation(table: TextTable) -> tuple[list[int], str | None] | None:
+def _orientation(table: TextTable) -> Columns | None:
     """The columns of a quaternion or a rotation vector, and the unit that the header states."""
     return find_named(table, _QUATERNION) or find_named(table, _ROTATION, tuple(_ANGLES))
 
@@ -185,45 +153,53 @@ def _reading_columns(
 ) -> list[int]:
     """Columns of joint readings, counted from 0; ``alone``: there are no poses, so there must be some."""
     if wanted is not None:
-        found = table.pick(wanted)
-        if len(found) != joints:
+        picked = table.pick(wanted)
+        if len(picked) != joints:
             raise InputError(
-                f"{path}: {len(found)} columns are picked for the readings of {joints} joints; pick one for each."
+                f"{path}: {len(picked)} columns are picked for the readings of {joints} joints; pick one for each."
             )
-        return found
+        return picked
     position = position_columns(table)
     taken = position[0] if position is not None else []
     return reading_columns(table, joints, taken, _OPTION) if alone else columns_of_joints(table, joints, taken)[0]
 
 
+def _angle_unit(path: str | os.PathLike, header: str | None, stated: str | None) -> str | None:
+    """The unit of joint readings: that of the header, or the one that is stated."""
+    if header is not None and (header not in _ANGLES or stated not in (None, header)):
+        raise InputError(f"{path} states {header} for joint readings; give them in deg or rad, and leave out --unit.")
+    return header or stated
+
+
 def _poses(
-    path: str | os.PathLike, table: TextTable, angle: float, length: str | None = None
+    path: str | os.PathLike, table: TextTable, angle: float, length: str | None, position: Columns | None = None
 ) -> Float[np.ndarray, "N 4 4"]:
-    """Positions, mm, and orientations; ``angle`` and ``length``: units of a rotation vector and of positions that the
-    header does not state."""
-    position, orientation = position_columns(table), _orientation(table)
-    if position is None or orientation is None:
+    """Positions, mm, and orientations, where there are some; ``angle`` and ``length``: units of a rotation vector and
+    of positions that the header does not state; ``position``: the columns of a table without names."""
+    position, orientation = position or position_columns(table), _orientation(table)
+    if position is None:
         raise InputError(f"{path} has orientations, but no positions in columns x, y and z; add them.")
     if length is not None and position[1] not in (None, length):
         raise InputError(f"{path} states positions in {position[1]}; leave out --length-unit.")
-    unit, (columns, rotation_unit) = position[1] or length or "mm", orientation
+    unit, (columns, rotation_unit) = position[1] or length or "mm", orientation or ([], None)
     if unit not in LENGTH_UNITS or rotation_unit not in (None, *_ANGLES):
         raise InputError(
             f"{path} states positions in {unit}; give one of {', '.join(LENGTH_UNITS)}, and angles in deg or rad."
         )
-    numbers = table.numbers(columns)
-    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses = np.tile(np.eye(4), (table.length, 1, 1))
     poses[:, :3, 3] = LENGTH_UNITS[unit] * table.numbers(position[0])
     if len(columns) == len(_QUATERNION):
-        poses[:, :3, :3] = _rotations(path, numbers)
-    else:
-        vectors = (angle if rotation_unit is None else _ANGLES[rotation_unit]) * numbers
-        poses[:, :3, :3] = np.stack([rotation_matrix(vector) for vector in vectors])
+        poses[:, :3, :3] = _rotations(path, table.numbers(columns))
+    elif columns:
+        vectors = (angle if rotation_unit is None else _ANGLES[rotation_unit]) * table.numbers(columns)
+        poses[:, :3, :3] = np.moveaxis(np.asarray(rotation_matrix(vectors.T)), -1, 0)
     return poses
 
 
 def _rotations(path: str | os.PathLike, quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
     """Rotation matrices of quaternions w, x, y, z, whose length may differ from 1 by rounding."""
+    from scipy.spatial.transform import Rotation
+
     size = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(np.abs(size - 1) > _ROUNDED)
     if len(wrong):
@@ -231,10 +207,4 @@ def _rotations(path: str | os.PathLike, quaternions: Float[np.ndarray, "N 4"]) -
             f"{path} row {wrong[0] + 1}: the quaternion has length {size[wrong[0]]:.6g} instead of 1; correct it, or "
             "its columns."
         )
-    w, x, y, z = (quaternions / size[:, None]).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()

@@ -1,13 +1,13 @@
 """Compared models of an arm's joints in HDF5: what `compare-models` found, model by model and region by region."""
 
-import math
+import json
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from .hdf5 import Table, check_sense, columns, need, numbering, read_tables, undamaged, write_tables
+from .hdf5 import Table, check_sense, columns, opened, undamaged, write_tables
 
 KIND = "model comparison"
 # Columns of the table of models: unit and meaning.
@@ -25,8 +25,6 @@ _MODELS = {
 }
 _NEEDED = ("parameters", "effective_parameters", "rms_inside", "rms_outside", "log_evidence", "cpu_seconds")
 _LARGEST = 1e12
-_TEXTS = ("arm", "best", "recommended")
-_LISTS = ("findings", "warnings", "regions")
 
 
 def save_compared_models(
@@ -51,26 +49,31 @@ def save_compared_models(
         >>> print(aj.files.load_compared_models("models.h5")["arm"])
         Cheng 2018, simulated arm
     """
-    models = summary["models"]
-    named: dict[str, Any] = {"model": ([row["model"] for row in models], "", "model of the joints")}
-    named |= {key: ([_number(row[key]) for row in models], unit, text) for key, (unit, text) in _MODELS.items()}
-    named["converged"] = ([int(row["converged"]) for row in models], "1", "whether its calibration converged")
-    rows = [(row["model"], one) for row in models for one in row["regions"]]
+    models, rows = summary["models"], [(row["model"], region) for row in summary["models"] for region in row["regions"]]
+    by_model = {
+        name: (np.array([row[name] for row in models], float), unit, says) for name, (unit, says) in _MODELS.items()
+    }
     by_region = columns(
         "row",
         model=([model for model, _ in rows], "", "model of the joints"),
-        region=([one["region"] for _, one in rows], "", "region that was left out"),
-        poses=([one["poses"] for _, one in rows], "1", "its poses"),
-        rms=([_number(one["rms"]) for _, one in rows], "mm", "RMS error of its poses"),
-        ratio=([_number(one["ratio"]) for _, one in rows], "1", "mean of (error / predicted standard deviation)^2"),
+        region=([region["region"] for _, region in rows], "", "region that was left out"),
+        poses=([region["poses"] for _, region in rows], "1", "its poses"),
+        rms=(np.array([region["rms"] for _, region in rows], float), "mm", "RMS error of its poses"),
+        ratio=(
+            np.array([region["ratio"] for _, region in rows], float),
+            "1",
+            "mean of (error / predicted standard deviation)^2",
+        ),
     )
-    tables = {
-        "models": Table(columns("model", **named)),
-        "by_region": Table(numbering("row", len(rows)) | by_region),
+    converged = np.array([bool(row["converged"]) for row in models])
+    tables = {  # for other programs: the summary has all of it
+        "models": Table(
+            columns("model", model=([row["model"] for row in models], "", "model of the joints"), **by_model)
+            | columns("model", converged=(converged, "", "whether its calibration converged"))
+        ),
+        "by_region": Table(by_region),
     }
-    attributes = {key: summary[key] for key in _TEXTS} | {key: list(summary[key]) or None for key in _LISTS}
-    attributes |= {"poses": int(summary["poses"]), "sources": list(sources) or None, "seed": seed}
-    write_tables(path, KIND, tables, attributes, summary=dict(summary))
+    write_tables(path, KIND, tables, {"sources": list(sources) or None, "seed": seed}, summary=summary)
 
 
 def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
@@ -80,7 +83,7 @@ def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
         path: The file to read.
 
     Raises:
-        InputError: The file does not exist, is damaged, is not of this kind, or was written by a newer version.
+        InputError: The file does not exist, is damaged, is not of this kind, or was written by another version.
 
     Example:
         >>> from aacmm_jax.summaries.compared_models import compared_models_summary
@@ -90,59 +93,30 @@ def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
         >>> print(aj.files.load_compared_models("models.h5")["recommended"])
         dh
     """
-    stored = read_tables(path, (KIND,))
-    need(path, stored.tables, "models", "by_region")
-    with undamaged(path):
-        models, regions, attributes = stored.tables["models"], stored.tables["by_region"], stored.attributes
-        found: dict[str, Any] = {key: str(attributes[key]) for key in _TEXTS}
-        found |= {key: [str(one) for one in np.atleast_1d(attributes.get(key) or [])] for key in _LISTS}
-        found["poses"] = int(attributes["poses"])
-        found["models"] = [
-            {"model": str(name)}
-            | {key: _finite(models[key][i]) for key in _MODELS}
-            | {"parameters": int(models["parameters"][i]), "converged": bool(models["converged"][i])}
-            | {
-                "regions": [
-                    {
-                        "region": str(regions["region"][k]),
-                        "poses": int(regions["poses"][k]),
-                        "rms": _finite(regions["rms"][k]),
-                        "ratio": _finite(regions["ratio"][k]),
-                    }
-                    for k in np.flatnonzero(regions["model"] == name)
-                ]
-            }
-            for i, name in enumerate(models["model"])
-        ]
-        _check(path, found)
-        return found
+    with undamaged(path), opened(path, (KIND,)) as content:
+        summary = json.loads(str(content.values(content.file.id, "summary")))
+        _check(path, summary)
+        return summary
 
 
-def _check(path: str | os.PathLike, found: Mapping[str, Any]) -> None:
+def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
     """Raise `InputError` where values make no sense."""
-    models = found["models"]
+    models = summary["models"]
     names = [row["model"] for row in models]
     numbers = [row[key] for row in models for key in _MODELS]
-    numbers += [one[key] for row in models for one in row["regions"] for key in ("rms", "ratio")]
+    numbers += [region[key] for row in models for region in row["regions"] for key in ("rms", "ratio")]
+    uneven = any([region["region"] for region in row["regions"]] != summary["regions"] for row in models)
     positive = [row[key] for row in models for key in _NEEDED[:4]]
-    positive += [one["rms"] or 0.0 for row in models for one in row["regions"]]
+    positive += [region["rms"] or 0.0 for row in models for region in row["regions"]]
     check_sense(
         path,
         {
             "it holds no models": not models,
             "a model is named twice": len(set(names)) != len(names),
-            "the recommended model is none of its models": not {found["best"], found["recommended"]} <= set(names),
-            "a model lacks a region": any([one["region"] for one in r["regions"]] != found["regions"] for r in models),
+            "the recommended model is none of its models": not {summary["best"], summary["recommended"]} <= set(names),
+            "a model lacks a region": uneven,
             "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
-            "a number is larger than any can be": any(abs(one) > _LARGEST for one in numbers if one is not None),
-            "a number is negative that cannot be": any(one is not None and one < 0 for one in positive),
+            "a number is larger than any can be": any(abs(value) > _LARGEST for value in numbers if value is not None),
+            "a number is negative that cannot be": any(value is not None and value < 0 for value in positive),
         },
     )
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

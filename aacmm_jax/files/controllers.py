@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ..core.arguments import checked_arguments
 from ..core.errors import InputError
 from ..core.rotations import roll_pitch_yaw
 from ..core.units import DEG
@@ -41,7 +42,14 @@ class ZeroOffsets(NamedTuple):
     largest: float  # mm
 
 
-def dh_table(arm: Arm, *, convention: str = "standard", units: str = "mm-deg", base: Transform | None = None) -> str:
+@checked_arguments
+def dh_table(
+    arm: Arm,
+    *,
+    convention: Literal["standard", "craig"] = "standard",
+    units: Literal["mm-deg", "m-rad"] = "mm-deg",
+    base: Transform | None = None,
+) -> str:
     """A Denavit-Hartenberg table as CSV, with comments that say what each column is and where base and tip are.
 
     Args:
@@ -60,10 +68,6 @@ def dh_table(arm: Arm, *, convention: str = "standard", units: str = "mm-deg", b
         5,0.0,500.0,0.0,-90.00021045914971,0.0
         6,0.0,11.5,0.0,-90.0,0.0
     """
-    if convention not in ("standard", "craig"):
-        raise InputError(f"the convention is '{convention}'; give standard or craig.")
-    if units not in _UNITS:
-        raise InputError(f"the units are '{units}'; give {' or '.join(_UNITS)}.")
     length_unit, angle_unit, length, angle = _UNITS[units]
     geometry = geometry_of(without_corrections(single(arm)))
     beta = np.zeros(arm.joints) if geometry.beta is None else geometry.beta

@@ -1,6 +1,5 @@
 """Joint corrections in arm files: the table ``[corrections]``, and variables of HDF5 files."""
 
-import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +10,7 @@ from pydantic import Field, FiniteFloat, NonNegativeFloat, model_validator
 from ..kinematics.arm import Arm, correction_names
 from ..kinematics.chain import Geometry
 from ..kinematics.corrected_arm import corrected_like, loads_of, with_corrections
-from .hdf5 import Variable, columns, need
+from .hdf5 import Variable, columns
 from .toml import Strict
 
 if TYPE_CHECKING:
@@ -97,12 +96,10 @@ def correction_variables(arm: Arm) -> dict[str, Variable]:
     return variables
 
 
-def corrected_of(path: str | os.PathLike, arm: Arm, arrays: Mapping[str, np.ndarray]) -> Arm:
+def corrected_of(arm: Arm, arrays: Mapping[str, np.ndarray]) -> Arm:
     """The arm with the corrections of its table in an HDF5 file, if it has any."""
     if "coefficients" not in arrays:
         return arm
-    wanted = ("coefficient", "gravity", *(f"nominal_{kind}" for kind in ("alpha", "a", "d", "theta", "probe")))
-    need(path, arrays, *wanted, of="entry")
     nominal = arm.replace(
         **{kind: arrays[f"nominal_{kind}"] for kind in (*_KINDS, "probe") if f"nominal_{kind}" in arrays}
     )

@@ -1,8 +1,8 @@
 """What an HDF5 file contains, read without following it anywhere else, and the SHA-256 by which damage is detected.
 
-The seal, some bytes after the end of what HDF5 reads, is the SHA-256 of all bytes before it. Every file has had one
-since format version 2. It detects damage and is no signature: whoever changes a file on purpose can compute it again.
-So `reader_process` reads everything in a file once, by `Content.check`, before anything of it is used.
+The seal, some bytes after the end of what HDF5 reads, is the SHA-256 of all bytes before it. It detects damage and is
+no signature: whoever changes a file on purpose can compute it again. So `reader_process` reads everything in a file
+once, by `Content.check`, before anything of it is used.
 """
 
 import contextlib
@@ -23,6 +23,8 @@ _SEAL_SIZE = len(_SEAL % (64 * b"0"))
 # An honest file's arrays exceed its size little; a few repeated numbers are compressed a thousand times.
 _ALWAYS_READ, _MOST_COMPRESSED = 64 * 2**20, 100
 _BUFFER = 16 * 2**20  # bytes of an array that are read at a time
+# Numbers, truth values (an enumeration) and text; no compound, reference or array types, nor lists of lists.
+_TYPES = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
 
 
 def seal(stream: Any) -> str:
@@ -36,15 +38,15 @@ def seal(stream: Any) -> str:
 
 def seal_of(stream: Any) -> str | None:
     """The SHA-256 at the end of a file: empty where it is not that of all bytes before, None where there is none."""
-    size = stream.seek(0, os.SEEK_END) - _SEAL_SIZE
-    if size < 0:
+    left = stream.seek(0, os.SEEK_END) - _SEAL_SIZE
+    if left < 0:
         return None
-    stream.seek(size)
+    stream.seek(left)
     last = stream.read()
     if not last.startswith(_SEAL[: _SEAL.index(b"%")]):  # most files of other origin are not read whole
         return None
     stream.seek(0)
-    sha256, left = hashlib.sha256(), size
+    sha256 = hashlib.sha256()
     while left and (part := stream.read(min(left, 2**20))):
         sha256.update(part)
         left -= len(part)
@@ -71,21 +73,21 @@ class Content:
         file: The open `h5py.File`.
         size: Its size in bytes.
         largest: The most bytes that may be read into memory.
-
-    Attributes:
-        attributes: Those of its root. A study's say in which folder the blocks are that virtual arrays may be made of.
     """
 
     def __init__(self, path: str | os.PathLike, file: Any, size: int, largest: int):
         self.path, self.file = path, file
         self.attributes = attributes_of(file)
-        self._virtual = self.attributes.get("parts") if self.attributes.get("kind") == "study" else None
         self._credible = _ALWAYS_READ + _MOST_COMPRESSED * size
         self._left = min(largest, self._credible)
         self._texts_at_once = max(1, self._credible // size)
 
     def _refuse(self, name: str, what: str) -> InputError:
         return InputError(f"{self.path}: '{name}' is {what}, which is not read; name a file written by aacmm.")
+
+    def _too_large(self, name: str, item: Any) -> InputError:
+        sizes = " x ".join(map(str, item.shape)) or "1"
+        return self._refuse(name, f"an array of {sizes}, far more than the file contains")
 
     def names(self, group: Any) -> list[str]:
         """Names in a group, in their order."""
@@ -98,10 +100,6 @@ class Content:
             if isinstance(item, h5py.h5g.GroupID):
                 yield name, item
 
-    def group(self, name: str) -> Any:
-        """The identifier of a group."""
-        return dict(self.groups())[name]
-
     def _item(self, group: Any, name: str) -> Any:
         if group.links.get_info(name.encode()).type != _LOW.h5l.TYPE_HARD:
             raise self._refuse(name, "a link to something else")
@@ -113,36 +111,26 @@ class Content:
         if not isinstance(item, h5py.h5d.DatasetID):
             raise self._refuse(name, "no array")
         properties = item.get_create_plist()
-        if properties.get_external_count():
+        if properties.get_external_count() or properties.get_layout() == h5py.h5d.VIRTUAL:
             raise self._refuse(name, "stored in another file")
-        if properties.get_layout() == h5py.h5d.VIRTUAL:
-            self._check_virtual(name, properties)
-        _check_type(name, self._refuse, item.get_type())
+        self._check_type(name, item.get_type())
         return item
 
-    def dataset(self, group: Any, name: str) -> Any:
+    def dataset(self, group: str, name: str) -> Any:
         """An array as an `h5py.Dataset`, to be read in parts."""
-        return h5py.Dataset(self.array(group, name))
-
-    def _check_virtual(self, name: str, properties: Any) -> None:
-        if self._virtual is None:
-            raise self._refuse(name, "made of other files")
-        for i in range(properties.get_virtual_count()):
-            folder, _, block = properties.get_virtual_filename(i).rpartition("/")
-            if folder.replace("%%", "%") != self._virtual or not block or block in (".", ".."):
-                raise self._refuse(name, "made of files that are not blocks of this study")
+        return h5py.Dataset(self.array(dict(self.groups())[group], name))
 
     def values(self, group: Any, name: str) -> np.ndarray:
-        """An array, read whole; texts are str."""
+        """An array, read whole; texts are str, and what xarray marks as truth values is bool."""
         item = self.array(group, name)
         shape, kind = item.shape, item.dtype
         self._left -= math.prod(shape) * kind.itemsize
-        if self._left >= 0:
-            return self._texts(item, name) if h5py.check_string_dtype(kind) else _read(item, shape, kind)
-        raise self._too_large(name, item)
-
-    def _too_large(self, name: str, item: Any) -> InputError:
-        return self._refuse(name, f"an array of {_sizes(item.shape)}, far more than the file contains")
+        if self._left < 0:
+            raise self._too_large(name, item)
+        if h5py.check_string_dtype(kind):
+            return self._texts(item, name)
+        values = _read(item, shape, kind)
+        return values.astype(bool) if h5py.Dataset(item).attrs.get("dtype") == "bool" else values
 
     def _texts(self, item: Any, name: str) -> np.ndarray:
         """Some at a time: many may refer to the same bytes of the file."""
@@ -151,22 +139,16 @@ class Content:
             raise self._refuse(name, "a table of texts in several dimensions")
         if not item.shape:
             return np.asarray(texts[()], dtype=object)
-        found = []
+        parts = [np.empty(0, dtype=object)]
         for first in range(0, item.shape[0], self._texts_at_once):
-            part = texts[first : first + self._texts_at_once]
-            self._left -= sum(map(len, part))
+            parts.append(texts[first : first + self._texts_at_once])
+            self._left -= sum(map(len, parts[-1]))
             if self._left < 0:
                 raise self._too_large(name, item)
-            found.append(part)
-        return np.concatenate(found) if found else np.empty(0, dtype=object)
+        return np.concatenate(parts)
 
     def check(self) -> None:
-        """Read everything once that a reader of the file may read: raise where HDF5 cannot, or it is not allowed.
-
-        Of a file of another program, only the attributes that show this.
-        """
-        if self.attributes and "format" not in self.attributes:
-            return
+        """Read everything once that a reader of the file may read: raise where HDF5 cannot, or it is not allowed."""
         root = self.file.id
         self._check_attributes(root, read=False)  # as they have been
         for name in self.names(root):
@@ -180,12 +162,7 @@ class Content:
 
     def _check_array(self, group: Any, name: str) -> None:
         item = self.array(group, name)
-        if self.attributes.get("kind") == "study":  # which xarray reads with all that describes an array
-            self._check_attributes(item)
-            for dimension in h5py.Dataset(item).dims:
-                dimension.keys()
-            if item.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
-                return  # its values are those of other files, which are checked when they are opened
+        self._check_attributes(item)
         shape, kind = item.shape, item.dtype
         declared = math.prod(shape) * kind.itemsize
         if declared > self._credible:
@@ -201,13 +178,17 @@ class Content:
     def _check_attributes(self, item: Any, read: bool = True) -> None:
         for index in range(h5py.h5a.get_num_attrs(item)):
             attribute = h5py.h5a.open(item, index=index)
-            if attribute.name not in (b"DIMENSION_LIST", b"REFERENCE_LIST"):  # by which HDF5 attaches scales
-                _check_type(attribute.name.decode(), self._refuse, attribute.get_type())
-            shape, kind = attribute.shape, attribute.dtype
+            name, shape, kind = attribute.name.decode(), attribute.shape, attribute.dtype
+            if name not in ("DIMENSION_LIST", "REFERENCE_LIST"):  # by which HDF5 attaches scales
+                self._check_type(name, attribute.get_type())
             if math.prod(shape) * kind.itemsize > self._credible:
-                raise self._too_large(attribute.name.decode(), attribute)
+                raise self._too_large(name, attribute)
             if read and math.prod(shape):
                 attribute.read(np.empty(shape, kind))
+
+    def _check_type(self, name: str, kind: Any) -> None:
+        if kind.get_class() not in _TYPES:
+            raise self._refuse(name, "of a type that no file of aacmm has")
 
 
 def attributes_of(item: Any) -> dict[str, Any]:
@@ -229,17 +210,6 @@ def _read(item: Any, shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
     if values.size:
         item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
     return values
-
-
-def _check_type(name: str, refuse: Any, kind: Any) -> None:
-    """Numbers, truth values (an enumeration) and text; no compound, reference or array types, nor lists of lists."""
-    allowed = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
-    if kind.get_class() not in allowed:
-        raise refuse(name, "of a type that no file of aacmm has")
-
-
-def _sizes(shape: tuple[int, ...]) -> str:
-    return " x ".join(map(str, shape)) or "1"
 
 
 def _parts(shape: tuple[int, ...], itemsize: int) -> Iterator[tuple[slice, ...]]:

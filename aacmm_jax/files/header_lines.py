@@ -37,15 +37,8 @@ def names_of_columns(
 ) -> list[str]:
     """The names of the columns, perhaps with units from a line of their own; none where they are not named.
 
-    Args:
-        path: The table, for messages.
-        width: Number of columns.
-        words: Lines of words above the first row.
-        comments: Comments, which may name the columns where no line of words does.
-        wanted: Columns that are going to be picked.
-
-    Raises:
-        InputError: Several lines may be the names.
+    Comments may name the columns where no line of ``words`` above the first row does. Where several lines may be the
+    names, it is the one that has the columns that are ``wanted``, or numbered ones; else `InputError`.
     """
     lines = [(line, cells) for line, cells in words if len(cells) == width]
     units = [cells for _, cells in lines if are_units(cells, alone=len(lines) == 1)]

@@ -27,14 +27,8 @@ def largest_file() -> int:
 class InputFile(os.PathLike):
     """A file that is read once: what is parsed and what `fingerprint` identifies are the same bytes.
 
-    Functions that read a file take one in place of a path.
-
-    Args:
-        path: The file; an `InputFile` is taken as it is.
-        share: Part of the limit of `largest_file` that its size may be.
-
-    Raises:
-        InputError: The file is missing, cannot be read, is no ordinary file, or is larger than the limit.
+    Functions that read a file take one in place of a path, and so does this class. Refused is what is missing, cannot
+    be read, is not an ordinary file, or is larger than this ``share`` of `largest_file`.
     """
 
     def __init__(self, path: str | os.PathLike, share: float = 1.0):
@@ -111,6 +105,22 @@ def fingerprint(path: str | os.PathLike, folder: str | os.PathLike | None = None
     below = folder is not None and path.is_relative_to(folder)
     name = path.relative_to(folder).as_posix() if below and folder is not None else path.name
     return storable_name(f"{name} (SHA-256 {digest})")
+
+
+class InputFiles:
+    """The files of a manifest in the order in which they are opened; ``share`` as of `InputFile`."""
+
+    def __init__(self, manifest: InputFile, share: float):
+        self._files, self._share = [manifest], share
+
+    def open(self, path: str | os.PathLike) -> InputFile:
+        """Read another file."""
+        self._files.append(InputFile(path, self._share))
+        return self._files[-1]
+
+    def sources(self, folder: Path) -> tuple[str, ...]:
+        """The `fingerprint` of each file."""
+        return tuple(dict.fromkeys(fingerprint(file, folder) for file in self._files))
 
 
 def storable_name(text: str) -> str:

@@ -2,7 +2,7 @@
 
 import datetime
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -20,24 +20,23 @@ from pydantic import (
 
 from ..acceptance.standards import Standard
 from ..core.errors import InputError
+from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings
+from ..data.joined_captures import join_sessions
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
 from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
-from .inputs import InputFile, fingerprint
+from .inputs import InputFile, InputFiles
 from .manifest_angles import Angles, Readings
 from .manifest_observations import Source, name_of, observations, parts
-from .manifest_sessions import in_sessions
 from .manifest_tables import FIELDS, TABLES, Picked, SocketTable, Table
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .text_lines import TABLE_SHARE
 from .toml import Strict, each_once, read_toml
-
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class _Length(Strict):
@@ -127,15 +126,13 @@ class PointsManifest(_Recorded):
 
     @model_validator(mode="after")
     def _own_tip(self) -> "PointsManifest":
-        own = [entry for entry in self.socket if entry.target or entry.session]
-        named = [
-            entry for entry in (*own, *self.socket, *self.sphere) if entry in own or entry.temperature_C is not None
-        ]
-        if named:
-            raise ValueError(
-                "target, session and temperature_C are for manifests of poses, but "
-                f"'{named[0].name or named[0].paths[0]}' has points, which say where the tip was; leave them out."
-            )
+        for entry in (*self.socket, *self.sphere):
+            seated = isinstance(entry, SocketTable) and (entry.target or entry.session)
+            if seated or entry.temperature_C is not None:
+                raise ValueError(
+                    "target, session and temperature_C are for manifests of poses, but "
+                    f"'{entry.name or entry.paths[0]}' has points, which say where the tip was; leave them out."
+                )
         return self
 
 
@@ -214,37 +211,29 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
     try:
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
-        files = [manifest]
-
-        def opened(file: Path) -> InputFile:
-            files.append(read := InputFile(file, TABLE_SHARE))
-            return read
-
+        files = InputFiles(manifest, TABLE_SHARE)
         readings = Readings(nominal.arm, model.angles)
-        source = Source(path.parent, opened, "q", readings)
+        source = Source(path.parent, files.open, "q", readings)
         recorded = read_recorded(model, source)
-        # Another tip than the arm's own probe was held in these, so that they are observations.
-        of_targets = [
-            (seated.session, Socket(name, seated.poses, target=seated.target))
-            for name, seated in recorded.sockets.items()
-            if seated.target
+        # Where another tip than the arm's own probe was held, it is an observation.
+        seats = [seated for seated in recorded.sockets.values() if not seated.target]
+        targets = [seated for seated in recorded.sockets.values() if seated.target]
+        observed: list[tuple[str, AbstractObservation]] = [
+            (seated.session, Socket(seated.name, seated.poses, target=seated.target)) for seated in targets
         ]
-        seats = {name: seated for name, seated in recorded.sockets.items() if not seated.target}
-        sockets = {name: seated.poses for name, seated in seats.items()}
-        visits = {name: seated.visits for name, seated in seats.items() if seated.visits is not None}
-        observed = [*of_targets, *_observations(model, source)]
-        if not sockets and not observed:
+        for kind in TABLES:
+            for entry in () if kind is Socket else getattr(model, kind.table):
+                for values in _fields(path.parent, entry, kind.table):
+                    observed += observations(source, kind, entry, values)
+        if not seats and not observed:
             raise InputError("there is neither a [[socket]] nor another observation; add one.")
-        sources = tuple(dict.fromkeys(fingerprint(file, path.parent) for file in files))
-        sessions = {name: seated.session for name, seated in seats.items()}
-        if {*sessions.values(), *(session for session, _ in observed)} - {""}:
+        if any(seated.session for seated in seats) or any(session for session, _ in observed):
             remounted = (model.sessions or _Sessions()).probe == "remounted"
-            capture = in_sessions(sessions, sockets, recorded.lengths, observed, remounted, visits)
+            capture = _in_sessions(seats, recorded.lengths, observed, remounted)
         elif model.sessions is not None:
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
         else:
-            others = [observation for _, observation in observed]
-            capture = Capture(sockets, recorded.lengths, others, visits=visits)
+            capture = _capture(seats, recorded.lengths, [observation for _, observation in observed])
         if capture.columns == nominal.arm.joints + 1:
             nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
         check_readings(capture, nominal.arm)
@@ -252,7 +241,7 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
             capture,
             nominal if proposed else with_parameters(nominal, capture),
             spheres=recorded.spheres,
-            sources=sources,
+            sources=files.sources(path.parent),
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
             measuring_range=model.measuring_range,
@@ -263,24 +252,18 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
         raise InputError(f"{path}: {error}") from error
 
 
-def _observations(model: _Poses, source: Source) -> Iterator[tuple[str, AbstractObservation]]:
-    for kind in TABLES:
-        for entry in () if kind is Socket else getattr(model, kind.table):
-            for values in _fields(source.folder, entry, kind.table):
-                yield from observations(source, kind, entry, values)
-
-
 class Seated(NamedTuple):
     """The poses of one socket."""
 
-    session: str
+    session: str  # empty where there are none
+    name: str  # within its session
     poses: np.ndarray
     target: str
     visits: np.ndarray | None
 
 
 class Recorded(NamedTuple):
-    """The sockets, lengths and spheres that a manifest names."""
+    """The sockets, lengths and spheres that a manifest names; names of sockets begin with their session."""
 
     sockets: dict[str, Seated]
     lengths: list[ReferenceLength]
@@ -294,7 +277,9 @@ def read_recorded(model: _Recorded, source: Source) -> Recorded:
     for entry in model.socket:
         for values in _fields(source.folder, entry, "socket"):
             fields.append(values)
-            for name, seated in _seated(source, entry, values):
+            for seated in _seated(source, entry, values):
+                name = "/".join(filter(None, (seated.session, seated.name)))
+                check_name(name)
                 if name in sockets:
                     raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
                 sockets[name] = seated
@@ -302,11 +287,10 @@ def read_recorded(model: _Recorded, source: Source) -> Recorded:
     for entry in model.sphere:
         if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
             raise InputError(f"sphere '{entry.name}' is defined twice for one test; give its files in one [[sphere]].")
-        found = list(parts(source, Socket, entry, {}, f"[[sphere]] '{entry.name}'"))
         # A group is a repeat, or an orientation: a file, or the rows of one value in the column of groups.
         groups = [
             part.rows[source.quantity][part.files == file]
-            for part in found
+            for part in parts(source, Socket, entry, {}, f"[[sphere]] '{entry.name}'")
             for file in dict.fromkeys(part.files.tolist())
         ]
         numbers = (entry.diameter, entry.u, entry.stylus, entry.form, entry.u_form)
@@ -314,15 +298,50 @@ def read_recorded(model: _Recorded, source: Source) -> Recorded:
     return Recorded(sockets, _lengths(model.length, fields, sockets), tuple(spheres))
 
 
-def _seated(source: Source, entry: SocketTable, values: Mapping[str, str]) -> Iterator[tuple[str, Seated]]:
+def _seated(source: Source, entry: SocketTable, values: Mapping[str, str]) -> Iterator[Seated]:
     """The sockets of one entry: one, or one for each session and group."""
-    own = name_of(entry, values)
-    named = "" if entry.name is None and entry.group is not None else own
-    for part in parts(source, Socket, entry, values, f"[[socket]] '{own}'"):
-        name = "/".join(text for text in (part.session, named, part.group) if text)
-        check_name(name)
+    stated = name_of(entry, values)
+    named = "" if entry.name is None and entry.group is not None else stated
+    for part in parts(source, Socket, entry, values, f"[[socket]] '{stated}'"):
+        name = "/".join(filter(None, (named, part.group)))
         visits = None if entry.visits is None else part.files
-        yield name, Seated(part.session, part.rows[source.quantity], part.rows.get("target", ""), visits)
+        yield Seated(part.session, name, part.rows[source.quantity], part.rows.get("target", ""), visits)
+
+
+def _capture(
+    seats: Sequence[Seated], lengths: Sequence[ReferenceLength], observed: Sequence[AbstractObservation]
+) -> Capture:
+    visits = {seated.name: seated.visits for seated in seats if seated.visits is not None}
+    return Capture({seated.name: seated.poses for seated in seats}, lengths, observed, visits=visits or None)
+
+
+def _in_sessions(
+    seats: Sequence[Seated],
+    lengths: Sequence[ReferenceLength],
+    observed: Sequence[tuple[str, AbstractObservation]],
+    remounted: bool,
+) -> Capture:
+    """One capture of all sessions, each but the first with a probe of its own where that was ``remounted``."""
+    items = [*((seated.session, seated.name) for seated in seats), *((key, item.name) for key, item in observed)]
+    without = [name for session, name in items if not session]
+    if without:
+        raise InputError(f"{shorten(without)} has no session, but other tables have; state it for every table.")
+    lengths_of: dict[str, list[ReferenceLength]] = {session: [] for session, _ in items}
+    for length in lengths:  # named session/name
+        ends = (length.start, length.end)
+        session = next((name for name in lengths_of if all(end.startswith(f"{name}/") for end in ends)), "")
+        if not session:
+            raise InputError(
+                f"length from '{length.start}' to '{length.end}' is not between two sockets of one session; name them "
+                "session/name."
+            )
+        start, end = (end.removeprefix(f"{session}/") for end in ends)
+        lengths_of[session].append(ReferenceLength(start, end, length.value, length.u))
+    captures = {}
+    for session, between in lengths_of.items():
+        observed_then = [observation for key, observation in observed if key == session]
+        captures[session] = _capture([seated for seated in seats if seated.session == session], between, observed_then)
+    return join_sessions(captures, own_probe=remounted)
 
 
 def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
@@ -330,30 +349,28 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
     if not entry.paths:
         yield {}
         return
-    first = entry.paths[0]
-    for text in (entry.name or "", *entry.paths):
+    first, name = entry.paths[0], entry.name or ""
+    for text in (name, *entry.paths):
         check_fields(text)
     fields = fields_of(first)
-    of_session = fields_of(getattr(entry, "session", None) or "")
-    for what, text in (("name", entry.name or ""), *(("file", file) for file in entry.paths[1:])):
-        if fields_of(text) | (of_session & fields if what == "name" else set()) != fields:
-            if what == "name" and not text:
-                line = "/".join(f"{{{field}}}" for field in sorted(fields - of_session))
-                raise InputError(f"file '{first}' has {in_braces(fields)}, so add name = \"{line}\" in [[{table}]].")
+    # A field that names the session need not be in the name.
+    of_session = fields_of(getattr(entry, "session", None) or "") & fields
+    if not name and fields:
+        line = "/".join(f"{{{field}}}" for field in sorted(fields - of_session))
+        raise InputError(f"file '{first}' has {in_braces(fields)}, so add name = \"{line}\" in [[{table}]].")
+    for what, text, known in (("name", name, of_session), *(("file", file, set()) for file in entry.paths[1:])):
+        if fields_of(text) | known != fields:
             raise InputError(
                 f"{table} {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has "
                 f"{in_braces(fields)}; use the same fields in the name and in every file."
             )
-    if fields:
-        yield from matches(folder, first, entry.exclude)
-        return
-    if entry.exclude:
+    if entry.exclude and not fields:
         raise InputError(f"exclude is for files with a field in braces, but '{first}' has none; leave it out.")
-    yield {}
+    yield from matches(folder, first, entry.exclude) if fields else [{}]
 
 
 def _lengths(
-    entries: list[_Length], fields: list[dict[str, str]], sockets: Mapping[str, Seated]
+    entries: Sequence[_Length], fields: Sequence[dict[str, str]], sockets: Mapping[str, Seated]
 ) -> list[ReferenceLength]:
     """Reference lengths; one with fields in braces gives every combination that the sockets' files have."""
     lengths = []
@@ -361,19 +378,17 @@ def _lengths(
         check_fields(entry.start)
         check_fields(entry.end)
         names = fields_of(entry.start) | fields_of(entry.end)
-        if not names:
-            lengths.append(entry.between(entry.start, entry.end))
-            continue
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
-        if not choices:
+        if not choices and names:
             raise InputError(
                 f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; "
                 "name the fields alike."
             )
+        choices = choices if names else {()}
         pairs = [(fill(entry.start, dict(choice)), fill(entry.end, dict(choice))) for choice in sorted(choices)]
         # The field may also be in the names of sockets that this length is not between.
-        known = [pair for pair in pairs if pair[0] in sockets or pair[1] in sockets]
-        lengths += [entry.between(*pair) for pair in known or pairs]
+        between = [pair for pair in pairs if set(pair) & sockets.keys()]
+        lengths += [entry.between(*pair) for pair in between or pairs]
     # Repeated measurements have other values, or are named in the other direction.
     given = [(length.start, length.end, float(length.value)) for length in lengths]
     for start, end, value in given:

@@ -14,6 +14,7 @@ from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm, by_joint
+from .header_lines import Column
 from .manifest_tables import Picked, Wanted, as_list
 from .table_columns import check_not_taken, reading_columns
 from .temperatures import TEMPERATURE, with_temperature
@@ -21,18 +22,19 @@ from .text_table import TextTable
 from .toml import Strict
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_ByJoint = _Positive | Annotated[list[_Positive], Field(min_length=1)]
 
 
 class Angles(Strict):
     """How every column of readings is turned into rad, or mm of a prismatic joint."""
 
     unit: Literal["rad", "deg", "arcsec", "gon", "mrad", "counts"]
-    counts_per_turn: _Positive | Annotated[list[_Positive], Field(min_length=1)] | None = None
+    counts_per_turn: _ByJoint | None = None
     sign: Literal[1, -1] | list[Literal[1, -1]] = 1
     offset: FiniteFloat | list[FiniteFloat] = 0.0
     columns: Picked | None = None
     linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
-    counts_per_mm: _Positive | Annotated[list[_Positive], Field(min_length=1)] | None = None
+    counts_per_mm: _ByJoint | None = None
 
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
@@ -42,47 +44,22 @@ class Angles(Strict):
             raise ValueError("give counts_per_mm with linear_unit = 'counts', and only with it.")
         return self
 
+    def converted(self, readings: Float[np.ndarray, "N n"], arm: Arm) -> Float[np.ndarray, "N n"]:
+        """Readings in rad, and in mm of prismatic joints."""
 
-def angles_of(angles: Angles | None, unit: str | None = None, preset: str | None = None) -> Angles:
-    """How readings are written: what a table states comes first, then [angles], then the table's preset."""
-    unit = unit if unit is not None or angles is not None else preset
-    if unit is None and angles is None:
-        raise InputError(
-            "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" or "
-            '"rad", or state it in the header of the table, as J1 [deg].'
-        )
-    if unit is None:
-        assert angles is not None
-        return angles
-    if unit not in ANGLE_UNITS:
-        raise InputError(f"units.q is '{unit}'; it must be one of {', '.join(ANGLE_UNITS)}.")
-    same = ("sign", "offset", "linear_unit", "counts_per_mm")
-    stated = {} if angles is None else {what: getattr(angles, what) for what in same}
-    return Angles(unit=unit, **stated)  # pyright: ignore[reportArgumentType]
+        def numbers(key: str) -> np.ndarray:
+            array = np.asarray(getattr(self, key), dtype=float)
+            if array.ndim and array.shape != (arm.joints,):
+                raise InputError(
+                    f"angles.{key} has {array.size} values, but there are {arm.joints} joints; give one, or one a "
+                    "joint."
+                )
+            return array
 
-
-def in_rad(readings: np.ndarray, angles: Angles, arm: Arm) -> np.ndarray:
-    """Readings in rad, and in mm of prismatic joints."""
-    joints = readings.shape[1]
-
-    def a_joint(value: float | list, what: str) -> np.ndarray:
-        array = np.asarray(value, dtype=float)
-        if array.ndim and array.shape != (joints,):
-            raise InputError(
-                f"angles.{what} has {array.size} values, but there are {joints} joints; give one, or one a joint."
-            )
-        return array
-
-    unit = (
-        2 * math.pi / a_joint(angles.counts_per_turn, "counts_per_turn")
-        if angles.counts_per_turn
-        else ANGLE_UNITS[angles.unit]
-    )
-    linear = (
-        1 / a_joint(angles.counts_per_mm, "counts_per_mm") if angles.counts_per_mm else LENGTH_UNITS[angles.linear_unit]
-    )
-    units = np.where(by_joint(arm, False, True), linear, unit)
-    return a_joint(angles.sign, "sign") * (readings - a_joint(angles.offset, "offset")) * units
+        angular = 2 * math.pi / numbers("counts_per_turn") if self.counts_per_turn else ANGLE_UNITS[self.unit]
+        linear = 1 / numbers("counts_per_mm") if self.counts_per_mm else LENGTH_UNITS[self.linear_unit]
+        units = np.where(by_joint(arm, False, True), linear, angular)
+        return numbers("sign") * (readings - numbers("offset")) * units
 
 
 def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str | None) -> tuple[str | None, str | None]:
@@ -94,17 +71,18 @@ def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str |
     """
     slides = [picked[i - 1] for i in arm.prismatic]
     turns = [i for i in picked if i not in slides]
-    units = text.unit(turns, stated), text.unit(slides)
-    for unit, known, columns, joints in zip(
-        units, (ANGLE_UNITS, LENGTH_UNITS), (turns, slides), ("revolute", "prismatic"), strict=True
-    ):
+    kinds = (("revolute", turns, ANGLE_UNITS, stated), ("prismatic", slides, LENGTH_UNITS, None))
+    units = []
+    for joints, columns, known, stated_unit in kinds:
+        unit = text.unit(columns, stated_unit)
         if unit not in (None, "counts", *known):
             raise InputError(
-                f"{text.path} states {quoted(str(unit))} for readings of {joints} joints "
+                f"{text.path} states {quoted(unit)} for readings of {joints} joints "
                 f"({quoted(text.header[columns[0]])}), but these are in {', '.join(known)} or counts; pick their "
                 "columns with columns = [...], or correct the header."
             )
-    return units
+        units.append(unit)
+    return units[0], units[1]
 
 
 class Readings:
@@ -121,42 +99,43 @@ class Readings:
 
     def __init__(self, arm: Arm, angles: Angles | None):
         self._arm, self._angles = arm, angles
-        self._tables: list[tuple[int, str | os.PathLike]] = []  # columns of readings of the first table, and its file
+        self._first: tuple[int, str | os.PathLike] | None = None  # columns of readings of the first table, and its file
         self.columns: list[int] = []  # of the joints in the first table, from 1
         self.angles: Angles | None = None  # with which the first table was read, its header and units considered
 
     def __call__(self, text: TextTable, wanted: Wanted) -> Float[np.ndarray, "N n"]:
         """The readings of one table."""
-        picked = self._picked(text, wanted)
-        own = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
-        if set(own) & set(picked):
+        stated = wanted.columns
+        if stated is None and self._angles is not None and self._angles.columns is not None:
+            stated = as_list(self._angles.columns)
+        picked = self._picked(text, stated, wanted)
+        thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
+        if set(thermometer) & set(picked):
             raise InputError(
-                f"{text.path} column {own[0] + 1} is {TEMPERATURE}, no joint reading; leave it out of columns."
+                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; leave it out of "
+                "columns."
             )
-        stated = wanted.columns is not None or (self._angles is not None and self._angles.columns is not None)
-        numbers = text.numbers(picked, measured=True, stated=stated)
+        numbers = text.numbers(picked, measured=True, stated=stated is not None)
         angles = self._angles_of(text, picked, wanted)
-        q = in_rad(numbers, angles, self._arm)
+        q = angles.converted(numbers, self._arm)
         check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
-        temperature = text.numbers(own)[:, 0] if own else None
+        temperature = text.numbers(thermometer)[:, 0] if thermometer else None
         readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
+        self._first = self._first or (readings.shape[1], text.path)
         self.columns, self.angles = self.columns or [i + 1 for i in picked], self.angles or angles
-        self._tables = [*self._tables[:1], (readings.shape[1], text.path)]
-        (fewer, without), (more, other) = sorted((self._tables[0], self._tables[-1]), key=lambda table: table[0])
-        if fewer != more:
+        if self._first[0] != readings.shape[1]:
+            (_, without), (_, other) = sorted((self._first, (readings.shape[1], text.path)), key=lambda table: table[0])
             raise InputError(
                 f"{without} has no temperatures, but {other} has; give it a column {TEMPERATURE}, or state "
                 f"{TEMPERATURE} in its table."
             )
         return readings
 
-    def _picked(self, text: TextTable, wanted: Wanted) -> list[int]:
-        columns, joints = wanted.columns, self._arm.joints
-        if columns is None and self._angles is not None and self._angles.columns is not None:
-            columns = as_list(self._angles.columns)
-        if columns is None:
+    def _picked(self, text: TextTable, stated: Sequence[Column] | None, wanted: Wanted) -> list[int]:
+        joints = self._arm.joints
+        if stated is None:
             return reading_columns(text, joints, wanted.taken)
-        picked = text.pick(columns)
+        picked = text.pick(stated)
         check_not_taken(text, picked, wanted.taken)
         if len(picked) != joints:
             what = "angles.columns" if wanted.columns is None else "columns"
@@ -167,27 +146,40 @@ class Readings:
         return picked
 
     def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted) -> Angles:
-        """How these readings are written: what the manifest states must not contradict the header."""
-        stated_unit = wanted.unit or (None if self._angles is None else self._angles.unit)
-        angular, linear = header_units(text, picked, self._arm, stated_unit)
-        if angular == "counts" and self._angles is None and wanted.unit is None:
+        """How these readings are written: what the table states comes first, then [angles], the header, the preset.
+
+        What the manifest states must not contradict the header.
+        """
+        angles = self._angles
+        unit = wanted.unit or (None if angles is None else angles.unit)
+        angular, linear = header_units(text, picked, self._arm, unit)
+        if angular == "counts" and unit is None:
             raise InputError(
                 f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'
             )
-        angles = angles_of(self._angles, wanted.unit, angular or wanted.usual_unit)
-        given = self._angles is not None and "linear_unit" in self._angles.model_fields_set
-        pairs = (
-            (angular, angles.unit, "readings"),
-            (linear, angles.linear_unit if given else linear, "prismatic joints"),
-        )
-        for header, stated, what in pairs:
-            if header is not None and header != stated:
-                raise InputError(
-                    f"{text.path}: the header of the {what} says {header}, but the manifest {stated}; correct one of "
-                    "them."
-                )
-        if linear == "counts" and angles.counts_per_mm is None:
+        unit = unit or angular or wanted.usual_unit
+        if unit is None:
+            raise InputError(
+                "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" "
+                'or "rad", or state it in the header of the table, as J1 [deg].'
+            )
+        if unit not in ANGLE_UNITS and (angles is None or unit != angles.unit):  # which may be counts
+            raise InputError(f"units.q is '{unit}'; it must be one of {', '.join(ANGLE_UNITS)}.")
+        stated = {} if angles is None else angles.model_dump(exclude_unset=True)
+        if angles is None or unit != angles.unit:
+            stated = {key: value for key, value in stated.items() if key != "counts_per_turn"}
+        if angular is not None and angular != unit:
+            raise _contradiction(text, "readings", angular, unit)
+        if linear is not None and linear != stated.setdefault("linear_unit", linear):
+            raise _contradiction(text, "prismatic joints", linear, stated["linear_unit"])
+        if linear == "counts" and "counts_per_mm" not in stated:
             raise InputError(
                 f'{text.path} has readings in counts; add linear_unit = "counts" and counts_per_mm = [...].'
             )
-        return angles if linear is None else angles.model_copy(update={"linear_unit": linear})
+        return Angles(**{**stated, "unit": unit})
+
+
+def _contradiction(text: TextTable, what: str, header: str, stated: str) -> InputError:
+    return InputError(
+        f"{text.path}: the header of the {what} says {header}, but the manifest {stated}; correct one of them."
+    )

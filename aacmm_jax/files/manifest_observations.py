@@ -17,7 +17,6 @@ from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
 from .header_lines import Column
 from .inputs import InputFile
-from .manifest_sessions import session_name
 from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, Wanted, as_list
 from .patterns import check_name, fields_of, fill
 from .text_table import TextTable
@@ -63,7 +62,8 @@ def parts(
 ) -> Iterator[Part]:
     """The parts of one table of a manifest, one for each session and group; ``where`` names it in messages."""
     reader = _Reader(source, kind, table, where)
-    session = session_name(getattr(table, "session", None), values, where)
+    session = _filled(getattr(table, "session", None) or "", values, f"{where}: session")
+    check_name(session)
     labels, files_read = zip(*((label, fill(file, values)) for label, file in _files(table)), strict=True)
     try:
         found = [reader.read(label, file, session) for label, file in zip(labels, files_read, strict=True)]
@@ -91,6 +91,14 @@ def parts(
         rows = {key: value[chosen] for key, value in by_pose.items()}
         reader.check_complete({*rows, *stated})
         yield Part(session, group, rows | stated, files[chosen])
+
+
+def _filled(text: str, values: Mapping[str, str], what: str) -> str:
+    """A text whose fields in braces are filled in."""
+    unknown = fields_of(text) - values.keys()
+    if unknown:
+        raise InputError(f"{what} uses the unknown field {shorten(sorted(unknown))}.")
+    return fill(text, values)
 
 
 def _files(table: Any) -> list[tuple[str, str]]:
@@ -260,10 +268,7 @@ class _Reader:
                 found[entry.dimensions[0]] = np.array(list(value))
                 found[entry.name] = np.array(list(value.values()), dtype=float) * self._unit(entry)
             elif entry.content == "text":
-                unknown = fields_of(value) - values.keys()
-                if unknown:
-                    raise InputError(f"{self._where}: {entry.name} uses the unknown field {shorten(sorted(unknown))}.")
-                found[entry.name] = fill(value, values)
+                found[entry.name] = _filled(value, values, f"{self._where}: {entry.name}")
             else:
                 found[entry.name] = value if entry.content == "truth" else value * self._unit(entry)
         return found

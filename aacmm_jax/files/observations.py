@@ -1,14 +1,14 @@
 """Observations in HDF5: one table each, of the entries that its kind declares; nothing here depends on a kind."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from ..core.errors import InputError
 from ..data.observations.observation import AbstractObservation, kinds
-from .hdf5 import Stored, Table, Variable, axes, columns, need, numbering
+from .hdf5 import Stored, StoredTable, Table, Variable
 from .temperatures import reading_variables, readings_of
 
 _PREFIX = "observation_"
@@ -38,9 +38,6 @@ def _table(observation: AbstractObservation, joints: int, unit: str) -> Table:
             variables |= reading_variables(entry.name, value, joints, unit)
             continue
         variables[entry.name] = Variable(entry.dimensions, value, entry.unit, entry.says)
-        for dimension, size in zip(entry.dimensions, value.shape, strict=True):
-            if dimension not in variables and dimension != entry.name:
-                variables |= _coordinate(dimension, size)
     return Table(variables, attributes)
 
 
@@ -48,25 +45,15 @@ def _attribute(name: str, unit: str) -> str:
     return f"{name}_{unit}" if unit else name
 
 
-def _coordinate(dimension: str, size: int) -> dict[str, Variable]:
-    if dimension == "axis":
-        return axes()
-    if dimension == "axis_2":
-        return columns("axis_2", axis_2=(["x", "y", "z"], "", "second axis"))
-    return numbering(dimension, size)
-
-
 def observations_of(path: str | os.PathLike, stored: Stored) -> list[AbstractObservation]:
     """The observations that a file holds, checked as when they were made. Raises `InputError`."""
     numbers = sorted(int(name.removeprefix(_PREFIX)) for name in stored.tables if name.startswith(_PREFIX))
     tables = [f"{_PREFIX}{number}" for number in numbers]
-    return [_observation(path, stored.tables[name], stored.table_attributes[name]) for name in tables]
+    return [_observation(path, stored.tables[name]) for name in tables]
 
 
-def _observation(
-    path: str | os.PathLike, table: Mapping[str, np.ndarray], attributes: Mapping[str, Any]
-) -> AbstractObservation:
-    need(path, attributes, "kind", "name", of="attribute")
+def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObservation:
+    attributes = table.attributes
     kind = kinds().get(attributes["kind"])
     if kind is None:
         raise InputError(
@@ -75,12 +62,10 @@ def _observation(
         )
     values: dict[str, Any] = {}
     for entry in kind.entries:
+        source, name = (table, entry.name) if entry.dimensions else (attributes, _attribute(entry.name, entry.unit))
         if entry.name == "q" and entry.name in table:
             values[entry.name] = readings_of(table, entry.name)
-            continue
-        found = table.get(entry.name) if entry.dimensions else attributes.get(_attribute(entry.name, entry.unit))
-        if found is not None:
-            values[entry.name] = found.astype(str) if entry.dimensions and entry.content == "text" else found
-        elif entry.required:
-            need(path, {}, entry.name, of="entry")
+        elif entry.required or name in source:
+            value = source[name]
+            values[entry.name] = value.astype(str) if entry.dimensions and entry.content == "text" else value
     return kind.rebuilt(attributes["name"], values)

@@ -1,9 +1,9 @@
-"""The files that a command writes: none of them is a file that it reads, and all of them appear together or not at all.
-
-A command replaces a file only where aacmm wrote it, as it says itself or as its beginning shows (`asking`).
+"""Files that are written: whole or not at all, all those of a command together, and none that the command reads.
 
 Whatever is written goes to a temporary file in the same folder, which is locked while its writer lives and is renamed
 at the end. So a temporary file that nobody has locked was left by a process that was killed, and is removed.
+
+A command replaces a file only where aacmm wrote it, as it says itself or as its beginning shows (`asking`).
 """
 
 import contextlib
@@ -15,7 +15,7 @@ import stat
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..core.errors import InputError
 from ..core.file_owners import is_planted_link, may_replace
@@ -26,6 +26,11 @@ except ImportError:  # Windows, where an open file cannot be removed, which serv
     fcntl = None
 
 ELSEWHERE = "choose another output path"
+_MARKS = (b"aacmm", b"atplotlib")  # near the beginning or end of most files that are written here
+_MARKED = (".h5", ".html", ".pdf", ".png", ".svg", ".xml")  # of which all have one
+_ENDS = 2**14  # bytes
+_FIRST_ELEMENT = re.compile(rb"<[A-Za-z][^>]*>")
+_asking: ContextVar[bool] = ContextVar("asking", default=False)
 
 
 def as_path(path: Any) -> Path:
@@ -33,6 +38,56 @@ def as_path(path: Any) -> Path:
     if isinstance(path, str | os.PathLike):
         return Path(path)
     raise InputError(f"a file is named by a {type(path).__name__}; give its path as text.")
+
+
+def storable(text: str) -> str:
+    """The same text, or `InputError` where HDF5 and TOML cannot hold it (NUL, or a file name that is not UTF-8)."""
+    if "\0" in text or text.encode(errors="ignore").decode() != text:
+        raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
+    return text
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a text file whole or not at all."""
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(text.encode())
+
+
+@contextlib.contextmanager
+def write_atomically(
+    path: str | os.PathLike,
+    advice: str = ELSEWHERE,
+    *,
+    leftovers: bool = True,
+    same_kind: Callable[[Path], bool] | None = None,
+) -> Iterator[Path]:
+    """Write a file whole or not at all: yields a temporary path in the same folder, renamed onto it at the end.
+
+    Inside `together`, the end is that of all outputs. A symbolic link is followed: the file that it points to is
+    written. A file that is replaced leaves its permissions to the new one. Whatever goes wrong (Ctrl-C included), the
+    temporary file is removed and an existing target stays as it was; ``leftovers``: those of killed processes are
+    removed as well; ``same_kind`` as in `OutputFile`. Raises `InputError` where the path cannot be written, is a
+    folder, a device, a pipe or read-only, or, in a command, where it is a file that aacmm did not write (`asking`).
+    """
+    file, group = OutputFile(path, advice, same_kind), _current.get()
+    waits = False
+    try:
+        with file.refusing():
+            file.check()
+            if leftovers:
+                _remove_leftovers(file.target)
+            file.create()
+            yield file.temporary
+            file.finish()
+            file.check_replaced()
+            if group is None:
+                _put_in_place([file])
+            else:
+                group.take(file)
+                waits = True
+    finally:
+        if not waits:
+            file.discard()
 
 
 class OutputFile:
@@ -66,8 +121,8 @@ class OutputFile:
             raise InputError(f"{self.named} cannot be written: {reason}; {self._advice}.") from error
 
     def check(self) -> None:
-        """Raise `OSError` where the file cannot be written: a folder, a device, a read-only file."""
-        named, target = self.named, self.target
+        """Raise `OSError` where the file cannot be written."""
+        named, target, folder = self.named, self.target, self.target.parent
         if is_planted_link(named):
             raise OSError(None, "it is another user's link")
         # A link in /proc (/dev/stdout) leads to what has no path, and one that leads to itself remains a link.
@@ -76,10 +131,10 @@ class OutputFile:
         # The superuser may write to a file without write permission, which is protected all the same.
         if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
             raise OSError(None, "it is read-only")
-        target.parent.stat()  # which there must be
-        if not target.parent.is_dir():
+        folder.stat()  # which there must be
+        if not folder.is_dir():
             raise OSError(None, "not a directory")
-        if not os.access(target.parent, os.W_OK | os.X_OK):
+        if not os.access(folder, os.W_OK | os.X_OK):
             raise OSError(None, "its folder is read-only")
         if target.exists() and not may_replace(target):
             raise OSError(None, "it belongs to another user, and only they can replace it in its folder")
@@ -115,7 +170,9 @@ class OutputFile:
         """
         if not _asking.get() or not self.target.exists():
             return
-        if self.temporary.exists():
+        if not self.temporary.exists():
+            own = self.target.suffix.lower() not in _MARKED or _is_marked(self.target)
+        else:
             own = _is_own(self.target, self.temporary)
             if own and self._same_kind is not None and os.path.getsize(self.target):
                 token = _current.set(None)  # it may be read, though it is an output
@@ -123,34 +180,20 @@ class OutputFile:
                     own = self._same_kind(self.target)
                 finally:
                     _current.reset(token)
-        else:
-            own = self.target.suffix.lower() not in _MARKED or _is_marked(self.target)
         if not own:
             raise InputError(
                 f"{self.named} exists and is no earlier output of this kind; choose another name, or replace it with "
                 "--overwrite."
             )
 
-    def discard(self) -> None:
-        """Remove the temporary files that are left."""
-        self._unlock()
-        for left in (self.temporary, self._backup):
-            with contextlib.suppress(OSError):
-                if left is not None:
-                    left.unlink()
-
-    def keep_old(self) -> None:
-        """Keep the file that will be replaced, under another name."""
-        if not self.target.exists():
-            return
-        self._backup = self._sibling()
-        try:
-            os.link(self.target, self._backup)
-        except OSError:  # a file system without hard links
-            shutil.copy2(self.target, self._backup)
-
-    def replace(self) -> None:
-        """Put the new file in place."""
+    def replace(self, keep: bool) -> None:
+        """Put the new file in place; with ``keep``, the old one can be put back by `undo`."""
+        if keep and self.target.exists():
+            self._backup = self._sibling()
+            try:
+                os.link(self.target, self._backup)
+            except OSError:  # a file system without hard links
+                shutil.copy2(self.target, self._backup)
         self.check()
         if fcntl is None:
             self._unlock()
@@ -159,10 +202,18 @@ class OutputFile:
     def undo(self) -> None:
         """As it was before `replace`."""
         with contextlib.suppress(OSError):
-            if self._backup is not None:
-                os.replace(self._backup, self.target)
-            else:
+            if self._backup is None:
                 self.target.unlink()
+            else:
+                os.replace(self._backup, self.target)
+
+    def discard(self) -> None:
+        """Remove the temporary files that are left."""
+        self._unlock()
+        for left in (self.temporary, self._backup):
+            if left is not None:
+                with contextlib.suppress(OSError):
+                    left.unlink()
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -170,18 +221,16 @@ class OutputFile:
             self._lock = None
 
 
-def put_in_place(files: list[OutputFile]) -> None:
+def _put_in_place(files: list[OutputFile]) -> None:
     """Rename all files or none: where one cannot be, those before it are undone."""
-    started: list[OutputFile] = []
+    replaced: list[OutputFile] = []
     try:
         for file in files:
             with file.refusing():
-                if len(files) > 1:
-                    file.keep_old()
-                    started.append(file)
-                file.replace()
+                file.replace(keep=len(files) > 1)
+            replaced.append(file)
     except BaseException:
-        for file in reversed(started):
+        for file in reversed(replaced):
             file.undo()
         raise
     finally:
@@ -189,33 +238,19 @@ def put_in_place(files: list[OutputFile]) -> None:
             file.discard()
 
 
-def remove_leftovers(target: Path) -> None:
+def _remove_leftovers(target: Path) -> None:
     """Remove the temporary files of processes that were killed while they wrote this file."""
     pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{8}}\.part")
     with contextlib.suppress(OSError):
         for item in os.scandir(target.parent):
-            if pattern.fullmatch(item.name) and item.is_file(follow_symlinks=False):
-                with contextlib.suppress(OSError):
-                    _remove_unlocked(item.path)
-
-
-def _remove_unlocked(path: str) -> None:
-    if fcntl is None:
-        os.unlink(path)
-        return
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.unlink(path)
-    finally:
-        os.close(descriptor)
-
-
-_asking: ContextVar[bool] = ContextVar("asking", default=False)
-_MARKS = (b"aacmm", b"atplotlib")  # near the beginning or end of most files that are written here
-_MARKED = (".h5", ".html", ".pdf", ".png", ".svg", ".xml")  # of which all have one
-_ENDS = 2**14  # bytes
-_FIRST_ELEMENT = re.compile(rb"<[A-Za-z][^>]*>")
+            if not pattern.fullmatch(item.name) or not item.is_file(follow_symlinks=False):
+                continue
+            with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+                if fcntl is not None:
+                    descriptor = os.open(item.path, os.O_RDONLY | os.O_NOFOLLOW)
+                    stack.callback(os.close, descriptor)
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.unlink(item.path)
 
 
 @contextlib.contextmanager
@@ -266,13 +301,20 @@ def _beginning(text: bytes) -> bytes:
     return element[0] if element else b"".join(text.split(b"\n", 2)[: 2 if text.startswith(b"{") else 1])
 
 
-class _Outputs:
-    """The outputs of a command: those that are announced, and those that are made and wait."""
+class _Outputs(NamedTuple):
+    """The outputs of a command: those that are announced, those that are made and wait; and what it reads."""
 
-    def __init__(self, announced: list[OutputFile]):
-        self.announced = announced
-        self.made: dict[Path, OutputFile] = {}
-        self.read: list[Path] = []
+    announced: list[OutputFile]
+    made: dict[Path, OutputFile]
+    read: list[Path]
+
+    def take(self, file: OutputFile) -> None:
+        """Have a finished file wait for the others."""
+        for path in self.read:
+            _check_different(file, path)
+        if file.target in self.made:
+            self.made[file.target].discard()
+        self.made[file.target] = file
 
 
 _current: ContextVar[_Outputs | None] = ContextVar("outputs", default=None)
@@ -292,11 +334,11 @@ def together(*paths: str | os.PathLike | None) -> Iterator[None]:
         output.check_replaced()
         if any(_same(output.target, other.target) for other in outputs[:number]):
             raise InputError(f"{output.named} is named for two outputs; choose another for one of them.")
-    group = _Outputs(outputs)
+    group = _Outputs(outputs, {}, [])
     token = _current.set(group)
     try:
         yield
-        put_in_place(list(group.made.values()))
+        _put_in_place(list(group.made.values()))
     finally:
         _current.reset(token)
         for file in group.made.values():
@@ -317,20 +359,6 @@ def waiting(path: str | os.PathLike) -> Path:
     group = _current.get()
     made = None if group is None else group.made.get(Path(os.path.realpath(path)))
     return Path(path) if made is None else made.temporary
-
-
-def hand_over(file: OutputFile) -> bool:
-    """Whether a finished file waits for the other outputs of the command."""
-    group = _current.get()
-    if group is None:
-        return False
-    for path in group.read:
-        _check_different(file, path)
-    earlier = group.made.pop(file.target, None)
-    if earlier is not None:
-        earlier.discard()
-    group.made[file.target] = file
-    return True
 
 
 def _check_different(output: OutputFile, path: Path) -> None:

@@ -19,7 +19,7 @@ from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
-from .atomic_write import write_text
+from .outputs import write_text
 
 Angles = Literal["deg", "rad"]
 

@@ -1,7 +1,6 @@
 """The manifest of points instead of poses, for acceptance tests of arms that report coordinates."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +9,7 @@ from ..core.errors import InputError, nearest
 from ..core.text import quoted
 from ..core.units import LENGTH_UNITS
 from ..kinematics.workspace import Reach
-from .inputs import InputFile, fingerprint
+from .inputs import InputFile, InputFiles
 from .manifest import PointsManifest, read_recorded
 from .manifest_observations import Source
 from .manifest_tables import Wanted, as_list
@@ -53,17 +52,13 @@ def read_points(path: str | os.PathLike) -> Measured:
     path = as_path(path)
     model = read_toml(manifest := InputFile(path), PointsManifest)
     try:
-        files = [manifest]
-
-        def opened(file: Path) -> InputFile:
-            files.append(read := InputFile(file, TABLE_SHARE))
-            return read
+        files = InputFiles(manifest, TABLE_SHARE)
 
         def points(text: TextTable, wanted: Wanted) -> np.ndarray:
             return _points(text, wanted, model)
 
-        seated, lengths, spheres = read_recorded(model, Source(path.parent, opened, "points", points))
-        sockets = {name: one.poses for name, one in seated.items()}
+        seated, lengths, spheres = read_recorded(model, Source(path.parent, files.open, "points", points))
+        sockets = {name: socket.poses for name, socket in seated.items()}
         for length in lengths:
             for end in (length.start, length.end):
                 if end not in sockets:
@@ -74,13 +69,12 @@ def read_points(path: str | os.PathLike) -> Measured:
         if not sockets and not spheres:
             raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")
         reach = None if model.points.reach is None else Reach(np.array(model.points.shoulder), model.points.reach)
-        sources = tuple(fingerprint(file, path.parent) for file in files)
         return Measured(
             sockets,
             tuple(lengths),
             spheres,
             reach,
-            sources=sources,
+            sources=files.sources(path.parent),
             measured=str(model.date or ""),
             measuring_range=model.points.measuring_range,
         )

@@ -1,13 +1,10 @@
 """A process that reads every HDF5 file before this one does, within limits of time and memory.
 
 On damaged metadata the HDF5 library loops for ever in C, where Ctrl-C does not end it, takes gigabytes, or crashes. The
-SHA-256 at the end of a file detects what happened to it by chance, but anybody can compute it again, and files of
-format version 1 have none. So a child process reads all of a file first, in the way in which it will be read here.
-Where it does not come to the end, the file is refused and the child replaced.
-
-It is started when the first file is read, serves all that follow, and ends with this process, whose pipe to it is then
-closed. It is a new interpreter and no fork: threads of JAX may hold locks. It does not run the user's script again, as
-one of `multiprocessing` would.
+SHA-256 at the end of a file detects what happened to it by chance, but anybody can compute it again. So a child process
+reads all of a file first, in the way in which it will be read here. Where it does not come to the end, the file is
+refused. The child serves all files up to the first that is refused, then another is started; it ends with this process,
+whose pipe to it is then closed. It is a new interpreter and no fork: threads of JAX may hold locks.
 """
 
 import atexit
@@ -30,9 +27,6 @@ _CPU_SECONDS, _SECONDS_PER_MIB, _CLOCK_PER_CPU = 2.0, 1.0, 30
 _MEMORY = 256 * 2**20
 _MOST_SEALS = 100_000
 _vouched_for: set[str] = set()
-_OUT_OF_TIME = (1, -getattr(signal, "SIGPROF", 0))  # exit statuses, by the clock and by the CPU time
-_UNSTARTABLE = (OSError, TypeError, ValueError)  # an interpreter that is not there, has no name, or fails
-_KEPT = 2**20  # bytes of an intact file, for comparison
 _READY = b"ready\n"
 _COMMAND = "import sys; sys.path[:] = sys.argv[1:]; from aacmm_jax.files.reader_process import serve; serve()"
 
@@ -49,21 +43,22 @@ def vouch_for(seal: str) -> None:
     _vouched_for.add(seal)
 
 
-def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, seal: str | None) -> None:
+def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, seal: str) -> None:
     """Raise `InputError` where HDF5 cannot read a file, or what is in it is not what files of this package contain.
 
     ``source`` is its bytes, or the open file where they are too many for the memory: the child opens it by its name.
     ``largest`` is the most bytes that may be read into memory.
     """
-    if seal in _vouched_for or (seal is not None and not _has_interpreter()):
+    # A program that contains Python may have none beside it; files are then read without a child.
+    if seal in _vouched_for or not sys.executable or getattr(sys, "frozen", False):
         return
     content = source.getbuffer() if hasattr(source, "getbuffer") else source  # of a file that is in memory already
     sent = isinstance(content, bytes | memoryview)
-    opened = None if sent else os.path.abspath(path)
     seconds = _CPU_SECONDS + _SECONDS_PER_MIB * size / 2**20
     request = {
         "path": str(path),
-        "opened": opened,
+        "opened": None if sent else os.path.abspath(path),
+        "sent": len(content) if sent else 0,
         "size": size,
         "largest": largest,
         # Of memory: the bytes, copies of them in HDF5, and what is read.
@@ -74,19 +69,13 @@ def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, 
         raise damaged(path)
     if answer:
         raise InputError(answer)
-    if seal is not None:
-        vouch_for(seal)
-
-
-def _has_interpreter() -> bool:
-    """Whether there is a Python to start: a program that contains one may have none beside it. Files with their SHA-256
-    are then read without a child."""
-    return bool(sys.executable) and not getattr(sys, "frozen", False)
+    vouch_for(seal)
 
 
 def start() -> None:
     """Start the child where none runs; it is ready some time later."""
-    _reader.start()
+    with _reader.lock, contextlib.suppress(OSError, TypeError, ValueError):  # which `answer` meets again
+        _reader.start()
 
 
 class _Reader:
@@ -94,14 +83,10 @@ class _Reader:
 
     def __init__(self) -> None:
         self._process: Any = None
+        self._started = False  # whether it has said that it is ready
         self.lock = threading.Lock()
-        self._ready = self._has_refused = False
 
     def start(self) -> None:
-        with self.lock, contextlib.suppress(*_UNSTARTABLE):  # which `answer` meets again
-            self._start()
-
-    def _start(self) -> None:
         if self._process is not None and self._process.poll() is None:
             return
         self.stop()
@@ -123,8 +108,7 @@ class _Reader:
 
     def stop(self) -> None:
         """End the child, which has nothing to lose."""
-        process, self._process = self._process, None
-        self._ready = self._has_refused = False
+        process, self._process, self._started = self._process, None, False
         if process is not None:
             process.kill()
             process.wait()
@@ -132,133 +116,116 @@ class _Reader:
                 with contextlib.suppress(OSError):  # what was not sent
                     pipe.close()
 
-    def forget(self) -> None:
-        """After a fork: the child is the parent's, and so are requests to it, which another thread may have begun."""
-        if self._process is not None:
-            self._process.returncode = 0
-            for pipe in (self._process.stdin, self._process.stdout):
-                os.close(pipe.fileno())  # and not `close`, which would send what the parent's thread has begun to send
-
     def answer(self, request: dict[str, Any], content: Any) -> str | None:
         """Empty where a file can be read, else why not; None where it is damaged."""
         with self.lock:
             try:
-                had_refused = self._has_refused
-                answer, crashed = self._ask(request, content)
-                if crashed and had_refused:  # what it read before may have spoilt its memory
-                    answer, _ = self._ask(request, content)
-                self._has_refused |= answer is None
-                return answer
+                return self._ask(request, content)
             except BaseException:  # the answer to a request that was interrupted must not be taken for the next one's
                 self.stop()
                 raise
 
-    def _ask(self, request: dict[str, Any], content: Any) -> tuple[str | None, bool]:
-        """The answer, and whether the child crashed in place of one."""
+    def _ask(self, request: dict[str, Any], content: Any) -> str | None:
         try:
-            self._start()
-            if not self._ready and self._process.stdout.readline() != _READY:
+            self.start()
+            if not self._started and self._process.stdout.readline() != _READY:
                 raise OSError(None, f"exit status {self._process.wait()}")
-        except _UNSTARTABLE as error:
+        except (OSError, TypeError, ValueError) as error:  # an interpreter that is not there, has no name, or fails
             reason = (getattr(error, "strerror", None) or str(error)).lower()
             raise InputError(
                 f"{request['path']} cannot be read, as the process that opens HDF5 files first does not start: "
                 f"{reason}; see whether {sys.executable} -c 'import h5py' works."
             ) from error
-        self._ready, answer = True, b""
+        self._started, answer = True, b""
         with contextlib.suppress(OSError):  # it has ended
-            self._process.stdin.write(json.dumps(request | {"sent": len(content)}).encode() + b"\n")
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
             self._process.stdin.write(content)
             self._process.stdin.flush()
             answer = self._process.stdout.readline()
         if answer.endswith(b"\n"):
-            return json.loads(answer), False
+            if answer != b'""\n':  # it ends
+                self.stop()
+            return json.loads(answer)
         status = self._process.wait()
         self.stop()
         if status == -getattr(signal, "SIGKILL", 0):
             path = request["path"]
-            return f"{path} cannot be read: the system ended the process that opens it; free some memory.", False
-        return None, status not in _OUT_OF_TIME
+            return f"{path} cannot be read: the system ended the process that opens it; free some memory."
+        return None
 
 
-def _renew() -> None:
-    """A reader of its own for a process that was forked, with a lock that nobody holds."""
+def _after_fork() -> None:
+    """The child is the parent's, and so are requests to it, which another thread may have begun."""
     global _reader
-    _reader.forget()
-    _reader = _Reader()
+    process, _reader = _reader._process, _Reader()
+    if process is not None:
+        process.returncode = 0
+        for pipe in (process.stdin, process.stdout):
+            os.close(pipe.fileno())  # and not `close`, which would send what the parent's thread has begun to send
 
 
 _reader = _Reader()
-atexit.register(_reader.stop)
+atexit.register(lambda: _reader.stop())
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew)
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def serve() -> None:
-    """What the child does: read one file after the other, until nobody can ask any more."""
+    """What the child does: read one file after the other, until one cannot be read or nobody can ask any more."""
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what a library prints is no answer
     from .hdf5_content import content_of
 
-    def check(content: bytes, request: dict[str, Any]) -> None:
-        with limits.of(*request["limits"]), contextlib.ExitStack() as stack:
-            source = content or stack.enter_context(open(request["opened"], "rb"))
-            stack.enter_context(content_of(request["path"], source, request["size"], request["largest"])).check()
-
-    limits = _Limits()
-    intact: tuple[bytes, dict[str, Any]] | None = None
+    used = _memory_used()
+    if hasattr(signal, "SIGPROF"):
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process; the parent may have had it ignored
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGPROF])
     answers.write(_READY)
     for line in sys.stdin.buffer:
         request = json.loads(line)
         content = sys.stdin.buffer.read(request["sent"])
         answer: str | None = ""
         try:
-            check(content, request)
+            with _limited(used, *request["limits"]), contextlib.ExitStack() as stack:
+                source = content or stack.enter_context(open(request["opened"], "rb"))
+                stack.enter_context(content_of(request["path"], source, request["size"], request["largest"])).check()
         except InputError as error:
             answer = str(error)
         except Exception:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
             answer = None
         answers.write(json.dumps(answer).encode() + b"\n")
-        if answer == "" and 0 < len(content) < _KEPT:
-            intact = content, request
-        if answer is None:  # without memory, for one, HDF5 can no longer read what it could before
-            if intact is None:
-                break
-            try:
-                check(*intact)
-            except Exception:
-                break
+        if answer != "":  # without memory, for one, HDF5 can no longer read what it could before
+            break
 
 
-class _Limits:
-    """Of time and memory, in the child: on Linux all of them, on macOS those of time, on Windows that by the clock."""
+def _memory_used() -> int:
+    """Bytes of address space of this process on Linux; 0 elsewhere, where memory is not limited."""
+    with contextlib.suppress(OSError, ImportError):
+        import resource
 
-    def __init__(self) -> None:
-        if hasattr(signal, "SIGPROF"):
-            signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process; the parent may have had it ignored
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGPROF])
-        self._used = 0
-        with contextlib.suppress(OSError, ImportError):
-            import resource
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    return 0
 
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            self._used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
-    @contextlib.contextmanager
-    def of(self, cpu: float, clock: float, memory: int) -> Iterator[None]:
-        """While a file is read: so many seconds of CPU time and by the clock, and bytes of memory."""
-        faulthandler.dump_traceback_later(clock, exit=True)
-        if self._used:
-            import resource
+@contextlib.contextmanager
+def _limited(used: int, cpu: float, clock: float, memory: int) -> Iterator[None]:
+    """While a file is read: so many seconds of CPU time and by the clock, and bytes of memory.
 
-            hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-            limit = self._used + memory if hard == resource.RLIM_INFINITY else min(self._used + memory, hard)
-            resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    On Linux all of them, on macOS those of time, on Windows that by the clock.
+    """
+    faulthandler.dump_traceback_later(clock, exit=True)
+    if used:
+        import resource
+
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        limit = used + memory if hard == resource.RLIM_INFINITY else min(used + memory, hard)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_PROF, cpu)
+    try:
+        yield
+    finally:
         if hasattr(signal, "setitimer"):
-            signal.setitimer(signal.ITIMER_PROF, cpu)
-        try:
-            yield
-        finally:
-            if hasattr(signal, "setitimer"):
-                signal.setitimer(signal.ITIMER_PROF, 0)
-            faulthandler.cancel_dump_traceback_later()
+            signal.setitimer(signal.ITIMER_PROF, 0)
+        faulthandler.cancel_dump_traceback_later()

@@ -55,14 +55,8 @@ def columns_of_joints(
 ) -> tuple[list[int], bool]:
     """The columns, from 0, whose names are those of the joints, and whether there are any names of joints at all.
 
-    Args:
-        table: The table.
-        joints: Number of joints.
-        taken: Columns that hold something else.
-        line: What states columns, for messages.
-
-    Raises:
-        InputError: Several sets of columns have such names, or their numbers do not ascend.
+    ``taken`` are columns that hold something else, and ``line`` is what states columns, for messages. Raises
+    `InputError` where several sets of columns have such names, or their numbers do not ascend.
     """
     sets = [
         columns
@@ -100,10 +94,7 @@ def check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[in
 
 def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE) -> list[int]:
     """The columns of the joint readings, from 0: those with names of joints, or all that are not ``taken`` where these
-    are as many as the joints, and nothing in the header contradicts it.
-
-    Raises:
-        InputError: It is not clear which they are; the message has the line to add.
+    are as many as the joints, and nothing in the header contradicts it. Else `InputError`, with the line to add.
     """
     columns, any_names = columns_of_joints(table, joints, taken, line)
     if columns:

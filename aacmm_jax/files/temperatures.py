@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError
-from .hdf5 import Variable, numbering
+from .hdf5 import Variable
 
 TEMPERATURE = "temperature_C"
 
@@ -15,8 +15,7 @@ def reading_variables(
     name: str, readings: Float[np.ndarray, "N n"], joints: int, unit: str, rows: str = "pose"
 ) -> dict[str, Variable]:
     """Readings as variables: those of the joints, and the temperature that may follow them."""
-    variables = numbering(rows, len(readings)) | numbering("joint", joints)
-    variables[name] = Variable((rows, "joint"), readings[:, :joints], unit, "joint reading")
+    variables = {name: Variable((rows, "joint"), readings[:, :joints], unit, "joint reading")}
     if readings.shape[1] > joints:
         variables["temperature"] = Variable((rows,), readings[:, joints], "degC", "temperature of the arm")
     return variables

@@ -23,10 +23,8 @@ _BLANKS_OR_QUOTES = re.compile('"[^"]*"|[^ \t]+')
 def table_lines(path: str | os.PathLike) -> tuple[list[str], bool]:
     """The lines of a text file, and whether its last line is ended.
 
-    UTF-8, UTF-16 with a byte order mark (spreadsheets' "Unicode text"), and the degree sign of 8-bit encodings.
-
-    Raises:
-        InputError: It is not text, or larger than a table is; both are found before it is decoded.
+    UTF-8, UTF-16 with a byte order mark (spreadsheets' "Unicode text"), and the degree sign of 8-bit encodings. What is
+    not text, or larger than a table is, is refused before it is decoded.
     """
     file = path if isinstance(path, InputFile) else InputFile(path, TABLE_SHARE)
     content = file.content

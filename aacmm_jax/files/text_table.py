@@ -39,15 +39,9 @@ class TextTable:
     A name that the header does not have exactly is compared without regard to case, blanks and a unit in brackets.
     A header is a line of words before the first row: none of them begins like a number.
 
-    Args:
-        path: The file.
-        delimiter: What divides its columns; None finds it.
-        decimal: The decimal mark of its numbers.
-        skip: Lines before its header.
-        wanted: Columns that are going to be picked; of several lines of words, the header is the one that has them.
-
-    Raises:
-        InputError: The file is no text, its rows differ in their number of columns, or several lines may be its header.
+    ``delimiter`` is found where it is None; ``skip`` lines before the header are left out; of several lines of words,
+    the header is the one that has the columns that are ``wanted``. Raises `InputError` where the file is no text, its
+    rows differ in their number of columns, or several lines may be its header.
     """
 
     def __init__(
@@ -191,13 +185,8 @@ class TextTable:
     def unit(self, picked: Sequence[int], stated_unit: str | None = None, key: str = "q") -> str | None:
         """The unit that the header states for columns, counted from 0, or None.
 
-        Args:
-            picked: The columns.
-            stated_unit: The unit that the manifest states; it decides what the ambiguous grad is.
-            key: What the manifest calls the quantity in ``units``.
-
-        Raises:
-            InputError: It states several units, or one that is not clear.
+        ``stated_unit``, that of the manifest, decides what the ambiguous grad is; ``key`` is what the manifest calls
+        the quantity in ``units``. Raises `InputError` where the header states several units, or one that is not clear.
         """
         stated = {self._header[i]: unit_in(self._header[i]) for i in picked if self._header}
         found = {unit: name for name, unit in stated.items() if unit is not None}

@@ -40,18 +40,10 @@ _LINE = re.compile(r"( *)([\w-]+) *:(?: +([^#]*?))?\s*(?:#.*)?")
 
 
 def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None) -> ArmSpecification:
-    """The arm of a ``kinematics.yaml``, or of a YAML file with a robot's D-H parameters.
+    """The arm of a ``kinematics.yaml``, or of a YAML file with a robot's D-H parameters; ``probe`` as of `load_arm`.
 
-    Args:
-        path: The file.
-        probe: A tool's tip in the tool flange's frame, mm; by default that frame's origin.
-
-    Returns:
-        The arm, in mm and rad, in the controller's base frame (``base_link_inertia`` of the URDF); its limits are those
-        of these robots' joints, two revolutions.
-
-    Raises:
-        InputError: Naming the file, the line or entry, and what to do.
+    It is in the controller's base frame (``base_link_inertia`` of the URDF); its limits are those of these robots'
+    joints, two revolutions.
     """
     file = InputFile(path)
     try:

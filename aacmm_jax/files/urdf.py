@@ -29,8 +29,8 @@ from ..kinematics.axes_to_dh import (
 )
 from ..kinematics.chain import JointKinds
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single, with_tool
-from .atomic_write import write_text
 from .inputs import InputFile
+from .outputs import write_text
 from .urdf_text import Robot, UrdfJoint, edited, parse_urdf
 
 _REVOLUTION = (-2 * math.pi, 2 * math.pi)  # limits of a continuous joint: readings of -pi to pi and of 0 to 2 pi
@@ -99,20 +99,9 @@ class ExportedUrdf(NamedTuple):
 def read_urdf(
     path: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
 ) -> ArmSpecification:
-    """The arm of a serial chain of a URDF; meshes are not read.
+    """The arm of a serial chain of a URDF, with the text of the file, for `save_urdf`; arguments as of `load_arm`.
 
-    Args:
-        path: The file.
-        base: Name of the link that does not move; by default the root of the file.
-        tip: Name of the link at the end; by default the only one that has no link after it.
-        probe: A tool's tip in the tip link's frame, mm; by default that frame's origin.
-
-    Returns:
-        The arm, in mm and rad, in the first D-H frame, which is the base link's frame where the first axis is its z
-        axis; and with it the text of the file, for `save_urdf`.
-
-    Raises:
-        InputError: Naming the file, the joint or link, and what to do.
+    The arm is in the first D-H frame, which is the base link's frame where the first axis is its z axis.
     """
     file = InputFile(path)
     try:

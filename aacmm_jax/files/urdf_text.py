@@ -164,11 +164,8 @@ class Robot(NamedTuple):
 def parse_urdf(text: str) -> Robot:
     """The joints and links of a URDF.
 
-    Args:
-        text: The whole file.
-
-    Raises:
-        InputError: It is no XML or no URDF, a value is not a number, or a name is unknown, missing or there twice.
+    Raises `InputError` where it is no XML or no URDF, a value is not a number, or a name is unknown, missing or there
+    twice.
     """
     root, end = _parsed(text)
     joints, links, before = {}, {}, {}
@@ -194,14 +191,8 @@ def parse_urdf(text: str) -> Robot:
 
 
 def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
-    """The collision shapes of each link that has some; kinds that a URDF does not know are left out.
-
-    Args:
-        text: The whole file, which `parse_urdf` takes.
-
-    Raises:
-        InputError: A shape has no size, or a number of it is not one.
-    """
+    """The collision shapes of each link that has some, of a text that `parse_urdf` takes; kinds that a URDF does not
+    know are left out. Raises `InputError` where a shape has no size."""
     shapes: dict[str, tuple[UrdfShape, ...]] = {}
     for link in _parsed(text)[0].children:
         if link.name == "link":
@@ -214,13 +205,9 @@ def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
 
 
 def edited(text: str, origins: Mapping[str, tuple[str | None, str | None]], robot: Robot, added: str = "") -> str:
-    """The text with other origins, and with elements added at its end; everything else stays to the byte.
+    """The text with other origins, and with elements ``added`` at its end; everything else stays to the byte.
 
-    Args:
-        text: The whole file.
-        origins: By joint the new xyz (m) and rpy (rad), each None where it stays.
-        robot: What `parse_urdf` found in the text.
-        added: Elements to add before ``</robot>``.
+    ``origins`` has by joint the new xyz (m) and rpy (rad), each None where it stays.
     """
     content = text.encode()
     changes: list[tuple[int, int, bytes]] = [(robot.end, robot.end, added.encode())]

@@ -18,7 +18,7 @@ from .parameters import ArmSpecification as ArmSpecification
 from .parameters import Bounds as Bounds
 from .parameters import Parameters as Parameters
 from .parameters import perturbed_arm as perturbed_arm
-from .prior_scales import default_prior as default_prior
 from .priors import Prior as Prior
+from .priors import default_prior as default_prior
 from .workspace import arm_reach as arm_reach
 from .workspace import closest_approach as closest_approach

@@ -1,16 +1,17 @@
 """The arm: a serial chain of joints in standard Denavit-Hartenberg form, with a probe on its last frame."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from ..core.arguments import items_of, shown
+from ..core.arguments import NOT_EMPTY, Range, checked, items_of, shown
 from ..core.arrays import Numbers, as_array, as_floats
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
@@ -62,16 +63,16 @@ class Arm(eqx.Module):
         (100, 4, 4)
     """
 
-    alpha: Float[AnyArray, "... n"]  # link twist, rad
-    a: Float[AnyArray, "... n"]  # link length, mm
-    d: Float[AnyArray, "... n"]  # link offset, mm
-    theta: Float[AnyArray, "... n"]  # joint zero offset, rad
-    beta: Float[AnyArray, "... n"] | None  # Hayati's angle, rad
-    probe: Float[AnyArray, "... 3"]  # tip in the last frame, mm
-    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)  # rad, or mm of prismatic joints
-    prismatic: tuple[int, ...] = eqx.field(static=True)  # numbers of the prismatic joints, from 1
-    coefficients: Float[AnyArray, "... k"] | None  # of the corrections
-    gravity: Float[AnyArray, "... 3"] | None  # its direction in the base frame
+    alpha: Float[AnyArray, "... n"]
+    a: Float[AnyArray, "... n"]
+    d: Float[AnyArray, "... n"]
+    theta: Float[AnyArray, "... n"]
+    beta: Float[AnyArray, "... n"] | None
+    probe: Float[AnyArray, "... 3"]
+    limits: tuple[tuple[float, float], ...] | None = eqx.field(static=True)
+    prismatic: tuple[int, ...] = eqx.field(static=True)
+    coefficients: Float[AnyArray, "... k"] | None
+    gravity: Float[AnyArray, "... 3"] | None
     corrections: Corrections | None
     thermometer: bool = eqx.field(static=True)
 
@@ -91,24 +92,24 @@ class Arm(eqx.Module):
         corrections: Corrections | None = None,
         thermometer: bool = False,
     ):
-        self.alpha = as_floats(alpha, "alpha")
-        self.a = as_floats(a, "a")
-        self.d = as_floats(d, "d")
-        self.theta = as_floats(np.zeros(self.alpha.shape), "theta") if theta is None else as_floats(theta, "theta")
-        self.beta = None if beta is None else as_floats(beta, "beta")
-        self.probe = as_floats(probe, "probe")
-        if self.alpha.ndim == 0 or self.alpha.shape[-1] == 0:
-            raise InputError("alpha needs one value per joint, and an arm at least one joint.")
-        joints = self.alpha.shape[-1]
-        for kind in ("a", "d", "theta", "beta"):
-            array = getattr(self, kind)
-            if array is not None and array.shape[-1:] != (joints,):
-                raise InputError(
-                    f"{kind} has shape {array.shape}, but alpha has {joints} joints; give one value per joint."
-                )
-        if self.probe.shape[-1:] != (3,):
-            raise InputError(f"probe has shape {self.probe.shape}; give its three coordinates (x, y, z) in mm.")
-        self._correct(coefficients, gravity, corrections)
+        sizes: dict[str, int] = {}
+
+        def array(value: Numbers, what: str, shape: str = "... joints") -> Any:
+            return checked(value, Float[Array, shape], what, sizes)
+
+        self.alpha = checked(alpha, Annotated[Float[Array, "... joints"], NOT_EMPTY], "alpha", sizes)
+        self.a, self.d = array(a, "a"), array(d, "d")
+        self.theta = array(np.zeros(self.alpha.shape) if theta is None else theta, "theta")
+        self.beta = None if beta is None else array(beta, "beta")
+        self.probe = array(probe, "probe", "... 3")
+        self.corrections, self.coefficients, self.gravity = corrections, None, None
+        if corrections is not None:
+            sizes["coefficients"] = len(corrections.functions.terms)
+            given = np.zeros(sizes["coefficients"]) if coefficients is None else coefficients
+            self.coefficients = array(given, "coefficients", "... coefficients")
+            self.gravity = array(DOWN if gravity is None else gravity, "gravity", "... 3")
+        elif coefficients is not None or gravity is not None:
+            raise InputError("coefficients and gravity need an arm made by with_corrections().")
         kinds = ("alpha", "a", "d", "theta", "beta", "probe", "coefficients", "gravity")
         batches = [array.shape[:-1] for array in (getattr(self, kind) for kind in kinds) if array is not None]
         try:
@@ -117,29 +118,10 @@ class Arm(eqx.Module):
             raise InputError(
                 f"the parameters have the batch shapes {', '.join(map(str, batches))}; make them alike."
             ) from error
-        self.prismatic = _joint_numbers(prismatic, joints)
-        self.limits = None if limits is None else checked_limits(limits, joints, self.prismatic)
-        expands = corrections is not None and corrections.functions.expands
-        self.thermometer = bool(thermometer) or expands
-
-    def _correct(self, coefficients: Numbers | None, gravity: Numbers | None, corrections: Corrections | None) -> None:
-        """Set what the corrections need: of the constructor."""
-        self.corrections = corrections
-        if corrections is None:
-            if coefficients is not None or gravity is not None:
-                raise InputError("coefficients and gravity are of corrections; make the arm by with_corrections first.")
-            self.coefficients = self.gravity = None
-            return
-        count = len(corrections.functions.terms)
-        given = np.zeros(count) if coefficients is None else coefficients
-        self.coefficients = as_floats(given, "coefficients")
-        self.gravity = as_floats(DOWN if gravity is None else gravity, "gravity")
-        if self.coefficients.shape[-1:] != (count,):
-            raise InputError(
-                f"coefficients has shape {self.coefficients.shape}, but the corrections have {count}; give one each."
-            )
-        if self.gravity.shape[-1:] != (3,):
-            raise InputError(f"gravity has shape {self.gravity.shape}; give the three components of its direction.")
+        numbers = checked(prismatic, Sequence[Annotated[int, Range(1, self.joints)]], "prismatic")
+        self.prismatic = tuple(sorted({int(number) for number in numbers}))
+        self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic)
+        self.thermometer = bool(thermometer) or (corrections is not None and corrections.functions.expands)
 
     @property
     def joints(self) -> int:
@@ -181,9 +163,9 @@ class Arm(eqx.Module):
         Raises:
             InputError: A name is unknown, or q has another number of joints.
         """
-        names = (
-            parameter_names(self) if names is None else (names,) if isinstance(names, str) else items_of(names, "names")
-        )
+        if names is None:
+            names = parameter_names(self)
+        names = (names,) if isinstance(names, str) else items_of(names, "names")
         joints, corrections = self.joints, correction_names(self)
         indices = tuple(located(joints, corrections, name, extra=("q",)) for name in names)
         return _evaluated(partial(tip_jacobian, indices=indices), self, q)
@@ -198,8 +180,7 @@ class Arm(eqx.Module):
         Raises:
             InputError: A name is unknown, or the arm that results is refused.
         """
-        whole = ("alpha", "a", "d", "theta", "beta", "probe", "limits", "prismatic")
-        whole = (*whole, "coefficients", "gravity", "corrections", "thermometer")
+        whole = [field.name for field in dataclasses.fields(self)]
         arguments: dict[str, Any] = {key: changes.get(key, getattr(self, key)) for key in whole}
         for name, value in changes.items():
             if name in whole:
@@ -218,12 +199,12 @@ class Arm(eqx.Module):
 def _evaluated(function: Callable, arm: Arm, q: Numbers) -> Any:
     """A function of the geometry and q: by NumPy, which compiles nothing, for a moderate number of known values."""
     geometry = arm.geometry
-    known = to_numpy(geometry)
-    q = checked_readings(arm, q, like=known.alpha)
+    in_numpy = to_numpy(geometry)
+    q = checked_readings(arm, q, like=in_numpy.alpha)
     shape = np.broadcast_shapes(q.shape[:-1], *(leaf.shape[:-1] for leaf in jax.tree.leaves(geometry)))
     if math.prod(shape) > _LARGEST:
         return function(geometry, q)
-    values = function(*to_numpy((known, q)))
+    values = function(*to_numpy((in_numpy, q)))
     return values if namespace(geometry, q) is np else to_jax(values)
 
 
@@ -245,15 +226,6 @@ def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) 
     del arrays["kinds"]
     prismatic = () if geometry.kinds is None else geometry.kinds.prismatic
     return Arm(**arrays, limits=limits, prismatic=[i for i, slides in enumerate(prismatic, start=1) if slides])
-
-
-def _joint_numbers(numbers: Iterable[int], joints: int) -> tuple[int, ...]:
-    """Numbers of joints, from 1, in order, or `InputError`."""
-    given = items_of(numbers, "prismatic")
-    for number in given:
-        if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= joints:
-            raise InputError(f"prismatic names the joint {shown(number)}; give numbers of joints from 1 to {joints}.")
-    return tuple(sorted({int(number) for number in given}))
 
 
 def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
@@ -352,9 +324,9 @@ def located(joints: int, corrections: tuple[str, ...], name: str, extra: tuple[s
         return "coefficients", corrections.index(name)
     if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
         return kind, int(index) - 1
-    known = [f"{k}_{i}" for k in kinds for i in range(1, joints + 1)] + [f"probe_{axis}" for axis in _AXES]
+    names = [*(f"{k}_{i}" for k in kinds for i in range(1, joints + 1)), *(f"probe_{axis}" for axis in _AXES)]
     given = name if isinstance(name, str) else shown(name)
-    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*known, *corrections])}")
+    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*names, *corrections])}")
 
 
 def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:

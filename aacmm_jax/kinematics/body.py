@@ -1,22 +1,27 @@
-"""The body of an arm as capsules that its frames carry: segments with a radius, about the links or about given shapes.
+"""The body of an arm as capsules that its frames carry, and how far capsules are from each other and from boxes.
 
-A capsule's ends may be in two frames, so that a link whose length changes with a joint keeps its ends.
+A capsule is a segment with a radius, so that its distance from another is that of the segments less the radii. Its ends
+may be in two frames: a link whose length changes with a joint keeps its ends. Distances are exact, for batches, and
+under jit too; points are columns, ``(..., 3, N)`` for N configurations, as in `chain`.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from .arm import Arm
-from .chain import ForwardPass, forward_pass, joint_motion
+from .chain import forward_pass, joint_motion
 
 _SHORTEST = 1e-6  # mm: shorter links have no capsule
 _NEAR = 2.0  # times the sum of the radii: capsules that less of the arm joins than this are neighbours
-_LARGEST_RADIUS = 2000.0  # mm
+_RADIUS = Range(above=0, most=2000, unit="mm")
+_PARALLEL = 1e-14  # squared sine of the angle between segments that count as parallel
+_TINY = 1e-24  # mm^2: keeps derivatives of a square root finite
 
 
 class Body(NamedTuple):
@@ -48,11 +53,7 @@ class Frames(NamedTuple):
 
 def frames_at(arm: Arm, q: Float[AnyArray, "N n"]) -> Frames:
     """The frames of an arm at N configurations."""
-    return frames_of(forward_pass(arm.geometry, joint_motion(arm.geometry, q)))
-
-
-def frames_of(forward: ForwardPass) -> Frames:
-    """The frames of a forward pass of N configurations."""
+    forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
     xp = namespace(forward)
     z = xp.concatenate([forward.z_before[1:], forward.frame[2][None]])
     if forward.y is None:
@@ -99,13 +100,11 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
         7 40.0 mm
     """
     arm = to_numpy(arm)
-    radii = np.asarray(radius, dtype=float)
-    radii = np.full(arm.joints, radii) if radii.ndim == 0 else radii
-    if radii.shape != (arm.joints,):
-        raise InputError(f"radius has {radii.size} values, but the arm has {arm.joints} joints; give one for each.")
+    shapes = Float[np.ndarray, ""] | Float[np.ndarray, "joints"]
+    radii = np.asarray(checked(radius, Annotated[shapes, _RADIUS], "radius", {"joints": arm.joints}))
+    radii = np.broadcast_to(radii, (arm.joints,))
     tool = float(min(radii[-1] / 4, 8.0) if tool_radius is None else tool_radius)
-    if not all(np.isfinite(x) and 0 < x <= _LARGEST_RADIUS for x in (*radii, tool)):
-        raise InputError(f"a radius of the arm's links must be above 0 and at most {_LARGEST_RADIUS:g} mm.")
+    checked(tool, Annotated[float, _RADIUS], "tool_radius")
     rows: list[tuple[str, int, np.ndarray, int, np.ndarray, float, float]] = []
     beta = np.zeros(arm.joints) if arm.beta is None else np.asarray(arm.beta)
     for i in range(arm.joints):
@@ -123,7 +122,8 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
         rows.append(("probe", arm.joints, np.zeros(3), arm.joints, end, tool, size))
     if not rows:
         raise InputError("the arm has no link that is longer than 0, so it has no body; give its URDF.")
-    names, start_frame, start, end_frame, end, widths, lengths = zip(*rows, strict=True)
+    names, *columns, lengths = zip(*rows, strict=True)
+    start_frame, start, end_frame, end, widths = map(np.array, columns)
     until = np.concatenate([[0.0], np.cumsum(lengths)])  # how much of the arm is before each capsule
     pairs = [
         (i, j)
@@ -131,7 +131,73 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
         for j in range(i + 1, len(rows))
         if until[j] - until[i + 1] > _NEAR * (widths[i] + widths[j])
     ]
-    return Body(
-        names, np.array(start_frame), np.array(start), np.array(end_frame), np.array(end), np.array(widths),
-        np.array(pairs, dtype=int).reshape(-1, 2),
-    )  # fmt: skip
+    return Body(names, start_frame, start, end_frame, end, widths, np.array(pairs, dtype=int).reshape(-1, 2))
+
+
+def segment_distance(
+    start: Float[AnyArray, "... 3 N"],
+    end: Float[AnyArray, "... 3 N"],
+    other_start: Float[AnyArray, "... 3 N"],
+    other_end: Float[AnyArray, "... 3 N"],
+) -> Float[AnyArray, "... N"]:
+    """Distance between two segments, mm; a segment may be a point.
+
+    The point of one segment that is nearest to the line of the other, the point of the other that is nearest to that,
+    and once more the first: with each kept on its segment, the third step is the minimum (Ericson 2005, 5.1.9).
+    """
+    xp = namespace(start, end, other_start, other_end)
+    along, other_along, between = end - start, other_end - other_start, start - other_start
+    aa, bb, ab = _dot(along, along), _dot(other_along, other_along), _dot(along, other_along)
+    a_between, b_between = _dot(along, between), _dot(other_along, between)
+    determinant = aa * bb - ab**2
+    parallel = determinant <= _PARALLEL * aa * bb
+    first = (ab * b_between - bb * a_between) / xp.where(parallel, 1.0, determinant)
+    first = xp.where(parallel, 0.0, xp.clip(first, 0.0, 1.0))
+    second = xp.clip((ab * first + b_between) / xp.where(bb > 0, bb, 1.0), 0.0, 1.0)
+    first = xp.clip((ab * second - a_between) / xp.where(aa > 0, aa, 1.0), 0.0, 1.0)
+    gap = between + first[..., None, :] * along - second[..., None, :] * other_along
+    return _length(gap)
+
+
+def distance_from_box(
+    start: Float[AnyArray, "... 3 N"], end: Float[AnyArray, "... 3 N"], half: Float[AnyArray, "... 3 1"]
+) -> Float[AnyArray, "... N"]:
+    """Distance of a segment from a solid box about the origin with half edges ``half`` along the axes, mm.
+
+    The squared distance along the segment is convex, and its derivative is linear between the places where the segment
+    crosses the planes of the six faces: the zero of the derivative is found between two of these.
+    """
+    xp = namespace(start, end, half)
+    along = end - start
+
+    def beyond(places: AnyArray) -> AnyArray:
+        """From the box to the points at these places, one more axis in front."""
+        points = start[None] + places[..., None, :] * along[None]
+        return points - xp.clip(points, -half[None], half[None])
+
+    still = xp.abs(along) < 1e-9
+    safe = xp.where(still, 1.0, along)
+    crossings = [xp.where(still, 0.0, xp.clip((face - start) / safe, 0.0, 1.0)) for face in (-half, half)]
+    both = xp.concatenate(crossings, axis=-2)
+    ends = xp.concatenate([xp.zeros_like(both[..., :1, :]), both, xp.ones_like(both[..., :1, :])], axis=-2)
+    places = xp.moveaxis(xp.sort(ends, axis=-2), -2, 0)
+    slopes = xp.sum(beyond(places) * along[None], axis=-2)
+    # The last place where the distance still becomes smaller, and the one after it.
+    last = xp.clip(xp.sum(slopes <= 0, axis=0) - 1, 0, len(places) - 2)[None]
+    low, high = (xp.take_along_axis(places, last + i, axis=0)[0] for i in (0, 1))
+    slope_low, slope_high = (xp.take_along_axis(slopes, last + i, axis=0)[0] for i in (0, 1))
+    rise = slope_high - slope_low
+    part = xp.clip(-slope_low / xp.where(rise > 0, rise, 1.0), 0.0, 1.0)
+    # Without a rise the derivative is 0 all along, inside the box, or the segment is a point.
+    place = low + xp.where(rise > 0, part, 0.0) * (high - low)
+    return _length(beyond(place[None])[0])
+
+
+def _dot(one: AnyArray, other: AnyArray) -> AnyArray:
+    return (one * other).sum(axis=-2)
+
+
+def _length(vector: AnyArray) -> AnyArray:
+    xp = namespace(vector)
+    square = _dot(vector, vector)
+    return xp.where(square > _TINY, xp.sqrt(xp.maximum(square, _TINY)), 0.0)

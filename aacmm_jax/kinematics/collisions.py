@@ -1,17 +1,16 @@
 """Obstacles, and how far an arm's body is from them and from itself."""
 
-import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..core.arguments import Positive, Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, to_numpy
 from ..core.rotations import rotation_matrix
 from .arm import Arm
-from .body import Body, capsule_ends, frames_at
-from .segment_distances import distance_from_box, segment_distance
+from .body import Body, capsule_ends, distance_from_box, frames_at, segment_distance
 
 _ROWS = 1024  # of one call
 _SAMPLES = 500
@@ -85,15 +84,12 @@ class Cell(NamedTuple):
 
 def check_obstacle(obstacle: Obstacle) -> None:
     """Raise `InputError` for an obstacle without extent or direction."""
-    numbers = [x for part in obstacle[1:] for x in (part if isinstance(part, tuple | list) else (part,))]
-    if not all(math.isfinite(x) for x in numbers) or any(len(part) != 3 for part in obstacle[1:3]):  # pyright: ignore
-        raise InputError(f"obstacle '{obstacle.name}' needs finite numbers, three for a point or a direction.")
+    numbers = {"radius": Positive, "size": Annotated[Float[np.ndarray, "3"], Range(above=0, unit="mm")]}
+    for field, value in obstacle._asdict().items():
+        if field != "name":
+            checked(value, numbers.get(field, Float[np.ndarray, "3"]), f"{field} of obstacle '{obstacle.name}'")
     if isinstance(obstacle, HalfSpace) and not np.linalg.norm(obstacle.normal) > 0:
         raise InputError(f"the normal of obstacle '{obstacle.name}' has the length 0; give a direction.")
-    if isinstance(obstacle, Box) and min(obstacle.size) <= 0:
-        raise InputError(f"box '{obstacle.name}' has an edge of {min(obstacle.size):g} mm; give three above 0.")
-    if isinstance(obstacle, Post) and obstacle.radius <= 0:
-        raise InputError(f"capsule '{obstacle.name}' has a radius of {obstacle.radius:g} mm; give one above 0.")
 
 
 def checked_cell(arm: Arm, cell: Cell, limits: Float[np.ndarray, "n 2"]) -> Cell:
@@ -115,17 +111,13 @@ def checked_cell(arm: Arm, cell: Cell, limits: Float[np.ndarray, "n 2"]) -> Cell
         check_obstacle(obstacle)
         if names.count(obstacle.name) > 1:
             raise InputError(f"two obstacles have the name '{obstacle.name}'; give each one of its own.")
-    if not (math.isfinite(cell.clearance) and cell.clearance >= 0):
-        raise InputError(f"the clearance is {cell.clearance:g} mm; give zero or a positive number.")
+    checked(cell.clearance, Annotated[float, Range(least=0, unit="mm")], "the clearance")
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
-    body = cell.body
-    start, end = capsule_ends(body, frames_at(to_numpy(arm), q))
-    touching = np.mean(_between_capsules(body, start, end) < cell.clearance, axis=1) >= _MOSTLY
-    unchecked = [(body.names[i], body.names[j]) for i, j in body.pairs[touching]]
-    for obstacle in cell.obstacles:
-        always = np.all(_from_obstacle(obstacle, body, start, end) < cell.clearance, axis=1)
-        unchecked += [(body.names[i], obstacle.name) for i in np.flatnonzero(always)]
-    return cell._replace(body=body._replace(pairs=body.pairs[~touching]), unchecked=tuple(unchecked))
+    names, distances = _distances(cell._replace(unchecked=()), to_numpy(arm), q)
+    share, pairs = np.mean(distances < cell.clearance, axis=1), len(cell.body.pairs)
+    touching = share >= np.where(np.arange(len(names)) < pairs, _MOSTLY, 1.0)
+    unchecked = tuple(name for name, left_out in zip(names, touching, strict=True) if left_out)
+    return cell._replace(body=cell.body._replace(pairs=cell.body.pairs[~touching[:pairs]]), unchecked=unchecked)
 
 
 def clearances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> Float[AnyArray, " N"]:
@@ -145,17 +137,7 @@ def clearances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> Float[AnyArra
         >>> print(aj.kinematics.clearances(cell, arm, q[None]).round(1), "mm")
         [25.6] mm
     """
-    xp, left_out = namespace(arm, q), set(cell.unchecked)
-    start, end = capsule_ends(cell.body, frames_at(arm, q))
-    found = [xp.full(q.shape[:1], np.inf)[None]]
-    if len(cell.body.pairs):
-        found.append(_between_capsules(cell.body, start, end))
-    for obstacle in cell.obstacles:
-        checked = np.array([(name, obstacle.name) not in left_out for name in cell.body.names])
-        if checked.any():
-            part = cell.body._replace(radius=cell.body.radius[checked])
-            found.append(_from_obstacle(obstacle, part, start[checked], end[checked]))
-    return xp.min(xp.concatenate(found), axis=0)
+    return namespace(arm, q).min(_distances(cell, arm, q)[1], axis=0, initial=np.inf)
 
 
 def is_clear(cell: Cell, arm: Arm, q: Float[np.ndarray, "N n"]) -> Bool[np.ndarray, " N"]:
@@ -166,27 +148,25 @@ def is_clear(cell: Cell, arm: Arm, q: Float[np.ndarray, "N n"]) -> Bool[np.ndarr
 
 def nearest_contact(cell: Cell, arm: Arm, q: Float[np.ndarray, " n"]) -> tuple[str, str]:
     """The two things that are nearest to each other at one configuration: capsules, or a capsule and an obstacle."""
-    body, left_out = cell.body, set(cell.unchecked)
-    start, end = capsule_ends(body, frames_at(to_numpy(arm), q[None]))
-    found = []
-    if len(body.pairs):
-        between = _between_capsules(body, start, end)[:, 0]
-        found += [
-            (distance, (body.names[i], body.names[j])) for distance, (i, j) in zip(between, body.pairs, strict=True)
-        ]
+    names, distances = _distances(cell, to_numpy(arm), q[None])
+    return names[int(np.argmin(distances[:, 0]))]
+
+
+def _distances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[list[tuple[str, str]], Float[AnyArray, "m N"]]:
+    """The pairs of things that are checked, by name, and their distances: capsules, then capsules and obstacles."""
+    body, xp = cell.body, namespace(arm, q)
+    start, end = capsule_ends(body, frames_at(arm, q))
+    first, second = body.pairs.T
+    between = segment_distance(start[first], end[first], start[second], end[second])
+    found = [between - xp.asarray(body.radius[first] + body.radius[second])[:, None]]
+    names = [(body.names[i], body.names[j]) for i, j in body.pairs]
     for obstacle in cell.obstacles:
-        each = _from_obstacle(obstacle, body, start, end)[:, 0]
-        named = [(name, obstacle.name) for name in body.names]
-        found += [row for row in zip(each, named, strict=True) if row[1] not in left_out]
-    return min(found, key=lambda row: row[0])[1]
-
-
-def _between_capsules(
-    body: Body, start: Float[AnyArray, "k 3 N"], end: Float[AnyArray, "k 3 N"]
-) -> Float[AnyArray, "m N"]:
-    one, other = body.pairs.T
-    distance = segment_distance(start[one], end[one], start[other], end[other])
-    return distance - namespace(distance).asarray(body.radius[one] + body.radius[other])[:, None]
+        pairs = [(name, obstacle.name) for name in body.names]
+        chosen = np.array([pair not in cell.unchecked for pair in pairs])
+        part = body._replace(radius=body.radius[chosen])
+        found.append(_from_obstacle(obstacle, part, start[chosen], end[chosen]))
+        names += [pair for pair in pairs if pair not in cell.unchecked]
+    return names, xp.concatenate(found)
 
 
 def _from_obstacle(

@@ -1,11 +1,12 @@
 """Cones of approach: from which directions a tool may come to a socket, and configurations that keep to them."""
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import in_chunks, to_numpy
 from .arm import Arm
@@ -57,16 +58,13 @@ def cones_of(cones: list[Cone], tool_axis: tuple[float, float, float] = TOOL_AXI
     Raises:
         InputError: A direction has the length 0, or a half angle is not above 0.
     """
-    vectors = np.array([*(cone.normal for cone in cones), tool_axis], dtype=float)
+    directions = {f"normal of cone {i + 1}": cone.normal for i, cone in enumerate(cones)} | {"tool_axis": tool_axis}
+    vectors = np.array([checked(value, Float[np.ndarray, "3"], what) for what, value in directions.items()])
     sizes = np.linalg.norm(vectors, axis=1, keepdims=True)
-    if vectors.shape[1:] != (3,) or not np.all(np.isfinite(vectors)) or np.any(sizes == 0):
-        raise InputError("a normal or the tool's axis is no direction; give three numbers that are not all 0.")
-    for cone in cones:
-        if not 0 < cone.half_angle <= math.pi:
-            raise InputError(
-                f"a cone of approach has a half angle of {math.degrees(cone.half_angle):g} deg; give one above 0 and "
-                "at most 180."
-            )
+    if np.any(sizes == 0):
+        raise InputError("a normal or the tool's axis has the length 0; give three numbers that are not all 0.")
+    half_angles = np.degrees([cone.half_angle for cone in cones])
+    checked(half_angles, Annotated[Float[np.ndarray, " cones"], Range(above=0, most=180, unit="deg")], "half_angle")
     unit = vectors / sizes
     return Cones(unit[:-1], np.array([cone.half_angle for cone in cones], dtype=float), unit[-1])
 

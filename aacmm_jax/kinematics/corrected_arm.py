@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import items_of
-from ..core.arrays import Numbers, as_floats
+from ..core.arguments import checked
+from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
@@ -57,12 +57,11 @@ def with_corrections(
     if isinstance(model, str):
         terms = _determined(plain, terms_of(model, plain.joints, loads), down)
     else:
-        names = items_of(model, "model")
-        found = [term_of(name, plain.joints, loads) if isinstance(name, str) else None for name in names]
-        for name, term in zip(names, found, strict=True):
+        by_name = {name: term_of(name, plain.joints, loads) for name in checked(model, Iterable[str], "model")}
+        for name, term in by_name.items():
             if term is None:
-                raise InputError(f"'{name}' is no coefficient's name; write one such as cos1_2, or give a model.")
-        terms = tuple(dict.fromkeys(term for term in found if term is not None))
+                raise InputError(f"'{name}' is not the name of a coefficient; write one such as cos1_2, or a model.")
+        terms = tuple(dict.fromkeys(term for term in by_name.values() if term is not None))
     if not terms:
         return plain
     return plain.replace(corrections=Corrections(KnownFunctions(terms), plain.geometry), gravity=down)
@@ -79,20 +78,17 @@ def _loads(arm: Arm, mass: Numbers | None, centre: Numbers | None) -> Loads | No
         return None
     if mass is None or centre is None:
         raise InputError("masses and centres of mass go together; give both mass and centre.")
-    masses, centres = (np.asarray(to_numpy(as_floats(x, what))) for x, what in ((mass, "mass"), (centre, "centre")))
-    if masses.shape != (arm.joints,) or centres.shape != (arm.joints, 3):
-        raise InputError(
-            f"mass has shape {masses.shape} and centre {centres.shape}; give one mass (kg) and one centre (x, y, z in "
-            f"mm) for each of the {arm.joints} links."
-        )
+    sizes = {"links": arm.joints}
+    masses = checked(mass, Float[np.ndarray, " links"], "mass", sizes)
+    centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)
     return Loads(tuple(masses.tolist()), tuple((x, y, z) for x, y, z in centres.tolist()))
 
 
 def _direction(gravity: Numbers) -> Float[np.ndarray, " 3"]:
-    given = np.asarray(to_numpy(as_floats(gravity, "gravity")))
-    if given.shape != (3,) or not np.linalg.norm(given) > 0:
-        raise InputError("gravity must be a direction in the base frame, three numbers that are not all 0.")
-    return given / np.linalg.norm(given)
+    direction = checked(gravity, Float[np.ndarray, "3"], "gravity")
+    if not np.any(direction):
+        raise InputError("gravity has the length 0; give its direction in the base frame.")
+    return direction / np.linalg.norm(direction)
 
 
 def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"]) -> tuple[Term, ...]:
@@ -147,5 +143,4 @@ def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
 def loads_of(arm: Arm) -> Loads | None:
     """Masses and centres of the links, where functions of an arm's corrections know them."""
     assert arm.corrections is not None
-    loads = (getattr(term, "loads", None) for term in arm.corrections.functions.terms)
-    return next((found for found in loads if found is not None), None)
+    return next((term.loads for term in arm.corrections.functions.terms if term.loads is not None), None)

@@ -1,10 +1,9 @@
 """Which parameters of an arm are free, within what bounds, and what the file of an arm proposes for both."""
 
-import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arguments import checked_arguments, items_of, real_number
+from ..core.arguments import NotNegative, Range, checked_arguments
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
@@ -33,6 +32,8 @@ from .chain import Geometry
 from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
 from .priors import Prior
+
+_HalfWidth = Annotated[float, Range(least=0, infinite=True)]
 
 
 class Parameters(eqx.Module):
@@ -69,7 +70,9 @@ class Parameters(eqx.Module):
 
     @classmethod
     @checked_arguments
-    def free_of(cls, arm: Arm, *, held: Iterable[str] | None = None, free: Iterable[str] = ()) -> "Parameters":
+    def free_of(
+        cls, arm: Arm, *, held: str | Iterable[str] | None = None, free: str | Iterable[str] = ()
+    ) -> "Parameters":
         """Free parameters by name: by default the 4n - 3 of Cheng et al. 2018, in their order.
 
         These are all but ``d_1``, ``theta_1`` (they move the base frame), ``a_n``, ``alpha_n`` (redundant with the
@@ -89,14 +92,13 @@ class Parameters(eqx.Module):
             InputError: The arm has no such parameter, or one is named as held and as free.
         """
         n = arm.joints
-        free = (free,) if isinstance(free, str) else tuple(free)
+        free = _unique_names(arm, free, "free")
         if held is None:
             held = {"theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y"}
             held |= {f"a_{i}" for i in arm.prismatic} | {f"d_{i + 1}" for i in arm.prismatic if i < n}
             held |= {f"theta_{n}", "probe_z"} if n in arm.prismatic else set()
-            released = set(free)
-            held = [name for name in held if name not in released]
-        held, free = _unique_names(arm, held, "held"), _unique_names(arm, free, "free")
+            held = held - set(free)
+        held = _unique_names(arm, held, "held")
         for name in free:
             if name in held:
                 raise InputError(f"parameter '{name}' is named as held and as free; name it once.")
@@ -177,8 +179,7 @@ class Parameters(eqx.Module):
                 f"the arm has {arm.joints} joints, but these are parameters of an arm with {self.base.joints}; "
                 "choose the free parameters of this arm (Parameters.free_of)."
             )
-        known = is_concrete(*jax.tree.leaves(arm.geometry))
-        tools: Any = np if known else jnp  # see `joined`
+        tools: Any = np if is_concrete(*jax.tree.leaves(arm.geometry)) else jnp  # see `joined`
         values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
         values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)
         if arm.corrections is not None:
@@ -195,15 +196,20 @@ class Parameters(eqx.Module):
         Raises:
             InputError: The vector does not have p values.
         """
-        vector = as_array(vector, "vector", like=self.base)
-        if vector.shape[-1:] != (len(self.names),):
-            raise InputError(
-                f"vector has shape {vector.shape}, but {len(self.names)} parameters are free; give one value each."
-            )
+        vector = self.checked_vector(vector, "vector")
         base, indices = self.base, _indices(self.base, self.names)
         if base.beta is None and any(kind == "beta" for kind, _ in indices):
             base = with_arrays(base, beta=0.0 * base.alpha)
         return with_arrays(base, **with_values(base.geometry, vector, indices))
+
+    def checked_vector(self, vector: Numbers, what: str) -> Float[AnyArray, "... p"]:
+        """Values of the free parameters as an array, or `InputError`; NaN passes, as of an iteration that diverged."""
+        array = as_array(vector, what, like=self.base)
+        if array.shape[-1:] != (len(self.names),):
+            raise InputError(
+                f"{what} has shape {array.shape}, but {len(self.names)} parameters are free; give one value each."
+            )
+        return array
 
     def geometry(self, vector: Float[AnyArray, "... p"]) -> Geometry:
         """The geometry of ``arm(vector)``, unchecked: what an iteration evaluates."""
@@ -223,9 +229,7 @@ def _indices(arm: Arm, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
-    if isinstance(names, str):
-        names = (names,)
-    names = tuple(items_of(names, what))
+    names = (names,) if isinstance(names, str) else tuple(names)
     for name in names:
         locate(arm, name)
         if names.count(name) > 1:
@@ -262,17 +266,10 @@ class Bounds(eqx.Module):
     lower: Float[AnyArray, " p"]
     upper: Float[AnyArray, " p"]
 
+    @checked_arguments
     def __init__(self, space: Parameters, lower: Numbers, upper: Numbers):
-        if not isinstance(space, Parameters):
-            raise InputError(f"the space is a {type(space).__name__}; give aj.Parameters.")
         self.space = space
-        self.lower = as_array(lower, "lower", like=space)
-        self.upper = as_array(upper, "upper", like=space)
-        for what, bound in (("lower", self.lower), ("upper", self.upper)):
-            if bound.shape[-1:] != (len(space.names),):
-                raise InputError(
-                    f"{what} has shape {bound.shape}, but {len(space.names)} parameters are free; give one each."
-                )
+        self.lower, self.upper = space.checked_vector(lower, "lower"), space.checked_vector(upper, "upper")
         if is_concrete(self.lower, self.upper):
             wrong = ~(np.asarray(self.lower) <= np.asarray(self.upper))  # also true for NaN
             if wrong.any():
@@ -290,9 +287,9 @@ class Bounds(eqx.Module):
         arm: Arm,
         space: Parameters,
         *,
-        length: float = 10.0,
-        angle: float = 0.0175,
-        override: Mapping[str, float] | None = None,
+        length: _HalfWidth = 10.0,
+        angle: _HalfWidth = 0.0175,
+        override: Mapping[str, _HalfWidth] | None = None,
     ) -> "Bounds":
         """A box centred on an arm; the default half-widths are the paper's, 10 mm and about 1 degree.
 
@@ -307,14 +304,8 @@ class Bounds(eqx.Module):
             InputError: A half-width is negative, a name is not free, or the arm does not fit the parameters.
         """
         widths = np.where(space.lengths, float(length), float(angle))
-        if not isinstance(override, Mapping | None):
-            raise InputError("override is no dictionary; give half-widths by name, such as {'d_3': 20.0}.")
         for name, width in (override or {}).items():
-            real_number(width, f"the half-width of {name}")
             widths[space.index(name)] = float(width)
-        if not np.all(widths >= 0):
-            i = int(np.argmin(widths >= 0))
-            raise InputError(f"half-width of {space.names[i]} is {widths[i]:g}; give zero or a positive number.")
         centre = space.vector(arm)
         centre = np.asarray(centre) if is_concrete(centre) else centre
         return cls(space, centre - widths, centre + widths)
@@ -326,7 +317,7 @@ class Bounds(eqx.Module):
 
 
 @checked_arguments
-def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int = 0) -> Arm:
+def perturbed_arm(space: Parameters, *, length: NotNegative, angle: NotNegative, seed: int = 0) -> Arm:
     """The space's base arm with random errors of its free parameters, uniform and independent, as of manufacture.
 
     Args:
@@ -343,9 +334,6 @@ def perturbed_arm(space: Parameters, *, length: float, angle: float, seed: int =
         >>> print((as_built.a - arm.a).round(2))
         [ 0.51  0.06 -0.56 -0.04 -0.82  0.  ]
     """
-    for what, value in (("length", length), ("angle", angle)):
-        if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"the deviation of a free {what} is {value:g}; it must be zero or positive.")
     width = jnp.where(jnp.asarray(space.lengths), length, angle)
     shift = jax.random.uniform(random_key(seed), width.shape, jnp.float64, -1.0, 1.0)
     return space.arm(space.vector() + width * shift)

@@ -2,20 +2,22 @@
 
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from ..core.arguments import items_of, shown
-from ..core.arrays import Numbers, as_array, is_concrete
+from ..core.arguments import ANY_NUMBER, Range, checked, checked_arguments, items_of
+from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
-from .arm import Arm, is_length, natural_steps, parameter_names
+from .arm import Arm, correction_names, is_length, natural_steps, parameter_names
 from .corrections.harmonics import Harmonics, orders_of
 from .corrections.kinds import all_kinds, coefficient_of, is_kind, unit_of_coefficient
 
 _BROAD = 10.0  # standard deviation at which the search for a learned one begins, in natural steps
+_Deviation = Annotated[Float[Array, ""], ANY_NUMBER, Range(above=0, infinite=True)]
 LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
 
 
@@ -65,10 +67,7 @@ class Prior(eqx.Module):
         mean: Mapping[str, Numbers] | None = None,
         learn: bool | Iterable[str] = False,
     ):
-        for what, given in (("sd", sd), ("mean", mean)):
-            if given is not None and not isinstance(given, Mapping):
-                raise InputError(f"{what} is {shown(given)}; give a dictionary, such as {{'lengths': 0.5}}.")
-        given = {group: _number(value, f"the standard deviation of {group}") for group, value in (sd or {}).items()}
+        given: dict[str, Any] = checked(sd or {}, Mapping[str, _Deviation], "sd")
         if isinstance(learn, bool):
             chosen = [*(given or ("lengths", "angles"))] if learn else []
         else:
@@ -77,21 +76,8 @@ class Prior(eqx.Module):
         if not self.groups or not all(isinstance(group, str) and group for group in self.groups):
             raise InputError("a prior needs the names of groups; give at least one, such as Prior({'lengths': 0.5}).")
         self.learned = tuple(group in chosen for group in self.groups)
-        self.sd = {
-            group: value
-            for group, value in given.items()
-            if not (is_concrete(value) and np.isposinf(np.asarray(value)))
-        }
-        self.mean = {group: _number(value, f"the mean of {group}") for group, value in (mean or {}).items()}
-        for group, value in given.items():
-            if is_concrete(value) and not float(value) > 0:
-                raise InputError(
-                    f"the standard deviation of {group} is {float(value):g}; it must be positive (fix a parameter that "
-                    "is known exactly)."
-                )
-        for group, value in self.mean.items():
-            if is_concrete(value) and not np.isfinite(float(value)):
-                raise InputError(f"the mean of {group} is {float(value):g}; give a finite number.")
+        self.sd = {group: sd for group, sd in given.items() if not (is_concrete(sd) and np.isposinf(np.asarray(sd)))}
+        self.mean = checked(mean or {}, Mapping[str, Float[Array, ""]], "mean")
 
     def check(self, arm: Arm) -> None:
         """Raise `InputError` for a group that holds no parameter of an arm."""
@@ -111,9 +97,9 @@ class Prior(eqx.Module):
         mean, sd = xp.asarray(nominal), xp.asarray(_BROAD * steps)
         members, used = [], []
         for number, group in enumerate(self.groups):
-            own = [i for i, owner in enumerate(owners) if owner == number]
-            if own and (self.learned[number] or group in self.sd):
-                members.append(tuple(own))
+            indices = tuple(i for i, owner in enumerate(owners) if owner == number)
+            if indices and (self.learned[number] or group in self.sd):
+                members.append(indices)
                 used.append(number)
         if not members:
             return None
@@ -122,16 +108,15 @@ class Prior(eqx.Module):
             owner = _owner(means, name)
             if owner is not None:
                 mean = set_at(mean, i, given.mean[means[owner]])
-        for number, own in zip(used, members, strict=True):
-            group = self.groups[number]
-            if group in self.sd:
-                index = np.array(own)
-                mixed = _unit(names[i] for i in own) == MIXED
-                sd = set_at(sd, index, given.sd[group] * xp.asarray(steps[index] if mixed else np.ones(len(own))))
         groups = tuple(self.groups[number] for number in used)
+        units = tuple(_unit(names[i] for i in indices) for indices in members)
+        for group, indices, unit in zip(groups, members, units, strict=True):
+            if group in self.sd:
+                index = np.array(indices)
+                factors = steps[index] if unit == MIXED else np.ones(len(index))
+                sd = set_at(sd, index, given.sd[group] * xp.asarray(factors))
         learned = tuple(self.learned[number] for number in used)
-        expected = tuple(self.learned[number] and self.groups[number] in self.sd for number in used)
-        units = tuple(_unit(names[i] for i in own) for own in members)
+        expected = tuple(is_learned and group in self.sd for group, is_learned in zip(groups, learned, strict=True))
         return ParameterPrior(mean, sd, groups, learned, expected, tuple(members), units)
 
 
@@ -152,22 +137,13 @@ class ParameterPrior(eqx.Module):
     @property
     def index(self) -> np.ndarray:
         """Indices of the parameters that have a prior, group after group."""
-        return np.array([i for own in self.members for i in own])
+        return np.concatenate([np.array(indices, dtype=int) for indices in self.members])
 
     @property
     def membership(self) -> Float[np.ndarray, "g k"]:
         """1 where a parameter of ``index`` belongs to a group."""
-        owner = np.repeat(np.arange(len(self.members)), [len(own) for own in self.members])
+        owner = np.repeat(np.arange(len(self.members)), [len(indices) for indices in self.members])
         return (owner[None, :] == np.arange(len(self.members))[:, None]).astype(float)
-
-
-def _number(value: Numbers, what: str) -> Float[AnyArray, ""]:
-    number = as_array(value, what)
-    if number.ndim:
-        raise InputError(f"{what} has shape {number.shape}; give one number for the group.")
-    if is_concrete(number) and np.isnan(np.asarray(number)):
-        raise InputError(f"{what} is NaN; give a number.")
-    return number
 
 
 def is_of_group(group: str, name: str) -> bool:
@@ -182,16 +158,16 @@ def is_of_group(group: str, name: str) -> bool:
 def _is_correction(group: str, name: str) -> bool:
     """Whether a coefficient is of the kind of a group, and of its orders where it names some."""
     kind, _, option = group.partition("=")
-    found = coefficient_of(name)
-    if found is None or found.kind.model != kind:
+    coefficient = coefficient_of(name)
+    if coefficient is None or coefficient.kind.model != kind:
         return False
-    return not option or (kind == Harmonics.model and found.number in (orders_of(option) or ()))
+    return not option or (kind == Harmonics.model and coefficient.number in (orders_of(option) or ()))
 
 
 def _owner(groups: tuple[str, ...], name: str) -> int | None:
     """Number of the group that a parameter belongs to."""
-    found = [(_closeness(group, name), i) for i, group in enumerate(groups) if is_of_group(group, name)]
-    return max(found)[1] if found else None
+    holders = [(_closeness(group, name), i) for i, group in enumerate(groups) if is_of_group(group, name)]
+    return max(holders)[1] if holders else None
 
 
 def _closeness(group: str, name: str) -> int:
@@ -212,8 +188,45 @@ def unit_of_group(group: str, names: Iterable[str]) -> str:
 
 def _unit(names: Iterable[str]) -> str:
     names = list(names)
-    own = {unit_of_coefficient(name) for name in names}
-    if len(own) == 1 and "" not in own:
-        return own.pop()
-    lengths = {is_length(name) for name in names}
+    units, lengths = {unit_of_coefficient(name) for name in names}, {is_length(name) for name in names}
+    if len(units) == 1 and "" not in units:
+        return units.pop()
     return MIXED if len(lengths) == 2 else "mm" if True in lengths else "rad"
+
+
+@checked_arguments
+def default_prior(arm: Arm) -> Prior:
+    """The prior with which an arm with joint corrections is calibrated where no other is given.
+
+    Learned from the data, each expected to a factor of 4.5: lengths (1 mm), angles (1 mrad), gravity (1 mrad for links
+    with levers of 1 m, or for 100 N m), gear and coupled (0.02 %), thermal expansion (20 um/(m K)), and one group for
+    each octave of harmonics (0.05 mrad).
+
+    Args:
+        arm: The nominal arm, with the corrections that are calibrated.
+
+    Returns:
+        The prior of the groups that the arm has.
+
+    One scale for each kind of parameter, and for harmonics one an octave of the order, which all joints share: the
+    error of an encoder or a gear is a function whose harmonics fade with their order at a rate that nobody knows
+    beforehand. A scale for each joint fails where a joint moves little, since high orders imitate anything there
+    (`benchmarks/NOTES.md`).
+
+    Example:
+        >>> bending = aj.kinematics.with_corrections(aj.load_arm("ur10e"), "gravity,harmonics=1")
+        >>> prior = aj.kinematics.default_prior(bending)
+        >>> print(prior.groups)
+        ('lengths', 'angles', 'gravity', 'harmonics=1')
+    """
+    terms = () if arm.corrections is None else arm.corrections.functions.terms
+    kinds: dict[str, float] = {}
+    slides: dict[str, float] = {}
+    for kind in all_kinds():
+        kinds |= kind.usual([term for term in terms if term.kind.model == kind.model])
+        if kind.usual_of_slide is not None:
+            # Coefficients of a slide are in mm, so that they cannot share a scale with those of joints that turn.
+            slides |= {f"{word}*_{joint}": kind.usual_of_slide for joint in arm.prismatic for word in kind.words}
+    names = correction_names(arm)
+    usual = {group: sd for group, sd in (kinds | slides).items() if any(is_of_group(group, name) for name in names)}
+    return Prior({"lengths": 1.0, "angles": 1e-3} | usual, learn=True)

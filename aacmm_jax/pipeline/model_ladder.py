@@ -30,7 +30,7 @@ from ..diagnostics.equations import equations_of
 from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds
-from ..kinematics.prior_scales import default_prior
+from ..kinematics.priors import default_prior
 from .model_evidence import log_evidence
 from .single import calibrate
 from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions

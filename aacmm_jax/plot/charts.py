@@ -125,6 +125,11 @@ def borders(values: Numbers) -> Marks:
     return Marks("", values, (), "border", "soft")
 
 
+def ordinates(marks: Sequence[Marks]) -> list[Numbers]:
+    """All that marks reach to along the vertical axis."""
+    return [ends for part in marks for ends in (part.y, part.low, part.high) if ends is not None]
+
+
 def linear(title: str, *values: Any, zero: bool = False, margin: float = 0.06) -> Axis:
     """An axis around values, with round numbers; ``zero``: it begins at 0, for numbers that are not negative."""
     low, high = _range(values)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.extras import require
-from ..files.atomic_write import write_atomically
+from ..files.outputs import write_atomically
 from .charts import Axis, Marks, Plot
 
 _FORMATS = ("png", "svg", "pdf")

@@ -11,7 +11,7 @@ from ..core.errors import InputError
 from ..study.results import Results
 from ..study.statistics import METRICS, correlation, factor_title, level_text, level_title, shown_unit
 from ..summaries.cells import format_number
-from .charts import SERIES, Marks, Plot, level, linear, logarithmic, names
+from .charts import SERIES, Marks, Plot, level, linear, logarithmic, names, ordinates
 from .figures import draw, draw_all, save_figure
 from .uncertainty import correlation_plot
 
@@ -195,19 +195,25 @@ def study_errors(results: Results, factor: str) -> Any:
         f"{kind}_stage1": {"name": "before the scale fix", "tone": "accent", "symbol": "triangle", "size": 15},
         kind: {"name": "after", "tone": "main", "symbol": "square", "size": 6},
     }
-    panels = {}
-    for words, cells in runs.items():
-        marks = []
-        for name, style in stages.items():
-            low, middle, high = _percentiles(results, name, cells)
-            if np.any(np.isfinite(middle)):
-                marks += [Marks("", x, middle, "band", style["tone"], low=low, high=high),
-                          Marks(x=x, y=middle, joined=True, **style)]  # fmt: skip
-        panels[fill(words, 60)] = tuple(marks)
-    y = logarithmic(_title(kind), *(end for marks in panels.values() for band in marks[::2]
-                                    for end in (band.low, band.high)))  # fmt: skip
+    panels = {
+        fill(words, 60): [
+            part for name, style in stages.items() for part in _curve(x, _percentiles(results, name, cells), **style)
+        ]
+        for words, cells in runs.items()
+    }
+    y = logarithmic(_title(kind), *(ends for marks in panels.values() for ends in ordinates(marks)))
     x_axis = logarithmic(factor_title(factor), x)._replace(ticks=tuple((float(at), f"{at:g}") for at in x))
-    return draw_all([Plot(x_axis, y, marks, title=words) for words, marks in panels.items()], len(panels), (5, 3.9))
+    plots = [Plot(x_axis, y, tuple(marks), title=words) for words, marks in panels.items()]
+    return draw_all(plots, len(plots), (5, 3.9))
+
+
+def _curve(x: np.ndarray, ends: np.ndarray, *, band: bool = True, **style: Any) -> list[Marks]:
+    """Medians as joined points, with a band from the 5th to the 95th percentile; nothing where no trial converged."""
+    low, middle, high = ends
+    if not np.any(np.isfinite(middle)):
+        return []
+    curve = Marks(x=x, y=middle, joined=True, **style)
+    return [Marks("", x, middle, "band", style["tone"], low=low, high=high), curve] if band else [curve]
 
 
 def study_scale(results: Results, factor: str) -> Any:
@@ -224,19 +230,14 @@ def study_scale(results: Results, factor: str) -> Any:
         >>> aj.plot.study_scale(results, "bounds.length_shift_mm").savefig("scale.svg")
     """
     runs = _runs(results, factor, most=len(SERIES))
-    marks = []
+    marks = [level(0.0)]
     for style, (words, cells) in zip(SERIES, runs.items(), strict=False):
+        ends, name = 1e6 * (_percentiles(results, "scale", cells) - 1), words if len(runs) > 1 else ""
         x = _values_of_factor(results, factor, cells)
-        low, middle, high = 1e6 * (_percentiles(results, "scale", cells) - 1)
-        if len(runs) <= 4:
-            marks.append(Marks("", x, middle, "band", style["tone"], low=low, high=high))
-        marks.append(Marks(words if len(runs) > 1 else "", x, middle, joined=True, **style))
-    ends = [end for part in marks for end in (part.y, part.low, part.high) if end is not None]
-    axes = (
-        linear(factor_title(factor), *(part.x for part in marks)),
-        linear("error of the scale of stage 1 [parts in a million]", *ends, [0.0]),
-    )
-    return draw_all([Plot(*axes, (*marks, level(0.0)))], 1, (6.4, 4.2 + 0.16 * len(runs)))
+        marks += _curve(x, ends, band=len(runs) <= 4, name=name, **style)
+    x_axis = linear(factor_title(factor), *(part.x for part in marks))
+    y = linear("error of the scale of stage 1 [parts in a million]", *ordinates(marks))
+    return draw_all([Plot(x_axis, y, tuple(marks))], 1, (6.4, 4.2 + 0.16 * len(runs)))
 
 
 def study_correlation(results: Results, cell: int) -> Any:

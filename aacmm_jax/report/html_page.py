@@ -9,10 +9,9 @@ from typing import Any
 from ..acceptance.record import SIMULATED
 from ..core.extras import require
 from ..files.administrative_data import AdministrativeData, check_conformity
-from ..files.atomic_write import write_text
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
-from ..files.outputs import together
+from ..files.outputs import together, write_text
 from ..plot.charts import Chart
 from ..plot.svg import drawn, key, points
 from ..summaries.cells import Table

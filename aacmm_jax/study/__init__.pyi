@@ -3,12 +3,12 @@ from .executors import dask_executor as dask_executor
 from .results import Results as Results
 from .results import open_study as open_study
 from .runner import run_study as run_study
+from .settings import DrawnTrials as DrawnTrials
 from .sources import make_study as make_study
 from .sources import read_study as read_study
 from .sources import shipped_studies as shipped_studies
 from .statistics import cell_summary as cell_summary
 from .statistics import concise as concise
 from .statistics import study_summary as study_summary
-from .trial_simulation import DrawnTrials as DrawnTrials
 from .trial_simulation import clear_pools as clear_pools
 from .trials import draw_trials as draw_trials

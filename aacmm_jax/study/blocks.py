@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,8 @@ from .computed_with import computed_with
 from .definition import Study
 from .settings import Setting
 
-MOST_BLOCKS = 10_000  # each takes 80 kB of memory when the study's file is made
+MOST_BLOCKS = 10_000  # files in one folder
+DIMENSIONS = ("cell", "trial", "parameter")
 NOT_RUN = -1  # of whole numbers; NaN of others, and -128 of active, where -1 is a bound
 
 
@@ -87,14 +87,15 @@ class Layout(NamedTuple):
     parameters: int
     block_cells: int
     block_trials: int
-    mark: str  # in the names of the files: blocks of this study, of this size, computed by this version and with these
+    mark: str  # in the names of the files: of this study, of this size, and of what it is computed with
+    chunk: int  # trials in a block that were asked for
     computed_with: str
 
     @classmethod
-    def of(cls, study: Study, chunk: int, made_by: tuple[str, str] | None = None) -> "Layout":
+    def of(cls, study: Study, chunk: int, settings: str | None = None) -> "Layout":
         """Blocks of about ``chunk`` trials; small cells share a block where they have the same compiled program.
 
-        ``made_by`` is the version of this package, and what the numbers are computed with; by default as they are here.
+        ``settings`` is what the numbers are `computed_with`; by default as they are here.
         """
         cells, trials = len(study.cells), study.trials
         if cells * -(-trials // chunk) > MOST_BLOCKS:
@@ -102,16 +103,14 @@ class Layout(NamedTuple):
                 f"chunks of {chunk} cut {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} blocks; "
                 "give a larger chunk."
             )
-        version, settings = made_by or (metadata.version("aacmm_jax"), computed_with())
-        mark = f"{study.digest[:12]}-{chunk}-{version}"
-        if settings:  # files of earlier versions do not say
-            mark += f"-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
+        settings = settings or computed_with()
+        mark = f"{study.digest[:12]}-{chunk}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
         together = 1
         if trials < chunk:
             together = max(n for n in range(1, min(chunk // trials, cells) + 1) if _uniform(study.settings, n))
         # Blocks of nearly equal size: a short last one would run the same compiled program for fewer trials.
         block_trials = -(-trials // -(-trials // chunk))
-        return cls(cells, trials, len(study.space.names), together, block_trials, mark, settings)
+        return cls(cells, trials, len(study.space.names), together, block_trials, mark, chunk, settings)
 
     def shape(self, name: str, cells: int | None = None, trials: int | None = None) -> tuple[int, ...]:
         """Shape of an array of results, of the whole study or of part of it."""
@@ -138,4 +137,4 @@ def parts_of(path: Path) -> Path:
 
 def part_of(path: Path, block: Block, layout: Layout) -> Path:
     """File of one block."""
-    return parts_of(path) / f"{layout.mark}-cell{block.first_cell:05d}-trial{block.first_trial:010d}.h5"
+    return parts_of(path) / f"{layout.mark}-cell{block.first_cell:05d}-trial{block.first_trial:010d}.npz"

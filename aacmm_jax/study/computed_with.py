@@ -7,7 +7,6 @@ computes a block: so no study mixes numbers that were computed in two ways. Rand
 
 import json
 import os
-from functools import cache
 from importlib import metadata
 from typing import Any
 
@@ -16,7 +15,7 @@ import jax
 from ..core._compat import jax_setting
 from ..core.errors import InputError
 
-_PACKAGES = ("jax", "jaxlib", "numpy", "scipy")
+_PACKAGES = ("aacmm_jax", "jax", "jaxlib", "numpy", "scipy")
 # Settings of JAX that change programs, with their defaults; benchmarks/attacks/settings.py tries all that JAX has.
 _SETTINGS: dict[str, Any] = {
     "jax_default_dtype_bits": "64",
@@ -42,7 +41,7 @@ _HARMLESS = (
 
 def computed_with() -> str:
     """What the numbers that this process computes depend on, as JSON; settings are left out where they are as usual."""
-    known = {**_versions(), "platform": jax.default_backend()}
+    known = {**{name: metadata.version(name) for name in _PACKAGES}, "platform": jax.default_backend()}
     settings = {name.upper(): (jax_setting(name, usual), usual) for name, usual in _SETTINGS.items()}
     known |= {name: str(value) for name, (value, usual) in settings.items() if value != usual}
     environment = {name: os.environ.get(name, "") for name in _ENVIRONMENT} | {_FLAGS: _flags()}
@@ -76,11 +75,6 @@ def _shown(name: str, value: str | None) -> str:
     if name in _PACKAGES or name == "platform":
         return f"{name} {value}"
     return f"no {name}" if value is None else f"{name}={value}"
-
-
-@cache
-def _versions() -> dict[str, str]:
-    return {name: metadata.version(name) for name in _PACKAGES}
 
 
 def _flags() -> str:

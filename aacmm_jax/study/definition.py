@@ -2,17 +2,15 @@
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from ..calibration.scale_anchor import default_method, scale_anchor
 from ..calibration.task import check_enough, check_observed
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..core.units import ARCSEC, DEG, M
 from ..data.capture import Capture
 from ..data.recording import Recording
@@ -38,21 +36,6 @@ _NONE = Distribution(uniform=0.0)
 POOL_PARTS = 32  # independent parts of a pose pool; trial t draws from part t modulo this
 
 
-@contextmanager
-def _naming(key: str) -> Iterator[None]:
-    """Prefix an error with the key of the specification that it is about."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{key}: {error}") from error
-
-
-class _Contents(NamedTuple):
-    specification: Specification
-    nominal: ArmSpecification
-    recording: Recording | None
-
-
 class Study:
     """A Monte Carlo study of calibrations: made by `make_study` and `read_study`, run by `run_study`. Immutable.
 
@@ -72,37 +55,26 @@ class Study:
         4 cells of 20 trials: {'bounds.length_mm': [5.0, 10.0], 'bounds.length_shift_mm': [0.0, 3.0]}
     """
 
+    specification: Specification
+    nominal: ArmSpecification
+    recording: Recording | None
+
     def __init__(self, specification: Specification, nominal: ArmSpecification, recording: Recording | None = None):
         single(nominal.arm)
         if recording is not None:
             true = None if recording.true is None else _picklable(recording.true)
             recording = recording._replace(nominal=_picklable(recording.nominal), true=true)
-        self._contents = _Contents(specification, _picklable(nominal), recording)
+        self.specification, self.nominal, self.recording = specification, _picklable(nominal), recording
         self._check()
 
     def __reduce__(self):
-        return _restored, (self.digest, self._contents)
+        return _restored, (self.digest, self.specification, self.nominal, self.recording)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Study) and self.digest == other.digest
 
     def __hash__(self) -> int:
         return hash(self.digest)
-
-    @property
-    def specification(self) -> Specification:
-        """What is asked."""
-        return self._contents.specification
-
-    @property
-    def nominal(self) -> ArmSpecification:
-        """The nominal arm."""
-        return self._contents.nominal
-
-    @property
-    def recording(self) -> Recording | None:
-        """The recording whose configurations are used, where the study names one."""
-        return self._contents.recording
 
     @property
     def capture(self) -> Capture | None:
@@ -127,11 +99,11 @@ class Study:
     @cached_property
     def factors(self) -> dict[str, list]:
         """What varies: dotted name -> the levels, as numbers or short texts."""
-        found = {}
+        factors = {}
         for name, levels in self.specification.factors().items():
             labels = [label(level) for level in levels]
-            found[name] = labels if all(isinstance(one, float) for one in labels) else [str(one) for one in labels]
-        return found
+            factors[name] = labels if all(isinstance(text, float) for text in labels) else list(map(str, labels))
+        return factors
 
     @cached_property
     def space(self) -> Parameters:
@@ -149,7 +121,7 @@ class Study:
         return Identified(self._spaces[setting.model], self._prior(setting.model, setting.prior))
 
     def _prior(self, model: str | None, text: str | None) -> Prior | None:
-        with _naming("identification.prior"):
+        with naming("identification.prior"):
             return prior_of(self.nominal, self._spaces[model], model, text)
 
     @property
@@ -160,25 +132,24 @@ class Study:
     @cached_property
     def _joints(self) -> Arm:
         """The nominal arm with all corrections of the study."""
-        found = self.nominal.arm
+        arm = self.nominal.arm
         for key in ("deviation.model", _MODEL):
-            with _naming(key):
+            with naming(key):
                 models = dict.fromkeys(cell[key] for cell in self.cells if key in cell)
-                found = all_joints(self.nominal._replace(arm=found), models)
-        return found
+                arm = all_joints(self.nominal._replace(arm=arm), models)
+        return arm
 
     @cached_property
     def _spaces(self) -> dict[str | None, Parameters]:
         """The free parameters by model of the joints."""
         held, models = self.specification.identification.held, dict.fromkeys(cell.get(_MODEL) for cell in self.cells)
-        with _naming("identification.held"):
+        with naming("identification.held"):
             return {model: identified(self.nominal, self._joints, held, model) for model in models}
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 of all that the numbers depend on: studies with the same digest give the same numbers."""
-        arm = specification_toml(self.nominal._replace(name=""))
-        content = [self.specification.content(), arm]
+        content = [self.specification.content(), specification_toml(self.nominal._replace(name=""))]
         if self.capture is not None:
             q, names, sizes = np.asarray(self.capture.q), self.capture.names, self.capture.sizes
             lengths = [(r.start, r.end, float(r.value), float(r.u)) for r in self.capture.lengths]
@@ -187,9 +158,8 @@ class Study:
                 content.append(repr((observation.kind, observation.name)))
                 for name, value in observation.stored().items():
                     array = np.asarray(value)
-                    content.append(
-                        f"{name} {array.shape} {array.tobytes().hex() if array.dtype.kind == 'f' else array.tolist()}"
-                    )
+                    values = array.tobytes().hex() if array.dtype.kind == "f" else array.tolist()
+                    content.append(f"{name} {array.shape} {values}")
         return hashlib.sha256("\n".join(content).encode()).hexdigest()
 
     @cached_property
@@ -197,35 +167,23 @@ class Study:
         """The setting of each cell."""
         keys = [(cell["identification.hold"], cell.get(_MODEL)) for cell in self.cells]
         anchors = {key: self._scale_anchor(*key) for key in dict.fromkeys(keys)}
-        recorded = self._recorded_fixtures()
+        recorded, capture = None, self.capture
+        if capture is not None:
+            rows = zip(capture.names, capture.sizes, _centroids(self.nominal.arm, capture), strict=True)
+            recorded = tuple(Fixture(name, size, (point,)) for name, size, point in rows)
         return [self._setting(cell, anchors[key], recorded) for cell, key in zip(self.cells, keys, strict=True)]
 
-    @cached_property
-    def eccentric(self) -> bool:
-        """Whether any cell has eccentric encoders (their sines are then computed for all)."""
-        return bool(np.any(self.cell_values.eccentricity > 0))
-
-    @cached_property
-    def cell_values(self) -> CellValues:
-        """The values of all cells."""
-        return CellValues(*(np.array(column) for column in zip(*map(self._values_of, self.cells), strict=True)))
-
-    @cached_property
-    def most_poses(self) -> dict[int, int]:
-        """The most poses that any cell takes at an end, of sockets (1) and of reference lengths (2)."""
-        fixtures = {fixture for setting in dict.fromkeys(self.settings) for fixture in setting.fixtures}
-        return {ends: max((one.poses for one in fixtures if one.ends == ends), default=0) for ends in (1, 2)}
-
-    def _recorded_fixtures(self) -> tuple[Fixture, ...] | None:
-        if self.capture is None:
-            return None
-        rows = zip(self.capture.names, self.capture.sizes, _centroids(self.nominal.arm, self.capture), strict=True)
-        return tuple(Fixture(name, size, (point,)) for name, size, point in rows)
+    def _scale_anchor(self, hold: str, model: str | None) -> str | None:
+        space = self._spaces[model]
+        with naming("identification.hold"):
+            return scale_anchor(space, space.base, None if hold == "none" else hold, capture=self.capture).hold
 
     def _setting(self, cell: Mapping[str, Any], hold: str | None, recorded: tuple[Fixture, ...] | None) -> Setting:
-        arm, random_start = self.nominal.arm, cell["identification.start"] == "random"
-        joints = cell.get(_MODEL), cell.get("identification.prior")
-        method = self._method(cell, self._prior(*joints))
+        random_start, joints = (
+            cell["identification.start"] == "random",
+            (cell.get(_MODEL), cell.get("identification.prior")),
+        )
+        method = self._method(cell.get("identification.method"), self._prior(*joints))
         if recorded is not None:
             return Setting(recorded, (), hold, method, random_start, True, *joints)
         region, poses = cell.get("capture.region"), cell["capture.poses"]
@@ -235,7 +193,11 @@ class Study:
         else:
             fixtures = [Fixture(f"S{i + 1}", poses, None, region) for i in range(cell["capture.sockets"])]
         fixtures += _reference_fixtures(cell, region)
-        degrees = cell.get("capture.joint_limits_deg")
+        limits = self._limits(cell.get("capture.joint_limits_deg"))
+        return Setting(tuple(fixtures), limits, hold, method, random_start, False, *joints)
+
+    def _limits(self, degrees: list[tuple[float, float]] | None) -> tuple[tuple[float, float], ...]:
+        arm = self.nominal.arm
         if degrees is not None and len(degrees) != arm.joints:
             raise InputError(
                 f"capture.joint_limits_deg has {len(degrees)} rows, but the arm has {arm.joints} joints; give "
@@ -247,12 +209,9 @@ class Study:
                 "in the arm's file."
             )
         limits = joint_limits(arm, None if degrees is None else [[math.radians(x) for x in pair] for pair in degrees])
-        return Setting(
-            tuple(fixtures), tuple((float(a), float(b)) for a, b in limits), hold, method, random_start, False, *joints
-        )
+        return tuple((float(lowest), float(highest)) for lowest, highest in limits)
 
-    def _method(self, cell: Mapping[str, Any], prior: Prior | None) -> str:
-        asked = cell.get("identification.method")
+    def _method(self, asked: str | None, prior: Prior | None) -> str:
         if self.observed:
             return self._observed_method(asked)
         if asked == "two-stage" and prior is not None:
@@ -269,7 +228,7 @@ class Study:
     def _observed_method(self, asked: str | None) -> str:
         """All observations are solved at once: jointly, or as stage 1 where nothing fixes the scale."""
         assert self.capture is not None
-        fixed = bool(self.capture.lengths) or any(one.fixes_scale for one in self.capture.observations)
+        fixed = bool(self.capture.lengths) or any(item.fixes_scale for item in self.capture.observations)
         possible = "joint" if fixed else "stage1"
         if asked not in (None, possible):
             raise InputError(
@@ -278,55 +237,58 @@ class Study:
             )
         return possible
 
-    def _scale_anchor(self, hold: str, model: str | None) -> str | None:
-        space = self._spaces[model]
-        with _naming("identification.hold"):
-            return scale_anchor(space, space.base, None if hold == "none" else hold, capture=self.capture).hold
+    @cached_property
+    def eccentric(self) -> bool:
+        """Whether any cell has eccentric encoders (their sines are then computed for all)."""
+        return bool(np.any(self.cell_values.eccentricity > 0))
 
-    def _values_of(self, cell: Mapping[str, Any]) -> tuple:
-        """The fields of `CellValues` for one cell."""
+    @cached_property
+    def cell_values(self) -> CellValues:
+        """The values of all cells."""
+        rows = [(*self._deviations(cell), *self._bounds(cell), *_noise(cell)) for cell in self.cells]
+        return CellValues(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def _deviations(self, cell: Mapping[str, Any]) -> tuple[np.ndarray, list[bool]]:
+        """Half-widths or standard deviations of the parameters of true arms, and which are standard deviations."""
+        names, corrections = self.space.names, set(correction_names(self._joints))
+        true = coefficients_of(self.nominal, cell["deviation.model"]) if "deviation.model" in cell else names
+        widths, normal = [], []
+        for name in names:
+            drawn, unit = deviation_of(cell, self._joints, name)
+            if drawn is None or (name in corrections and name not in true):
+                drawn = _NONE
+            normal.append(drawn.normal is not None)
+            widths.append(unit * (drawn.normal or drawn.uniform or 0.0))
+        return np.array(widths), normal
+
+    def _bounds(self, cell: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of the parameters; coefficients of corrections have none."""
         space, nominal, override = self.space, self.nominal, self.specification.bounds.override
-        is_length_of = space.lengths
         coefficients = np.isin(space.names, correction_names(self._joints))
-        drawn, units = zip(*(deviation_of(cell, self._joints, name) for name in space.names), strict=True)
-        true = coefficients_of(nominal, cell["deviation.model"]) if "deviation.model" in cell else space.names
-        deviations = [
-            _NONE if one is None or (corrects and name not in true) else one
-            for one, corrects, name in zip(drawn, coefficients, space.names, strict=True)
-        ]
-        unit = np.where(coefficients, 1.0, np.where(is_length_of, 1.0, DEG))
-        width = np.array(units) * [one.uniform if one.normal is None else one.normal for one in deviations]
         length, angle = cell.get("bounds.length_mm"), cell.get("bounds.angle_deg")
         length = nominal.length if length is None else length
         angle = nominal.angle if angle is None else math.radians(angle)
-        half = np.where(coefficients, np.inf, np.where(is_length_of, length, angle))
-        for name, value in (nominal.override if override is None else override).items():
-            if override is not None or name in space.names:
-                with _naming("bounds.override"):
-                    half[space.index(name)] = value if override is None else value * unit[space.index(name)]
-        shift = np.where(is_length_of, cell["bounds.length_shift_mm"], math.radians(cell["bounds.angle_shift_deg"]))
-        centre = self._nominal_vector
-        return (
-            width,
-            [one.normal is not None for one in deviations],
-            centre - half + shift,
-            centre + half + shift,
-            cell["noise.encoder_arcsec"] * ARCSEC,
-            cell["noise.resolution_arcsec"] * ARCSEC,
-            cell["noise.seating_mm"],
-            cell["noise.eccentricity_arcsec"] * ARCSEC,
-            cell.get("noise.linear_encoder_mm", M * cell["noise.encoder_arcsec"] * ARCSEC),
-            cell.get("noise.linear_resolution_mm", 0.0),
-            cell.get("reference.u_mm", math.nan),
-        )
+        half = np.where(coefficients, np.inf, np.where(space.lengths, length, angle))
+        if override is None:  # in the units of the arm's file
+            for name in set(nominal.override) & set(space.names):
+                half[space.index(name)] = nominal.override[name]
+        for name, value in (override or {}).items():
+            with naming("bounds.override"):
+                at = space.index(name)
+            half[at] = value * (1.0 if coefficients[at] or space.lengths[at] else DEG)
+        shift = np.where(space.lengths, cell["bounds.length_shift_mm"], math.radians(cell["bounds.angle_shift_deg"]))
+        centre = np.asarray(space.vector())
+        return centre - half + shift, centre + half + shift
 
     @cached_property
-    def _nominal_vector(self) -> Float[np.ndarray, " p"]:
-        return np.asarray(self.space.vector())
+    def most_poses(self) -> dict[int, int]:
+        """The most poses that any cell takes at an end, of sockets (1) and of reference lengths (2)."""
+        fixtures = {fixture for setting in dict.fromkeys(self.settings) for fixture in setting.fixtures}
+        return {ends: max((item.poses for item in fixtures if item.ends == ends), default=0) for ends in (1, 2)}
 
     def _check(self) -> None:
         """Refuse everything that can be known to be wrong before work starts, but for what cannot be reached."""
-        capture, pool = self.capture, self.specification.capture.pool
+        capture = self.capture
         if capture is not None and self.specification.reference is not None:
             raise InputError("the capture file brings its reference lengths; leave [reference] out.")
         if capture is not None and capture.columns not in (self.nominal.arm.joints, self.nominal.arm.columns):
@@ -344,18 +306,22 @@ class Study:
             if setting.method != "stage1" and capture is not None and not capture.lengths:
                 raise InputError("the capture file has no reference length; use method = 'stage1', or another file.")
             for fixture in () if capture is not None else setting.fixtures:
-                placements, poses = pool_capacity(self, fixture)
-                if fixture.points is None and placements < 2:
-                    raise InputError(
-                        f"a capture.pool of {pool} poses holds fewer than two placements of {fixture.poses} poses in "
-                        f"each of its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
-                    )
-                if fixture.poses > poses:
-                    raise InputError(
-                        f"{fixture.poses} poses are more than the pool has for a socket ({poses}); give a larger "
-                        f"capture.pool than {pool}."
-                    )
+                self._check_pool(fixture)
         _ = self.cell_values  # its checks
+
+    def _check_pool(self, fixture: Fixture) -> None:
+        """Raise `InputError` where the pool is too small for a fixture."""
+        pool, (placements, poses) = self.specification.capture.pool, pool_capacity(self, fixture)
+        if fixture.points is None and placements < 2:
+            raise InputError(
+                f"a capture.pool of {pool} poses holds fewer than two placements of {fixture.poses} poses in each of "
+                f"its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
+            )
+        if fixture.poses > poses:
+            raise InputError(
+                f"{fixture.poses} poses are more than the pool has for a socket ({poses}); give a larger capture.pool "
+                f"than {pool}."
+            )
 
 
 @lru_cache(maxsize=4)
@@ -364,18 +330,18 @@ def _derived(digest: str) -> dict[str, Any]:
     return {}
 
 
-def _restored(digest: str, contents: _Contents) -> Study:
+def _restored(digest: str, *contents: Any) -> Study:
     """A copied or unpickled study, with its own contents.
 
     What is derived from them depends on the digest alone: a worker receives the study with every block, and derives
     once.
     """
-    study = object.__new__(Study)
-    study._contents = contents
-    shared = _derived(digest)
+    study, shared = object.__new__(Study), _derived(digest)
+    given = dict(zip(Study.__annotations__, contents, strict=True))
+    vars(study).update(given)
     if not shared:
         study._check()
-        shared.update({name: value for name, value in vars(study).items() if name != "_contents"}, digest=digest)
+        shared.update({name: value for name, value in vars(study).items() if name not in given}, digest=digest)
     vars(study).update(shared)
     return study
 
@@ -408,3 +374,17 @@ def _reference_fixtures(cell: Mapping[str, Any], region: Region | None) -> list[
         return [Fixture(f"L{i + 1}", poses, (tuple(a), tuple(b))) for i, (a, b) in enumerate(pairs)]
     length = cell["reference.length_mm"]
     return [Fixture(f"L{i + 1}", poses, None, region, length) for i in range(cell["reference.positions"])]
+
+
+def _noise(cell: Mapping[str, Any]) -> tuple[float, ...]:
+    """The fields of `CellValues` after the bounds; linear encoders err by what the others do at 1 m."""
+    encoder = cell["noise.encoder_arcsec"] * ARCSEC
+    return (
+        encoder,
+        cell["noise.resolution_arcsec"] * ARCSEC,
+        cell["noise.seating_mm"],
+        cell["noise.eccentricity_arcsec"] * ARCSEC,
+        cell.get("noise.linear_encoder_mm", M * cell["noise.encoder_arcsec"] * ARCSEC),
+        cell.get("noise.linear_resolution_mm", 0.0),
+        cell.get("reference.u_mm", math.nan),
+    )

@@ -14,8 +14,7 @@ from ..files.priors import prior_of_text
 from ..kinematics.arm import DOWN, Arm, correction_names, is_length, parameter_unit, value_of, without_corrections
 from ..kinematics.corrected_arm import loads_of, with_corrections
 from ..kinematics.parameters import ArmSpecification, Parameters
-from ..kinematics.prior_scales import default_prior
-from ..kinematics.priors import Prior, is_of_group
+from ..kinematics.priors import Prior, default_prior, is_of_group
 
 # By kind of parameter or correction: the key of `DeviationTable`, and its unit in mm, rad or that of the coefficient.
 _DEVIATIONS = {

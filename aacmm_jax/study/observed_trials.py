@@ -21,8 +21,7 @@ from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
 from ..model.rows import rows_at
 from .definition import Study
-from .drawn_trials import DrawnTrials
-from .settings import CellValues, Setting
+from .settings import CellValues, DrawnTrials, Setting
 
 _ROUNDS = 4  # of the configurations' way to their tips, each of which leaves about a hundredth
 _LONGEST_STEP = 0.1  # rad

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import InputError
 from ..core.extras import require
 from ..files.hdf5 import check_sense, undamaged
 from ..files.outputs import as_path
 from . import store
-from .blocks import VARIABLES, fill_of
+from .blocks import DIMENSIONS, VARIABLES, fill_of
 from .definition import POOL_PARTS, Study
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ _LARGEST = 1e20  # mm, rad, or a factor
 
 
 def open_study(path: str | os.PathLike) -> "xarray.Dataset":
-    """Open the results of a study as an xarray dataset, read lazily; also while the study runs.
+    """Open the results of a study as an xarray dataset: lazily, or whole where they are in blocks, as while it runs.
 
     Args:
         path: File of the study (HDF5).
@@ -45,52 +44,46 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     require("data", "open_study")
     import xarray
 
-    opened = Results.of(path)
-    study = opened.study
-    if opened.stored.parts is not None:
-        blocks = store.finished_blocks(opened.path, layout := opened.stored.layout)
-        _allow_files(len(blocks), opened.path)
-        for block in blocks:  # HDF5 will read them without looking at their digests
-            store.check_block(opened.path, opened.stored, block, layout)
+    results = Results.of(path)
+    study, stored = results.study, results.stored
     with undamaged(path):
-        data = xarray.open_dataset(opened.path, group="trials", engine="h5netcdf")
-        columns = store.factor_columns(study)
+        if stored.parts is None:
+            data = xarray.open_dataset(results.path, group="trials", engine="h5netcdf")
+        else:
+            arrays = _assembled(results)
+            data = xarray.Dataset({name: (DIMENSIONS[: x.ndim], x, _words(name)) for name, x in arrays.items()})
+            data = data.assign_coords(parameter=list(study.space.names))
         labels = {
-            name: ("cell", np.asarray(v.values), {"units": v.units, "long_name": v.long_name})
-            for name, v in columns.items()
+            name: ("cell", np.asarray(column.values), {"units": column.units, "long_name": column.long_name})
+            for name, column in store.factor_columns(study).items()
         }
         nominal = ("parameter", np.asarray(study.space.vector()), {"long_name": "value in the nominal arm"})
         data = data.assign_coords(labels | {"nominal": nominal})
         if len(labels) == 1:
             data = data.swap_dims(cell=next(iter(labels)))
         elif labels:
-            data = data.drop_vars("cell").set_index(cell=list(labels))
+            data = data.drop_vars("cell", errors="ignore").set_index(cell=list(labels))
     data.attrs = {
         "name": study.specification.name,
         "seed": study.specification.seed,
-        "finished": opened.finished,
+        "finished": results.finished,
         "specification": study.specification.model_dump_json(exclude_unset=True),
     }
     return data
 
 
-def _allow_files(count: int, path: Path) -> None:
-    """Allow so many open files: HDF5 opens all blocks at once, and shows those that it cannot open as not run."""
-    try:
-        import resource
-    except ImportError:  # not a system with such limits
-        return
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = count + 200
-    if soft == resource.RLIM_INFINITY or soft >= needed:
-        return
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
-    except (ValueError, OSError) as error:  # over the hard limit, or over that of the system (macOS)
-        raise InputError(
-            f"{path} consists of {count} blocks, more files than this process may open; let the study end, or raise "
-            "the limit (ulimit -n)."
-        ) from error
+def _words(name: str) -> dict[str, str]:
+    return {"units": VARIABLES[name].units, "long_name": VARIABLES[name].long_name}
+
+
+def _assembled(results: "Results") -> dict[str, np.ndarray]:
+    """The results of all blocks that are kept in their folder."""
+    layout = results.stored.layout
+    arrays = {name: np.full(layout.shape(name), fill_of(name), kind.dtype) for name, kind in VARIABLES.items()}
+    for block in store.finished_blocks(results.path, layout):
+        for name, values in store.read_part(results.path, block, layout).items():
+            arrays[name][block.slices] = values
+    return arrays
 
 
 def _check_sense(path: Path, rows: Mapping[str, np.ndarray]) -> None:
@@ -102,15 +95,13 @@ def _check_sense(path: Path, rows: Mapping[str, np.ndarray]) -> None:
     converged = rows["converged"] == 1
     floats = {name: values for name, values in rows.items() if values.dtype.kind == "f"}
     parameters = [floats[name][converged] for name in ("estimate", "true") if name in floats]
+    large = any(np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats.values())
+    infinite = any(np.any(np.isinf(x[converged])) for x in floats.values())
     check_sense(
         path,
         {
-            "a result is larger than any can be": any(
-                np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats.values()
-            ),
-            "a trial that converged has an infinite result": any(
-                np.any(np.isinf(x[converged])) for x in floats.values()
-            ),
+            "a result is larger than any can be": large,
+            "a trial that converged has an infinite result": infinite,
             "a trial that converged has a parameter without a number": any(np.any(np.isnan(x)) for x in parameters),
         },
     )
@@ -162,24 +153,26 @@ class Results(NamedTuple):
 
     def columns(self, cell: int) -> dict[str, np.ndarray]:
         """Arrays of one cell with one number a trial; ``group`` is the part of the pool that a trial drew from."""
-        found = self._columns([name for name, kind in VARIABLES.items() if not kind.by_parameter], cell)
-        return found | {"group": np.arange(self.study.trials) % POOL_PARTS}
+        columns = self._columns([name for name, kind in VARIABLES.items() if not kind.by_parameter], cell)
+        return columns | {"group": np.arange(self.study.trials) % POOL_PARTS}
 
     def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
         layout = self.stored.layout
-        found = {name: np.full(layout.shape(name)[1:], fill_of(name), VARIABLES[name].dtype) for name in names}
-        with undamaged(self.path):
-            for part, rows in store.rows_of(self.path, self.stored, [*{*names, "converged"}], cell):
-                _check_sense(self.path, rows)
-                for name in names:
-                    found[name][part] = rows[name]
-        return found
+        arrays = {name: np.full(layout.shape(name)[1:], fill_of(name), VARIABLES[name].dtype) for name in names}
+        for part, rows in self._rows([*{*names, "converged"}], cell):
+            for name in names:
+                arrays[name][part] = rows[name]
+        return arrays
 
     def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:
         """Of converged trials, some at a time: parameter errors (estimate minus truth), active bounds, groups."""
+        for part, rows in self._rows(["converged", "estimate", "true", "active"], cell):
+            good = rows["converged"] == 1
+            group = np.arange(part.start, part.stop) % POOL_PARTS
+            yield (rows["estimate"] - rows["true"])[good], rows["active"][good], group[good]
+
+    def _rows(self, names: list[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
         with undamaged(self.path):
-            for part, rows in store.rows_of(self.path, self.stored, ["converged", "estimate", "true", "active"], cell):
+            for part, rows in store.rows_of(self.path, self.stored, names, cell):
                 _check_sense(self.path, rows)
-                good = rows["converged"] == 1
-                group = np.arange(part.start, part.stop) % POOL_PARTS
-                yield (rows["estimate"] - rows["true"])[good], rows["active"][good], group[good]
+                yield part, rows

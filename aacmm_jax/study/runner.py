@@ -14,17 +14,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from filelock import FileLock, Timeout
 
 from ..core.errors import InputError
-from ..files.outputs import as_path
+from ..files.outputs import OutputFile
 from . import store
 from .blocks import Block, Layout, parts_of
 from .computed_with import check_same, computed_with
 from .configuration_pool import check_reach
 from .definition import Study
-from .local_processes import THREADS
-from .parts_folder import check_ours, refuse_planted
+from .executors import THREADS, available_cores
+from .parts_folder import check_ours
 from .settings import Setting
 from .trials import run_block
 
@@ -85,7 +86,7 @@ def run_study(
         chunk: Trials in a block, which is one call of `identify_many`; default 1,000 (65,536 on a GPU). It changes no
             number, and stays what it was when the file was begun.
         shards: Let workers write their blocks themselves, into ``FILE.parts`` in a folder that all of them share.
-        keep_parts: Leave the blocks in their folder at the end; the file stays virtual. For results too large to copy.
+        keep_parts: Leave the blocks in their folder at the end: for results too large to copy.
         watch: Called with a `StudyProgress` at the beginning, after every block, and when an interrupt has come.
 
     Returns:
@@ -100,17 +101,17 @@ def run_study(
         >>> print(outcome.total, outcome.finished)
         80 True
     """
-    refuse_planted(as_path(path))
-    path = Path(os.path.realpath(as_path(path)))
+    output = OutputFile(path)
+    path = output.target
     for what, number in (("workers", workers), ("chunk", chunk)):
         if number is not None and (not isinstance(number, int) or number < 1):
             raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")
     if executor is not None:
         _check_executor(executor)
-    with _locked(path):
+    with _locked(output):
         check_ours(path)
         store.tidy(path)
-        layout, chunk, finished = _opened(study, path, chunk, executor)
+        layout, finished = _opened(study, path, chunk, executor)
         total = layout.cells * layout.trials
         if finished and not parts_of(path).is_dir():
             return Outcome(path, total, total, 0)
@@ -127,21 +128,21 @@ def run_study(
         tell(progress)
         with _stop_on_interrupt() as stopped:
             with _executor(executor, workers) as (pool, count, resources):
-                task = partial(_run_and_pack, study, layout, path if shards else None)
+                task = partial(_run, study, layout, path if shards else None)
                 submit = lambda block: pool.submit(task, block, next(resources))  # noqa: E731
                 waits_known = isinstance(pool, ThreadPoolExecutor | ProcessPoolExecutor)
                 results = _completed(submit, (first, others), _QUEUED * count, stopped, waits_known)
-                for block, packed in results:
+                for block, kept_here in results:
                     if block is None:
                         tell(progress := progress._replace(stopping=True))
                         continue
-                    if packed is not None:
-                        store.write_part(path, block, packed, layout)
+                    if kept_here is not None:
+                        store.write_part(path, block, kept_here, layout)
                     done, compiling = progress.done + block.size, max(progress.compiling - 1, 0)
                     tell(progress := progress._replace(done=done, compiling=compiling))
             done = progress.done
             if done == total:  # interrupts are still caught: one within HDF5 could damage the file
-                store.finish(path, study, layout, chunk, keep_parts)
+                store.finish(path, study, layout, keep_parts)
         return Outcome(path, done, total, done - before)
 
 
@@ -157,15 +158,15 @@ def _check_executor(executor: Any) -> None:
         )
 
 
-def _run_and_pack(
+def _run(
     study: Study, layout: Layout, shared: Path | None, block: Block, resources: "_Resources"
-) -> store.Packed | None:
-    """The task of a worker: one block, computed with what the study was begun with."""
+) -> dict[str, np.ndarray] | None:
+    """The task of a worker: one block, computed with what the study was begun with; written in a shared folder."""
     check_same(layout.computed_with, f"on the worker {platform.node()}: the study", "leave that worker out")
-    packed = store.pack(run_block(study, block, device=resources.device, workers=resources.threads), layout)
+    results = run_block(study, block, device=resources.device, workers=resources.threads)
     if shared is None:
-        return packed
-    store.write_part(shared, block, packed, layout)
+        return results
+    store.write_part(shared, block, results, layout)
     return None
 
 
@@ -180,12 +181,12 @@ class _Resources(NamedTuple):
 def _executor(executor: Executor | None, workers: int | None) -> Iterator[tuple[Executor, int, Iterator[_Resources]]]:
     """The executor, its number of workers, and the resources of one block after another."""
     if executor is not None:
-        count = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
+        count = workers or getattr(executor, "_max_workers", None) or len(available_cores())
         yield executor, count, itertools.repeat(_Resources())
         return
     devices = jax.local_devices()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = workers or (len(devices) if devices[0].platform != "cpu" else max(cores, len(devices)))
+    cores = len(available_cores()) if devices[0].platform == "cpu" else 0
+    count = workers or max(cores, len(devices))
     threads = ThreadPoolExecutor(count, thread_name_prefix=THREADS)
     try:
         yield threads, count, itertools.cycle(_Resources(device, 1) for device in devices)
@@ -289,22 +290,17 @@ def _interruptible(function: Callable, *args: Any) -> Any:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def _locked(output: OutputFile) -> Iterator[None]:
     """Keep other processes from writing the same study."""
-    if not path.name or os.path.isdir(path):
-        raise InputError(f"{path} cannot be written: it is a folder; choose another output path.")
-    if not os.path.isdir(path.parent):
-        raise InputError(
-            f"{path} cannot be written: no such file or directory; create the folder, or choose another output path."
-        )
-    lock = FileLock(path.with_name(f".{path.name}.lock"))
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise InputError(f"{path} is being written by another process; wait for it, or stop it first.") from error
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{path} cannot be written: {reason}; choose another output path.") from error
+    lock = FileLock(output.target.with_name(f".{output.target.name}.lock"))
+    with output.refusing():
+        output.check()
+        try:
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            raise InputError(
+                f"{output.named} is being written by another process; wait for it, or stop it first."
+            ) from error
     try:
         yield
     finally:
@@ -313,18 +309,16 @@ def _locked(path: Path) -> Iterator[None]:
         lock.release()
 
 
-def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> tuple[Layout, int, bool]:
-    """The layout of an existing or a new file, its chunk, and whether it is finished."""
-    from importlib import metadata
-
+def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> tuple[Layout, bool]:
+    """The layout of an existing or a new file, and whether it is finished."""
     if not path.exists():
         _interruptible(check_reach, study)
         chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
         # With what a worker computes: it may be another machine, with other devices.
         settings = computed_with() if executor is None else _result(executor.submit(computed_with), "the first task")
-        layout = Layout.of(study, chunk, (metadata.version("aacmm_jax"), settings))
-        store.create(path, study, layout, chunk)
-        return layout, chunk, False
+        layout = Layout.of(study, chunk, settings)
+        store.create(path, study, layout)
+        return layout, False
     stored = store.read(path)
     if stored.study != study:
         raise InputError(
@@ -333,21 +327,13 @@ def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | No
     store.check_parts(path, stored._replace(finished=False))
     if stored.finished and stored.parts is None:
         store.clean(path)  # left by a killed process
-        return stored.layout, stored.chunk, True
-    if chunk is not None and chunk != stored.chunk:
-        raise InputError(f"{path} was begun with chunks of {stored.chunk} trials; leave the chunk out to continue.")
-    if stored.package_version != metadata.version("aacmm_jax"):
-        raise InputError(
-            f"{path} was begun with aacmm_jax {stored.package_version}; continue with that version, or choose another "
-            "output path."
-        )
-    if not stored.computed_with:
-        raise InputError(
-            f"{path} does not say with which settings it was begun, as files of today do; choose another output path."
-        )
+        return stored.layout, True
+    begun = stored.layout
+    if chunk not in (None, begun.chunk):
+        raise InputError(f"{path} was begun with chunks of {begun.chunk} trials; leave the chunk out to continue.")
     if executor is None:
-        check_same(stored.computed_with, str(path), "choose another output path")
-    return stored.layout, stored.chunk, stored.finished
+        check_same(begun.computed_with, str(path), "choose another output path")
+    return begun, stored.finished
 
 
 def _difference(one: Study, other: Study) -> str:

@@ -1,6 +1,6 @@
-"""What a cell of a study is: fixtures and setting, which determine its compiled program, and the values of that."""
+"""What a cell of a study is: fixtures and setting, which determine its compiled program, its values, and its trials."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -55,3 +55,21 @@ class CellValues(NamedTuple):
     linear_encoder: Float[np.ndarray, " c"]  # of prismatic joints
     linear_resolution: Float[np.ndarray, " c"]
     u: Float[np.ndarray, " c"]  # of reference lengths; NaN: as recorded
+
+
+class DrawnTrials(NamedTuple):
+    """Trials, as `identify_many` takes them; mm and rad. q is NaN where the true arm did not reach its points.
+
+    Example:
+        >>> drawn, captures = aj.study.draw_trials(study, 0, [0, 1, 2])
+        >>> print(drawn.q.shape, drawn.true.shape)
+        (3, 30, 6) (3, 21)
+    """
+
+    q: Float[Any, "t N n"]
+    true: Float[Any, "t p"]
+    lower: Float[Any, "t p"]
+    upper: Float[Any, "t p"]
+    start: Float[Any, "t p"]
+    value: Float[Any, "t l"]  # certified values of the reference lengths
+    u: Float[Any, "t l"]

@@ -6,16 +6,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError, naming, nearest
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.simulation import simulate
 from ..files.arms import arm_beside, load_specification
-from ..files.atomic_write import storable
 from ..files.captures import load_capture
 from ..files.kits import read_kit
-from ..files.outputs import as_path
+from ..files.outputs import as_path, storable
 from ..files.toml import read_toml
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import ArmSpecification
@@ -70,18 +69,11 @@ def make_study(
         raise InputError(
             f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets, file or kit), or a Capture."
         )
-    recording, observed = None, capture if isinstance(capture, Capture) else None
-    if isinstance(capture, Mapping) and capture.get("file") is not None:
-        recording = load_capture(capture["file"])
-        observed = recording.capture
-    if isinstance(arm, Arm):
-        nominal = ArmSpecification(arm)
-    else:
-        nominal = arm if isinstance(arm, ArmSpecification) else load_specification(arm, capture=observed)
     if isinstance(capture, Capture):
+        nominal = _nominal(arm, capture)
         recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
-    elif capture.get("kit") is not None:
-        recording = _simulated(capture["kit"], nominal, seed)
+    else:
+        nominal, recording = _contents(arm, capture.get("file"), capture.get("kit"), seed)
     specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
     return Study(specification, nominal, recording)
 
@@ -135,24 +127,31 @@ def _shipped() -> Any:
 
 def _study_of_file(path: Path) -> Study:
     specification = read_toml(path, Specification)
-    if not specification.arm and specification.capture.file is None:
+    capture = specification.capture
+    if not specification.arm and capture.file is None:
         raise InputError(f"{path}: 'arm' is missing; add it.")
-    try:
-        recording = None
-        if specification.capture.file is not None:
-            recording = load_capture(path.parent / specification.capture.file)
-        if recording is not None and not specification.arm:
-            return Study(specification, recording.nominal, recording)
-        observed = None if recording is None else recording.capture
-        nominal = load_specification(arm_beside(path.parent, specification.arm), capture=observed)
-        if specification.capture.kit is not None:
-            recording = _simulated(path.parent / specification.capture.kit, nominal, specification.seed)
-        return Study(specification, nominal, recording)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    with naming(path):
+        arm = arm_beside(path.parent, specification.arm) if specification.arm else None
+        file, kit = (None if name is None else path.parent / name for name in (capture.file, capture.kit))
+        return Study(specification, *_contents(arm, file, kit, specification.seed))
 
 
-def _simulated(kit: str | os.PathLike, nominal: ArmSpecification, seed: int) -> Recording:
-    """A capture of the nominal arm with a kit, without noise, which the trials draw."""
-    things = [item.simulated for item in read_kit(kit)]
-    return Recording(simulate(nominal.arm, {}, observations=things, noise=Noise(), seed=seed), nominal)
+def _nominal(arm: Any, capture: Capture | None) -> ArmSpecification:
+    if isinstance(arm, Arm):
+        return ArmSpecification(arm)
+    return arm if isinstance(arm, ArmSpecification) else load_specification(arm, capture=capture)
+
+
+def _contents(arm: Any, file: Any, kit: Any, seed: int) -> tuple[ArmSpecification, Recording | None]:
+    """The nominal arm, by default that of the capture's file; and the capture in the file, or with the kit.
+
+    A kit is simulated with the nominal arm and without noise, which the trials draw.
+    """
+    recording = None if file is None else load_capture(file)
+    if recording is not None and arm is None:
+        return recording.nominal, recording
+    nominal = _nominal(arm, None if recording is None else recording.capture)
+    if recording is None and kit is not None:
+        things = [item.simulated for item in read_kit(kit)]
+        recording = Recording(simulate(nominal.arm, {}, observations=things, noise=Noise(), seed=seed), nominal)
+    return nominal, recording

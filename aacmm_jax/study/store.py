@@ -1,16 +1,14 @@
-"""The file of a study: one HDF5 file that is complete at every moment, whenever a process is killed.
+"""The file of a study, and its blocks until it is complete, whenever a process is killed.
 
-While a study runs, its file contains everything but the results, which are virtual: each finished block is a small file
-in ``FILE.parts``, written under a temporary name and renamed, and the study's file shows all of them as one array
-(trials not yet run as fill values). So nothing is ever appended to, a block is there entirely or not at all, and
-workers on a shared folder may write their blocks themselves. At the end the blocks are copied, still compressed, into
-one plain file.
+The file holds what was asked from the beginning, and all results at the end. Until then each finished block is a file
+of NumPy's arrays in ``FILE.parts``, written under a temporary name and renamed: it is there entirely or not at all, and
+workers on a shared folder may write their blocks themselves. Their zip archives carry a checksum of every array.
 """
 
 import contextlib
 import glob
+import io
 import shutil
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,151 +18,101 @@ import numpy as np
 
 from ..core._compat import named_members
 from ..core.errors import InputError
-from ..data.recording import Recording
-from ..files.atomic_write import ELSEWHERE, write_atomically
-from ..files.captures import arm_table, recording_of, recording_tables, specification_of
-from ..files.hdf5 import (
-    BLOCK,
-    FORMAT,
-    FORMAT_VERSION,
-    SEALED_SINCE,
-    Table,
-    Variable,
-    check_sense,
-    columns,
-    file_image,
-    need,
-    numbering,
-    opened,
-    read_tables,
-    undamaged,
-    write_tables,
-)
+from ..files.captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
+from ..files.hdf5 import Table, Variable, check_sense, columns, opened, read_tables, undamaged, write_tables
+from ..files.inputs import InputFile
+from ..files.outputs import ELSEWHERE, write_atomically
 from ..kinematics.arm import parameter_unit
-from .blocks import NOT_RUN, VARIABLES, Block, Layout, fill_of, part_of, parts_of
+from .blocks import DIMENSIONS, VARIABLES, Block, Layout, fill_of, part_of, parts_of
 from .definition import Study
-from .parts_folder import check_block as check_owner
-from .parts_folder import check_ours, check_readable
+from .parts_folder import check_block, check_ours, check_readable
 from .specification import Specification, unit
 
 _ADVICE = "free some space there, then run the same command again: what is finished is kept"
-Packed = dict[str, bytes]
 _TRIALS_IN_MEMORY = 50_000
 
 
-def pack(results: Mapping[str, np.ndarray], layout: Layout) -> Packed:
-    """Results as HDF5 stores them: bytes of equal significance together, then deflated.
-
-    Run lengths only: the noise in the lower bytes cannot be compressed, and searching for matches takes twice the time.
-    """
-    packed = {}
-    for name, values in results.items():
-        whole = np.full(
-            layout.shape(name, layout.block_cells, layout.block_trials), fill_of(name), VARIABLES[name].dtype
-        )
-        whole[: values.shape[0], : values.shape[1]] = values
-        shuffled = np.ascontiguousarray(whole.reshape(-1).view(np.uint8).reshape(-1, whole.itemsize).T)
-        compressor = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, zlib.Z_RLE)
-        packed[name] = compressor.compress(shuffled.tobytes()) + compressor.flush()
-    return packed
-
-
-def write_part(path: Path, block: Block, packed: Packed, layout: Layout) -> None:
+def write_part(path: Path, block: Block, results: Mapping[str, np.ndarray], layout: Layout) -> None:
     """Write a finished block: its file appears complete, or not at all."""
-    target = part_of(path, block, layout)
-
-    def fill(file: Any) -> None:
-        file.attrs.update(format=FORMAT, kind=BLOCK, format_version=FORMAT_VERSION, block=target.name)
-        for name, content in packed.items():
-            dataset = _dataset(file, name, layout, layout.shape(name, *block.shape))
-            dataset.id.write_direct_chunk((0,) * dataset.ndim, content)
-
+    target, content = part_of(path, block, layout), io.BytesIO()
+    arrays: dict[str, Any] = {name: np.asarray(results[name]) for name in VARIABLES}
+    np.savez(content, block=np.array(target.name), **arrays)
     with write_atomically(target, _ADVICE, leftovers=False) as temporary:
         temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: nobody else may change a block
-        temporary.write_bytes(file_image(fill))
+        temporary.write_bytes(content.getbuffer())
 
 
-@contextlib.contextmanager
-def _block(path: Path, block: Block, layout: Layout, bare: bool = False) -> Iterator[Mapping[str, Any]]:
-    """The arrays of a block, after its SHA-256 was verified; ``bare``: it may be of format version 1, without one."""
+def read_part(path: Path, block: Block, layout: Layout) -> dict[str, np.ndarray]:
+    """The arrays of a block. Raises `InputError` where its file is somebody else's, damaged or another block's."""
     file = part_of(path, block, layout)
-    check_owner(file)
-    with opened(file, (BLOCK,), bare=bare) as content:
-        check_sense(file, {"it is another block": content.attributes.get("block", file.name) != file.name})
-        yield {name: content.dataset(content.file.id, name) for name in VARIABLES}
+    check_block(file)
+    with undamaged(file), np.load(io.BytesIO(InputFile(file).content), allow_pickle=False) as archive:
+        results = {name: archive[name] for name in VARIABLES}
+        shapes = any(values.shape != layout.shape(name, *block.shape) for name, values in results.items())
+        check_sense(file, {"it is another block": str(archive["block"]) != file.name or shapes})
+        return results
 
 
-def _dataset(group: Any, name: str, layout: Layout, shape: tuple[int, ...]) -> Any:
-    """An array of results, compressed, each block a chunk; resizable, as a chunk may not exceed a fixed size."""
-    chunks = layout.shape(name, layout.block_cells, layout.block_trials)
-    return group.create_dataset(
-        name, shape, VARIABLES[name].dtype, chunks=chunks, maxshape=(None,) * len(shape), shuffle=True,
-        compression="gzip", fillvalue=fill_of(name),
-    )  # fmt: skip
+def is_readable(path: Path, block: Block, layout: Layout) -> bool:
+    """Whether a block's file is as it was written."""
+    try:
+        return bool(read_part(path, block, layout))
+    except InputError:
+        return False
 
 
-def create(path: Path, study: Study, layout: Layout, chunk: int) -> None:
+def finished_blocks(path: Path, layout: Layout) -> list[Block]:
+    """Blocks whose files exist. Raises `InputError` where one is a link, or somebody else's."""
+    folder = parts_of(path)
+    names = {item.name for item in folder.glob("*.npz")} if folder.is_dir() else set()
+    finished = [block for block in layout.blocks() if part_of(path, block, layout).name in names]
+    for block in finished:
+        check_block(part_of(path, block, layout))
+    return finished
+
+
+def create(path: Path, study: Study, layout: Layout) -> None:
     """Make the file of a new study, and the folder of its blocks."""
     folder = parts_of(path)
     try:
         folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
-        with _removed_if_empty(folder):
-            check_ours(path)
-        for item in folder.glob("*.h5"):  # blocks of a study whose file was removed
+        check_ours(path)
+        for item in folder.glob("*.npz"):  # blocks of a study whose file was removed
             if not item.name.startswith(f"{layout.mark}-"):
                 item.unlink()
+        _write(path, study, layout, finished=False, advice=ELSEWHERE)
     except OSError as error:
         raise InputError(
             f"{folder} cannot be created: {(error.strerror or str(error)).lower()}; choose another output path."
         ) from error
-
-    with _removed_if_empty(folder):
-        _write(path, study, chunk, partial(_add_virtual, path, layout), layout, finished=False, advice=ELSEWHERE)
-
-
-@contextlib.contextmanager
-def _removed_if_empty(folder: Path) -> Iterator[None]:
-    """Whatever goes wrong, an empty folder is not left behind."""
-    try:
-        yield
     except BaseException:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # one with blocks is left as it is
             folder.rmdir()
         raise
 
 
-def _add_virtual(path: Path, layout: Layout, group: Any, name: str) -> Any:
-    """An array of results that HDF5 assembles from the blocks whenever it is read."""
-    import h5py
+def finish(path: Path, study: Study, layout: Layout, keep_parts: bool = False) -> None:
+    """Copy all blocks into the study's file and remove their folder; with ``keep_parts``, leave them as they are."""
+    _write(path, study, layout, None if keep_parts else partial(_add_results, path, layout), finished=True)
+    if not keep_parts:
+        clean(path)
 
-    virtual = h5py.VirtualLayout(layout.shape(name), VARIABLES[name].dtype)
+
+def _add_results(path: Path, layout: Layout, file: Any) -> None:
+    """Copy the results of all blocks into the open file of a study."""
+    from ..solver.reason import Reason, numbers_of
+
+    group = file["trials"]
+    for name, kind in VARIABLES.items():
+        dataset = group.create_dataset(name, layout.shape(name), kind.dtype)
+        dataset.attrs["units"], dataset.attrs["long_name"] = kind.units, kind.long_name
+        for axis, dimension in enumerate(DIMENSIONS[: dataset.ndim]):
+            dataset.dims[axis].attach_scale(group[dimension])
+    numbered = (f"{int(numbers_of(reason))}: {name}" for name, reason in named_members(Reason))
+    group["reason"].attrs["reasons"] = ", ".join(numbered)
     for block in layout.blocks():
-        # HDF5 reads % as the beginning of a pattern.
-        source = f"{parts_of(path).name}/{part_of(path, block, layout).name}".replace("%", "%%")
-        virtual[block.slices] = h5py.VirtualSource(source, name, layout.shape(name, *block.shape))
-    return group.create_virtual_dataset(name, virtual, fillvalue=fill_of(name))
-
-
-def finish(path: Path, study: Study, layout: Layout, chunk: int, keep_parts: bool = False) -> None:
-    """Copy all blocks into one plain file and remove their folder; with ``keep_parts``, leave them as they are."""
-    if keep_parts:
-        _write(path, study, chunk, partial(_add_virtual, path, layout), layout, finished=True)
-        return
-
-    def add_results(group: Any, name: str) -> Any:
-        return _dataset(group, name, layout, layout.shape(name))
-
-    def fill(group: Any) -> None:
-        for block in layout.blocks():
-            with _block(path, block, layout) as part:
-                for name, source in part.items():
-                    target = group[name]
-                    mask, content = source.id.read_direct_chunk((0,) * source.ndim)
-                    target.id.write_direct_chunk((block.first_cell, block.first_trial, 0)[: source.ndim], content, mask)
-
-    with undamaged(parts_of(path)):
-        _write(path, study, chunk, add_results, layout, fill, finished=True)
-    clean(path)
+        for name, values in read_part(path, block, layout).items():
+            group[name][block.slices] = values
 
 
 def clean(path: Path) -> None:
@@ -174,126 +122,85 @@ def clean(path: Path) -> None:
 
 def tidy(path: Path) -> None:
     """Remove the temporary files of killed processes."""
-    for folder, name in ((path.parent, path.name), (parts_of(path), "*")):
-        for left in folder.glob(f".{glob.escape(name) if name != '*' else name}.????????.part"):
+    for folder, name in ((path.parent, glob.escape(path.name)), (parts_of(path), "*")):
+        for left in folder.glob(f".{name}.????????.part"):
             left.unlink(missing_ok=True)
 
 
 def _write(
     path: Path,
     study: Study,
-    chunk: int,
-    add_results: Callable,
     layout: Layout,
-    fill: Callable | None = None,
+    extend: Callable[[Any], None] | None = None,
     *,
     finished: bool,
     advice: str = _ADVICE,
 ) -> None:
-    """Write the study's file: with ``fill`` a plain one, else a virtual one. ``advice``: what to do where it fails."""
+    """Write the study's file; ``extend`` adds the results. ``advice``: what to do where it fails."""
     attributes = {
         "name": study.specification.name,
         "seed": study.specification.seed,
         "digest": study.digest,
-        "chunk": chunk,
+        "chunk": layout.chunk,
         "computed_with": layout.computed_with,
         "finished": int(finished),
-        "parts": parts_of(path).name if fill is None else None,
+        "parts": parts_of(path).name if extend is None else None,
     }
-
-    def extend(file: Any) -> None:
-        from ..solver.reason import Reason, numbers_of
-
-        group = file["trials"]
-        for name, kind in VARIABLES.items():
-            dataset = add_results(group, name)
-            dataset.attrs["units"], dataset.attrs["long_name"] = kind.units, kind.long_name
-            for axis, dimension in enumerate(("cell", "trial", "parameter")[: dataset.ndim]):
-                dataset.dims[axis].attach_scale(group[dimension])
-        if fill is not None:
-            fill(group)
-        numbered = (f"{int(numbers_of(reason))}: {name}" for name, reason in named_members(Reason))
-        group["reason"].attrs["reasons"] = ", ".join(numbered)
-
-    write_tables(path, "study", _tables(study), attributes, extend, advice, streamed=fill is not None)
-
-
-def _tables(study: Study) -> dict[str, Table]:
     names = list(study.space.names)
-    units = [parameter_unit(study.space.base, name) for name in names]
-    nominal = np.asarray(study.space.vector())
-    text = study.specification.model_dump_json(exclude_unset=True)
     parameter = columns("parameter", parameter=(names, "", "free parameter"))
+    units = [parameter_unit(study.space.base, name) for name in names]
+    nominal = (np.asarray(study.space.vector()), "mm or rad", "value in the nominal arm")
+    cell = columns("cell", cell=(np.arange(1, len(study.cells) + 1), "1", "cell of the grid"))
+    trial = columns("trial", trial=(np.arange(1, study.trials + 1), "1", "trial in the cell"))
+    text = study.specification.model_dump_json(exclude_unset=True)
     tables = {
-        "specification": Table(
-            numbering("line", 1, "line") | columns("line", text=([text], "", "specification as JSON"))
-        ),
-        "cells": Table(numbering("cell", len(study.cells), "cell of the grid") | factor_columns(study)),
+        "specification": Table(columns("line", text=([text], "", "specification as JSON"))),
+        "cells": Table(cell | factor_columns(study)),
         "parameters": Table(
-            parameter
-            | columns(
-                "parameter",
-                unit=(units, "", "unit of the parameter"),
-                nominal=(nominal, "mm or rad", "value in the nominal arm"),
-            )
-        ),
-        "trials": Table(
-            numbering("cell", len(study.cells), "cell of the grid, see group cells")
-            | numbering("trial", study.trials, "trial in the cell")
-            | parameter
+            parameter | columns("parameter", unit=(units, "", "unit of the parameter"), nominal=nominal)
         ),
     }
-    if study.recording is not None:
-        return tables | recording_tables(study.recording._replace(nominal=study.nominal))
-    return tables | {"nominal_arm": arm_table(study.nominal)}
+    if extend is not None:
+        tables["trials"] = Table(cell | trial | parameter)
+    if study.recording is None:
+        tables["nominal_arm"] = arm_table(study.nominal)
+    else:
+        tables |= recording_tables(study.recording._replace(nominal=study.nominal))
+        attributes = dict(recording_attributes(study.recording)) | attributes
+    write_tables(path, "study", tables, attributes, extend=extend, advice=advice)
 
 
 def factor_columns(study: Study) -> dict[str, Variable]:
     """One column for each factor: its level in every cell."""
     sizes = [len(levels) for levels in study.factors.values()]
     index = np.indices(sizes).reshape(len(sizes), -1) if sizes else np.zeros((0, 1), dtype=int)
-    found = {}
+    by_name = {}
     for (name, levels), chosen in zip(study.factors.items(), index, strict=True):
-        text = isinstance(levels[0], str)
         values = [levels[i] for i in chosen]
-        found[name.replace(".", "_")] = Variable(("cell",), values, "" if text else unit(name), name)
-    return found
+        by_name[name.replace(".", "_")] = (values, "" if isinstance(levels[0], str) else unit(name), name)
+    return columns("cell", **by_name)
 
 
 class StoredStudy(NamedTuple):
     """What a study's file contains, without the results."""
 
     study: Study
-    chunk: int
+    layout: Layout  # how it is cut into blocks
     finished: bool
     parts: str | None  # folder of the blocks, where the results are in it
-    package_version: str
-    version: int  # of the file's format
-    computed_with: str  # see `computed_with`; empty in files of earlier versions
-
-    @property
-    def layout(self) -> Layout:
-        """How it is cut into blocks."""
-        return Layout.of(self.study, self.chunk, (self.package_version, self.computed_with))
 
 
 def read(path: Path) -> StoredStudy:
     """Read a study without its results. Raises `InputError` for a file that is missing, damaged or no study."""
     stored = read_tables(path, ("study",), without=("trials",))
     with undamaged(path):
-        need(path, stored.tables, "specification", "nominal_arm", "parameters", "cells")
         specification = Specification.model_validate_json(str(stored.tables["specification"]["text"][0]))
-        nominal = specification_of(path, stored, "nominal_arm")
-        recording: Recording | None = recording_of(path, stored) if "capture" in stored.tables else None
-        attributes = stored.attributes
-        study = Study(specification, nominal, recording)
-        if study.digest != attributes["digest"]:
-            raise InputError(
-                f"{path} is damaged or was edited: its specification does not match its results; make it again."
-            )
-        finished, parts = bool(attributes["finished"]), attributes.get("parts")
-        made_by = attributes["package_version"], attributes["format_version"], attributes.get("computed_with", "")
-        return StoredStudy(study, attributes["chunk"], finished, parts, *made_by)
+        nominal, attributes = specification_of(path, stored, "nominal_arm"), stored.attributes
+        study = Study(specification, nominal, recording_of(path, stored) if "capture" in stored.tables else None)
+        different = study.digest != attributes["digest"]
+        check_sense(path, {"its specification does not match its results": different})
+        layout = Layout.of(study, attributes["chunk"], attributes["computed_with"])
+        return StoredStudy(study, layout, bool(attributes["finished"]), attributes.get("parts"))
 
 
 def check_parts(path: Path, stored: StoredStudy) -> None:
@@ -322,57 +229,30 @@ def check_parts(path: Path, stored: StoredStudy) -> None:
 
 def check_results(path: Path, stored: StoredStudy) -> None:
     """Raise `InputError` where the results have other shapes, or a finished study has trials that did not run."""
+    if stored.parts is not None:
+        return
     layout = stored.layout
     with opened(path, ("study",), verify=False) as content:
-        arrays = {name: content.dataset(content.group("trials"), name) for name in VARIABLES}
+        arrays = {name: content.dataset("trials", name) for name in VARIABLES}
         shapes = any(array.shape != layout.shape(name) for name, array in arrays.items())
         check_sense(path, {"its results have other shapes than its study": shapes})
-        unrun = stored.parts is None and not (stored.finished and (arrays["converged"][()] != NOT_RUN).all())
-        check_sense(path, {"it has trials that did not run": unrun})
+        ran = stored.finished and (arrays["converged"][()] != fill_of("converged")).all()
+        check_sense(path, {"it has trials that did not run": not ran})
 
 
 def rows_of(
     path: Path, stored: StoredStudy, names: Sequence[str], cell: int
 ) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
-    """Results of one cell, some trials at a time: which trials, and their arrays. One file is open at a time."""
+    """Results of one cell, some trials at a time: which trials, and their arrays."""
     layout = stored.layout
     if stored.parts is None:
         with opened(path, ("study",), verify=False) as content:
-            trials = {name: content.dataset(content.group("trials"), name) for name in names}
+            trials = {name: content.dataset("trials", name) for name in names}
             for first in range(0, layout.trials, _TRIALS_IN_MEMORY):
                 part = slice(first, min(first + _TRIALS_IN_MEMORY, layout.trials))
                 yield part, {name: trials[name][cell, part] for name in names}
         return
-    for block in _present(path, layout):
+    for block in finished_blocks(path, layout):
         if block.first_cell <= cell < block.last_cell:
-            with _block(path, block, layout, stored.version < SEALED_SINCE) as arrays:
-                found = {name: arrays[name][cell - block.first_cell] for name in names}
-            yield block.slices[1], found
-
-
-def check_block(path: Path, stored: StoredStudy, block: Block, layout: Layout) -> None:
-    """Raise `InputError` where a block's file is damaged."""
-    with _block(path, block, layout, stored.version < SEALED_SINCE):
-        pass
-
-
-def is_readable(path: Path, block: Block, layout: Layout) -> bool:
-    """Whether a block's file is as it was written."""
-    try:
-        with _block(path, block, layout) as arrays:
-            return all(arrays[name].shape == layout.shape(name, *block.shape) for name in VARIABLES)
-    except InputError:
-        return False
-
-
-def finished_blocks(path: Path, layout: Layout) -> list[Block]:
-    """Blocks whose files exist. Raises `InputError` where one is a link, or somebody else's."""
-    finished = _present(path, layout)
-    for block in finished:
-        check_owner(part_of(path, block, layout))
-    return finished
-
-
-def _present(path: Path, layout: Layout) -> list[Block]:
-    names = {item.name for item in parts_of(path).glob("*.h5")} if parts_of(path).is_dir() else set()
-    return [block for block in layout.blocks() if part_of(path, block, layout).name in names]
+            results = read_part(path, block, layout)
+            yield block.slices[1], {name: results[name][cell - block.first_cell] for name in names}

@@ -32,8 +32,7 @@ from ..kinematics.inverse_kinematics import damped_inverse
 from ..kinematics.jacobian import reading_columns
 from .configuration_pool import Pool, forget_pools, pool_of
 from .definition import POOL_PARTS, Study
-from .drawn_trials import DrawnTrials
-from .settings import CellValues, Setting
+from .settings import CellValues, DrawnTrials, Setting
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
 _SIZES = 64, 256  # trials of one call of the compiled program: few sizes, as each takes 10 s to compile

@@ -16,9 +16,8 @@ from ..kinematics.parameters import Parameters
 from ..solver.reason import numbers_of
 from .blocks import Block
 from .definition import Study
-from .drawn_trials import DrawnTrials
 from .observed_trials import draw_observed
-from .settings import Setting
+from .settings import DrawnTrials, Setting
 from .trial_simulation import draw, ends_of
 
 

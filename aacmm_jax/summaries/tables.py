@@ -1,12 +1,23 @@
-"""Titles and rows of tables that command line and report share; imports nothing, for the sake of ``--help``."""
+"""Lines and tables that people read: how they are declared, and words and rows that command line and report share.
+
+It imports nothing that computes, so that ``--help`` and ``show`` are quick.
+
+Example:
+    >>> rows = [{"socket": "A", "rms_mm": 0.01234}, {"socket": "B", "rms_mm": None}]
+    >>> listed("Sockets", rows, {"socket": "socket", "RMS [mm]": "rms_mm"}).rows
+    [['A', 0.01234], ['B', None]]
+    >>> shown(0.01234), shown(None)
+    ('0.0123', '-')
+"""
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from ..core.text import pluralise
 
 _MOST_DECIMALS = 6  # of a quantity that was found
+_MOST = 1e9  # from here on decimals mean nothing
 
 # Repeatability and errors of lengths, by their keys in a summary.
 METRICS = (
@@ -17,6 +28,78 @@ METRICS = (
     ("length_error_mean_absolute_mm", "length error, mean absolute"),
     ("length_error_largest_mm", "length error, largest"),
 )
+
+
+class Styled(NamedTuple):
+    """A text in a style of the terminal, such as "red"."""
+
+    text: str
+    style: str = "bold"
+
+
+Line = str | Styled | Sequence[str | Styled]
+
+
+class Table(NamedTuple):
+    """A table: a cell is a text, a number (of mm, with four decimals), or None for what there is not."""
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    left: Sequence[int] = (0,)  # columns that are set flush left
+    keys: int = 1  # columns that are repeated where a table is too wide for its page
+
+
+def listed(
+    title: str, rows: Iterable[Any], columns: Mapping[str, str | Callable[[Any], Any]], *, left: Sequence[int] = (0,)
+) -> Table:
+    """A table of rows: each column is a key of the row, or a function of the row."""
+    read = [getter if callable(getter) else lambda row, key=getter: row[key] for getter in columns.values()]
+    return Table(title, list(columns), [[cell(row) for cell in read] for row in rows], left)
+
+
+def shown(cell: Any) -> str | Styled:
+    """A cell as it is printed."""
+    if isinstance(cell, str | Styled):
+        return cell
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    return str(cell) if isinstance(cell, int) else formatted(cell)
+
+
+def formatted(value: float | None, decimals: int = 4) -> str:
+    """A number of mm with a fixed number of decimals, or in scientific notation if too small or too large for them."""
+    if value is None:
+        return "-"
+    if abs(value) < 1e-9:  # mm: rounding
+        value = 0.0
+    if not abs(value) < _MOST:
+        return f"{value:.6g}"
+    small = value != 0 and abs(value) < 0.5 * 10**-decimals
+    return f"{value:.1e}" if small else f"{value:.{decimals}f}"
+
+
+def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:") -> list[Line]:
+    """What a user should know before the numbers."""
+    return [[Styled(lead, "yellow"), f" {warning}"] for warning in summary["warnings"]]
+
+
+def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
+    """What a result is good for, in one line."""
+    verdict = summary.get("verdict")
+    style = {"good": "green", "unsure": "yellow", "bad": "red"}
+    return [Styled(verdict["says"], style.get(verdict["mark"], "bold"))] if verdict else []
+
+
+def limits_of(summary: Mapping[str, Any]) -> list[Line]:
+    """Limits that are kept, and limits that are exceeded."""
+    kept = [[Styled("Passed:", "green"), f" {sentence}"] for sentence in summary["kept"]]
+    return [*kept, *([Styled("Failed:", "red"), f" {sentence}"] for sentence in summary["failed"])]
+
+
+def written_of(summary: Mapping[str, Any]) -> list[Line]:
+    """The file that was written, where there is one."""
+    return [f"\nWritten: {summary['written']}"] if "written" in summary else []
 
 
 def observed_words(sockets: int, others: int, lengths: int | None = None) -> str:

@@ -78,12 +78,12 @@ class Place:
         """A study of a user without its last block, in the shared folder; ``poisoned``: with other numbers."""
         path, study = self.shared / "s.h5", aj.study.read_study(self.sample / "study.toml")
         layout = Layout.of(study, BLOCK)
-        store.create(path, study, layout, BLOCK)
+        store.create(path, study, layout)
         with h5py.File(self.sample / "study.h5") as whole:
             for block in list(layout.blocks())[:-1]:
                 results = {name: whole["trials"][name][block.slices] for name in store.VARIABLES}
                 results["estimate"] = results["estimate"] + poisoned
-                store.write_part(path, block, store.pack(results, layout), layout)
+                store.write_part(path, block, results, layout)
         own(path, owner)
         own(parts_of(path), owner)
         return path

@@ -56,7 +56,7 @@ def targets(folder: Path) -> dict[str, Target]:
         shutil.copytree(folder / "parts" / "study.h5.parts", f"{path}.parts", dirs_exist_ok=True)
 
     def finish(study: Any, path: Path) -> None:
-        store.finish(path, study, Layout.of(study, BLOCK), BLOCK)
+        store.finish(path, study, Layout.of(study, BLOCK))
 
     load_arm = partial(aj.load_arm, "cheng2018-simulation")
     return {

@@ -408,7 +408,7 @@ def test_a_conformity_rests_on_results(record, full, evaluation):
 @given(st.floats(-1e4, 1e4), st.floats(1e-9, 1e3))
 def test_values_are_rounded_to_two_digits_of_their_uncertainty(value, u):
     parent = ElementTree.Element("x")
-    xml_elements.add_real(parent, value, MM, u, 2.0)
+    parent.append(xml_elements.real(value, MM, u, 2.0))
     one = ElementTree.fromstring(xml_elements.xml_text(parent).replace("si:", ""))[0]
     digits = (one.findtext(".//valueExpandedMU") or "").replace(".", "").lstrip("0")
     assert len(digits.rstrip("0") or "0") <= 2
@@ -454,7 +454,7 @@ def test_any_number_reads_back(record, value):
     k = f"<si:value>{parse_dcc(text)['As left', 'Scale', 'k'].value!r}</si:value>"
     assert text.count(k) == 1
     parent = ElementTree.Element("x")
-    xml_elements.add_real(parent, value, MM)
+    parent.append(xml_elements.real(value, MM))
     again = ElementTree.fromstring(xml_elements.xml_text(parent).replace("si:", ""))[0]
     read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["As left", "Scale", "k"].value
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
@@ -666,7 +666,7 @@ def test_any_text_survives_or_is_refused(text):
         from aacmm_jax.files.administrative_data import held_by_xml
 
         parent = ElementTree.Element("x")
-        xml_elements.add_text(parent, "name", held_by_xml(text, "a name"))
+        parent.append(xml_elements.text("name", held_by_xml(text, "a name")))
         return ElementTree.fromstring(xml_elements.xml_text(parent).replace("dcc:", "").encode()).findtext(
             "name/content"
         )

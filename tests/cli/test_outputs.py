@@ -12,8 +12,9 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data.recording import Recording
-from aacmm_jax.files import atomic_write
+from aacmm_jax.files import outputs
 from aacmm_jax.files.arms import specification_toml
+from aacmm_jax.files.hdf5_content import seal
 from aacmm_jax.files.outputs import asking
 from tests.conftest import EXAMPLES
 from tests.refusals import assert_refused
@@ -115,7 +116,7 @@ FOREIGN = b"a,b\n1,2\n"
 
 def replaced(path, old: bytes, new: bytes) -> bool:
     path.write_bytes(old)
-    with asking(), contextlib.suppress(aj.InputError), atomic_write.write_atomically(path) as temporary:
+    with asking(), contextlib.suppress(aj.InputError), outputs.write_atomically(path) as temporary:
         temporary.write_bytes(new)
     return path.read_bytes() == new
 
@@ -138,7 +139,7 @@ def test_what_a_command_replaces(tmp_path, new, own, foreign):
     assert replaced(path, new, new)
     assert not replaced(path, foreign, new)
     assert [item.name for item in tmp_path.iterdir()] == ["output"]
-    with atomic_write.write_atomically(path) as temporary:  # from Python
+    with outputs.write_atomically(path) as temporary:  # from Python
         temporary.write_bytes(new)
 
 
@@ -149,7 +150,9 @@ def test_a_capture_of_somebody_else_is_not_replaced(aacmm, inputs):
     aacmm(*SIMULATE, "-o", "x.h5", "--overwrite")
     aacmm(*SIMULATE, "-o", "x.h5")
     with h5py.File(inputs / "x.h5", "a") as file:  # a file of aacmm, but of another kind
-        file.attrs.update(kind="calibration", format_version=1)
+        file.attrs["kind"] = "calibration"
+    with open(inputs / "x.h5", "rb+") as stream:
+        seal(stream)
     assert "x.h5 exists and is no earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
 
 
@@ -230,7 +233,7 @@ def test_permissions_are_kept(tmp_path, mode, named):
     (tmp_path / "file").touch()
     (tmp_path / "file").chmod(mode)
     (tmp_path / "link").symlink_to("file")
-    atomic_write.write_text(tmp_path / named, "after")
+    outputs.write_text(tmp_path / named, "after")
     assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == mode
     assert (tmp_path / "file").read_text() == "after"
     assert (tmp_path / "link").is_symlink()
@@ -238,21 +241,21 @@ def test_permissions_are_kept(tmp_path, mode, named):
 
 def test_a_read_only_file_is_refused(tmp_path):
     (tmp_path / "file").touch(0o444)
-    assert_refused(lambda: atomic_write.write_text(tmp_path / "file", ""), "it is read-only", "another output path")
+    assert_refused(lambda: outputs.write_text(tmp_path / "file", ""), "it is read-only", "another output path")
 
 
 def test_leftovers_of_killed_processes_are_removed(tmp_path):
     """Those of the same output only, and not that of a process that is still writing."""
     program = (
-        "import os, signal, sys; from aacmm_jax.files.atomic_write import write_atomically\n"
+        "import os, signal, sys; from aacmm_jax.files.outputs import write_atomically\n"
         "with write_atomically(sys.argv[1]): os.kill(os.getpid(), signal.SIGKILL)"
     )
     for name in ("a.txt", "b.txt"):
         subprocess.run([sys.executable, "-c", program, tmp_path / name], check=False)
     assert len(list(tmp_path.glob(".*.part"))) == 2
-    with atomic_write.write_atomically(tmp_path / "a.txt") as being_written:
+    with outputs.write_atomically(tmp_path / "a.txt") as being_written:
         being_written.write_text("first")
-        atomic_write.write_text(tmp_path / "a.txt", "second")
+        outputs.write_text(tmp_path / "a.txt", "second")
         assert being_written.exists()
     assert (tmp_path / "a.txt").read_text() == "first"
     assert [path.name[:7] for path in tmp_path.glob(".*.part")] == [".b.txt."]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.cli.plan_commands import _arm_for
+from aacmm_jax.cli.plan_commands import arm_for
 
 PLAN = (
     *("plan", "panda", "-o", "plan.csv", "--poses", 16, "--candidates", 120),
@@ -67,11 +67,11 @@ def test_a_robot_by_default(aacmm):
         (("--cone-deg", "wide"), "--cone-deg 'wide' is not of the form DEG or NAME=DEG"),
         (("--cone-deg", "50", "--cone-deg", "40"), "--cone-deg is given twice for all sockets"),
         (("--cone-deg", "Q=40"), "unknown socket 'Q'"),
-        (("--cone-deg", "200"), "half angle of 200 deg"),
+        (("--cone-deg", "200"), "half_angle[0] is 200 deg"),
         (("--normal", "A=1,2"), "--normal 'A=1,2' is not of the form X,Y,Z or NAME=X,Y,Z"),
-        (("--normal", "0,0,0"), "no direction"),
+        (("--normal", "0,0,0"), "has the length 0"),
         (("--tool-axis", "w"), "--tool-axis 'w' is not of the form"),
-        (("--link-radius-mm", "0"), "radius of the arm's links must be above 0"),
+        (("--link-radius-mm", "0"), "radius is 0 mm; it must be positive"),
         (("--cell", "none.toml"), "none.toml"),
         (("--acceptance", "iso", "--cone-deg", "50"), "and --cone-deg; leave out"),
         (("--cone-deg", "A=20", "--normal", "A=0,0,-1"), "socket 'A' at (450, 100, 200) mm cannot be reached"),
@@ -105,11 +105,11 @@ def test_a_manifest_names_the_arm_relative_to_itself_where_it_can(tmp_path, monk
     arm = tmp_path / "arms" / "arm.toml"
     arm.parent.mkdir()
     arm.write_text("")
-    assert _arm_for(tmp_path / "manifests" / "plan.toml", str(arm)) == "../arms/arm.toml"
-    assert _arm_for(tmp_path / "plan.toml", "panda") == "panda"
+    assert arm_for(tmp_path / "manifests" / "plan.toml", str(arm)) == "../arms/arm.toml"
+    assert arm_for(tmp_path / "plan.toml", "panda") == "panda"
 
     def other_drive(*_):
         raise ValueError("path is on mount 'D:', start on mount 'C:'")
 
     monkeypatch.setattr(os.path, "relpath", other_drive)  # as Windows does
-    assert _arm_for(tmp_path / "plan.toml", str(arm)) == arm.as_posix()
+    assert arm_for(tmp_path / "plan.toml", str(arm)) == arm.as_posix()

@@ -12,11 +12,11 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import aacmm_jax as aj
-from aacmm_jax.cli import _FAMILIES, acceptance_display, calibration_display
+from aacmm_jax.cli import _FAMILIES, calibration_views, evaluation_views
 from aacmm_jax.cli.app import app, examples, length_option
-from aacmm_jax.cli.display import formatted, new_console, new_table, print_table
+from aacmm_jax.cli.display import display, new_console, print_table
 from aacmm_jax.summaries.calibration import calibration_summary
-from aacmm_jax.summaries.tables import observed_words
+from aacmm_jax.summaries.tables import Table, formatted, observed_words
 from tests.example_counts import example_count
 from tests.refusals import assert_refused
 
@@ -71,10 +71,8 @@ def test_nothing_in_a_table_is_cut(columns, keys, data):
     count = data.draw(st.integers(keys + 1, 8))
     rows = data.draw(st.lists(st.lists(texts, min_size=count, max_size=count), min_size=1, max_size=4))
     stream = io.StringIO()
-    table = new_table("", *rows[0])
-    for row in rows[1:]:
-        table.add_row(*row)
-    print_table(Console(file=stream, width=columns, highlight=False), table, keys)
+    table = Table("", rows[0], rows[1:], keys=keys)
+    print_table(Console(file=stream, width=columns, highlight=False), table)
     lines = stream.getvalue().splitlines()
     printed = [word for line in lines for word in line.split()]
     assert all(word in printed for row in rows for cell in row for word in cell.split())
@@ -103,7 +101,7 @@ def test_acceptance_at_80_columns(monkeypatch, capsys):
         | {"figures": [{"name": name} | numbers | parts for name in NAMES]}
     ]
     summary = {"points": 9, "sockets": 2, "lengths": 1, "spheres": 0, "warnings": [], "u_test_mm": 0.0}
-    acceptance_display.points(summary | {"acceptance": tests})
+    display(evaluation_views.points(summary | {"acceptance": tests}))
     shown = capsys.readouterr().out
     assert max(map(len, shown.splitlines())) <= 80
     words = shown.split()
@@ -120,7 +118,7 @@ def test_a_decision_rule_is_named_only_where_there_is_a_limit(monkeypatch, capsy
     metric |= {"decision": decision, "failing": 0, "parts": [], "where": ""}
     test = {"standard": "ISO 10360-12:2016", "title": "articulated arms", "missing": [], "figures": [metric]}
     summary = {"points": 9, "sockets": 2, "lengths": 1, "spheres": 0, "warnings": [], "u_test_mm": 0.0}
-    acceptance_display.points(summary | {"acceptance": [test]})
+    display(evaluation_views.points(summary | {"acceptance": [test]}))
     assert ("ISO 14253-1" in capsys.readouterr().out) == said
 
 
@@ -149,11 +147,8 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     ],
 )
 def test_verdict(capsys, converged, plausible, said, unsaid):
-    calibration_display.print_solve(
-        new_console(),
-        {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"], "observations": []}
-        | {"converged": converged, "residual_plausible": plausible},
-    )
+    summary = {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"], "observations": []}
+    display([calibration_views.solve(summary | {"converged": converged, "residual_plausible": plausible})])
     shown = " ".join(capsys.readouterr().out.split())
     assert said in shown
     assert unsaid not in shown
@@ -177,8 +172,7 @@ def test_what_was_observed_in_words(counts, words):
 def test_base_has_its_units_and_the_digits_of_its_uncertainty(capsys):
     row = {"in": "tracker", "position_mm": [507.922315, 1.0, 2.0], "position_u_mm": [0.08, 0.0031, None]}
     row |= {"rotation_rad": [0.1, 0.0, 0.0], "rotation_u_rad": [1e-3, 1e-3, 1e-3]}
-    summary = {"base": [row], "uncertainty": {"coverage_factor_geometry_95": 2.0}}
-    calibration_display._base(new_console(), summary)
+    display([calibration_views.base([row], 2.0)])
     shown = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["tracker", "position", "[mm]", "507.92", "1.0000", "2.0000"] in shown
     assert ["U", "0.16", "0.0062", "-"] in shown

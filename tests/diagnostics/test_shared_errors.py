@@ -17,7 +17,7 @@ from aacmm_jax.diagnostics.random_effects import Effects, one_variance
 from aacmm_jax.diagnostics.residual_tests import LEVEL, Residuals
 from aacmm_jax.diagnostics.shared_errors import _USUAL, missing_functions, with_shared_errors
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
-from aacmm_jax.kinematics.prior_scales import default_prior
+from aacmm_jax.kinematics.priors import default_prior
 from aacmm_jax.summaries.calibration import shared_rows
 from aacmm_jax.summaries.uncertainty_sentences import shared_sentence
 from aacmm_jax.uncertainty.degrees_of_freedom import Law, coverage_factor

@@ -9,8 +9,8 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.diagnostics.fixed_parameters import fixed_parameters
 from aacmm_jax.diagnostics.reading_fit import Explanation
-from aacmm_jax.files.angles import angles_toml
 from aacmm_jax.files.manifest import read_manifest
+from aacmm_jax.files.reading_checks import angles_toml
 
 Q = np.random.default_rng(0).uniform(-1.4, 1.4, (8, 6))  # rad, of the arm
 ORDER, SIGNS, ZEROS = (0, 1, 2, 4, 3, 5), (1, 1, -1, 1, 1, 1), (0.0, -math.pi / 2, 0.0, 0.5 * math.pi, 0.0, 0.0)

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.files import load_cell
-from aacmm_jax.files.urdf_shapes import bounding_capsule, mesh_path
+from aacmm_jax.files.cells import bounding_capsule, mesh_path
 from aacmm_jax.kinematics import Box, HalfSpace, Post, clearances
 from aacmm_jax.kinematics.body import capsule_ends, frames_at
 from tests.example_counts import example_count
@@ -161,10 +161,16 @@ def test_meshes_that_are_not_at_hand(tmp_path):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (("size = [400, 200, 600]", "size = [400, 0, 600]"), "cell.toml: box 'cabinet' has an edge of 0 mm"),
+        (
+            ("size = [400, 200, 600]", "size = [400, 0, 600]"),
+            "cell.toml: size.1. of obstacle 'cabinet' is 0 mm; it must be positive",
+        ),
         (("radius = 30.0", "radius = -30.0"), "cell.toml.*radius"),
         (("[[capsule]]", "[[sphere]]"), "cell.toml.*sphere"),
-        (("radius = 50.0", "radius = [1.0, 2.0]"), "cell.toml: radius has 2 values, but the arm has 7 joints"),
+        (
+            ("radius = 50.0", "radius = [1.0, 2.0]"),
+            "cell.toml: radius has shape .2,.; give one number, or .joints,. with 7 joints",
+        ),
         (("normal = [0, 0, 1]", "normal = [0, 0]"), "cell.toml.*normal"),
     ],
 )

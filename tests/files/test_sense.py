@@ -24,14 +24,16 @@ def files(tmp_path_factory, paper_arm, noisy_capture):
 @pytest.mark.parametrize(
     ("kind", "name", "value", "said"),
     [
-        ("calibration", "scale_k", 2.0, "the scale k is not that of its lengths"),
-        ("calibration", "scale_u", -1.0, "the uncertainty of k is negative"),
-        ("calibration", "scale_u", 1e-9, "its summary is not that of its values"),
-        ("calibration", "method", "guess", "the method is unknown"),
-        ("calibration", "steps", -1, "its number of steps is negative"),
+        ("calibration", "k", 2.0, "the scale k is not that of its lengths"),
+        ("calibration", "u_k", -1.0, "u_k (standard uncertainty of k) is below 0"),
+        ("calibration", "u_k", 1e-9, "its summary is not that of its values"),
+        ("calibration", "method", "guess", "method (method) is none of two-stage, joint, repeatability"),
+        ("calibration", "steps", -1, "steps (number of evaluations) is below 0"),
+        ("calibration", "steps", 1.5, "steps (number of evaluations) is of another type"),
+        ("calibration", "degrees_of_freedom", -1.0, "is below 0"),
         ("calibration", "measured", "soon", "the day of measurement is no date"),
         ("capture", "measured", "soon", "the day of measurement is no date"),
-        ("capture", "seed", 1.5, "its seed is no whole number"),
+        ("capture", "seed", 1.5, "seed (seed of a simulated capture) is of another type"),
     ],
 )
 def test_show_refuses_what_makes_no_sense(aacmm, files, tmp_path, kind, name, value, said):
@@ -39,7 +41,7 @@ def test_show_refuses_what_makes_no_sense(aacmm, files, tmp_path, kind, name, va
     path.write_bytes((files / f"{kind}.h5").read_bytes())
     aacmm("show", path)
     with h5py.File(path, "a") as file:
-        file.attrs[name] = value
+        (file.attrs if name in file.attrs or kind == "capture" else file["parameters"].attrs)[name] = value
     with open(path, "rb+") as stream:
         seal(stream)
     assert said in aacmm("show", path, expect=2).stderr

@@ -99,9 +99,9 @@ def test_what_always_touches_is_left_out_and_named(panda):
     ("obstacles", "text"),
     [
         ((HalfSpace("w", (0.0, 0, 0), (0.0, 0, 0)),), "normal of obstacle 'w' has the length 0"),
-        ((Box("b", (0.0, 0, 0), (1.0, -1, 1)),), "box 'b' has an edge of -1 mm"),
-        ((Post("p", (0.0, 0, 0), (1.0, 0, 0), 0.0),), "capsule 'p' has a radius of 0 mm"),
-        ((Box("b", (math.nan, 0, 0), (1.0, 1, 1)),), "needs finite numbers"),
+        ((Box("b", (0.0, 0, 0), (1.0, -1, 1)),), "size\\[1\\] of obstacle 'b' is -1 mm; it must be positive"),
+        ((Post("p", (0.0, 0, 0), (1.0, 0, 0), 0.0),), "radius of obstacle 'p' is 0; it must be positive"),
+        ((Box("b", (math.nan, 0, 0), (1.0, 1, 1)),), "centre\\[0\\] of obstacle 'b' is nan; give finite numbers"),
         ((Post("p", (0.0, 0, 0), (1.0, 0, 0), 1.0),) * 2, "two obstacles have the name 'p'"),
     ],
 )
@@ -113,7 +113,10 @@ def test_refused_obstacles(planar, obstacles, text):
 
 @pytest.mark.parametrize(
     ("radius", "text"),
-    [(0.0, "radius of the arm's links must be above 0"), ([1.0, 2.0], "radius has 2 values")],
+    [
+        (0.0, "radius is 0 mm; it must be positive and at most 2000"),
+        ([1.0, 2.0], "one number, or .* with 3 joints"),
+    ],
 )
 def test_refused_radii(planar, radius, text):
     with pytest.raises(aj.InputError, match=text):
@@ -151,10 +154,10 @@ def test_configurations_are_brought_into_cones(panda, normal):
 @pytest.mark.parametrize(
     ("cone", "axis", "text"),
     [
-        (Cone(0.0), UP, "half angle of 0 deg"),
-        (Cone(4.0), UP, "half angle of 229"),
-        (Cone(normal=(0, 0, 0.0)), UP, "no direction"),
-        (Cone(), (0.0, 0.0, 0.0), "no direction"),
+        (Cone(0.0), UP, "half_angle.0. is 0 deg; it must be positive and at most 180"),
+        (Cone(4.0), UP, "half_angle.0. is 229"),
+        (Cone(normal=(0, 0, 0.0)), UP, "has the length 0"),
+        (Cone(), (0.0, 0.0, 0.0), "has the length 0"),
     ],
 )
 def test_refused_cones(cone, axis, text):

@@ -183,7 +183,7 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         ("coupled=2-9", "names joint 9 of 7"),
         (["cos1_9"], "is of a joint from 1 to 7"),
         (["compliance1_2"], "is of a link from 2 to 7"),
-        (["d_3"], "'d_3' is no coefficient's name"),
+        (["d_3"], "'d_3' is not the name of a coefficient"),
     ],
 )
 def test_refused(model, sentence):

@@ -85,7 +85,7 @@ def test_the_default_has_the_groups_that_the_arm_has(paper_arm):
     [
         ({}, "at least one"),
         ({"sd": {"lengths": 0.0}}, "must be positive"),
-        ({"sd": {"lengths": float("nan")}}, "is NaN"),
+        ({"sd": {"lengths": float("nan")}}, "is nan; it must be positive"),
         ({"sd": {"lengths": [1.0, 2.0]}}, "one number"),
         ({"sd": {"lengths": 1.0}, "mean": {"d_3": np.inf}}, "finite"),
     ],

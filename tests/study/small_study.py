@@ -83,7 +83,7 @@ def until(condition, process: subprocess.Popen) -> None:
 
 def until_parts(path: Path, count: int, process: subprocess.Popen) -> None:
     """Wait until so many blocks are kept, or the process has ended."""
-    until(lambda: len(list(parts_of(path).glob("*.h5"))) >= count, process)
+    until(lambda: len(list(parts_of(path).glob("*.npz"))) >= count, process)
 
 
 def interrupted_at(count: int):

@@ -1,7 +1,6 @@
 """What a study's numbers depend on besides the study is kept, and nothing else continues it."""
 
 import json
-from importlib import metadata
 
 import h5py
 import jax
@@ -56,19 +55,11 @@ def test_the_difference_is_named(case):
             check_same(begun, "s.h5", "choose another output path")
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ("other", r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, and here is no XLA_FLAGS"),
-        ("", r"s\.h5 does not say with which settings it was begun, as files of today do; choose another output path"),
-    ],
-    ids=["other settings", "a file of an earlier version"],
-)
-def test_what_was_begun_otherwise_is_read_but_not_continued(study, tmp_path, settings, message):
-    if settings:
-        settings = json.dumps(json.loads(computed_with()) | {"XLA_FLAGS": "--xla_a=1"}, sort_keys=True)
-    layout = Layout.of(study, 16, (metadata.version("aacmm_jax"), settings))
-    store.create(tmp_path / "s.h5", study, layout, 16)
+def test_what_was_begun_otherwise_is_read_but_not_continued(study, tmp_path):
+    settings = json.dumps(json.loads(computed_with()) | {"XLA_FLAGS": "--xla_a=1"}, sort_keys=True)
+    message = r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, and here is no XLA_FLAGS"
+    layout = Layout.of(study, 16, settings)
+    store.create(tmp_path / "s.h5", study, layout)
     with pytest.raises(aj.InputError, match=message):
         aj.study.run_study(study, tmp_path / "s.h5")
     found = aj.study.Results.of(tmp_path / "s.h5")
@@ -90,7 +81,7 @@ def test_a_worker_with_other_settings_computes_nothing(study, monkeypatch):
     with pytest.raises(
         aj.InputError, match=r"on the worker .*: the study was begun with no OPENBLAS_CORETYPE, and her"
     ):
-        runner._run_and_pack(study, layout, None, next(layout.blocks()), runner._Resources())
+        runner._run(study, layout, None, next(layout.blocks()), runner._Resources())
 
 
 def test_the_file_says_what_it_was_computed_with(home):

@@ -12,10 +12,9 @@ import jax
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.study import local_processes, worker_setup
+from aacmm_jax.study import executors
 from aacmm_jax.study.blocks import parts_of
-from aacmm_jax.study.local_processes import LocalProcesses
-from aacmm_jax.study.worker_setup import CacheSettings, use_compilation_cache
+from aacmm_jax.study.executors import CacheSettings, LocalProcesses, use_compilation_cache
 
 from . import worker_tasks
 from .small_study import CHUNK, ROOT, command, same, until, until_parts
@@ -59,7 +58,7 @@ def test_processes_import_nothing_from_the_working_folder(tmp_path):
     script = tmp_path / "script" / "aacmm"
     script.parent.mkdir()
     script.write_text(
-        "import os\nfrom aacmm_jax.study.local_processes import LocalProcesses\n"
+        "import os\nfrom aacmm_jax.study.executors import LocalProcesses\n"
         "if __name__ == '__main__':\n    print(LocalProcesses(1).submit(os.getcwd).result())\n"
         "    print('PYTHONSAFEPATH' in os.environ)"
     )
@@ -83,7 +82,7 @@ def test_a_process_that_dies_is_replaced(processes, tmp_path, monkeypatch):
     first = processes.submit(os.getpid).result()
     assert processes.submit(worker_tasks.die_once, tmp_path / "marker").result() == "done"
     assert processes.submit(os.getpid).result() not in (first, os.getpid())
-    monkeypatch.setattr(local_processes, "_TRIES", 1)
+    monkeypatch.setattr(executors, "_RETRIES", 0)
     with pytest.raises(RuntimeError, match="died 1 times"):
         processes.submit(worker_tasks.die, None).result()
 
@@ -111,7 +110,7 @@ def test_the_cache_of_a_worker_is_that_of_its_environment(tmp_path, monkeypatch)
         assert CacheSettings.current() == (str(tmp_path), 0.0)
     finally:
         use_compilation_cache(before)
-    assert worker_setup.CacheSettings.current() == before
+    assert CacheSettings.current() == before
 
 
 @pytest.mark.exhaustive
@@ -171,7 +170,7 @@ def test_an_interrupt_lets_running_blocks_end(home, tmp_path, prepared, where):
     until_parts(path, 2, process)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=600)
-    kept = len(list(parts_of(path).glob("*.h5")))
+    kept = len(list(parts_of(path).glob("*.npz")))
     assert 2 < kept < 12
     assert errors == (f"Stopped; {kept * CHUNK} of 96 trials are kept. Continue with: aacmm study --resume -o {path}\n")
     assert process.returncode == 130

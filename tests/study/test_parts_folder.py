@@ -40,12 +40,12 @@ def colleague(path):
 
 
 FOLDER = r"s\.h5\.parts belongs to nobody, "
-BLOCK = r"cell.*\.h5 belongs to nobody, who does not own its folder, so it is not read; remove it"
+BLOCK = r"cell.*\.npz belongs to nobody, who does not own its folder, so it is not read; remove it"
 OURS = ("a link to a folder", "a link to a block", "an open folder")  # which need no second user
 # What is done to a study of the user with blocks, and how running it and reading it is refused; None: it is not.
 PLANTED = {
     "a link to a folder": (link_folder, *[r"s\.h5\.parts is a link, so the blocks in it are not read"] * 2),
-    "a link to a block": (link_block, *[r"cell.*\.h5 is a link, so it is not read; remove it"] * 2),
+    "a link to a block": (link_block, *[r"cell.*\.npz is a link, so it is not read; remove it"] * 2),
     "an open folder": (
         lambda path: parts_of(path).chmod(0o777),
         *[r"others may write to .*s\.h5\.parts \(mode 0777\), .*; if they are yours, run chmod go-w '.*s\.h5\.parts'"]
@@ -83,7 +83,7 @@ def test_what_others_could_have_written_is_refused(case, home, study, tmp_path):
 def test_nobody_else_may_write_into_a_new_folder(study, tmp_path, umask):
     former = os.umask(umask)
     try:
-        store.create(tmp_path / "s.h5", study, Layout.of(study, 16), 16)
+        store.create(tmp_path / "s.h5", study, Layout.of(study, 16))
     finally:
         os.umask(former)
     assert parts_of(tmp_path / "s.h5").stat().st_mode & 0o777 == 0o755 & ~umask
@@ -118,12 +118,12 @@ def test_this_file_system_keeps_owners(tmp_path):
 def test_a_folder_that_another_user_made_first_is_left_as_it_is(study, tmp_path):
     parts = parts_of(tmp_path / "s.h5")
     parts.mkdir()
-    (parts / "old.h5").touch()
+    (parts / "old.npz").touch()
     give(parts)
-    for check in (check_ours, lambda path: store.create(path, study, Layout.of(study, 16), 16)):
+    for check in (check_ours, lambda path: store.create(path, study, Layout.of(study, 16))):
         with pytest.raises(aj.InputError, match=r"s\.h5\.parts belongs to nobody"):
             check(tmp_path / "s.h5")
-    assert os.listdir(parts) == ["old.h5"]
+    assert os.listdir(parts) == ["old.npz"]
 
 
 def test_without_a_folder_there_is_nothing_to_check(tmp_path):

@@ -210,7 +210,7 @@ def test_levels_that_differ_little_are_told_apart():
 
 
 def test_a_study_that_has_just_begun_is_shown(aacmm, study, tmp_path):
-    store.create(tmp_path / "s.h5", study, Layout.of(study, 1000), 1000)
+    store.create(tmp_path / "s.h5", study, Layout.of(study, 1000))
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
     assert "No trial of it has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout
 

@@ -9,7 +9,7 @@ import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.diagnostics import reading_check, reading_search
 from aacmm_jax.diagnostics.reading_fit import Explanation
-from aacmm_jax.files.angles import units_toml
+from aacmm_jax.files.reading_checks import units_toml
 from aacmm_jax.summaries.reading_check import check_capture, explanation_words, reading_check_summary
 
 DEG = math.pi / 180

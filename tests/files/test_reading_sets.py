@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.other_readings import ReadingSet, compare_reading_sets, reading_sets, reading_sets_sentence
+from aacmm_jax.files.reading_checks import ReadingSet, compare_reading_sets, reading_sets, reading_sets_sentence
 from tests.conftest import EXAMPLES
 
 

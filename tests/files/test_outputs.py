@@ -4,8 +4,7 @@ import os
 
 import pytest
 
-from aacmm_jax.files.atomic_write import write_text
-from aacmm_jax.files.outputs import as_path
+from aacmm_jax.files.outputs import as_path, write_text
 from tests.refusals import assert_refused
 
 

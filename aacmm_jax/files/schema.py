@@ -1,0 +1,261 @@
+"""What the HDF5 files of captures, calibrations and evaluations hold: every field with its unit, said once.
+
+Nothing here needs JAX, so that ``aacmm show`` checks a file and prints the summary in it quickly.
+"""
+
+from ..acceptance.standards import STANDARDS
+from .records import Field, Fields, count, mapping, number, part, text, truth
+
+_BOTH = "see unit"
+_EITHER = "mm or rad"
+
+RECORDING: Fields = {
+    "seed": count("seed of a simulated capture"),
+    "sources": text("files that were read, with their SHA-256"),
+    "measured": text("day of the measurement"),
+    "acceptance": text("standards whose acceptance procedure was followed", among=("", *STANDARDS)),
+    "measuring_range": number("diameter of the measuring volume, as the maker states it", "mm"),
+}
+
+NOISE: Fields = {
+    "encoder_arcsec": Field("standard deviation of a reading, arcsec", name="encoder_arcsec", least=0),
+    "linear_encoder": number("standard deviation of the reading of a prismatic joint", "mm", least=0),
+    "seating": number("standard deviation of a coordinate of the seated tip", "mm", least=0),
+}
+
+USUAL_NOISE: Fields = {
+    "arm_class": text("class of the arm"),
+    "source": text("where the noise is stated"),
+    "noise": part(NOISE),
+}
+
+LENGTHS: Fields = {
+    "start": text("socket at one end"),
+    "end": text("socket at the other end"),
+    "value": number("calibrated length", "mm"),
+    "u": number("standard uncertainty", "mm", least=0),
+}
+
+# A row for each group of a sphere, whose numbers stand in every one.
+SPHERES: Fields = {
+    "name": text("reference sphere", name="sphere"),
+    "test": text("acceptance test that the sphere was touched for"),
+    "diameter": number("calibrated diameter", "mm"),
+    "u": number("standard uncertainty of the diameter", "mm", least=0),
+    "stylus": number("diameter of the probe's ball", "mm", least=0),
+    "form": number("calibrated form error", "mm", least=0),
+    "u_form": number("standard uncertainty of the form error", "mm", least=0),
+}
+
+SPECIFICATION: Fields = {
+    "name": text("what the arm is called"),
+    "length": number("half-width of the bounds of lengths", "mm", name="half_width_length_mm"),
+    "angle": number("half-width of the bounds of angles", "rad", name="half_width_angle_rad"),
+    "override": mapping("half-widths of single parameters, mm or rad"),
+    "held": text("fixed parameters"),
+    "free": text("parameters that are free in addition"),
+}
+
+_SQUARE = ("parameter", "parameter_2")
+CALIBRATION: Fields = {
+    "names": text("free parameter", "parameter", name="parameter"),
+    "lower": number("lower bound of the identification", _BOTH, "parameter"),
+    "upper": number("upper bound of the identification", _BOTH, "parameter"),
+    "active_stage1": count(
+        "-1 on the lower bound, +1 on the upper, in stage 1", "parameter", least=None, among=(-1, 0, 1)
+    ),
+    "active": count("-1 on the lower bound, +1 on the upper", "parameter", least=None, among=(-1, 0, 1)),
+    "determined": truth("whether it is determined, and not only a combination with others", "parameter"),
+    "open": number("projector onto what is not determined, in mm and mrad", "1", *_SQUARE),
+    "covariance": number("covariance", "products of units", *_SQUARE),
+    "held": text("fixed parameters"),
+    "hold": text("scale anchor of stage 1"),
+    "scale_set_by": text("fixed lengths that set the scale"),
+    "k": number("scale factor, measured over certified lengths", "1"),
+    "u_k": number("standard uncertainty of k", "1", least=0),
+    "surplus_k": number("part of the variance of k by lengths that disagree", "1", least=0),
+    "noise": part(NOISE),
+    "noise_model": text("model of the errors of tips"),
+    "degrees_of_freedom": number("degrees of freedom of the scatter of single poses", "1", least=0),
+    "reduced_chi": number("residuals in units of the given noise", "1", least=0),
+    "method": text("method", among=("two-stage", "joint", "repeatability")),
+    "steps": count("number of evaluations"),
+    "converged": truth("whether the solve converged"),
+    "reason": text("why the solve ended"),
+    "divided": truth("whether the arm is that of stage 1 divided by k"),
+    "against_division": text("what stood against the division by k"),
+    "sampled_says": text("result of the Monte Carlo simulation"),
+    "robust": text("robust loss"),
+}
+
+SAMPLED: Fields = {
+    "quantity": text("parameter, k or length", "quantity"),
+    "estimate": number("value of the calibration", "mm or rad; 1 for k", "quantity"),
+    "u": number("standard uncertainty by Monte Carlo", "mm or rad; 1 for k", "quantity"),
+    "low": number("lower end of the Monte Carlo interval", "mm or rad; 1 for k", "quantity"),
+    "high": number("upper end of the Monte Carlo interval", "mm or rad; 1 for k", "quantity"),
+    "linear_u": number("standard uncertainty by the law of propagation", "mm or rad; 1 for k", "quantity"),
+    "agrees": truth("whether the linear interval is within the tolerance of JCGM 101", "quantity"),
+}
+
+NOISY_ENCODERS: Fields = {
+    "joint": count("joint whose encoder is noisier than expected", least=1),
+    "expected": number("standard deviation as given, or as that of the others", "rad, or mm of a prismatic joint"),
+    "found": number("standard deviation, estimated", "rad, or mm of a prismatic joint"),
+    "u": number("its standard uncertainty", "rad, or mm of a prismatic joint"),
+    "probability": number("probability of such residuals, were the noise as expected", "1"),
+}
+
+LEFT_OUT: Fields = {
+    "sockets": text("sockets left out together", "left_out_socket"),
+    "poses": count("poses in sockets with more than one"),
+    "rms": number("RMS distance from the centroid, found", "mm"),
+    "rms_predicted": number("the same, predicted", "mm"),
+    "length_error": number("error of a length left out", "mm", "left_out_length"),
+    "length_u": number("its standard uncertainty, predicted", "mm", "left_out_length"),
+    "converged": truth("whether the calibration with the others converged"),
+    "rms_degrees_of_freedom": number("effective degrees of freedom of rms_predicted", "1"),
+    "length_degrees_of_freedom": number("effective degrees of freedom of length_u", "1"),
+    "noise_degrees_of_freedom": number("degrees of freedom of the noise behind both", "1"),
+}
+
+REMOVED: Fields = {
+    "kind": text("kind of group"),
+    "group": text("group left out, because it contradicts the rest"),
+    "members": text("socket or observation left out", "removed_member"),
+    "ratio": number("F: mean square that it added, over that of the rest", "1"),
+    "degrees_of_freedom": count("degrees of freedom of numerator and denominator", "fraction"),
+    "probability": number("probability of this F where nothing is wrong", "1"),
+    "rms_with": number("RMS distance of the rest from its geometry", "mm"),
+    "rms_without": number("the same without the group", "mm"),
+    "changed_most": text("parameter that changed most"),
+    "change": number("its change in standard uncertainties", "1"),
+}
+
+OBSERVED: Fields = {
+    "name": text("observation", name="observation"),
+    "kind": text("its kind"),
+    "rms_before": number("root mean square distance from the geometry, nominal arm", "mm", least=0),
+    "rms_after": number("the same by the calibrated arm", "mm", least=0),
+    "reduced_chi": number("root mean square in standard deviations of a residual", "1"),
+    "weights": number("weight of a pose; below 1 by a robust loss", "1", "pose", least=0),
+}
+
+GEOMETRY: Fields = {
+    "part": text("part of the unknown geometry"),
+    "unit": text("unit"),
+    "value": number("value", "mm or rad, see unit"),
+    "covariance": number("row of the covariance of the part's numbers", "products of units", "entry"),
+}
+
+OTHER_POSES: Fields = {
+    "names": text("observation", "observation", name="observation"),
+    "poses": count("number of poses that the arm was not calibrated with", "observation"),
+    "rms": number("their root mean square distance from the geometry found", "mm", "observation"),
+    "rms_angle": number("their root mean square angle", "rad", "observation"),
+}
+
+PRIOR: Fields = {
+    "groups": text("group of parameters with one prior", "prior_group", name="prior_group"),
+    "learned": truth("whether its standard deviation was learned from the data", "prior_group"),
+    "units": text("unit of its standard deviation", "prior_group"),
+    "parameters": count("how many free parameters it has", "prior_group"),
+    "sd": number("standard deviation, given or learned", "mm or rad, see unit", "prior_group"),
+    "effective": number("how many of its parameters the data determine", "1", "prior_group"),
+    "supported": truth("whether the data support a deviation from the mean", "prior_group"),
+    "names": text("free parameter", "prior_parameter", name="prior_parameter"),
+    "mean": number("mean", _EITHER, "prior_parameter"),
+    "weight": number("one over the standard deviation; 0 without a prior", "1/mm or 1/rad", "prior_parameter"),
+}
+
+
+def _law(dimension: str) -> Field:
+    possible = f"{dimension}_variance"
+    return part(
+        {
+            "degrees_of_freedom": number("degrees of freedom of the variance", "1", dimension),
+            "ratios": number("possible variances over the stated one", "1", dimension, possible),
+            "weights": number("their probabilities", "1", dimension, possible),
+        }
+    )
+
+
+_COEFFICIENTS = ("coefficient", "coefficient_2")
+SHARED_ERRORS: Fields = {
+    "kinds": text("what poses share", "shared_kind", name="shared_kind"),
+    "units": text("unit of its standard deviation", "shared_kind"),
+    "names": text("coefficient of a function", "coefficient", name="coefficient"),
+    "sd": number("standard deviation, learned from the residuals", "mm or rad, see units", "shared_kind"),
+    "moments": number("second moments of the coefficients about 0", "products of units", *_COEFFICIENTS),
+    "follow": number(
+        "derivatives of the parameters by the coefficients", "quotients of units", "shared_parameter", "coefficient"
+    ),
+    "correlation_length": number("correlation length of successive poses", "1"),
+    "added": number(
+        "part of the covariance", "products of units", "tip_kind", "shared_parameter", "shared_parameter_2"
+    ),
+    "by_group": number(
+        "derivatives of the moments by the logarithm of each kind's variance", "products of units",
+        "function_kind", *_COEFFICIENTS,
+    ),
+    "law": _law("shared_kind"),
+}  # fmt: skip
+
+COMPONENTS: Fields = {
+    "names": text("what a part of the covariance rests on", "component", name="component"),
+    "matrices": number(
+        "part of the covariance", "products of units", "component", "component_parameter", "component_parameter_2"
+    ),
+    "law": _law("component"),
+}
+
+UNCERTAINTY: Fields = {
+    "names": text("free parameter", "parameter", name="parameter"),
+    "covariance": number("covariance", "products of units", *_SQUARE),
+    "open": number("projector onto what is not determined, in mm and mrad", "1", *_SQUARE),
+    "noise": part(NOISE),
+    "scatter_degrees_of_freedom": number("degrees of freedom of the noise", "1", least=0),
+}
+
+JUDGED: Fields = {
+    "limits": mapping("fixed part, mm, and divisor of the length, of each MPE by metric"),
+    "u_test": number("standard uncertainty that seat and fixture add", "mm", least=0),
+    "standards": text("standards whose tests are run", among=("", *STANDARDS)),
+    "influences": mapping("relative uncertainty, and the expansion of artefact and arm"),
+    "rule": text("decision rule"),
+}
+
+EVALUATION: Fields = {
+    "used": text("sockets that the arm was identified from"),
+    "warnings": text("what makes the results doubtful"),
+    "calibration_warnings": text("what should be read about the calibration"),
+    "maxima": mapping("largest values allowed, mm"),
+    **JUDGED,
+}
+
+POINTS: Fields = {
+    "sources": text("files that were read, with their SHA-256"),
+    "measured": text("day of the measurement"),
+    "measuring_range": number("diameter of the measuring volume, as the maker states it", "mm"),
+}
+
+# By the name of the table.
+TABLES: dict[str, Fields] = {
+    "usual_noise": USUAL_NOISE,
+    "reference": LENGTHS,
+    "sphere": SPHERES,
+    "parameters": CALIBRATION,
+    "monte_carlo": SAMPLED,
+    "noisy_encoders": NOISY_ENCODERS,
+    "cross_validation": LEFT_OUT,
+    "removed": REMOVED,
+    "observed": OBSERVED,
+    "geometry": GEOMETRY,
+    "other_poses": OTHER_POSES,
+    "prior": PRIOR,
+    "shared_errors": SHARED_ERRORS,
+    "components": COMPONENTS,
+    "uncertainty": UNCERTAINTY,
+    "evaluation": EVALUATION,
+    "points": JUDGED,
+}

@@ -1,0 +1,194 @@
+"""A recording calibrated as ``aacmm calibrate`` does it: one call, whose options state their defaults once."""
+
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from ..calibration.record import CalibrationRecord, record_of
+from ..calibration.results import Calibration, Identification
+from ..calibration.sampling import monte_carlo
+from ..core.arguments import checked_arguments, with_options
+from ..core.errors import IdentifiabilityWarning, InputError
+from ..data.capture import Capture, draw_poses
+from ..data.joined_captures import join_sessions
+from ..data.noise import Noise
+from ..data.recording import Recording
+from ..diagnostics.contradictions import remove_contradicting
+from ..kinematics.priors import Prior
+from ..model.loss_names import LossName
+from .cross_validation import can_cross_validate, cross_validate
+from .single import CalibrationOptions, calibrate, identify
+
+_SOLVE = CalibrationOptions()
+
+
+class CaptureOptions(NamedTuple):
+    """How `calibrate_capture` calibrates: its keyword arguments, described there, and their defaults."""
+
+    method: Literal["two-stage", "joint"] | None = _SOLVE.method
+    robust: LossName | None = _SOLVE.robust
+    prior: Prior | Literal["stated"] | None = "stated"
+    scale: Literal["measured", "nominal"] = "measured"
+    only_poses: int | None = None
+    seed: int = 0
+    hold: str | None = _SOLVE.hold
+    noise: Noise | None = _SOLVE.noise
+    replace_noise: bool = _SOLVE.replace_noise
+    shared_errors: bool = _SOLVE.shared_errors
+    cross_validate: bool | None = None
+    leave_out: tuple[str, ...] = ()
+    monte_carlo: bool = False
+    strict: bool = False
+    remove_contradicting: bool = False
+    max_steps: int = _SOLVE.max_steps
+    stage: Callable[[str, Callable[[], Any]], Any] = lambda what, work: work()
+
+
+@checked_arguments
+@with_options(CaptureOptions)
+def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord:
+    """Calibrate a recording: what ``aacmm calibrate`` does, with the same defaults.
+
+    The nominal arm of the recording says which parameters are free, between which bounds, and their prior
+    (``recording.nominal._replace(length=5.0, free=("beta_2",))`` for others); its model of the joints is calibrated
+    too. What the data leave undetermined is no warning, but part of the record (`warnings_of`).
+
+    Args:
+        recording: the capture and its nominal arm.
+        method: "two-stage" or "joint", as for `calibrate`.
+        robust: a robust loss, as for `identify`.
+        prior: what is known of the parameters; "stated", that of the nominal arm; None, nothing.
+        scale: "nominal" for stage 1 alone, with the scale of the nominal arm, where nothing observed fixes it.
+        only_poses: calibrate with so many poses drawn at random, and evaluate the result on the others.
+        seed: of these random numbers.
+        hold: the scale anchor of stage 1, as for `identify`.
+        noise: standard deviations of readings and seat, as for `identify`.
+        replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
+        shared_errors: add errors that poses share to the covariance, as for `calibrate`.
+        cross_validate: calibrate without each group, as `cross_validate` does. By default where a real arm was recorded
+            in several placements of the reference length, and there is neither a prior nor a robust loss.
+        leave_out: groups that cross-validation leaves out, as names or shell patterns.
+        monte_carlo: check the uncertainties by Monte Carlo.
+        strict: raise `InputError` where such data could not determine free parameters even without noise.
+        remove_contradicting: leave out groups that contradict all others.
+        max_steps: most evaluations of each solve.
+        stage: called with what is done next, in words, and a function that does it, such as to show progress.
+
+    Returns:
+        The calibration with all that was found of it, to save (`files.save_calibration`), show or evaluate.
+
+    Raises:
+        InputError: as `calibrate` does, and where options do not go together.
+
+    Example:
+        >>> calibrated = aj.calibrate_capture(aj.Recording(two_bars, nominal), noise=noise)
+        >>> print(calibrated.method, f"{calibrated.validation.rms:.3f} mm in unseen placements")
+        joint 0.016 mm in unseen placements
+    """
+    chosen = CaptureOptions(**options)
+    if chosen.leave_out and not chosen.cross_validate:
+        raise InputError("--leave-out (leave_out) says what --cross-validate (cross_validate) leaves out; give both.")
+    others = None
+    if chosen.only_poses is not None:
+        part, others = draw_poses(recording.capture, chosen.only_poses, chosen.seed)
+        recording = recording._replace(capture=part)
+    bounds = recording.nominal.bounds()
+    recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
+    solving = CalibrationOptions(
+        method=chosen.method,
+        hold=chosen.hold,
+        noise=chosen.noise,
+        robust=chosen.robust,
+        prior=recording.nominal.prior if isinstance(chosen.prior, str) else chosen.prior,
+        replace_noise=chosen.replace_noise,
+        shared_errors=chosen.shared_errors,
+        undetermined="raise" if chosen.strict else "ignore",  # the record says it
+        max_steps=chosen.max_steps,
+    )
+
+    def solved(capture: Capture) -> Calibration | Identification:
+        if chosen.scale == "measured":
+            return calibrate(bounds.space.base, capture, bounds, **solving._asdict())
+        _check_stage1(capture, solving)
+        return identify(bounds.space.base, capture, bounds, **solving.of_stage1)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", IdentifiabilityWarning)
+        result = chosen.stage("Calibrating", lambda: solved(recording.capture))
+        record = record_of(result, recording, robust=chosen.robust, others=others)
+        if chosen.remove_contradicting:
+            record = chosen.stage("Comparing groups", lambda: remove_contradicting(record, solved))
+        if _to_cross_validate(record.recording, solving, chosen):
+            if chosen.scale != "measured":
+                raise InputError("--cross-validate needs a calibrated scale; leave out --scale nominal (scale).")
+            left_out = chosen.stage("Cross-validating", lambda: cross_validate(
+                *(bounds.space.base, record.recording.capture, bounds),
+                groups=chosen.leave_out or None,
+                **solving._asdict() | {"undetermined": "ignore"},
+            ))  # fmt: skip
+            record = record._replace(validation=left_out)
+        if chosen.monte_carlo:
+            result = solved(record.recording.capture) if record.removed else result
+            if not isinstance(result, Calibration) or chosen.robust is not None:
+                raise InputError(
+                    "--monte-carlo is for calibrations without --robust and --scale nominal; leave it out."
+                )
+            sampled = chosen.stage("Drawing trials", lambda: monte_carlo(result, record.recording.capture))
+            record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
+    return record
+
+
+def _check_stage1(capture: Capture, solving: CalibrationOptions) -> None:
+    """Raise `InputError` where the scale need not be that of the nominal arm, or an option is not of stage 1."""
+    if solving.method is not None or solving.undetermined == "raise":
+        raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")
+    if any(observation.fixes_scale for observation in capture.observations):
+        raise InputError(
+            "--scale nominal is for captures without a scale, but these observations fix it; leave it out."
+        )
+
+
+def _to_cross_validate(recording: Recording, solving: CalibrationOptions, chosen: CaptureOptions) -> bool:
+    """Whether groups are left out: where that was asked for; by default where a real arm measured the reference length
+    in several placements, and leaving each of them out takes no longer than the calibration itself."""
+    capture = recording.capture
+    if chosen.cross_validate is not None:
+        return chosen.cross_validate
+    plain = chosen.scale == "measured" and solving.robust is None and solving.prior is None
+    if not plain or capture.observations or recording.true is not None or len(capture.lengths) < 2:
+        return False
+    return can_cross_validate(capture, len(recording.nominal.space().names))
+
+
+def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = False) -> Recording:
+    """Join the recordings of several sessions of one arm, as `join_sessions` joins their captures.
+
+    Args:
+        recordings: name of a session -> its recording.
+        same_probe: whether the probe was not remounted between sessions.
+
+    Returns:
+        One recording; of a single session, the recording itself.
+
+    Raises:
+        InputError: the nominal arms differ, or as `join_sessions` does.
+
+    Example:
+        >>> one = aj.Recording(aj.simulate(true, {"A": (400, 200, 300)}, poses=5), nominal)
+        >>> print(aj.pipeline.join_recordings({"monday": one, "friday": one}).capture.names)
+        ('monday/A',)
+    """
+    first, *rest = recordings.values()
+    if not rest:
+        return first
+    for name, recording in list(recordings.items())[1:]:
+        arms = [jax.tree.leaves(other.nominal.arm) for other in (first, recording)]
+        same = jax.tree.structure(first.nominal.arm) == jax.tree.structure(recording.nominal.arm)
+        if not same or not all(map(np.array_equal, *arms)):
+            raise InputError(f"'{name}' has another nominal arm than the first session; import both with the same arm.")
+    capture = join_sessions({name: each.capture for name, each in recordings.items()}, own_probe=not same_probe)
+    sources = tuple(source for recording in recordings.values() for source in recording.sources)
+    return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources)
