@@ -32,6 +32,7 @@ from .data.noise import Noise as Noise
 from .data.recording import Recording as Recording
 from .data.reference_length import ReferenceLength as ReferenceLength
 from .data.simulation import simulate as simulate
+from .diagnostics.findings import warnings_of as warnings_of
 from .files.arms import load_arm as load_arm
 from .kinematics.arm import Arm as Arm
 from .kinematics.parameters import Bounds as Bounds
@@ -47,6 +48,5 @@ from .pipeline.single import calibrate as calibrate
 from .pipeline.single import identify as identify
 from .solver.bounded import least_squares as least_squares
 from .solver.reason import Reason as Reason
-from .summaries.warnings import warnings_of as warnings_of
 from .uncertainty.identifiability import observability as observability
 from .uncertainty.volume import volumetric_uncertainty as volumetric_uncertainty

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import aacmm_jax as aj
+from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.diagnostics.missing_terms import missing_terms
-from aacmm_jax.summaries.warnings import observed, of_calibration
 
 # Beginnings of the warnings that chance or an error can raise.
 WARNINGS = {
@@ -134,10 +134,7 @@ class Trials:
             undetermined="ignore",
         )
         record = aj.calibration.record_of(result, aj.Recording(capture, self.specification))
-        if seed % POSE_SETS not in self.seen:
-            self.seen[seed % POSE_SETS] = observed(record)
-        found = of_calibration(record, self.seen[seed % POSE_SETS])
-        return [sentence for sentence in found if not sentence.startswith(STATEMENTS)]
+        return [sentence for sentence in sentences(findings_of(record)) if not sentence.startswith(STATEMENTS)]
 
 
 def kind_of(sentence: str) -> str:

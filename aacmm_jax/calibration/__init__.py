@@ -1,7 +1,7 @@
 """Identification and calibration: one (`single`), many (`batch`), repeated, cross-validated; and their results.
 
 Elsewhere: the rows that are minimised (`model.rows`), the active set (`solver.active_set`), covariance
-(`uncertainty`), the file of a calibration (`files.calibrations`), the wording of its warnings (`summaries.warnings`).
+(`uncertainty`), the file of a calibration (`files.calibrations`), the wording of its warnings (`diagnostics.findings`).
 """
 
 import lazy_loader as _lazy_loader

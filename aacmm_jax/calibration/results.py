@@ -29,7 +29,7 @@ from ..uncertainty.shared_errors import SharedErrors
 from .scale_anchor import ScaleAnchor
 
 _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
-_PLAUSIBLE_SCALE = (0.5, 2.0)
+PLAUSIBLE_SCALE = (0.5, 2.0)
 # Repeatability of an arm or robot relative to the sum of its links: the paper's arm reaches 1e-5 (0.026 mm on 2.5 m).
 _RELATIVE_REPEATABILITY = 1e-5
 # Residuals larger by these factors come from wrong data, not from an arm: than that, and than its noise predicts.
@@ -368,7 +368,7 @@ def converged(result: Reason) -> Bool[AnyArray, "*batch"]:
 
 def plausible(k: Any) -> Any:
     """Whether a scale can be a calibration's at all, and not a mistaken unit or socket."""
-    return (k >= _PLAUSIBLE_SCALE[0]) & (k <= _PLAUSIBLE_SCALE[1])
+    return (k >= PLAUSIBLE_SCALE[0]) & (k <= PLAUSIBLE_SCALE[1])
 
 
 def largest_plausible_residual(arm: Arm, *noises: Noise | None) -> float:

@@ -9,10 +9,10 @@ from ..acceptance.record import EvaluationRecord, same_arm
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
 from ..data.observations.observation import certified_quantities
+from ..diagnostics.contradictions import LEFT_OUT
+from ..diagnostics.findings import findings_of
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
-from ..summaries.contradictions import removals
 from ..summaries.observations import scale_sources
-from ..summaries.warnings import of_calibration
 from . import xml_elements as xml
 from .acceptance_results import acceptance_results, overall
 from .measurement_results import results_of, uncertainty_statement
@@ -215,11 +215,12 @@ def _statements(record: CalibrationRecord, given: AdministrativeData, sources: S
     yield _statement("Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
-    left_out = removals(record)
-    for sentence, removed in zip(left_out, record.removed, strict=True):
-        members = f"Sockets and observations left out: {', '.join(removed.members)}."
-        yield _statement("Data left out", f"{sentence} {members}")
-    yield from (_statement("Warning", words) for words in of_calibration(record) if words not in left_out)
+    for finding in findings_of(record):
+        if finding.code == LEFT_OUT:
+            members = f"Sockets and observations left out: {', '.join(finding.concerns)}."
+            yield _statement("Data left out", f"{finding.sentence} {members}")
+        else:
+            yield _statement("Warning", finding.sentence)
     if sources:
         yield _statement("Files", ", ".join(sources))
     if given.conformity is not None:

@@ -134,10 +134,10 @@ def calibrate(
     kinds (measured points, spheres, planes, artefacts) are solved with all else at once. Several captures are sessions
     of one arm.
     """
+    from ..diagnostics.usability import does_not_fit
     from ..files.calibrations import save_calibration
     from ..pipeline.capture_calibration import CaptureOptions, calibrate_capture
     from ..summaries.calibration import calibration_summary
-    from ..summaries.warnings import does_not_fit
 
     options = CaptureOptions(
         method=method,

@@ -137,11 +137,11 @@ def _evaluated(
 ) -> dict[str, Any]:
     """Evaluate a calibration on a capture; the summary."""
     from ..acceptance.record import evaluation_of
+    from ..diagnostics.findings import findings_of, sentences
     from ..files.calibrations import load_calibration
     from ..files.captures import load_capture
     from ..files.evaluations import save_evaluation
     from ..summaries.evaluation import evaluation_summary
-    from ..summaries.warnings import of_calibration
 
     with together(output):
         read = InputFile(calibration), InputFile(capture)
@@ -152,7 +152,7 @@ def _evaluated(
             measuring_range=measuring_range or recording.measuring_range,
         )
         stored = read_summary(read[0], ("calibration",))[1]
-        warnings = of_calibration(record) if stored is None else stored["warnings"]
+        warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
         evaluation = evaluation_of(record, recording, **of_test)._replace(calibration_warnings=tuple(warnings))
         summary = with_spinner("Evaluating", lambda: evaluation_summary(evaluation))
         if not summary["acceptance"]:

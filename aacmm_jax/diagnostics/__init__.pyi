@@ -1,9 +1,12 @@
 from .contradictions import contradictions_of as contradictions_of
 from .contradictions import remove_contradicting as remove_contradicting
 from .contradictions import session_metrics as session_metrics
+from .findings import Finding as Finding
+from .findings import findings_of as findings_of
 from .joint_travel import StandingJoint as StandingJoint
 from .joint_travel import standing_joints as standing_joints
 from .model_errors import model_tests as model_tests
 from .reading_check import ReadingCheck as ReadingCheck
 from .reading_check import check_readings as check_readings
 from .reading_fit import Explanation as Explanation
+from .recorded import findings_of_capture as findings_of_capture

@@ -1,4 +1,4 @@
-"""Sockets, stations, placements and sessions that contradict the others of a calibration; and it without them."""
+"""Inconsistent groups of a calibration (sockets, stations, placements, sessions), and recalibration without them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -9,11 +9,15 @@ from jaxtyping import Float
 from ..calibration.record import CalibrationRecord, Removed, record_of
 from ..calibration.results import Calibration, Identification
 from ..core.errors import InputError
+from ..core.units import DEG
 from ..data.capture import Capture, part_of
 from ..data.observations.socket import Socket
-from .equations import PROBE, Equations, Rows, equations_of
+from .equations import PROBE, Equations, Rows
+from .findings import Case, Finding, case_of
 from .group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of
 
+ORDER, NEEDS = 30, "scale"
+LEFT_OUT = "left-out"  # code of the finding on a group that the calibration left out
 # Mean square that a group adds over that of the others: errors outside the D-H model make it 7 on real arms, and it
 # is 1 where there are none.
 _LEAST_RATIO = 9.0
@@ -24,6 +28,7 @@ _LEVEL = 0.01
 _EXPLAINS = 0.67  # share of a contradiction that a single cause must explain to be named
 _EXACT = 1e-6  # mm: smaller contradictions are rounding errors of a simulation without noise
 _LARGE = ("session", "station")  # kinds of groups with more poses than parameters
+_NAMED_ALIKE = ("socket", "observation")  # kinds whose groups are chosen by their own names
 
 
 class Cause(NamedTuple):
@@ -53,36 +58,123 @@ class Contradiction(NamedTuple):
     suspects: tuple[Suspect, ...]
 
 
+def test(case: Case) -> list[Finding]:
+    """What the calibration left out, and groups that contradict the others; nearly always nothing."""
+    record = case.record
+    removed = [removal(group) for group in record.removed]
+    sessions = len(record.recording.capture.sessions)
+    return removed + [_finding(contradiction, sessions) for contradiction in contradictions_of(record)]
+
+
+def removal(removed: Removed) -> Finding:
+    """A group that the calibration left out."""
+    probability = "< 0.0001" if removed.probability < 1e-4 else f"= {removed.probability:.2g}"
+    first, second = removed.degrees_of_freedom
+    return Finding(
+        LEFT_OUT,
+        f"Left out: {removed.kind} {removed.group}, which contradicts the rest (F = {removed.ratio:.3g} with {first} "
+        f"and {second} degrees of freedom, p {probability}).",
+        f"Without it, the rest is {removed.rms_without:.3g} mm RMS from its geometry instead of "
+        f"{removed.rms_with:.3g} mm, and {removed.changed_most} changed most, by {removed.change:.2g} standard "
+        "uncertainties.",
+        probability=removed.probability,
+        concerns=removed.members,
+    )
+
+
+def _finding(contradiction: Contradiction, sessions: int) -> Finding:
+    kind, suspects = contradiction
+    concerns = tuple(name for suspect in suspects for name in suspect.members)
+    probability = max(suspect.test.probability for suspect in suspects)
+    remounted = [suspect.cause for suspect in suspects if suspect.cause is not None and suspect.cause.names == PROBE]
+    if kind == "session" and remounted and len(suspects) in (1, sessions):
+        cause, session = remounted[-1], next(s.group for s in reversed(suspects) if s.cause is remounted[-1])
+        return Finding(
+            "probe-remounted",
+            f"Session {session} contradicts the other sessions, and a probe of its own explains "
+            f"{100 * cause.share:.0f} % of that: the probe seems remounted, displaced by {_offset(cause)}.",
+            advice="Calibrate with a probe for each session (without --same-probe).",
+            probability=probability,
+            concerns=concerns,
+        )
+    changes = "; ".join(_change(suspect) for suspect in suspects)
+    options = " or ".join(f"--without '{_pattern(kind, suspect)}'" for suspect in suspects)
+    plural = "indices" if kind == "index" else f"{kind}s"
+    alone = len(suspects) == 1
+    says = (
+        f"{kind.capitalize()} {suspects[0].group} contradicts the other {plural}: {changes}."
+        if alone
+        else f"Some {plural} contradict each other, and the data do not show which of these is wrong: {changes}."
+    )
+    as_if = _as_if(suspects[-1].cause, "it" if alone else suspects[-1].group)
+    return Finding(
+        "contradiction",
+        f"{says} {as_if}".rstrip(),
+        advice=f"Check its readings, and calibrate without it ({options})."
+        if alone
+        else f"Check their readings, and calibrate without the wrong one ({options}).",
+        probability=probability,
+        concerns=concerns,
+    )
+
+
+def _pattern(kind: str, suspect: Suspect) -> str:
+    """A shell pattern that selects the group."""
+    if kind in _NAMED_ALIKE or len(suspect.members) == 1:
+        return suspect.members[0]
+    inside = f"{suspect.group}/"
+    return f"{inside}*" if all(name.startswith(inside) for name in suspect.members) else "' '".join(suspect.members)
+
+
+def _change(suspect: Suspect) -> str:
+    others, own = suspect.rms_others, suspect.rms
+    return (
+        f"without {suspect.group}, the others scatter by {others[1]:.2g} mm RMS instead of {others[0]:.2g} mm, and it "
+        f"by {own[1]:.2g} mm instead of {own[0]:.2g} mm"
+    )
+
+
+def _as_if(cause: Cause | None, group: str) -> str:
+    if cause is None:
+        return ""
+    if cause.names == PROBE:
+        return f"In {group}, the probe seems displaced by {_offset(cause)}."
+    kind, joint = cause.names[0].split("_")
+    more = f"{-cause.values[0]:+.3g} mm" if kind == "d" else f"{-cause.values[0] / DEG:+.3g} deg"
+    return f"In {group}, joint {joint} seems to read {more} more."
+
+
+def _offset(cause: Cause) -> str:
+    return f"{', '.join(f'{value:+.3g}' for value in cause.values)} mm (x, y, z of the last frame)"
+
+
 def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
     """Kinds of groups, the largest ones first -> sockets and observations with their group of this kind."""
     names = [*capture.names, *(observation.name for observation in capture.observations)]
-    kinds: dict[str, dict[str, str | None]] = {}
+    divisions: dict[str, dict[str, str | None]] = {}
     if capture.sessions:
-        kinds["session"] = {name: capture.session_of(name) for name in names}
+        divisions["session"] = {name: capture.session_of(name) for name in names}
     sockets = {*capture.names, *(o.name for o in capture.observations if isinstance(o, Socket))}
     for kind in ("station", "target", "index"):
-        kinds[kind] = dict.fromkeys(names) | {o.name: getattr(o, kind, None) for o in capture.observations}
-    kinds["target"] = {name: label or None for name, label in kinds["target"].items()}
+        divisions[kind] = dict.fromkeys(names) | {o.name: getattr(o, kind, None) for o in capture.observations}
+    divisions["target"] = {name: label or None for name, label in divisions["target"].items()}
     placed = {o.name: getattr(o, "placement", None) for o in capture.observations}
     alone = len(sockets) == len(names)
     placed |= {name: name.rpartition("/")[0] or (name if alone else None) for name in sockets}
-    each: dict[str, str | None] = {name: name for name in names}
+    single: dict[str, str | None] = {name: name for name in names}
     # Of equal divisions the first is kept, and it is named in the words of a user.
-    kinds |= {"socket": each, "placement": placed} if alone else {"placement": placed, "observation": each}
-    found: dict[str, dict[str, str | None]] = {}
+    divisions |= {"socket": single, "placement": placed} if alone else {"placement": placed, "observation": single}
+    kinds: dict[str, dict[str, str | None]] = {}
     seen: set[frozenset[frozenset[str]]] = set()
-    for kind, labels in kinds.items():
-        by_label: dict[str, list[str]] = {}
+    for kind, labels in divisions.items():
+        members: dict[str | None, set[str]] = {}
         for name, label in labels.items():
-            if label is not None:
-                by_label.setdefault(label, []).append(name)
-        rest = [name for name, label in labels.items() if label is None]
-        parts = [*by_label.values(), *([rest] if rest else [])]
-        division = frozenset(frozenset(part) for part in parts)
-        if by_label and len(division) > 1 and division not in seen:
-            found[kind] = labels
+            members.setdefault(label, set()).add(name)
+        division = frozenset(frozenset(group) for group in members.values())
+        if set(members) != {None} and len(division) > 1 and division not in seen:
+            kinds[kind] = labels
             seen.add(division)
-    return found
+    return kinds
 
 
 def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
@@ -102,45 +194,44 @@ def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
         >>> print(aj.diagnostics.contradictions_of(record))
         []
     """
-    equations = equations_of(record)
+    return case_of(record).once(_contradictions)
+
+
+def _contradictions(case: Case) -> list[Contradiction]:
+    equations, kinds = case.equations, groupings(case.record.recording.capture)
     best: tuple[float, str, list[list[GroupTest]]] = (0.0, "", [])
-    kinds = groupings(record.recording.capture)
     for kind, labels in kinds.items():
         blocks = equations.grouped(labels)
-        with np.errstate(all="ignore"):
-            found = contradicting_groups(blocks, level=_LEVEL, least_ratio=_LEAST_RATIO)
-            # An unlikely error of a few poses does not hide one that all poses of a session share.
-            if kind in _LARGE:
-                found = max(found, _different(equations, blocks, labels), key=_first_ratio)
-        if found and _first_ratio(found) > best[0]:
-            best = _first_ratio(found), kind, found
-    _, kind, found = best
-    if not found:
+        tests = contradicting_groups(blocks, level=_LEVEL, least_ratio=_LEAST_RATIO)
+        # An unlikely error of a few poses does not hide one that all poses of a session share.
+        if kind in _LARGE:
+            tests = max(tests, _different(equations, blocks, labels), key=_first_ratio)
+        if tests and _first_ratio(tests) > best[0]:
+            best = _first_ratio(tests), kind, tests
+    _, kind, tests = best
+    if not tests:
         return []
     labels = kinds[kind]
-    result = [
-        Contradiction(kind, tuple(_suspect(equations, labels, test) for test in tests)) for tests in found
-    ]  # fmt: skip
+    result = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in tests]
     return [] if result[0].suspects[0].rms_others[0] < _EXACT else result
 
 
-def _first_ratio(found: Sequence[Sequence[GroupTest]]) -> float:
-    return found[0][0].ratio if found else 0.0
+def _first_ratio(tests: Sequence[Sequence[GroupTest]]) -> float:
+    return tests[0][0].ratio if tests else 0.0
 
 
 def _different(
     equations: Equations, blocks: Sequence[Block], labels: Mapping[str, str | None]
 ) -> list[list[GroupTest]]:
     """The group whose own parameters, or own probe, differ from those of the others, and those that do so as well."""
-    tests = different_groups(blocks)
-    found = []
+    tests, different = different_groups(blocks), []
     for test in tests:
         cause = _cause(equations, [name for name, label in labels.items() if label == test.group])
         remounted = cause is not None and cause.names == PROBE and cause.ratio > _LEAST_REMOUNTED
         significant = test.probability * len(tests) < _LEVEL
         if significant and (test.ratio > _LEAST_DIFFERENCE or remounted):
-            found.append(test)
-    return [[test for test in found if test.variance < 1.1 * found[0].variance]] if found else []
+            different.append(test)
+    return [[test for test in different if test.variance < 1.1 * different[0].variance]] if different else []
 
 
 def _suspect(equations: Equations, labels: Mapping[str, str | None], test: GroupTest) -> Suspect:
@@ -168,14 +259,14 @@ def _suspect(equations: Equations, labels: Mapping[str, str | None], test: Group
 
 def rms_of(rows: Sequence[Rows], step: Float[np.ndarray, " s"]) -> float:
     """Root mean square distance of poses from their geometry, mm, after a step."""
-    return float(np.sqrt(np.mean(np.concatenate([each.squares(step) for each in rows]))))
+    return float(np.sqrt(np.mean(np.concatenate([part.squares(step) for part in rows]))))
 
 
 def _cause(equations: Equations, members: Sequence[str]) -> Cause | None:
     """The zero of a joint, or else the probe, that explains why some observations contradict the others."""
-    one = [block._replace(group="members" if block.fixture in members else block.group) for block in equations.blocks()]
-    whole = fit_of(one)
-    apart = sum(fit_of([b for b in one if b.group in (group, None)]).cost for group in ("", "members"))
+    blocks = [b._replace(group="members" if b.fixture in members else b.group) for b in equations.blocks()]
+    whole = fit_of(blocks)
+    apart = sum(fit_of([block for block in blocks if block.group in (group, None)]).cost for group in ("", "members"))
     contradicted = max(whole.cost - apart, 1e-300)
     best = None
     for names in (*((name,) for name in equations.extra if name not in PROBE), PROBE):
@@ -211,14 +302,14 @@ def session_metrics(record: CalibrationRecord) -> dict[str, tuple[int, float, fl
     capture = record.recording.capture
     if not capture.sessions:
         return {}
-    equations, found = equations_of(record), {}
+    equations, metrics = case_of(record).equations, {}
     for session in capture.sessions:
         own = [rows for rows in equations.rows if capture.session_of(rows.name) == session]
         if own:
             alone = fit_of([*(rows.block("") for rows in own), *equations.relations]).step
             poses = sum(len(rows.residual) for rows in own)
-            found[session] = poses, rms_of(own, np.zeros_like(alone)), rms_of(own, alone)
-    return found
+            metrics[session] = poses, rms_of(own, np.zeros_like(alone)), rms_of(own, alone)
+    return metrics
 
 
 def remove_contradicting(
@@ -242,7 +333,7 @@ def remove_contradicting(
     """
     most = sum(len(set(labels.values())) for labels in groupings(record.recording.capture).values()) // 2
     for _ in range(most):
-        clear = [found for found in contradictions_of(record) if len(found.suspects) == 1]
+        clear = [contradiction for contradiction in contradictions_of(record) if len(contradiction.suspects) == 1]
         if not clear:
             break
         (suspect,) = clear[0].suspects
@@ -264,7 +355,7 @@ def remove_contradicting(
 
 
 def _removed(before: CalibrationRecord, after: CalibrationRecord, kind: str, suspect: Suspect) -> Removed:
-    equations = equations_of(after)
+    equations = case_of(after).equations
     changed = np.abs(after.vectors()["calibrated"] - before.vectors()["calibrated"])
     u = np.sqrt(np.diag(before.covariance))
     changes = np.where(u > 0, changed / np.where(u > 0, u, 1.0), 0.0)

@@ -42,6 +42,10 @@ class Rows(NamedTuple):
         flat = (array.reshape(self.residual.size, array.shape[2]) for array in (shared, self.own))
         return Block(self.name, group, self.residual.ravel(), *flat)
 
+    def at(self, poses: "slice | np.ndarray") -> "Rows":
+        """Some of the poses."""
+        return Rows(self.name, *(part[poses] for part in self[1:]))
+
     def squares(self, step: Float[np.ndarray, " s"]) -> Float[np.ndarray, " m"]:
         """Squared distance of each pose from the geometry, mm^2, after a step; its own geometry follows."""
         moved = self.residual + self.shared @ step
@@ -61,8 +65,8 @@ class Equations(NamedTuple):
     def blocks(self, members: Sequence[str] = (), names: Sequence[str] = ()) -> list[Block]:
         """All in one group; with some of ``extra`` as unknowns that only certain observations have."""
         columns = [self.extra.index(name) for name in names]
-        found = [rows.block("", columns, rows.name in members) for rows in self.rows]
-        return [*found, *wider(self.relations, len(columns))]
+        blocks = [rows.block("", columns, rows.name in members) for rows in self.rows]
+        return [*blocks, *wider(self.relations, len(columns))]
 
     def grouped(self, groups: Mapping[str, str | None]) -> list[Block]:
         """By the group of each observation."""
@@ -77,28 +81,24 @@ def equations_of(record: CalibrationRecord) -> Equations:
     return Equations(*_rows_and_relations(record, extra), extra, steps)
 
 
-def equations_in_chunks(record: CalibrationRecord) -> tuple[list[Rows], list[Block]]:
+def in_chunks(equations: Equations) -> tuple[list[Rows], list[Block]]:
     """The equations of poses in chunks, or of very many an even choice of these, and those of relations.
 
     Unknowns of an observation that is divided become shared ones.
     """
-    equations = equations_of(record)
-    divided = [each for each in equations.rows if len(each.poses) > _CHUNK]
-    added = sum(each.own.shape[2] for each in divided)
+    added = sum(rows.own.shape[2] for rows in equations.rows if len(rows.poses) > _CHUNK)
     chunks, position = [], 0
-    for each in equations.rows:
-        shared = np.pad(each.shared, ((0, 0), (0, 0), (0, added)))
-        if len(each.poses) <= _CHUNK:
-            chunks.append(each._replace(shared=shared))
+    for rows in equations.rows:
+        shared = np.pad(rows.shared, ((0, 0), (0, 0), (0, added)))
+        if len(rows.poses) <= _CHUNK:
+            chunks.append(rows._replace(shared=shared))
             continue
-        width = each.own.shape[2]
-        shared[..., each.shared.shape[2] + position :][..., :width] = each.own
+        width = rows.own.shape[2]
+        shared[..., rows.shared.shape[2] + position :][..., :width] = rows.own
         position += width
-        whole = each._replace(shared=shared, own=each.own[..., :0])
-        for start in range(0, len(each.poses), _CHUNK):
-            of = slice(start, start + _CHUNK)
-            chunks.append(whole._replace(**{name: getattr(whole, name)[of] for name in Rows._fields if name != "name"}))
-    step = -(-sum(len(each.poses) for each in chunks) // _MOST_POSES)
+        whole = rows._replace(shared=shared, own=rows.own[..., :0])
+        chunks += [whole.at(slice(start, start + _CHUNK)) for start in range(0, len(rows.poses), _CHUNK)]
+    step = -(-sum(len(rows.poses) for rows in chunks) // _MOST_POSES)
     return chunks[:: max(step, 1)], wider(equations.relations, added)
 
 

@@ -12,10 +12,13 @@ from ..calibration.scale_fix import ends_between, positions_at_ends
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..model.observed import Observed
+from ..uncertainty.shared_kinds import PLACES
 from .equations import LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
+from .findings import Case, Finding, chance_text
 from .group_test import Block
-from .residual_tests import consistency
+from .residual_tests import LEVEL, consistency
 
+ORDER, NEEDS = 66, "fit"
 _EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
 # A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
 _CLEAR, _AGREE = 9.0, 0.05
@@ -32,28 +35,45 @@ class Lengths(NamedTuple):
     difference: float = 0.0  # of that one from what the others say, mm
 
 
-def length_test(
-    record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block], spare: int
-) -> Lengths | None:
-    """Lengths and certified values against the arm as the poses alone determine it, but for its scale.
+def test(case: Case) -> list[Finding]:
+    """The finding, where lengths disagree by more than chance."""
+    lengths = case.once(lengths_of)
+    if lengths is None or lengths.probability >= LEVEL:
+        return []
+    kinds = set() if case.record.shared is None else set(case.record.shared.kinds)
+    odd = f"; without {lengths.odd} ({lengths.difference:+.3g} mm) the others agree" if lengths.odd else ""
+    predicted = "u, the poses and the errors that these share" if kinds and not odd else "u and the poses"
+    # Errors of places take the part of what u(k) had for lengths that disagree.
+    enlarged = case.record.final_method == "two-stage" and PLACES not in kinds
+    return [
+        Finding(
+            "lengths-disagree",
+            f"Reference lengths that disagree with the arm: the {lengths.number} err {lengths.birge_ratio:.2g} times "
+            f"as much as their {predicted} predict (Birge ratio, {chance_text(lengths.probability)}){odd}.",
+            "u(k) allows for it." if enlarged else "",
+            "Look for a wrong length, or for errors outside the D-H model.",
+            severity="doubt",
+            probability=lengths.probability,
+            concerns=(lengths.odd,) if lengths.odd else (),
+        )
+    ]
+
+
+def lengths_of(case: Case) -> Lengths | None:
+    """Lengths and certified values against the arm as the poses alone determine it, but for its scale; None where there
+    are too few to contradict each other.
 
     Errors that poses share, where the calibration has found them, are part of what is expected, unless a single length
     is what all others contradict.
-
-    Args:
-        record: The calibration.
-        rows: Its equations of poses.
-        relations: Its equations of lengths and certified values, where it has any.
-        spare: Degrees of freedom of the noise, where it was estimated.
-
-    Returns:
-        None where there are too few to contradict each other.
     """
+    if not case.testable:
+        return None
+    record, (rows, relations), freedom = case.record, case.chunks, case.left.degrees_of_freedom
     afterwards = bool(record.recording.capture.lengths) and not lengths_in_solve(record)
     related = lengths_of_sockets(record, rows) if afterwards else _of_observations(record, rows, relations)
     if related is None:
         return None
-    plain = _tested(record, related, related.covariance, spare)
+    plain = _tested(record, related, related.covariance, freedom)
     if plain is None or plain.odd or record.shared is None or not record.recording.capture.lengths:
         return plain
     arm = to_numpy(record.calibrated.arm)
@@ -61,33 +81,32 @@ def length_test(
     number = len(by_shared)  # they come before certified values
     by_shared = by_shared / (related.units[:number, None] * related.units[:number])
     others = len(related.names) - number
-    return _tested(record, related, related.covariance + np.pad(by_shared, (0, others)), spare)
+    return _tested(record, related, related.covariance + np.pad(by_shared, (0, others)), freedom)
 
 
 def _tested(
-    record: CalibrationRecord, related: "Related", covariance: Float[np.ndarray, "l l"], spare: int
+    record: CalibrationRecord, related: "Related", covariance: Float[np.ndarray, "l l"], freedom: int
 ) -> Lengths | None:
-    names, units = related.names, related.units
-    found = consistency(related.poses, related.relations, covariance, related.scale)
-    if found.degrees_of_freedom < 1:
+    tested = consistency(related.poses, related.relations, covariance, related.scale)
+    if tested.degrees_of_freedom < 1:
         return None
 
     def probability(square: float, number: int) -> float:
         if record.given_noise is not None:
             return chi_square_tail(square, number)
-        return f_tail(square / number, number, spare)
+        return f_tail(square / number, number, freedom)
 
-    worst, number = int(np.argmax(found.gains)), found.degrees_of_freedom
-    square = max(found.square, 0.0)
-    rest = max(square - found.gains[worst], 0.0)
+    worst, number = int(np.argmax(tested.gains)), tested.degrees_of_freedom
+    square = max(tested.square, 0.0)
+    rest = max(square - tested.gains[worst], 0.0)
     clear = number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square
     return Lengths(
         birge_ratio=float(np.sqrt(square / number)),
         degrees_of_freedom=number,
         probability=probability(square, number),
-        number=len(names),
-        odd=names[worst] if clear else "",
-        difference=float(found.shifts[worst] * units[worst]) if clear else 0.0,
+        number=len(related.names),
+        odd=related.names[worst] if clear else "",
+        difference=float(tested.shifts[worst] * related.units[worst]) if clear else 0.0,
     )
 
 

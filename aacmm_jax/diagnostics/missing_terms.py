@@ -14,19 +14,100 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import to_numpy
+from ..core.text import shorten
+from ..core.units import ARCSEC
 from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections.kinds import all_sought, model_with, terms_of
+from ..kinematics.corrections.kind import Term
+from ..kinematics.corrections.kinds import all_sought, model_of, model_with, terms_of
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import Rows, wider
+from .findings import Case, Finding, chance_text, rounded
 from .group_test import Block
 from .residual_tests import LEVEL, Residuals, ScoreTest, score_tests
 
+ORDER, NEEDS = 60, "fit"
 MOST_TERMS = 6  # that are looked for one after the other
 _AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below which another term explains as much
 # Part of the residuals. A step of a joint, 1 mrad, turns the residuals themselves by 1e-3 of their size, and so does
 # the frame of a station that imitates it: in what is left of its column after the frame, linear equations are wrong.
 _SECOND_ORDER = 3e-3
+# Terms that no kind of joint correction has: what residuals follow, of joint {i}, and what causes that.
+_OTHERS: dict[str, tuple[str, str]] = {
+    "zero": ("the zero of joint {i}, which is fixed", "a wrong zero"),
+    "drifting zero": ("a drift of joint {i} from pose to pose", "a zero that drifts"),
+    "drifting base": ("a drift of the tip from pose to pose", "a base or socket that moves"),
+    "growing arm": ("a growth of the arm from pose to pose", "an arm that warms or cools"),
+}
+
+
+def test(case: Case) -> list[Finding]:
+    """Terms that the model lacks, in one finding: each explains what those before it leave."""
+    terms = case.once(missing)
+    if not terms:
+        return []
+    kinds = dict.fromkeys(term.kind for term in terms)
+    named = {(term.kind, term.joint) for term in terms}
+    others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in named)
+    likely = [_words(kind)[0].format(i=joint) for kind, joint in others]
+    model = wider_model(terms, case.record.calibrated.arm)
+    probability = max(term.probability for term in terms)
+    texts = [f"{_words(term.kind)[0].format(i=term.joint)} ({_amplitude_text(term)})" for term in terms]
+    shared = set() if case.record.shared is None else set(case.record.shared.kinds)
+    in_uncertainty = bool(shared - {PLACES, VISITS, SUCCESSIVE})
+    return [
+        Finding(
+            "missing-terms",
+            f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model lacks: "
+            f"{', '.join(_words(kind)[1] for kind in kinds)}{f'; try --model {model}' if model else ''}."
+            + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
+            "The stated uncertainties include these errors as estimated from the residuals."
+            if in_uncertainty
+            else "Every stated uncertainty is too small.",
+            severity="doubt",
+            probability=probability,
+            concerns=tuple(dict.fromkeys("tip" if t.joint is None else f"joint {t.joint}" for t in terms)),
+        )
+    ]
+
+
+def missing(case: Case) -> "tuple[FoundTerm, ...]":
+    """The terms that the model of a calibration lacks."""
+    if not case.scatters:
+        return ()
+    return found_terms(case.record.calibrated.arm, np.asarray(case.record.recording.capture.readings), *case.chunks)
+
+
+def explained(case: Case) -> tuple[list[Rows], list[Block]]:
+    """The equations of a calibration, with these terms as further unknowns."""
+    return with_terms(*case.chunks, case.once(missing), case.record.calibrated.arm.joints)
+
+
+def _words(name: str) -> tuple[str, str]:
+    """What residuals follow, of joint {i}, and what causes that."""
+    sought = all_sought().get(name)
+    return _OTHERS[name] if sought is None else (sought[1].follows, sought[1].cause)
+
+
+def _amplitude_text(term: "FoundTerm") -> str:
+    if term.term.relative and term.kind != "zero":
+        return f"{rounded(100 * term.amplitude)} %"
+    return f"{rounded(term.amplitude)} mm" if term.joint is None else f"{rounded(term.amplitude / ARCSEC)} arcsec"
+
+
+def wider_model(terms: "Sequence[FoundTerm]", arm: Arm | None) -> str:
+    """The model that the arm has, with the terms that were found besides; empty where that is no other model."""
+    functions = () if arm is None or arm.corrections is None else arm.corrections.functions.terms
+    present = [term for term in functions if isinstance(term, Term)]
+    sought, added = all_sought(), []
+    for kind, one in (sought[term.kind] for term in terms if term.kind in sought):
+        # All of its default functions where the model has none yet, as a first harmonic is seldom alone.
+        option = one.option if any(term.kind.model == kind.model for term in present) else ""
+        joints = 1 if arm is None else arm.joints
+        added += kind.terms(max(joints, *(term.joint or 1 for term in terms)), option, None)
+    wider = model_of([*present, *added]) if added else ""
+    return "" if present and wider == model_of(present) else wider
 
 
 class MissingTerm(NamedTuple):
@@ -59,9 +140,9 @@ def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], joints: int) 
     factors = np.concatenate([np.zeros((poses, 0)), *(term.values for term in of_joints)], axis=1)
     moves = np.concatenate([np.zeros((poses, 3, 0)), *(term.values for term in of_tip)], axis=2)
     blocks = []
-    for each in rows:
-        by_joints = each.extra[..., :joints][..., owner] * factors[each.poses][:, None]
-        both = np.concatenate([by_joints, each.by_tip @ moves[each.poses]], axis=2)
+    for part in rows:
+        by_joints = part.extra[..., :joints][..., owner] * factors[part.poses][:, None]
+        both = np.concatenate([by_joints, part.by_tip @ moves[part.poses]], axis=2)
         blocks.append(both.reshape(-1, both.shape[2]))
     ends = np.cumsum([term.values.shape[-1] for term in (*of_joints, *of_tip)])
     return np.split(np.concatenate(blocks), ends[:-1], axis=1)
@@ -77,20 +158,20 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
     arm = to_numpy(arm)
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
     tip = np.moveaxis(np.asarray(forward_pass(arm.geometry, joint_motion(arm.geometry, q)).tip), -1, 0)
-    found, of_arm = [], []
+    of_joints, of_arm = [], []
     for joint in range(1, arm.joints + 1):
         zeros = MissingTerm("zero", joint, np.ones_like(order), relative=True)
-        found += [zeros, MissingTerm("drifting zero", joint, order)]
+        of_joints += [zeros, MissingTerm("drifting zero", joint, order)]
     for name, (kind, sought) in all_sought().items():
         functions = _functions(arm, q, model_with(kind, sought.option))
         if kind.of_arm:
-            growth = [one for one in functions[0].T if np.ptp(one) > 0]
-            of_arm += [MissingTerm(name, None, one[:, None, None] * tip[:, :, None] / 1e3) for one in growth]
+            growth = [values for values in functions[0].T if np.ptp(values) > 0]
+            of_arm += [MissingTerm(name, None, values[:, None, None] * tip[:, :, None] / 1e3) for values in growth]
         # A scale has no revolution to repeat, and carries what it moves.
         joints = [joint for joint in functions if joint and (joint not in arm.prismatic or sought.of_slides)]
-        found += [MissingTerm(name, joint, functions[joint], sought.relative) for joint in joints]
+        of_joints += [MissingTerm(name, joint, functions[joint], sought.relative) for joint in joints]
     return [
-        *found,
+        *of_joints,
         MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
         MissingTerm("growing arm", None, order[:, :, None] * tip[:, :, None] / 1e3),  # by 1 mm a m
         *of_arm,
@@ -117,23 +198,23 @@ def found_terms(
         rows: Equations of the poses.
         relations: Equations of lengths, certified values and priors.
     """
-    left = Residuals.of([*(each.block("") for each in rows), *relations])
+    left = Residuals.of([*(part.block("") for part in rows), *relations])
     candidates, others_rows = missing_terms(arm, q), sum(len(block.residual) for block in relations)
-    columns = [np.pad(each, ((0, others_rows), (0, 0))) for each in columns_of(candidates, rows, arm.joints)]
+    columns = [np.pad(values, ((0, others_rows), (0, 0))) for values in columns_of(candidates, rows, arm.joints)]
     chosen: list[tuple[int, ScoreTest, float, list[int]]] = []
-    explained, least = left, _SECOND_ORDER * float(np.sqrt(left.cost))
+    rest, least = left, _SECOND_ORDER * float(np.sqrt(left.cost))
     for _ in range(MOST_TERMS):
-        tests = score_tests(explained, columns, least)
+        tests = score_tests(rest, columns, least)
         number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
         significant = [i for i, test in enumerate(tests) if test.probability * number < LEVEL]
         if not significant:
             break
-        criterion = [_criterion(explained, test) for test in tests]
+        criterion = [_criterion(rest, test) for test in tests]
         best = min(significant, key=lambda i: criterion[i])
         others = [i for i in significant if i != best and criterion[i] < criterion[best] + _AS_WELL]
         others.sort(key=lambda i: criterion[i])
         chosen.append((best, tests[best], min(tests[best].probability * number, 1.0), others))
-        explained = explained.extended(columns[best])
+        rest = rest.extended(columns[best])
     if not chosen:
         return ()
     (together,) = score_tests(left, [np.concatenate([columns[i] for i, *_ in chosen], axis=1)], least)
@@ -141,25 +222,25 @@ def found_terms(
     return tuple(
         FoundTerm(
             *(candidates[i].kind, candidates[i].joint, test, probability),
-            amplitude=_amplitude(candidates[i], own),
+            amplitude=_amplitude(candidates[i], coefficient),
             alternatives=tuple((candidates[j].kind, candidates[j].joint) for j in others),
             term=candidates[i],
         )
-        for (i, test, probability, others), own in zip(chosen, coefficients, strict=True)
+        for (i, test, probability, others), coefficient in zip(chosen, coefficients, strict=True)
     )
 
 
 def with_terms(
-    rows: Sequence[Rows], relations: Sequence[Block], found: Sequence[FoundTerm], joints: int
+    rows: Sequence[Rows], relations: Sequence[Block], terms: Sequence[FoundTerm], joints: int
 ) -> tuple[list[Rows], list[Block]]:
     """The equations with these terms as further unknowns."""
-    if not found:
+    if not terms:
         return list(rows), list(relations)
-    columns = np.concatenate(columns_of([one.term for one in found], rows, joints), axis=1)
-    ends = np.cumsum([each.residual.size for each in rows])[:-1]
+    columns = np.concatenate(columns_of([term.term for term in terms], rows, joints), axis=1)
+    parts = np.split(columns, np.cumsum([part.residual.size for part in rows])[:-1])
     extended = [
-        each._replace(shared=np.concatenate([each.shared, of.reshape(*each.residual.shape, -1)], axis=2))
-        for each, of in zip(rows, np.split(columns, ends), strict=True)
+        part._replace(shared=np.concatenate([part.shared, added.reshape(*part.residual.shape, -1)], axis=2))
+        for part, added in zip(rows, parts, strict=True)
     ]
     return extended, wider(relations, columns.shape[1])
 

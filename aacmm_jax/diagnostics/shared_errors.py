@@ -16,26 +16,22 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.record import CalibrationRecord, record_of
+from ..calibration.record import CalibrationRecord
 from ..calibration.redrawn import functions_of, places_of
 from ..calibration.results import Calibration
 from ..calibration.stages import Sensitivities
-from ..core._compat import inside_trace
-from ..core.arrays import is_concrete
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture
-from ..data.recording import Recording
 from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
 from ..kinematics.corrections.kinds import coefficient_of, shared_model
-from ..kinematics.parameters import ArmSpecification
 from ..kinematics.priors import default_prior
 from ..uncertainty.covariance import DISAGREEMENT
 from ..uncertainty.degrees_of_freedom import Law
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .equations import EXACT, PRIOR, Rows, equations_in_chunks, lengths_in_solve, residual_rms
+from .equations import EXACT, PRIOR, Rows, lengths_in_solve, residual_rms
+from .findings import Case
 from .random_effects import NULL, Effects, Moments, OneVariance, group_deviations, one_variance, second_moments
 from .residual_tests import block_diagonal, form_of_poses, form_test, score_tests
 from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, with_lengths
@@ -61,45 +57,41 @@ _USUAL = 1.25
 _FEW = 2
 
 
-def with_shared_errors(
-    result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]
-) -> Calibration:
-    """The calibration with the errors that its poses share in its covariance; as it is where its values are traced.
+def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivities]) -> Calibration:
+    """The calibration with the errors that its poses share in its covariance.
 
     What is left of an estimated noise is that of single poses. The covariance by the noise of all stays: where chance
     looks like shared errors, intervals do not become narrower.
     """
-    if inside_trace() or not is_concrete(*jax.tree.leaves((result, capture))) or result.implausible_residual:
-        return result
     with np.errstate(all="ignore"):
-        found = _found(to_numpy(result), to_numpy(capture), sensitivities)
-    if found is None:
+        addition = _addition(case, sensitivities)
+    if addition is None:
         return result
     before = result.parameter_covariance
-    if PLACES in found.shared.kinds:
+    if PLACES in addition.shared.kinds:
         before = before.without(DISAGREEMENT)
     covariance = before._replace(
-        matrix=before.matrix + found.added,
-        noise=jax.tree.map(lambda leaf: np.sqrt(found.variance) * leaf, before.noise),
+        matrix=before.matrix + addition.added,
+        noise=jax.tree.map(lambda leaf: np.sqrt(addition.variance) * leaf, before.noise),
     )
     if not np.all(np.isfinite(covariance.matrix)):
         return result
     return eqx.tree_at(
-        lambda r: (r.parameter_covariance, r.shared), result, (covariance, found.shared), is_leaf=lambda x: x is None
+        lambda r: (r.parameter_covariance, r.shared),
+        result,
+        (covariance, addition.shared),
+        is_leaf=lambda x: x is None,
     )
 
 
-class _Found(NamedTuple):
+class _Addition(NamedTuple):
     shared: SharedErrors
     added: Float[np.ndarray, "p p"]
     variance: float  # of independent errors, over that of all
 
 
-def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Sensitivities]) -> _Found | None:
-    record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
-    if not record.converged:
-        return None
-    rows, relations = equations_in_chunks(record)
+def _addition(case: Case, sensitivities: Callable[[], Sensitivities]) -> _Addition | None:
+    record, (rows, relations) = case.record, case.chunks
     rows = _trusted(record, rows)
     if not rows or residual_rms(rows) < EXACT:
         return None
@@ -135,16 +127,14 @@ def _found(result: Calibration, capture: Capture, sensitivities: Callable[[], Se
 
 def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
     """Without poses that lost most of their weight to a robust loss: what is left of their errors is no noise."""
-    weights, found = np.concatenate([np.asarray(one) for one in record.observed.weights]), []
-    for each in rows:
-        kept = weights[each.poses] > _TRUSTED
-        found.append(each._replace(**{name: getattr(each, name)[kept] for name in Rows._fields if name != "name"}))
-    return [each for each in found if len(each.poses)]
+    weights = np.concatenate([np.asarray(part) for part in record.observed.weights])
+    trusted = [part.at(weights[part.poses] > _TRUSTED) for part in rows]
+    return [part for part in trusted if len(part.poses)]
 
 
 def _summed(
     problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
-) -> _Found:
+) -> _Addition:
     """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
     found = [effect for effect in tips if effect.learned is not None]
     kinds, units = [effect.kind for effect in found], ["mm" for _ in found]
@@ -179,7 +169,7 @@ def _summed(
         by_group=moments.by_group,
         law=law,
     )
-    return _Found(shared, added.sum(axis=0) + follow @ moments.matrix @ follow.T, every.variance)
+    return _Addition(shared, added.sum(axis=0) + follow @ moments.matrix @ follow.T, every.variance)
 
 
 class _Tips(NamedTuple):

@@ -116,8 +116,8 @@ def cross_validate(
         capture: sockets, reference lengths and other observations.
         bounds: box of the free parameters ``(p,)``, mm and rad.
         groups: what to leave out instead, each as a name or a shell pattern: ``["monday/*", "tuesday/*"]``.
-        options: how each calibration is solved, as for `calibrate`; nothing is said of what data do not determine, and
-            bad poses of what is left out count in full, whatever the loss is.
+        options: as for `calibrate`, like all arguments that are not named here; nothing is said of what data do not
+            determine, and bad poses of what is left out count in full, whatever the loss is.
 
     Returns:
         Errors of each group, found and predicted, mm.

@@ -28,8 +28,8 @@ from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..diagnostics.encoder_noise import with_noise_by_joint
-from ..diagnostics.shared_errors import with_shared_errors
+from ..diagnostics import noisy_encoders, shared_errors
+from ..diagnostics.findings import amendable
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..kinematics.priors import Prior
@@ -140,14 +140,15 @@ def identify(
     task = _stage1_task("identify_many", arm, capture, bounds, options)
     capture = to_numpy(capture)
     result = to_jax(_identified(to_numpy(task), capture))
-    if not options.may_replace_noise:
+    case = amendable(result, capture) if options.may_replace_noise else None
+    if case is None:
         return result
     again = options._replace(noise_model=None, replace_noise=False)
 
     def with_noise(replaced: Noise) -> Identification:
         return identify(arm, capture, bounds, **again._replace(noise=replaced).of_stage1)
 
-    return with_noise_by_joint(result, capture, with_noise)
+    return noisy_encoders.amend(result, case, with_noise)
 
 
 def _stage1_task(many: str, arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions) -> Task:
@@ -227,17 +228,18 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         warn_of_known_scale(first.anchor.set_by, bool(arm.prismatic))
     first, task, capture = to_numpy((first, task, capture))
     result, sensitivities = _calibrated(first, task, capture, method)
-    if given.may_replace_noise:
+    case = amendable(result, capture)
+    if case is not None and given.may_replace_noise:
         again = given._replace(noise_model=None, replace_noise=False, undetermined="ignore")
 
         def with_noise(replaced: Noise) -> Calibration:
             return calibrate(arm, capture, bounds, **again._replace(noise=replaced)._asdict())
 
-        replaced = with_noise_by_joint(result, capture, with_noise)
+        replaced = noisy_encoders.amend(result, case, with_noise)
         if replaced is not result:
             return replaced
-    if given.shared_errors and sensitivities is not None:
-        result = with_shared_errors(result, capture, sensitivities)
+    if case is not None and given.shared_errors and sensitivities is not None:
+        result = shared_errors.amend(result, case, sensitivities)
     return to_jax(result)
 
 

@@ -9,6 +9,8 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read
+from ..diagnostics.determined import determined
+from ..diagnostics.findings import case_of
 from ..plot.lengths import length_chart
 from ..plot.residuals import arms_chart, distances_by_arm
 from ..summaries.calibration import calibration_summary
@@ -16,7 +18,6 @@ from ..summaries.cells import Cell, Table, format_number, number, table
 from ..summaries.observations import capture_words
 from ..summaries.tables import decimals_for, lengths_sentence, two_digits
 from ..summaries.uncertainty_sentences import shared_sentence
-from ..summaries.warnings import observed
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
 from .elements import Block, Report, Section, with_table
@@ -34,9 +35,9 @@ _OBSERVED = "Joint least squares of everything observed"
 
 def calibration_report(record: CalibrationRecord) -> Report:
     """The report, except for the origin of its file."""
-    uncertainty, observability = uncertainty_of(record), observed(record)
+    uncertainty, observability = uncertainty_of(record), case_of(record).once(determined)
     volume = volumetric_uncertainty(uncertainty)
-    summary = calibration_summary(record, observability, volume)
+    summary = calibration_summary(record, volume)
     evaluations = record.evaluations()
     capture = record.recording.capture
     joint = record.final_method == "joint"

@@ -1,19 +1,22 @@
 """Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..calibration.results import PriorMetrics, active_names
+from ..calibration.results import NoisyEncoder, PriorMetrics, active_names
 from ..core.text import csv_text, pluralise
-from ..core.units import people_read
+from ..core.units import ARCSEC, people_read
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
-from ..diagnostics.model_errors import model_tests
+from ..diagnostics.determined import determined
+from ..diagnostics.findings import case_of, finding_rows, findings_of, sentences
+from ..diagnostics.model_errors import rows_of_tests, values_of_tests
+from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.tried_poses import tried_poses
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.corrections.kinds import coefficient_of
@@ -22,11 +25,9 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
-from .model_errors import noisy_encoder_rows, summary_of_tests
 from .observations import capture_observations, observed_summary
 from .validation import cross_validation_summary
 from .verdicts import calibration_verdict, checked_lengths
-from .warnings import observed, of_calibration, of_import
 
 _CORRELATED = 0.95
 
@@ -101,7 +102,7 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
         ],
         "temperature_C": [float(end) for end in (warmth.min(), warmth.max())] if warmth.size else None,
         "simulated": recording.true is not None,
-        "warnings": of_import(recording),
+        "warnings": sentences(findings_of_capture(recording)),
     }
 
 
@@ -166,15 +167,15 @@ def metrics_by_socket_and_length(
 
 def calibration_summary(
     record: CalibrationRecord,
-    observability: Observability | None = None,
     volume: VolumetricUncertainty | None = None,
 ) -> dict[str, Any]:
     """A calibration: method, metrics by arm, scale, parameters, uncertainty and warnings.
 
-    ``observability`` (`warnings.observed`) and ``volume`` (`volumetric_uncertainty`) are computed if not given.
+    ``volume`` (`volumetric_uncertainty`) is computed if not given.
     """
-    observability = observed(record) if observability is None else observability
-    tests = None if record.implausible_residual or not record.plausible_scale else model_tests(record)
+    case, findings = case_of(record), findings_of(record)
+    observability = case.once(determined)
+    tests = None if record.implausible_residual or not record.plausible_scale else rows_of_tests(values_of_tests(case))
     evaluations, vectors = record.evaluations(), record.vectors()
     uncertainty, u = uncertainty_of(record), np.sqrt(np.diag(record.covariance))
     expanded = uncertainty.factor() * u
@@ -214,10 +215,11 @@ def calibration_summary(
         "uncertainty": uncertainty_summary(record, observability, volume),
         "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
         "monte_carlo": record.sampled_says,
-        "model_tests": None if tests is None else summary_of_tests(tests),
+        "model_tests": tests,
         "prior": None if record.prior is None else prior_rows(record.prior),
         "shared_errors": None if record.shared is None else shared_rows(record.shared),
-        "warnings": of_calibration(record, observability, tests),
+        "findings": finding_rows(findings),
+        "warnings": sentences(findings),
         **observed_summary(record, evaluations["nominal"]),
     }
     if "true" in vectors:
@@ -225,7 +227,9 @@ def calibration_summary(
             stage: truth_errors(record, vectors, stage) for stage in ("nominal", "stage1", "calibrated")
         }
     checked = checked_lengths(summary["lengths"], summary["cross_validation"], record.fixed_by_one_length)
-    return summary | {"lengths_tested": checked, "verdict": calibration_verdict(summary)._asdict()}
+    volume_row, held_out = summary["uncertainty"]["volume"], summary["cross_validation"]
+    verdict = calibration_verdict(findings, volume_row, held_out, "truth" in summary)
+    return summary | {"lengths_tested": checked, "verdict": verdict._asdict()}
 
 
 def prior_rows(prior: PriorMetrics) -> list[dict[str, Any]]:
@@ -252,6 +256,16 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
     scale, unit = people_read(row["unit"])
     scale_in_words = f"{row['sd'] * scale:.3g} {unit}".strip()
     return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {scale_in_words}; {spent}"
+
+
+def noisy_encoder_rows(encoders: Iterable[NoisyEncoder], slides: Collection[int]) -> list[dict[str, Any]]:
+    """Encoders whose noise was replaced; arcsec, or mm of prismatic joints."""
+    rows = []
+    for encoder in encoders:
+        unit, factor = ("mm", 1.0) if encoder.joint in slides else ("arcsec", 1 / ARCSEC)
+        values = {name: factor * getattr(encoder, name) for name in ("expected", "found", "u")}
+        rows.append({"joint": encoder.joint, "probability": encoder.probability, "unit": unit, **values})
+    return rows
 
 
 def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:

@@ -15,11 +15,13 @@ from ..core.text import common_labels
 from ..data.capture import Capture, names_in, part_of
 from ..data.noise import Noise
 from ..data.observations.socket import Socket
+from ..diagnostics.findings import sentences
+from ..diagnostics.held_out import no_better, surprise
 from ..kinematics.arm import Arm
 from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import length_metrics, metrics, metrics_by_socket_and_length
-from .validation import agreement_row, finite, no_better, surprise
+from .validation import agreement_row, finite
 from .verdicts import evaluation_verdict
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
@@ -147,7 +149,7 @@ def _add_prediction(
     }
     before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
     unseen = surprise(poses, lengths_found, each, lambda: _with_probe_fitted(record.uncertainty, part))
-    return unseen + no_better(before, after)
+    return sentences(unseen + no_better(before, after))
 
 
 def _with_probe_fitted(uncertainty: Uncertainty | None, part: Capture | None) -> Agreement | None:

@@ -7,8 +7,8 @@ import aacmm_jax as aj
 from aacmm_jax.calibration import sampling
 from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
 from aacmm_jax.calibration.sampling import numerical_tolerance
+from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.pipeline.cross_validation import groups_of
-from aacmm_jax.summaries import warnings as cautions
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 
@@ -145,7 +145,7 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     assert checked.excess > 3
     result = aj.calibrate(arm, bent, bounds, **options, shared_errors=False)
     record = aj.calibration.record_of(result, aj.Recording(bent, aj.kinematics.ArmSpecification(arm, "bent")))
-    found = cautions.of_calibration(record._replace(validation=checked))
+    found = sentences(findings_of(record._replace(validation=checked)))
     assert found[0].startswith("Held out one after the other, placements have larger errors than predicted")
     assert f"{checked.rms / checked.rms_predicted:.1f} times the predicted {checked.rms_predicted:.3g} mm;" in found[0]
     assert f"{checked.length_rms / checked.length_u:.1f} times the predicted {checked.length_u:.3g} mm" in found[0]

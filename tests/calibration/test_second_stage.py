@@ -14,9 +14,9 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.calibration.scale_anchor import scale_anchor
 from aacmm_jax.core.units import ARCSEC
+from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.kinematics.arm import value_of
 from aacmm_jax.model.scale import divided_arm
-from aacmm_jax.summaries import warnings as cautions
 
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300)}
 POSES = {"A": 40, "B": 5}
@@ -124,7 +124,7 @@ def test_a_fixed_length_that_sets_the_scale_comes_back_as_given(too_long, captur
     assert short.scale_set_by == ("d_3",)
     aj.files.save_calibration(tmp_path / "new.h5", short)
     assert aj.files.load_calibration(tmp_path / "new.h5").scale_set_by == ("d_3",)
-    said = " ".join(cautions.of_calibration(record))
+    said = " ".join(sentences(findings_of(record)))
     assert "d_3 is fixed and already sets the scale" in said
     assert "--method joint" in said
     joint = aj.calibrate(too_long, capture, bounds, method="joint")
@@ -360,7 +360,7 @@ def test_a_residual_that_no_arm_has_is_not_plausible(paper_arm, capture, cut):
     assert (good.stage1.implausible_residual, bad.stage1.implausible_residual) == (False, True)
     nominal = aj.kinematics.ArmSpecification(paper_arm, "arm")
     said = [
-        cautions.of_calibration(aj.calibration.record_of(result, aj.Recording(data, nominal)))
+        sentences(findings_of(aj.calibration.record_of(result, aj.Recording(data, nominal))))
         for result, data in ((good, capture), (bad, wrong))
     ]
     assert "data and arm do not belong together" in " ".join(said[1])

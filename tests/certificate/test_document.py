@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import aacmm_jax as aj
 from aacmm_jax.calibration.record import Removed
 from aacmm_jax.certificate import dcc_xml, measurement_results, parse_dcc, xml_elements
+from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.files.administrative_data import (
     AdministrativeData,
     CalibratedItem,
@@ -25,7 +26,6 @@ from aacmm_jax.files.administrative_data import (
 )
 from aacmm_jax.kinematics.corrections import kinds
 from aacmm_jax.kinematics.corrections.kind import Loads
-from aacmm_jax.summaries.warnings import of_calibration
 from tests.certificate import dcc_model
 from tests.refusals import assert_refused
 from tests.renamed_sockets import renamed_sockets
@@ -605,7 +605,7 @@ def test_warnings_and_simulations_are_stated(record):
     recording = record.recording
     given = aj.Noise(encoder_arcsec=2.0 / 3, seating=0.005 / 3)
     simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0, noise=given)
-    warnings = of_calibration(simulated)
+    warnings = sentences(findings_of(simulated))
     assert any("times what the given noise predicts" in sentence for sentence in warnings)
     text = dcc_xml(simulated, AdministrativeData(), created=CREATED)
     assert dcc_model.faults(text) == []

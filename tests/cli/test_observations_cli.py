@@ -240,7 +240,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
     assert "no reference length" in aacmm("calibrate", folder / "free.h5", "-o", "c.h5", expect=2).stderr
     shown = aacmm("calibrate", folder / "free.h5", "-o", "c.h5", "--scale", "nominal").stdout
     assert "repeatability: converged" in shown
-    assert "The scale is that of the nominal arm" in shown
+    assert "The scale is taken from the nominal arm" in shown
     found = json.loads(aacmm("show", "c.h5", "--json").stdout)
     assert found["scale_k"] is None
     assert found["calibrated"]["rms_mm"] < 0.1

@@ -7,7 +7,8 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.summaries import warnings
+from aacmm_jax.diagnostics.findings import sentences
+from aacmm_jax.diagnostics.recorded import of_recording
 
 
 @pytest.fixture
@@ -50,13 +51,13 @@ def test_what_was_left_out_is_reported_and_kept(paper_arm, noisy_capture, copied
     poses, length = (9 * size for size in noisy_capture.sizes), "A - B"
     counts = ", ".join(f"{name} ({count})" for name, count in zip(noisy_capture.names, poses, strict=True))
     for found in (recording, aj.files.load_capture(tmp_path / "c.h5")):
-        said = warnings.of_capture(found)
+        said = sentences(of_recording(found))
         assert f"of another pose of the same socket or observation: {counts};" in said[0]
         assert said[1].startswith("Counted once: reference lengths given again")
         assert f"{length[::-1]}, {length}; delete" in said[1]
     only = copied.select(only="A")
     assert only.repeated == (copied.repeated.poses[:1], ())
-    assert not any("once" in text for text in warnings.of_capture(aj.Recording(noisy_capture, specification)))
+    assert not any("once" in text for text in sentences(of_recording(aj.Recording(noisy_capture, specification))))
 
 
 def test_only_copies_are_left_out():

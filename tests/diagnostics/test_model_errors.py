@@ -8,9 +8,20 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.diagnostics import equations, model_errors, model_tests
-from aacmm_jax.summaries.model_errors import sentences_of_tests, summary_of_tests
+from aacmm_jax.diagnostics import (
+    equations,
+    length_consistency,
+    missing_terms,
+    model_errors,
+    model_tests,
+    noise_level,
+    noisy_encoders,
+    successive_poses,
+)
+from aacmm_jax.diagnostics.findings import case_of, sentences
+from aacmm_jax.diagnostics.model_errors import rows_of_tests, values_of_tests
 
+MODULES = (missing_terms, noise_level, noisy_encoders, successive_poses, length_consistency)
 ARCSEC = aj.units.ARCSEC
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300), "D": (500, 300, 100)}
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
@@ -61,23 +72,25 @@ def calibrated(arm, capture, given, **options):
 
 
 def checked(arm, capture, given, **options):
-    return model_tests(calibrated(arm, capture, given, replace_noise=False), capture, **options)
+    """The tests, and the sentences of their findings."""
+    case = case_of(calibrated(arm, capture, given, replace_noise=False), capture, **options)
+    return values_of_tests(case), sentences(finding for module in MODULES for finding in module.test(case))
 
 
 @pytest.mark.parametrize("given", [True, False])
 def test_nothing_wrong(paper_arm, captured, given):
-    found = checked(paper_arm, captured(), given)
+    found, said = checked(paper_arm, captured(), given)
     assert not found.warns
-    assert sentences_of_tests(found) == []
+    assert said == []
     assert (found.misfit is not None) == given
     assert found.lengths is not None
     assert found.lengths.degrees_of_freedom == 2
-    assert summary_of_tests(found)["missing_terms"] == []
+    assert rows_of_tests(found)["missing_terms"] == []
 
 
 @pytest.mark.parametrize("given", [True, False])
 @pytest.mark.parametrize(
-    ("errors", "expected", "amplitude", "said"),
+    ("errors", "expected", "amplitude", "cause"),
     [
         (eccentric, {("first harmonic", 2), ("first harmonic", 3)}, 10 * ARCSEC, "an eccentric encoder"),
         (tilted, {("second harmonic", 2)}, 10 * ARCSEC, "a tilted or oval encoder"),
@@ -85,14 +98,14 @@ def test_nothing_wrong(paper_arm, captured, given):
         (warming, {("drifting zero", 3)}, 10 * ARCSEC, "a zero that drifts"),
     ],
 )
-def test_what_the_model_lacks_is_named(paper_arm, captured, given, errors, expected, amplitude, said):
-    found = checked(paper_arm, captured(errors), given)
+def test_what_the_model_lacks_is_named(paper_arm, captured, given, errors, expected, amplitude, cause):
+    found, said = checked(paper_arm, captured(errors), given)
     named = {(term.kind, term.joint): term for term in found.terms}
     assert expected <= named.keys() | {other for term in found.terms for other in term.alternatives}
     for term in expected & named.keys():
         assert named[term].amplitude == pytest.approx(amplitude, rel=0.5)
-    (sentence,) = (text for text in sentences_of_tests(found) if text.startswith("Residuals follow"))
-    assert said in sentence
+    (sentence,) = (text for text in said if text.startswith("Residuals follow"))
+    assert cause in sentence
 
 
 def test_gravity_is_named(paper_arm, captured):
@@ -102,17 +115,17 @@ def test_gravity_is_named(paper_arm, captured):
         reach = np.asarray(paper_arm.position(q * (np.arange(6) != 0)))[:, :1]
         return 1e-7 * reach * (np.arange(6) == 1)
 
-    found = checked(paper_arm, captured(errors), True)
+    found, said = checked(paper_arm, captured(errors), True)
     named = {(term.kind, term.joint) for term in found.terms}
     assert ("gravity", 2) in named | {other for term in found.terms for other in term.alternatives}
-    assert any("a joint or link that bends" in text for text in sentences_of_tests(found))
+    assert any("a joint or link that bends" in text for text in said)
 
 
 @pytest.mark.parametrize("given", [True, False])
 def test_a_noisy_encoder_is_named(paper_arm, captured, given):
-    found = checked(paper_arm, captured(noise=FIVE_TIMES), given)
+    found, said = checked(paper_arm, captured(noise=FIVE_TIMES), given)
     assert (found.noisy_joint.joint, found.noisy_joint.probability < 1e-4) == (3, True)
-    assert any("reading of joint 3 moves the tip" in text for text in sentences_of_tests(found))
+    assert any("reading of joint 3 moves the tip" in text for text in said)
     assert found.lengths.probability > model_errors.LEVEL
 
 
@@ -126,15 +139,15 @@ def test_seats_that_shift_are_noticed(paper_arm, captured):
 
     capture = captured(errors)
     alone = aj.Capture(capture.sockets, [aj.ReferenceLength("A", "B", 200.0, 0.05)])
-    found = checked(paper_arm, alone, False)
+    found, said = checked(paper_arm, alone, False)
     assert found.successive.probability < 1e-4
     assert found.successive.correlation > 0.1
-    assert any("successive poses are alike" in text for text in sentences_of_tests(found))
+    assert any("successive poses are autocorrelated" in text for text in said)
     assert found.lengths is None  # a single one cannot disagree
 
 
 def test_a_wrong_length_among_three(paper_arm, captured):
-    found = checked(paper_arm, captured(wrong=0.1), True)
+    found, _ = checked(paper_arm, captured(wrong=0.1), True)
     assert found.lengths.probability < 1e-6
     assert found.lengths.odd == "A - B"
     assert found.lengths.difference == pytest.approx(-0.1, abs=0.02)
@@ -142,14 +155,14 @@ def test_a_wrong_length_among_three(paper_arm, captured):
 
 
 def test_estimated_noise_against_that_of_the_class(paper_arm, captured):
-    usual = checked(paper_arm, captured(), False, class_noise=NOISE)
+    usual, _ = checked(paper_arm, captured(), False, class_noise=NOISE)
     assert usual.misfit.usual
     assert usual.misfit.ratio == pytest.approx(1, abs=0.15)
     fine = aj.Noise(encoder_arcsec=0.4, seating=0.001)
-    unusual = checked(paper_arm, captured(), False, class_noise=fine)
+    unusual, said = checked(paper_arm, captured(), False, class_noise=fine)
     assert unusual.misfit.ratio == pytest.approx(5 * usual.misfit.ratio, rel=0.02)
     assert unusual.misfit.probability < model_errors.LEVEL < usual.misfit.probability
-    assert any("usual for such an arm" in text for text in sentences_of_tests(unusual))
+    assert any("usual for such an arm" in text for text in said)
 
 
 @pytest.mark.parametrize(("stated", "too"), [(0.5, "small"), (2.0, "large")])
@@ -169,7 +182,7 @@ def test_observations_and_their_division_into_chunks(paper_arm, monkeypatch):
     station = kinds.SimulatedPoints("tracker", corners, 60, (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0), u=0.005)
     other = kinds.SimulatedPoints("camera", corners, 30, (0.3, 0.1, 0.2, 900.0, 1000.0, -300.0), u=0.1)
     capture = aj.simulate(paper_arm, {}, observations=[station, other], noise=NOISE, seed=3)
-    assert not checked(paper_arm, capture, True).warns
+    assert not checked(paper_arm, capture, True)[0].warns
     first, second = capture.observations
 
     def changed(errors, u):
@@ -180,24 +193,24 @@ def test_observations_and_their_division_into_chunks(paper_arm, monkeypatch):
         ]
         return aj.Capture({}, observations=points)
 
-    found = checked(paper_arm, changed(eccentric, 0.1), False)
+    found, said = checked(paper_arm, changed(eccentric, 0.1), False)
     assert {("first harmonic", 2), ("first harmonic", 3)} <= {(term.kind, term.joint) for term in found.terms}
     wrong = changed(eccentric, 0.02)
-    found = checked(paper_arm, wrong, True)
+    found, said = checked(paper_arm, wrong, True)
     assert [one.name for one in found.noisy_observations][:1] == ["camera"]
-    assert any("camera (" in text and "their u" in text for text in sentences_of_tests(found))
+    assert any("camera (" in text and "their u" in text for text in said)
     monkeypatch.setattr(equations, "_CHUNK", 25)
-    divided = checked(paper_arm, wrong, True)
+    divided, _ = checked(paper_arm, wrong, True)
     assert divided.misfit.ratio == pytest.approx(found.misfit.ratio)
     assert [term[:2] for term in divided.terms] == [term[:2] for term in found.terms]
     assert divided.noisy_joint.ratio == pytest.approx(found.noisy_joint.ratio)
     monkeypatch.setattr(equations, "_MOST_POSES", 45)
-    assert checked(paper_arm, wrong, True).misfit.degrees_of_freedom < found.misfit.degrees_of_freedom / 1.5
+    assert checked(paper_arm, wrong, True)[0].misfit.degrees_of_freedom < found.misfit.degrees_of_freedom / 1.5
 
 
 def test_without_noise_nothing_is_checked(paper_arm):
     capture = aj.simulate(paper_arm, SOCKETS, poses=10, lengths=[("A", "B"), ("C", "D")], seed=0)
-    found = checked(paper_arm, capture, False)
+    found, _ = checked(paper_arm, capture, False)
     assert found == model_errors.ModelTests()
     assert not found.warns
 

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from aacmm_jax.diagnostics.findings import diagnostics
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "aacmm_jax"
 PAGE = (ROOT / "docs" / "warnings.md").read_text(encoding="utf-8")
 # Where warnings are worded: of a module all functions, or those that are named.
 SOURCES: dict[str, tuple[str, ...]] = {
-    "summaries/warnings.py": (),
-    "summaries/model_errors.py": ("sentences_of_tests", "sentence_of_noisy_encoders", "_terms", "_misfit", "_lengths"),
-    "summaries/contradictions.py": ("_sentence", "_removal", "_remounted"),
-    "summaries/likely_cause.py": ("likely_cause",),
-    "summaries/validation.py": ("contradicted_prediction", "surprise", "no_better"),
+    "diagnostics/likely_cause.py": ("likely_cause",),
     "summaries/arm_survey.py": ("arm_survey", "_warnings"),
     "summaries/compared_models.py": ("_warnings",),
     "summaries/correction.py": ("correction_summary",),
@@ -36,12 +34,6 @@ SOURCES: dict[str, tuple[str, ...]] = {
 PARTS = (
     "Converged",
     "It has not ended",
-    "Every u contains",
-    "Such poses count",
-    "The arm or its probe has changed since",
-    "With the probe's place",
-    "As good an explanation",
-    "Every u is too small",
     "... mm RMS, ... times",
     "... (... times)",
     "... (... mm, ... times)",
@@ -90,8 +82,19 @@ def _name(node: ast.AST) -> str:
     return ast.unparse(node.targets[0]) if isinstance(node, ast.Assign) else ""
 
 
+def _findings(every: bool = False) -> Iterator[str]:
+    """What the findings of all diagnostics say, where it is worded in their place; or every text of a diagnostic."""
+    for module in diagnostics():
+        tree = ast.parse(Path(module.__file__ or "").read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if every:
+                yield _text(node)
+            elif not every and isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding":
+                yield from _sentences(node.args[1])
+
+
 def _warnings() -> list[str]:
-    found = []
+    found = [text for text in _findings() if not text.startswith("...")]
     for name, functions in SOURCES.items():
         tree = ast.parse((PACKAGE / name).read_text(encoding="utf-8"))
         named = {_name(node): node for node in ast.walk(tree) if _name(node)}
@@ -115,7 +118,7 @@ def test_each_warning_has_an_entry(warning: str) -> None:
 
 
 def test_each_entry_is_of_a_warning() -> None:
-    warnings = _warnings()
+    warnings = [*_warnings(), *_findings(every=True)]
     unused = [title for title, entry in _entries().items() if not any(entry.match(text) for text in warnings)]
     assert not unused, f"docs/warnings.md has entries that no warning begins with: {unused}"
 

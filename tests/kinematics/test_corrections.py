@@ -7,7 +7,7 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.core.numpy_or_jax import to_numpy
-from aacmm_jax.diagnostics.missing_terms import FoundTerm
+from aacmm_jax.diagnostics.missing_terms import FoundTerm, wider_model
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.chain import forward_pass, joint_motion, joints_first
@@ -15,7 +15,6 @@ from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections.kinds import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
 from aacmm_jax.kinematics.joint_functions import KnownFunctions
-from aacmm_jax.summaries.model_errors import _wider_model
 
 MODEL = "gravity,harmonics,gear,coupled"
 
@@ -321,4 +320,4 @@ def test_functions_together_are_those_one_by_one():
 def test_a_model_that_the_arm_has_is_not_advised(model, found, advised):
     arm = with_corrections(aj.load_arm("panda"), model)
     terms = tuple(FoundTerm(kind, 2, *[None] * (len(FoundTerm._fields) - 2)) for kind in found)
-    assert set(_wider_model(terms, arm).split(",")) == set(advised.split(","))
+    assert set(wider_model(terms, arm).split(",")) == set(advised.split(","))

@@ -289,15 +289,15 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
 
 def test_a_report_says_what_was_left_out(observed_record):
     from aacmm_jax.calibration.record import Removed
+    from aacmm_jax.diagnostics.contradictions import removal
     from aacmm_jax.report.observations import removed_tables
-    from aacmm_jax.summaries.contradictions import removals
 
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     record = observed_record._replace(removed=(removed,))
     (row,) = removed_tables(record)[0].rows
     expected = ["T2", "station", "T2/day, T2/night", "45.6", "6 and 60", "< 0.0001", "0.2000", "0.1000"]
     assert [cell.text for cell in row] == [*expected, "theta_3, by 12.0 u"]
-    assert removals(record)[0].startswith("Left out: station T2")
+    assert removal(record.removed[0]).says.startswith("Left out: station T2")
 
 
 def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
@@ -472,7 +472,7 @@ def test_a_verdict_is_marked_as_what_it_is(written):
     assert (report.verdict[:20], report.verdict_mark) == ("To be used with care", "unsure")  # d_5 is on its bound
     assert "on a bound: d_5" in report.verdict
     failed = calibration_report(written.record._replace(converged=False))
-    assert (failed.verdict[:14], failed.verdict_mark) == ("Not to be used", "bad")
+    assert (failed.verdict[:10], failed.verdict_mark) == ("Not usable", "bad")
     measured = points_report(PointsRecord(aj.acceptance.Measured({"A": np.eye(3)})))
     assert (measured.verdict, measured.verdict_mark) == ("Measured; no limit was given.", "neutral")
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from aacmm_jax.diagnostics import Finding
 from aacmm_jax.summaries.tables import decimals_for, lengths_sentence, rms_difference, two_digits
 from aacmm_jax.summaries.verdicts import (
     calibration_verdict,
@@ -10,45 +11,57 @@ from aacmm_jax.summaries.verdicts import (
 )
 
 VOLUME = {"length_mm": 300.0, "expanded_length_reading_median_mm": 0.02, "expanded_length_reading_largest_mm": 0.1}
-SOUND = {
-    "converged": True, "reason": "stopped", "residual_plausible": True, "method": "two-stage", "hold": "d_3",
-    "active": {}, "active_stage1": {}, "cross_validation": {"rms_mm": 0.1, "surprising": False}, "model_tests": None,
-    "uncertainty": {"volume": VOLUME},
-}  # fmt: skip
-TESTS = dict.fromkeys(("misfit", "lengths", "noisy_joint", "successive_poses")) | {
-    "level": 0.01, "missing_terms": [], "noisy_observations": []
-}  # fmt: skip
-UNKNOWN = {"volume": VOLUME | {"expanded_length_reading_largest_mm": None}}
+HELD_OUT_RMS = {"rms_mm": 0.1}
+
+
+def finding(severity, doubt="", says="Something was found."):
+    return Finding("code", says, severity=severity, doubt=doubt)
 
 
 @pytest.mark.parametrize(
-    ("changed", "mark", "says"),
+    ("findings", "held_out", "mark", "says"),
     [
         (
-            {},
+            [],
+            HELD_OUT_RMS,
             "good",
-            "U (95 %) of a measured length of 300 mm, 0.020 mm (at worst 0.10 mm); held-out data agree with it.",
+            "Calibrated: U (95 %) of a measured length of 300 mm, 0.020 mm (at worst 0.10 mm); held-out data agree "
+            "with it.",
         ),
-        ({"truth": {}}, "good", "Calibrated, in simulation: U (95 %)"),
-        ({"cross_validation": None}, "neutral", "no held-out data confirm it"),
-        ({"model_tests": TESTS}, "good", "Calibrated: U (95 %)"),
-        ({"converged": False}, "bad", "Not to be used. stopped"),
-        ({"residual_plausible": False}, "bad", "data and arm do not belong together"),
-        ({"scale_plausible": False}, "bad", "a scale that it cannot have"),
-        ({"cross_validation": {"rms_mm": 0.1, "surprising": True}}, "unsure", "held-out data disagree"),
-        ({"model_tests": TESTS | {"lengths": {"probability": 0.001}}}, "unsure", "errors that the model lacks"),
-        ({"model_tests": TESTS | {"misfit": {"probability": 0.001, "ratio": 2.0}}}, "unsure", "the model lacks"),
-        ({"model_tests": TESTS | {"misfit": {"probability": 0.001, "ratio": 0.5}}}, "good", "Calibrated: U (95 %)"),
-        ({"model_tests": TESTS | {"missing_terms": [{}]}}, "unsure", "so errors may exceed the stated U"),
-        ({"active_stage1": {"a_2": "upper"}}, "unsure", "on a bound: a_2"),
-        ({"method": "repeatability"}, "unsure", "nothing that was measured set its scale"),
-        ({"uncertainty": UNKNOWN}, "unsure", "the data do not determine lengths all over the working volume."),
+        ([], None, "neutral", "no held-out data confirm it"),
+        ([finding("note")], HELD_OUT_RMS, "good", "Calibrated: U (95 %)"),
+        ([finding("unusable", says="It stopped.")], HELD_OUT_RMS, "bad", "Not usable. It stopped."),
+        (
+            [finding("unusable", "data and arm differ"), finding("doubt")],
+            None,
+            "bad",
+            "Not usable: data and arm differ.",
+        ),
+        (
+            [finding("doubt"), finding("doubt")],
+            HELD_OUT_RMS,
+            "unsure",
+            "care: the residuals show errors that the model",
+        ),
+        (
+            [finding("doubt", "on a bound: a_2")],
+            HELD_OUT_RMS,
+            "unsure",
+            "on a bound: a_2, so errors may exceed the stated U",
+        ),
     ],
 )
-def test_of_a_calibration(changed, mark, says):
-    verdict = calibration_verdict(SOUND | changed)
+def test_of_a_calibration(findings, held_out, mark, says):
+    verdict = calibration_verdict(findings, VOLUME, held_out, simulated=False)
     assert verdict.mark == mark
     assert says in verdict.says
+
+
+def test_of_a_simulation_and_of_what_is_not_determined():
+    assert calibration_verdict([], VOLUME, None, simulated=True).says.startswith("Calibrated, in simulation: U (95 %)")
+    unknown = VOLUME | {"expanded_length_reading_largest_mm": None}
+    verdict = calibration_verdict([], unknown, HELD_OUT_RMS, simulated=False)
+    assert verdict == ("unsure", "To be used with care: the data do not determine lengths all over the working volume.")
 
 
 def evaluated(*decisions, missing=(), found=None, **more):
@@ -82,7 +95,7 @@ def held_out(probability, predicted=0.1):
             evaluated(held_out=held_out(0.001)),
             0,
             "unsure",
-            "The calibration does not hold here: held-out poses are 0.2 mm",
+            "Errors on held-out data exceed the prediction (p = 0.001): held-out poses are 0.2 mm",
         ),
         (evaluated(held_out=held_out(0.5)), 0, "unsure", "larger than predicted, but may be so by chance: held-out"),
         (

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.summaries import warnings
+from aacmm_jax.diagnostics import findings_of
+from aacmm_jax.diagnostics.findings import sentences
 
 ENDS = {"A": (400, 200, 300), "B": (450, 200, 300)}
 REDUNDANT = ("theta_1", "d_1", "alpha_7", "a_7", "theta_7", "d_7")  # what ranks alone call redundant
@@ -99,7 +100,7 @@ def test_a_bound_that_ends_such_a_direction_is_part_of_u(panda, capture, method)
     assert abs(correlation) > 0.9
     specification = aj.kinematics.ArmSpecification(nominal, "test", held=REDUNDANT)
     record = aj.calibration.record_of(result, aj.Recording(capture, specification))
-    text = " ".join(warnings.of_calibration(record))
+    text = " ".join(sentences(findings_of(record)))
     assert "On a bound because the data hardly determine them: theta_6" in text
     assert "do not widen the bounds" in text
     assert "widen the bounds unless they are known limits" not in text

@@ -5,17 +5,19 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.calibration.results import plausible
+from aacmm_jax.diagnostics import findings_of
+from aacmm_jax.diagnostics.findings import case_of, diagnostics, finding_rows, sentences
+from aacmm_jax.diagnostics.recorded import of_recording
 from aacmm_jax.kinematics.parameters import ArmSpecification
-from aacmm_jax.summaries import warnings
 
 
 def warnings_of(capture, arm, **options):
     """Warnings of a calibration of the paper's arm on a capture."""
     specification = aj.kinematics.ArmSpecification(arm, "test")
     result = aj.calibrate(arm, capture, specification.bounds(), **options)
-    return result, " ".join(
-        warnings.of_calibration(aj.calibration.record_of(result, aj.Recording(capture, specification)))
-    )
+    record = aj.calibration.record_of(result, aj.Recording(capture, specification))
+    return result, " ".join(sentences(findings_of(record)))
 
 
 def with_lengths(capture, *lengths):
@@ -26,20 +28,20 @@ def with_lengths(capture, *lengths):
     ("factor", "said"),
     [
         (1.0, None),
-        (1 / 1000, "are the reference lengths in m by mistake?"),
-        (1 / 10, "are the reference lengths in cm by mistake?"),
-        (1 / 25.4, "are the reference lengths in inches by mistake?"),
-        (1000, "is the arm in m, or are the reference lengths in um by mistake?"),
-        (25.4, "is the arm in inches by mistake?"),
-        (3.0, "check units, sockets, lengths and arm."),
+        (1 / 1000, "Are the reference lengths in m by mistake?"),
+        (1 / 10, "Are the reference lengths in cm by mistake?"),
+        (1 / 25.4, "Are the reference lengths in inches by mistake?"),
+        (1000, "Is the arm in m, or are the reference lengths in um by mistake?"),
+        (25.4, "Is the arm in inches by mistake?"),
+        (3.0, "Check units, sockets, lengths and arm."),
         (1.02, "far from 1"),
     ],
 )
 def test_a_wrong_reference_length(paper_arm, noisy_capture, factor, said):
     true = float(noisy_capture.lengths[0].value)
     result, text = warnings_of(with_lengths(noisy_capture, ("A", "B", factor * true, 0.002)), paper_arm)
-    assert warnings.plausible(float(result.scale.value)) == (factor in (1.0, 1.02))
-    assert ("cannot be the scale" in text) == (factor not in (1.0, 1.02))
+    assert plausible(float(result.scale.value)) == (factor in (1.0, 1.02))
+    assert ("is not plausible (expected 0.5 to 2)" in text) == (factor not in (1.0, 1.02))
     assert said is None or said in text
     assert "Converged" not in text  # whatever the solver says
 
@@ -68,7 +70,7 @@ def test_what_stands_against_the_division_is_named(tmp_path, narrow, held, noise
     assert record.against_division == named
     assert record.final_method == ("joint" if named else "two-stage")
     assert record.divided == record.fixed_by_one_length == (not named and not record.scale_set_by)
-    said = [text for text in warnings.of_calibration(record) if "division" in text]
+    said = [text for text in sentences(findings_of(record)) if "division" in text]
     assert [named[0] in text for text in said] == [True] * len(named)
 
 
@@ -104,9 +106,8 @@ def test_redundant_and_too_few(paper_arm, noisy_capture):
     )
     with pytest.warns(aj.IdentifiabilityWarning, match="alpha_6 and d_6 trade off"):
         result = aj.calibrate(paper_arm, noisy_capture, specification.bounds())
-    text = " ".join(
-        warnings.of_calibration(aj.calibration.record_of(result, aj.Recording(noisy_capture, specification)))
-    )
+    record = aj.calibration.record_of(result, aj.Recording(noisy_capture, specification))
+    text = " ".join(sentences(findings_of(record)))
     assert "No measurement of this kind can separate: alpha_6 and d_6 trade off." in text
 
 
@@ -115,19 +116,19 @@ def test_readings_outside_the_limits():
     q = np.tile(np.deg2rad([0.0, 0, 0, -90, 0, 90, 0]), (3, 1)) + 0.01 * np.arange(3)[:, None]
     lengths = [aj.ReferenceLength("A", "B", 50.0)]
     right = aj.Capture({"A": q, "B": q + 0.1}, lengths)
-    assert [text.split(";")[0] for text in warnings.of_capture(aj.Recording(right, panda))] == [
-        "Taken as exact, because u is 0: A - B"
+    assert [finding.says for finding in of_recording(aj.Recording(right, panda))] == [
+        "Taken as exact, because u is 0: A - B."
     ]
     near = q.copy()
     near[0, 3] = panda.arm.limits[3][1] + np.deg2rad(0.009)  # as far beyond a limit as noise may take it
-    assert warnings.of_capture(aj.Recording(aj.Capture({"A": near}), panda)) == []
+    assert of_recording(aj.Recording(aj.Capture({"A": near}), panda)) == []
     near[0, 3] += np.deg2rad(0.002)
     beyond = aj.Recording(aj.Capture({"A": near}), panda)
-    assert warnings.of_capture(beyond)[0].startswith("Joint 4: 1 of 3")
-    assert warnings.of_capture(beyond._replace(true=panda)) == []
+    assert of_recording(beyond)[0].says.startswith("Joint 4: 1 of 3")
+    assert of_recording(beyond._replace(true=panda)) == []
     swapped = aj.Capture({"A": q[:, [0, 1, 3, 2, 4, 5, 6]], "B": jnp.asarray(q + 0.1)}, lengths)
-    found = warnings.of_capture(aj.Recording(swapped, panda))
-    assert found[0].startswith("Joint 4: 3 of 6 readings lie outside its limits, -176 to -4 deg")
+    (finding, *_) = of_recording(aj.Recording(swapped, panda))
+    assert finding.says.startswith("Joint 4: 3 of 6 readings lie outside its limits, -176 to -4 deg")
 
 
 @pytest.mark.parametrize(
@@ -136,8 +137,8 @@ def test_readings_outside_the_limits():
         (0.02, []),
         (1e-4, []),
         (1.0, []),
-        (20e-6, ["Less than 0.1 um is hardly ever reached: {} (u = 0.02 um); u is in mm, was it given in m?"]),
-        (20.0, ["More than 1 mm says next to nothing: {} (u = 20,000 um); u is in mm, was it given in um?"]),
+        (20e-6, ["u < 0.1 um is implausibly small: {} (u = 0.02 um). u is in mm; was it given in m?"]),
+        (20.0, ["u > 1 mm is implausibly large: {} (u = 20,000 um). u is in mm; was it given in um?"]),
     ],
 )
 def test_uncertainties_in_another_unit_are_named(paper_arm, u, said):
@@ -150,5 +151,28 @@ def test_uncertainties_in_another_unit_are_named(paper_arm, u, said):
     wheres = ("[[length]] A - B", "[[points]] T", "[[touched_sphere]] S")
     for where, capture in zip(wheres, (length, tracker, sphere), strict=True):
         recording = aj.Recording(capture, ArmSpecification(paper_arm))
-        assert warnings.of_capture(recording) == [text.format(where) for text in said]
-        assert warnings.of_capture(recording._replace(true=recording.nominal)) == []
+        assert sentences(of_recording(recording)) == [text.format(where) for text in said]
+        assert of_recording(recording._replace(true=recording.nominal)) == []
+
+
+def test_every_diagnostic_says_where_it_stands(noisy_capture, paper_arm):
+    """A module with a ``test`` is found by itself; its findings have all that a reader needs."""
+    modules = diagnostics()
+    assert {"missing_terms", "scale", "likely_cause"} & {m.__name__.rpartition(".")[2] for m in modules} == {
+        "missing_terms",
+        "scale",
+    }
+    assert len({module.ORDER for module in modules}) == len(modules)
+    assert {module.NEEDS for module in modules} <= {"nothing", "scale", "fit"}
+    specification = aj.kinematics.ArmSpecification(paper_arm, "test", override={"a_2": 1e-4})
+    result = aj.calibrate(paper_arm, noisy_capture, specification.bounds(), undetermined="ignore")
+    record = aj.calibration.record_of(result, aj.Recording(noisy_capture, specification))
+    findings = findings_of(record)
+    assert [finding.code for finding in findings][:1] == ["weak-on-bounds"]
+    assert "one-reference-length" in [finding.code for finding in findings]
+    bound = findings[0]
+    assert (bound.severity, bound.concerns) == ("doubt", ("a_2",))
+    assert bound.sentence == f"{bound.says} {bound.costs} {bound.advice}"
+    assert aj.warnings_of(result, noisy_capture) == sentences(findings)
+    assert finding_rows(findings)[0]["concerns"] == ["a_2"]
+    assert case_of(record) is case_of(record)

@@ -4,14 +4,19 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.summaries import warnings
-from aacmm_jax.summaries.contradictions import contradictions
+from aacmm_jax.diagnostics import contradictions as groups
+from aacmm_jax.diagnostics import findings_of
+from aacmm_jax.diagnostics.findings import case_of, sentences
 
 PLACEMENTS = {
     f"{place}/{hole}": (350 + 60 * i + 200 * hole, -250 + 120 * i, 150 + 60 * i)
     for i, place in enumerate("PQRS")
     for hole in (0, 1)
 }
+
+
+def contradictions(record):
+    return sentences(groups.test(case_of(record)))
 
 
 def calibrated(arm, capture):
@@ -43,7 +48,7 @@ def test_joint_3_shifted_in_some_sockets_only(paper_arm, several_placements, shi
     record = calibrated(paper_arm, aj.Capture(sockets, several_placements.lengths))
     found = contradictions(record)
     assert sorted(text.split(":")[0][: len(start)] for text, start in zip(found, said, strict=True)) == sorted(said)
-    assert [text for text in warnings.of_calibration(record) if text in found] == found
+    assert [text for text in sentences(findings_of(record)) if text in found] == found
     if len(said) == 1:
         kept = "'Q/*'" if len(shifted) > 1 else "'S/1'"
         assert f"(--without {kept})" in found[0]

@@ -7,12 +7,9 @@ import pytest
 
 from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
 from aacmm_jax.calibration.prediction import NOTHING, Agreement
-from aacmm_jax.summaries.validation import (
-    contradicted_prediction,
-    cross_validation_summary,
-    no_better,
-    surprise,
-)
+from aacmm_jax.diagnostics.findings import sentences
+from aacmm_jax.diagnostics.held_out import contradicted_prediction, no_better, surprise
+from aacmm_jax.summaries.validation import cross_validation_summary
 
 
 def group(place, rms=0.1, error=0.01, poses=30):
@@ -20,7 +17,7 @@ def group(place, rms=0.1, error=0.01, poses=30):
 
 
 def said(*groups):
-    return " ".join(contradicted_prediction(CrossValidation(groups)))
+    return " ".join(sentences(contradicted_prediction(CrossValidation(groups))))
 
 
 def test_the_placement_that_disagrees_is_named():
@@ -65,21 +62,21 @@ def unknown():
 def test_a_remounted_probe_is_named():
     """Where most of the excess is gone once the place of the probe is fitted, and only there."""
     bad = agreement(0.25, 90, 180.0)
-    (text,) = surprise(bad, NOTHING, {}, lambda: agreement(0.1))
+    (text,) = sentences(surprise(bad, NOTHING, {}, lambda: agreement(0.1)))
     assert "With the probe's place in the last frame fitted to them, they are 0.1 mm RMS: the tip was remounted" in text
-    (text,) = surprise(bad, NOTHING, {}, lambda: agreement(0.2))
+    (text,) = sentences(surprise(bad, NOTHING, {}, lambda: agreement(0.2)))
     assert "the tip was remounted" not in text
     assert "a remounted tip" in text
 
 
 def test_unseen_data_that_scatter_more_than_predicted():
     parts = {"A": agreement(0.11), "B": agreement(0.35), "C": agreement(0.25)}
-    (text,) = surprise(agreement(0.25, 90, 180.0), NOTHING, parts, unknown)
+    (text,) = sentences(surprise(agreement(0.25, 90, 180.0), NOTHING, parts, unknown))
     assert "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm, 3.5" in text
     assert "A (" not in text
     assert "reference lengths" not in text
     assert surprise(agreement(0.11), agreement(0.11), parts, unknown) == []
-    (text,) = surprise(agreement(0.1), agreement(0.3, 5, 5.0), parts, unknown)
+    (text,) = sentences(surprise(agreement(0.1), agreement(0.3, 5, 5.0), parts, unknown))
     assert "reference lengths err by 3.0 times their" in text
     assert surprise(NOTHING, NOTHING, {}, unknown) == []
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.summaries.likely_cause import likely_cause
+from aacmm_jax.diagnostics.likely_cause import likely_cause
 
 BOX = [[200, -300, 100], [600, 300, 500]]
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
@@ -45,7 +45,7 @@ def test_readings_of_sockets(paper_arm, noisy_capture, mistake, cause):
 
 
 def check(said, cause):
-    assert said.partition(". Corrected")[0] == (f"Likely cause: {cause}" if cause else "")
+    assert said.partition(". Correcting")[0] == (f"Likely cause: {cause}" if cause else "")
 
 
 def requaternioned(read, meant):

@@ -75,8 +75,8 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
     if not rms < min(given / _BETTER, _SMALL * size):
         return ""
     return (
-        f"Likely cause: {cause}. Corrected, the residuals by the nominal arm fall from {given:.3g} to {rms:.3g} mm RMS."
-        + write
+        f"Likely cause: {cause}. Correcting it reduces the residuals (nominal arm) from {given:.3g} to {rms:.3g} mm "
+        f"RMS.{write}"
     )
 
 

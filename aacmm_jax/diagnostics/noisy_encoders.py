@@ -1,0 +1,353 @@
+"""Encoders that are noisier than stated, or than the others: found by a test, and their noise estimated.
+
+Rows of poses are whitened by the noise of the calibration, V_0. With the columns z_j of the reading of joint j, those T
+of the tip in its seat, and F of what was measured, the covariance of a pose is V = F + sum_j v_j z_j z_j' + s T T'.
+
+The test is whether r'A r is too large, with the residuals r = M e and A = z_j z_j' - c T T' pose by pose. It is
+compared with r'r of the poses, so that a common factor of all noise does not matter; and c is such that a wrong noise
+of the seat does not, to first order: the expectation of r'A r over that of r'r has no derivative by s.
+
+Variances that are not stated are those of restricted maximum likelihood (Patterson and Thompson 1971, Biometrika 58,
+545-554). With K = z_j z_j' whitened by V, twice the log likelihood has the derivative r'K r - tr MK by v_j, and the
+information tr MKMK / 2, of which the blocks of single poses are taken: enough for Fisher scoring, and for u.
+"""
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Collection, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from ..calibration.record import CalibrationRecord
+from ..calibration.results import Calibration, Identification, NoisyEncoder
+from ..core.numpy_or_jax import to_numpy
+from ..core.text import shorten
+from ..data.noise import Noise, one_arcsec
+from .equations import Rows
+from .findings import Case, Finding, chance_text, reading_text
+from .group_test import Block
+from .missing_terms import MOST_TERMS, explained, found_terms, missing
+from .residual_tests import LEVEL, Residuals, chance_above_zero
+
+ORDER, NEEDS = 40, "scale"
+_ROUNDS = 50  # of Fisher scoring; usually 4 to 8
+_TOLERANCE = 1e-3  # of a log variance: a hundredth of its standard uncertainty
+_FACTOR = 1.5  # largest change of a log variance in one round
+_LEAST = 1e-6  # part of the residuals that a variance explains, below which it is 0
+_CLEAR = 1e-4  # probability of a missing term, below which the model is wrong rather than the noise
+_FEWEST = 20  # degrees of freedom below which no variance is estimated by joint
+_FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
+
+Result = TypeVar("Result", Calibration, Identification)
+
+
+def test(case: Case) -> list[Finding]:
+    """Encoders whose noise was replaced, and one that seems noisier than it was taken to be."""
+    record, findings = case.record, []
+    if record.noisy_encoders:
+        slides, given = record.calibrated.arm.prismatic, record.given_noise is not None
+        findings.append(_replaced(record.noisy_encoders, slides, given))
+    noisiest = None if record.implausible_residual else case.once(noisiest_joint)
+    if noisiest is not None and noisiest.probability < LEVEL:
+        findings.append(
+            Finding(
+                "noisy-encoder",
+                f"Residuals are larger the more the reading of joint {noisiest.joint} moves the tip "
+                f"({chance_text(noisiest.probability)}), as if its encoder were noisier than the others.",
+                advice="State the noise joint by joint, or look for play in this joint.",
+                severity="doubt",
+                probability=noisiest.probability,
+                concerns=(f"joint {noisiest.joint}",),
+            )
+        )
+    return findings
+
+
+def _replaced(encoders: Sequence[NoisyEncoder], slides: Collection[int], given: bool) -> Finding:
+    """That the noise of some encoders was replaced; ``slides`` are the numbers of prismatic joints."""
+    texts = []
+    for encoder in encoders:
+        # Of the others nothing may be left beside the noise of the tip, and what is given may be 0.
+        comparable = encoder.found < _FAR_MORE * encoder.expected
+        times = f"{encoder.found / encoder.expected:.2g} times as much as" if comparable else "far more than"
+        scatter, u = (reading_text(value, encoder.joint in slides) for value in (encoder.found, encoder.u))
+        texts.append(
+            f"joint {encoder.joint} scatter by {scatter} (u = {u.split(' ')[0]}), {times} "
+            f"{'given' if given else 'those of the others'} ({chance_text(encoder.probability)})"
+        )
+    return Finding(
+        "noisy-encoders-replaced",
+        f"Readings of {shorten(texts, 3)}.",
+        "Their noise was re-estimated; weights and uncertainties use the estimate (--keep-noise: "
+        f"{'the noise as given' if given else 'one noise for all encoders'}).",
+        "Check the encoder, and the joint for play.",
+        probability=max(encoder.probability for encoder in encoders),
+        concerns=tuple(f"joint {encoder.joint}" for encoder in encoders),
+    )
+
+
+class NoisyJoint(NamedTuple):
+    """The joint whose readings seem noisier than those of the others."""
+
+    joint: int
+    ratio: float  # of the squares that its column sees, to what the residuals as a whole let expect
+    probability: float
+
+
+class _Variances(NamedTuple):
+    readings: Float[np.ndarray, " n"]  # arcsec^2; of a prismatic joint, of what this is at 1 m
+    seat: float  # mm^2
+
+
+class _Equations(NamedTuple):
+    """Equations whose rows are whitened by some variances."""
+
+    rows: Sequence[Rows]
+    relations: Sequence[Block]
+    unit: Float[np.ndarray, " n"]  # of the readings' columns, for a standard deviation of 1 arcsec
+    variances: _Variances
+
+    @classmethod
+    def of(cls, record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> "_Equations":
+        kinds, joints = record.calibrated.arm.geometry.kinds, record.calibrated.arm.joints
+        unit = np.broadcast_to(one_arcsec(kinds), (joints,))
+        steps = np.where(np.zeros(joints, dtype=bool) if kinds is None else kinds.mask(), 1.0, 1e-3)
+        stated = np.broadcast_to(to_numpy(record.noise.of_readings(kinds)), (joints,)) / unit
+        return cls(rows, relations, unit / steps, _Variances(stated**2, float(record.noise.seating) ** 2))
+
+    def readings(self, rows: Rows) -> Float[np.ndarray, "m r n"]:
+        """The columns z_j."""
+        return rows.extra[..., : len(self.unit)] * self.unit
+
+    def left(self) -> Residuals:
+        return Residuals.of([*(rows.block("") for rows in self.rows), *self.relations])
+
+    def weighted(self, new: _Variances) -> "_Equations":
+        """The same rows, whitened by other variances."""
+        weighted, more, seat = [], new.readings - self.variances.readings, new.seat - self.variances.seat
+        for rows in self.rows:
+            z, t = self.readings(rows), rows.by_tip
+            covariance = (z * more) @ z.swapaxes(1, 2) + seat * t @ t.swapaxes(1, 2)
+            # Some noise of its own: where nothing else errs, poses with fewer than three errors would be singular.
+            covariance += (1 + 1e-9) * np.eye(z.shape[1])
+            factor = np.linalg.cholesky(0.5 * (covariance + covariance.swapaxes(1, 2)))
+            root = np.linalg.inv(factor)
+            whitened = {name: root @ getattr(rows, name) for name in ("shared", "own", "extra", "by_tip")}
+            residual = np.einsum("mab,mb->ma", root, rows.residual)
+            weighted.append(rows._replace(residual=residual, in_mm=rows.in_mm @ factor, **whitened))
+        return self._replace(rows=weighted, variances=new)
+
+    def projectors(self, left: Residuals) -> list[Float[np.ndarray, "_ _ _"]]:
+        """The blocks of M that belong to single poses."""
+        blocks = []
+        for rows, part, own in zip(self.rows, left.slices, left.own, strict=False):
+            columns = np.concatenate([own, left.basis[part]], axis=1).reshape(*rows.residual.shape, -1)
+            blocks.append(np.eye(columns.shape[1]) - columns @ columns.swapaxes(1, 2))
+        return blocks
+
+    def estimated(self, groups: Sequence[Sequence[int]], seat: bool) -> tuple["_Equations", Float[np.ndarray, " k"]]:
+        """With variances of groups of joints, one for each group, and of the seat, by restricted maximum likelihood.
+
+        Returns:
+            The equations whitened by them, and the standard uncertainty of the log of each variance.
+        """
+        last = len(groups)
+        now, log, u = self, np.zeros(last + seat), np.zeros(last + seat)
+        for i, group in enumerate(groups):
+            log[i] = np.log(max(np.mean(self.variances.readings[list(group)]), 1e-6))
+        if seat:  # from nothing it would not rise
+            left = self.left()
+            projected = zip(self.rows, self.projectors(left), strict=True)
+            trace = sum(float(np.sum(rows.by_tip * (block @ rows.by_tip))) for rows, block in projected)
+            log[last] = np.log(max(self.variances.seat, 0.05 * left.degrees_of_freedom / max(trace, 1e-300)))
+            now = self.weighted(_of_groups(self.variances, log, groups, seat))
+        for _ in range(_ROUNDS):
+            left = now.left()
+            slope, information, traces = now._scores(left, groups, seat)
+            variances = np.exp(log)
+            # By the logarithms: d/d(log v) = v d/dv.
+            slope, information = slope * variances, information * variances * variances[:, None]
+            u = np.sqrt(np.diag(np.linalg.pinv(information)))
+            # One that explains nothing, and would have to be negative, stays where it is.
+            moving = (variances * traces > _LEAST * left.degrees_of_freedom) | (slope > 0)
+            step = np.zeros(len(log))
+            damped = information[np.ix_(moving, moving)] + 1e-9 * np.eye(int(moving.sum()))
+            step[moving] = np.clip(np.linalg.solve(damped, slope[moving]), -_FACTOR, _FACTOR)
+            log = log + step
+            now = self.weighted(_of_groups(self.variances, log, groups, seat))
+            if np.max(np.abs(step), initial=0.0) < _TOLERANCE:
+                break
+        return now, u
+
+    def _scores(
+        self, left: Residuals, groups: Sequence[Sequence[int]], seat: bool
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
+        """Derivatives of the log likelihood by the variances, their information, and tr MK."""
+        count = len(groups) + seat
+        slope, information, traces = np.zeros(count), np.zeros((count, count)), np.zeros(count)
+        for rows, part, block in zip(self.rows, left.slices, self.projectors(left), strict=False):
+            r, z = left.values[part].reshape(rows.residual.shape), self.readings(rows)
+            columns = [*(z[..., list(group)] for group in groups), *([rows.by_tip] if seat else [])]
+            projected = [block @ column for column in columns]
+            for k, column in enumerate(columns):
+                trace = float(np.sum(column * projected[k]))
+                traces[k] += trace
+                slope[k] += 0.5 * (float(np.sum(np.einsum("mac,ma->mc", column, r) ** 2)) - trace)
+                for other in range(count):
+                    information[k, other] += 0.5 * float(np.sum((column.swapaxes(1, 2) @ projected[other]) ** 2))
+        return slope, information, traces
+
+    def noisiest(self, joints: Sequence[int]) -> NoisyJoint | None:
+        """The joint (from 0) of some whose readings are the noisiest; its probability is Holm's, of all."""
+        left = self.left()
+        blocks = self.projectors(left)
+        poses = [
+            left.values[part].reshape(rows.residual.shape) for rows, part in zip(self.rows, left.slices, strict=False)
+        ]
+        # Rows of priors, which may be far wider than what they say, are not what the others are compared with.
+        cost = float(sum(np.sum(r**2) for r in poses))
+        freedom = float(sum(np.sum(np.einsum("maa->m", block)) for block in blocks))
+        tips = [rows.by_tip @ rows.by_tip.swapaxes(1, 2) for rows in self.rows]
+        trace_t, trace_tt = _traces(blocks, tips, tips)
+        none, tests = [None] * (len(left.slices) - len(self.rows)), []
+        for joint in joints:
+            columns = [self.readings(rows)[..., joint, None] for rows in self.rows]
+            kernels = [column @ column.swapaxes(1, 2) for column in columns]
+            trace, trace_both = _traces(blocks, kernels, tips)
+            if trace <= 0:
+                continue
+            ratio = _value(kernels, poses) * freedom / max(trace * cost, 1e-300)
+            below = freedom * trace_tt - trace_t**2
+            seated = self.variances.seat * trace_t > _LEAST * freedom and below > 1e-9 * trace_t**2
+            c = (freedom * trace_both - trace * trace_t) / below if seated else 0.0
+            kernels = [kernel - c * tip for kernel, tip in zip(kernels, tips, strict=True)]
+            x = _value(kernels, poses) / max(cost, 1e-300)
+            chance = chance_above_zero(left, [*(kernel - x * np.eye(kernel.shape[1]) for kernel in kernels), *none])
+            tests.append(NoisyJoint(joint + 1, ratio, chance))
+        if not tests:
+            return None
+        worst = min(tests, key=lambda test: (test.probability, -test.ratio))
+        return worst._replace(probability=min(worst.probability * len(tests), 1.0))
+
+
+def _value(kernels: Sequence[np.ndarray], residuals: Sequence[np.ndarray]) -> float:
+    pairs = zip(kernels, residuals, strict=True)
+    return float(sum(np.einsum("ma,mab,mb->", r, kernel, r) for kernel, r in pairs))
+
+
+def _traces(blocks: Sequence[np.ndarray], one: Sequence[np.ndarray], other: Sequence[np.ndarray]):
+    """tr MK, and tr MKML by the blocks of single poses."""
+    first = sum(np.einsum("mab,mba->", block, k) for block, k in zip(blocks, one, strict=True))
+    products = ((block @ k, block @ n) for block, k, n in zip(blocks, one, other, strict=True))
+    return first, sum(np.einsum("mab,mba->", left, right) for left, right in products)
+
+
+def _of_groups(before: _Variances, log: Float[np.ndarray, " k"], groups: Sequence[Sequence[int]], seat: bool):
+    readings = before.readings.copy()
+    for group, value in zip(groups, np.exp(log), strict=False):
+        readings[list(group)] = value
+    return _Variances(readings, float(np.exp(log[-1])) if seat else before.seat)
+
+
+def noisiest_joint(case: Case) -> NoisyJoint | None:
+    """The joint in whose direction residuals are larger than in those of the others, with the terms that the model
+    lacks taken into account; where even these do not explain the residuals, what they miss looks like noise."""
+    if not case.shows_noise or len(case.once(missing)) == MOST_TERMS:
+        return None
+    return _noisiest(case.record, _Equations.of(case.record, *case.once(explained)))[0]
+
+
+def _noisiest(record: CalibrationRecord, equations: _Equations) -> tuple[NoisyJoint | None, _Equations]:
+    """The joint, and the equations as the test weighted them."""
+    joints = range(len(equations.unit))
+    noisiest = equations.noisiest(joints)
+    if noisiest is None or noisiest.probability >= LEVEL or record.given_noise is not None:
+        return noisiest, equations
+    # The noise of the calibration comes from two moments; its seat is often 0, and then poses that hardly see the
+    # encoders in some direction count too much there.
+    equations, _ = equations.estimated([list(joints)], seat=True)
+    return equations.noisiest(joints), equations
+
+
+def _noisy_within_observations(equations: _Equations, joint: int) -> bool:
+    """Whether a joint (from 1) is noisy even where its zero may differ from one observation to the next.
+
+    A zero that is off in some of them, as after a slip, moves all of their poses alike: these contradict the others,
+    and that is what has to be said.
+    """
+    rows = [
+        part._replace(own=np.concatenate([part.own, part.extra[..., [joint - 1]]], axis=2)) for part in equations.rows
+    ]
+    noisiest = equations._replace(rows=rows).noisiest([joint - 1])
+    return noisiest is not None and noisiest.probability < LEVEL
+
+
+def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
+    """The noise of a calibration with that of noisy encoders as the residuals show it; None where there are none.
+
+    The noise of all others stays as it is stated; where nothing is stated, it is estimated anew without them. Where a
+    term is clearly missing all the same, the model is what is wrong, and the noise stays.
+    """
+    record = case.record
+    if not case.scatters or case.left.degrees_of_freedom < _FEWEST:
+        return None
+    equations = _Equations.of(record, *case.chunks)
+    given, joints = record.given_noise is not None, len(equations.unit)
+    noisy, probabilities, u = [], [], np.zeros(0)
+    noisiest, now = _noisiest(record, equations)
+    if noisiest is None or noisiest.probability >= LEVEL or not _noisy_within_observations(now, noisiest.joint):
+        return None
+    while noisiest is not None and noisiest.probability < LEVEL and len(noisy) < joints - 1:
+        noisy.append(noisiest.joint - 1)
+        probabilities.append(noisiest.probability)
+        others = [joint for joint in range(joints) if joint not in noisy]
+        groups = [[joint] for joint in noisy] + ([] if given else [others])
+        now, u = equations.estimated(groups, seat=not given)
+        noisiest = now.noisiest(others)
+    stated = equations.variances.readings if given else np.full(joints, now.variances.readings[others[0]])
+    if np.any(now.variances.readings[noisy] <= stated[noisy]):
+        return None
+    arm, q = record.calibrated.arm, np.asarray(record.recording.capture.readings)
+    if any(term.probability < _CLEAR for term in found_terms(arm, q, now.rows, now.relations)):
+        return None
+    kinds = arm.geometry.kinds
+    units = np.broadcast_to(one_arcsec(kinds), (joints,))
+    expected, sd = np.sqrt(stated) * units, np.sqrt(now.variances.readings) * units
+    noise = Noise(
+        encoder_arcsec=np.sqrt(now.variances.readings),
+        seating=float(record.noise.seating) if given else np.sqrt(now.variances.seat),
+        linear_encoder=None if kinds is None else np.where(kinds.mask(), sd, 0.0),
+    )
+    encoders = [
+        # u of a standard deviation is half of it times u of its log variance.
+        NoisyEncoder(joint + 1, float(expected[joint]), float(sd[joint]), float(sd[joint] * u_log / 2), probability)
+        for joint, u_log, probability in zip(noisy, u, probabilities, strict=False)
+    ]
+    return noise, tuple(sorted(encoders))
+
+
+def amend(result: Result, case: Case, again: Callable[[Noise], Result]) -> Result:
+    """A result, or where it has noisy encoders that which their noise leads to.
+
+    Args:
+        result: Of `calibrate` or `identify`.
+        case: Its case.
+        again: The same calibration with a noise that is given.
+    """
+    replaced = case.once(noise_by_joint)
+    if replaced is None:
+        return result
+    noise, encoders = replaced
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the first calibration has said it
+        weighted = again(noise)
+    changes = {"noisy_encoders": encoders}
+    first = result if isinstance(result, Identification) else result.stage1
+    if result.given_noise is None:  # it is still one that was estimated
+        same = ("noise_model", "fitted_degrees_of_freedom", "reduced_chi")
+        changes |= {name: getattr(first, name) for name in same}
+    if isinstance(weighted, Identification):
+        return dataclasses.replace(weighted, **changes)
+    return dataclasses.replace(weighted, stage1=dataclasses.replace(weighted.stage1, **changes))
