@@ -117,18 +117,18 @@ class UnseenErrors(NamedTuple):
         """Some of the reference lengths, or all, as far as their errors can be predicted; both root mean squares weigh
         each error by its own standard uncertainty, so that their ratio is that of the normalised errors."""
         u = self.length_u
-        known = [i for i in (range(len(u)) if which is None else which) if np.isfinite(u[i])]
-        if not known:
+        chosen = [i for i in (range(len(u)) if which is None else which) if np.isfinite(u[i])]
+        if not chosen:
             return NOTHING
-        u = np.maximum(u[known], _LEAST_LENGTH_U)
-        correlation = self.length_covariance[np.ix_(known, known)] / np.outer(u, u)
+        u = np.maximum(u[chosen], _LEAST_LENGTH_U)
+        correlation = self.length_covariance[np.ix_(chosen, chosen)] / np.outer(u, u)
         predicted = math.sqrt(np.mean(u**2))
-        parts = np.mean(self.length_parts[known] / u[:, None] ** 2, axis=0)
+        parts = np.mean(self.length_parts[chosen] / u[:, None] ** 2, axis=0)
         return Agreement(
-            count=len(known),
-            rms=predicted * math.sqrt(np.mean((self.length_error[known] / u) ** 2)),
+            count=len(chosen),
+            rms=predicted * math.sqrt(np.mean((self.length_error[chosen] / u) ** 2)),
             predicted=predicted,
-            degrees_of_freedom=len(known) ** 2 / float(np.sum(correlation**2)),
+            degrees_of_freedom=len(chosen) ** 2 / float(np.sum(correlation**2)),
             noise_degrees_of_freedom=float(degrees_of_freedom(parts, self.law)),
         )
 
@@ -197,8 +197,8 @@ class _Unseen(NamedTuple):
             [np.asarray(r)[part] for r in influence.rows] for part in (slice(p, None), slice(p))
         )
         values, vectors = np.linalg.eigh(sum(_flat(rows) @ _flat(rows).T for rows in of_shared))
-        known = values > _NULL * values.max(initial=0.0)
-        basis = vectors[:, known] / np.sqrt(values[known])
+        large = values > _NULL * values.max(initial=0.0)
+        basis = vectors[:, large] / np.sqrt(values[large])
         of_shared = [np.einsum("sb,srm->brm", basis, rows) for rows in of_shared]
         of_parameters = [rows / scale for rows in of_parameters]
         along = np.sum([_flat(b) @ _flat(a).T for b, a in zip(of_shared, of_parameters, strict=True)], axis=0)

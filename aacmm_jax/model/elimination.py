@@ -290,13 +290,13 @@ def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> tuple[Float[An
     first = len(layout.classes) - layout.linear
     fitted = [xp.zeros(shape) for shape in layout.classes[first:]]
     point = rows_at(space, observed, whole, batch is not None)
-    found = list(point.rows)
+    rows_of_groups = list(point.rows)
     for number, (group, root) in enumerate(zip(layout.groups, whitening.roots, strict=True)):
         if group.of >= first:
             rows = point.rows[number]
             fitted[group.of - first] = shift = _of_rows(rows, root, group)[1]
-            found[number] = rows._replace(values=rows.values - to_poses(shift.T, group.sizes))
-    return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)]), point._replace(rows=found)
+            rows_of_groups[number] = rows._replace(values=rows.values - to_poses(shift.T, group.sizes))
+    return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)]), point._replace(rows=rows_of_groups)
 
 
 def _of_rows(
@@ -316,11 +316,11 @@ def _of_rows(
 def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) -> list[Float[AnyArray, "_ 3 3"]]:
     """Covariances of the positions of sockets by a given arm, as entries of a list of all classes."""
     layout = observed.layout
-    found: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)
+    covariances: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
         if group.of >= 0 and stack.linear:
-            found[group.of] = inverse_positive_definite(_of_rows(rows, root, group)[0])
-    return found
+            covariances[group.of] = inverse_positive_definite(_of_rows(rows, root, group)[0])
+    return covariances
 
 
 def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, "h h"], Float[AnyArray, " h"]]:
@@ -341,12 +341,12 @@ def pseudo_inverse(matrices: Float[AnyArray, "K k k"]) -> Float[AnyArray, "K k k
     xp, size = namespace(matrices), matrices.shape[-1]
     if xp is np:
         values, vectors = np.linalg.eigh(matrices)
-        known = values > _NULL * np.maximum(values[:, -1:], 1e-300)
-        return (vectors * np.where(known, 1 / np.where(known, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(-1, -2)
+        large = values > _NULL * np.maximum(values[:, -1:], 1e-300)
+        return (vectors * np.where(large, 1 / np.where(large, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(-1, -2)
     # Only a basis comes from the eigenvectors: their derivative is infinite where eigenvalues repeat.
     values, vectors = semidefinite_eigen(matrices)
-    known = values > _NULL * values[:, :1]
-    seen = xp.where(known[:, None, :], vectors, 0.0)
+    large = values > _NULL * values[:, :1]
+    seen = xp.where(large[:, None, :], vectors, 0.0)
     transposed = xp.swapaxes(seen, -1, -2)
-    inner = transposed @ matrices @ seen + xp.where(known, 0.0, 1.0)[..., None] * np.eye(size)[None]
+    inner = transposed @ matrices @ seen + xp.where(large, 0.0, 1.0)[..., None] * np.eye(size)[None]
     return seen @ inverse_positive_definite(inner) @ transposed
