@@ -8,17 +8,18 @@ Uncertainties are the tester's (artefacts, seat, fixture, temperature): the arm'
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
+from ..core.arguments import Range, checked, checked_arguments
 from ..core.errors import InputError, nearest
 from ..data.recording import Recording
 from ..data.sphere import checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
 from . import asme_b89_4_22, iso_10360_12, jjf_1408
-from .decision import MOST, Limit, Rule, checked_limit, checked_rule, decide, without_test
+from .decision import MOST, Limit, Rule, checked_limit, decide, without_test
 from .geometry import postures_of
 from .influences import Influences, checked_influences
 from .requirements import StandardTest
@@ -29,6 +30,7 @@ from .standards import DEFAULT_RULES
 
 TESTS: tuple[StandardTest, ...] = (*jjf_1408.TESTS, *asme_b89_4_22.TESTS, *iso_10360_12.TESTS)
 NO_INFLUENCES = Influences()
+_Millimetres = Annotated[float, Range(least=0, most=MOST, unit="mm")]
 _FARTHEST = 1e6  # mm: no arm reaches a kilometre
 
 
@@ -67,10 +69,11 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     )
 
 
+@checked_arguments
 def run(
     measured: Measured,
     limits: Mapping[str, Limit | float] | None = None,
-    u_test: float = 0.0,
+    u_test: _Millimetres = 0.0,
     *,
     influences: Influences = NO_INFLUENCES,
     rule: Rule | None = None,
@@ -104,14 +107,10 @@ def run(
         after ASME B89.4.22-2004 [('Volumetric', None), ('Volumetric_Range', None), ('Volumetric_2RMS', None)]
         after ISO 10360-12:2016 [('E_Uni', None)]
     """
-    measured = _checked(measured)
-    u_test = _number(u_test, "the standard uncertainty of the test")
-    influences = checked_influences(influences)
+    measured, influences, given = _checked(measured), checked_influences(influences), checked_limits(limits or {})
     influences = influences._replace(u=math.hypot(influences.u, u_test))
-    given = checked_limits(limits or {})
     tests = [result for test in TESTS if (result := test.run(measured, influences)) is not None]
-    rules = DEFAULT_RULES if rule is None else dict.fromkeys(DEFAULT_RULES, checked_rule(rule))
-    tests = [test._replace(rule=rules[test.standard]) for test in tests]
+    tests = [test._replace(rule=rule or DEFAULT_RULES[test.standard]) for test in tests]
     if measured.none_held_out:
         held_out = "Everything was used to identify the arm; measure sockets and lengths that were not."
         tests = [test._replace(missing=(held_out, *test.missing)) for test in tests]
@@ -146,14 +145,14 @@ def without_stated_uncertainty(tests: Sequence[AcceptanceTest]) -> list[str]:
 
 def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:
     """Limits by the name of a metric, numbers made into `Limit`; `InputError` for an unknown metric or a bad limit."""
-    checked = {}
+    by_name = {}
     for name, limit in limits.items():
         if name not in METRICS:
             raise InputError(f"there is no metric '{name}'{without_test(name, list(METRICS))}")
         fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
         what = f"the limit of {name}"
-        checked[name] = checked_limit(Limit(_number(fixed, what), divisor), what)
-    return checked
+        by_name[name] = checked_limit(Limit(float(checked(fixed, _Millimetres, what)), divisor), what)
+    return by_name
 
 
 def _checked(measured: Measured) -> Measured:
@@ -172,16 +171,6 @@ def _checked(measured: Measured) -> Measured:
     if size is not None and not 0 < size <= 2 * _FARTHEST:
         raise InputError(f"measuring_range is {size:g} mm; give the diameter of the maker's measuring volume in mm.")
     return measured._replace(sockets=sockets, spheres=spheres)
-
-
-def _number(value: Any, what: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{what} is {value!r}; give a number of mm.") from error
-    if not 0 <= number <= MOST:
-        raise InputError(f"{what} is {number:g} mm; it must be zero or positive, and finite.")
-    return number
 
 
 def _decided(metric: Metric, limits: Mapping[str, Limit], rule: Rule) -> Metric:

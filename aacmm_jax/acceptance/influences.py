@@ -3,15 +3,15 @@
 import math
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
+from ..core.arguments import Range, checked_fields
 from ..core.errors import InputError
 from ..core.text import number
 
 REFERENCE_TEMPERATURE = 20.0  # C (ISO 1)
-_LARGEST_COEFFICIENT, _TEMPERATURES = 1e-3, (-100.0, 200.0)  # 1/K; C: what no test is beyond
 _SMALLEST_GIVEN = 1e-3  # 1e-6/K: less than any body expands by
-_EXPANSION = re.compile(r"\s*(?P<of>artefact|arm)\s*=(?P<numbers>[^=]*)")
+_EXPANSION = re.compile(r"\s*(?P<body>artefact|arm)\s*=(?P<numbers>[^=]*)")
 
 
 class Expansion(NamedTuple):
@@ -23,10 +23,10 @@ class Expansion(NamedTuple):
         9.2 um/m, u = 2.4 um/m
     """
 
-    coefficient: float
-    u_coefficient: float = 0.0
-    temperature: float = REFERENCE_TEMPERATURE
-    u_temperature: float = 0.0
+    coefficient: Annotated[float, Range(least=-1e-3, most=1e-3, unit="per K")]  # what no body is beyond
+    u_coefficient: Annotated[float, Range(least=0, most=1e-3, unit="per K")] = 0.0
+    temperature: Annotated[float, Range(least=-100, most=200, unit="C")] = REFERENCE_TEMPERATURE
+    u_temperature: Annotated[float, Range(least=0, most=200, unit="C")] = 0.0
 
     @property
     def relative(self) -> float:
@@ -57,7 +57,7 @@ class Influences(NamedTuple):
     """
 
     u: float = 0.0  # standard uncertainty of every value: seat and fixture, mm
-    u_relative: float = 0.0  # standard uncertainty in proportion to a length
+    u_relative: Annotated[float, Range(least=0, most=1)] = 0.0  # standard uncertainty in proportion to a length
     artefact: Expansion | None = None  # None: at 20 C, or corrected for
     arm: Expansion | None = None  # None: the arm compensates its own expansion, or is tested as it is
 
@@ -80,7 +80,7 @@ def _relative(body: Expansion | None) -> float:
 
 def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
     """Expansions of ``artefact`` and ``arm``, from texts ``artefact=C,u,T,u``: coefficient in 1e-6/K, T in C."""
-    found: dict[str, Expansion] = {}
+    expansions: dict[str, Expansion] = {}
     for text in texts:
         match = _EXPANSION.fullmatch(text)
         try:
@@ -94,32 +94,16 @@ def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
             )
         if 0 < abs(values[0]) < _SMALLEST_GIVEN:
             raise InputError(f"--expansion '{text}' gives the coefficient in 1/K; give it in 1e-6/K, 11.5 for steel.")
-        if match["of"] in found:
-            raise InputError(f"--expansion gives the {match['of']} two expansions; give it one.")
-        found[match["of"]] = checked_expansion(Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:]), match["of"])
-    return found
+        if match["body"] in expansions:
+            raise InputError(f"--expansion gives the {match['body']} two expansions; give it one.")
+        body = Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:])
+        expansions[match["body"]] = checked_fields(body, f"the {match['body']}")
+    return expansions
 
 
-def checked_expansion(body: Expansion, of: str) -> Expansion:
-    """The same expansion, or `InputError` where no body has it."""
-    low, high = _TEMPERATURES
-    if not (abs(body.coefficient) <= _LARGEST_COEFFICIENT and 0 <= body.u_coefficient <= _LARGEST_COEFFICIENT):
-        raise InputError(
-            f"the {of} expands by {body.coefficient:g} per K with u = {body.u_coefficient:g}; give a coefficient such "
-            "as 11.5e-6 and a standard uncertainty of zero or more."
-        )
-    if not (low <= body.temperature <= high and 0 <= body.u_temperature <= high):
-        raise InputError(
-            f"the {of} has a temperature of {body.temperature:g} C with u = {body.u_temperature:g}; give both in C."
-        )
-    return body
-
-
-def checked_influences(found: Influences) -> Influences:
+def checked_influences(influences: Influences) -> Influences:
     """The same influences, or `InputError` where one is impossible."""
-    if not (0 <= found.u_relative <= 1):
-        raise InputError(f"u_relative is {found.u_relative:g}; give a part of the length, such as 2e-6.")
-    for of in ("artefact", "arm"):
-        if (body := getattr(found, of)) is not None:
-            checked_expansion(body, of)
-    return found
+    for name in ("artefact", "arm"):
+        if (body := getattr(influences, name)) is not None:
+            checked_fields(body, f"the {name}")
+    return checked_fields(influences)

@@ -103,11 +103,11 @@ class EvaluationRecord(NamedTuple):
     def acceptance(self) -> dict[str, list[AcceptanceTest]]:
         """The tests of ``standards``, and those with a limit, as far as the capture allows; as found and as left."""
         arms = self.arms() if self.standards or self.limits else {}
-        found = {
+        tests = {
             stage: run(self.measured(arm.arm), self.limits, self.u_test, influences=self.influences, rule=self.rule)
             for stage, arm in arms.items()
         }
-        return {stage: _chosen(found.get(stage, []), self.standards, self.limits) for stage in self.arms()}
+        return {stage: _chosen(tests.get(stage, []), self.standards, self.limits) for stage in self.arms()}
 
 
 class PointsRecord(NamedTuple):
@@ -194,9 +194,8 @@ def evaluation_of(
     if recording.true is not None:
         warnings.append(SIMULATED)
     warnings += recording.capture.repeated.sentences()
-    partly = [f"{name} ({count} of {len(readings[name])} poses)" for name, count in shared.items()
-              if 0 < count < len(readings[name])]  # fmt: skip
-    if partly:
+    counts = ((name, count, len(readings[name])) for name, count in shared.items())
+    if partly := [f"{name} ({count} of {poses} poses)" for name, count, poses in counts if 0 < count < poses]:
         names = ", ".join(partly)
         warnings.append(f"The arm was identified from some poses of {names}; these count as identified from.")
     if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
@@ -204,7 +203,7 @@ def evaluation_of(
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
             f"'{record.recording.nominal.name}'; check that it is the same arm."
         )
-    found = EvaluationRecord(
+    evaluation = EvaluationRecord(
         recording._replace(nominal=record.recording.nominal),
         record.calibrated,
         frozenset(name for name, count in shared.items() if count),
@@ -216,18 +215,18 @@ def evaluation_of(
         influences=influences,
         rule=rule,
     )
-    if not found.independent:
+    if not evaluation.independent:
         warnings.append(
             "The arm was identified from all of this capture, so the results are too favourable and are not a test; "
             "measure what the calibration does not use."
         )
-    warnings += unstated_uncertainty_warning(found.acceptance()["calibrated"])
-    return found._replace(warnings=tuple(warnings))
+    warnings += unstated_uncertainty_warning(evaluation.acceptance()["calibrated"])
+    return evaluation._replace(warnings=tuple(warnings))
 
 
 def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
     """With the unseen poses of observations of which others are known as observations of their own."""
-    found = []
+    observations = []
     for observation in capture.observations:
         seen = np.array([row.tobytes() in known for row in np.asarray(observation.q)])
         parts = [observation]
@@ -238,8 +237,8 @@ def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
                 parts = [observation.select(np.flatnonzero(seen)), unseen]
             except InputError:
                 pass  # too few poses: the observation counts as identified from
-        found += parts
-    return Capture(capture.sockets, capture.lengths, found, capture.repeated)
+        observations += parts
+    return Capture(capture.sockets, capture.lengths, observations, capture.repeated)
 
 
 def check_geometry(arm: Arm, capture: Capture) -> None:

@@ -12,7 +12,7 @@ from ..core.rotations import rotation_matrix
 from ..core.text import csv_text
 from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .header_lines import Column
+from .column_names import Column
 from .manifest_angles import header_units
 from .table_columns import columns_of_joints, find_named, position_columns, reading_columns
 from .temperatures import TEMPERATURE

@@ -14,7 +14,7 @@ from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm, by_joint
-from .header_lines import Column
+from .column_names import Column
 from .manifest_tables import Picked, Wanted, as_list
 from .table_columns import check_not_taken, reading_columns
 from .temperatures import TEMPERATURE, with_temperature

@@ -39,7 +39,7 @@ def check_fields(text: str) -> None:
 
 def check_name(name: str) -> None:
     """Refuse a name with characters that act on a terminal or end a text (NUL, ESC), and one longer than a line."""
-    if any(is_control(character) for character in name):
+    if any(map(is_control, name)):
         raise InputError(f"the name {quoted(name)} holds a control character; rename it.")
     if len(name) > _LONGEST_NAME:
         raise InputError(f"the name {quoted(name)} has {len(name):,} characters, over {_LONGEST_NAME}; shorten it.")
@@ -64,28 +64,31 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     Raises `InputError` where no file matches, naming those that nearly do.
     """
     before = "" if Path(pattern).is_absolute() else f"{folder.as_posix()}/"
-    literals = (glob.escape(text) for text in _FIELD.sub("\0", pattern).split("\0"))
     # Separators only: to resolve "./" or "//" would keep the pattern from matching.
-    found = sorted(path.replace(os.sep, "/") for path in glob.glob(glob.escape(before) + "*".join(literals)))
-    strict = re.compile(re.escape(before) + _expression(pattern, _WORD))
-    kept = [path for path in found if not _excluded(path.removeprefix(before), exclude)]
+    paths = _glob(glob.escape(before) + "*".join(map(glob.escape, _FIELD.sub("\0", pattern).split("\0"))))
+    paths = [path.removeprefix(before) for path in paths]
+    kept = [path for path in paths if not _excluded(path, exclude)]
     names = list(dict.fromkeys(_FIELD.findall(pattern)))
+    strict, loose = (re.compile(_expression(pattern, partial)) for partial in (_WORD, _ANYTHING))
     values = [dict(zip(names, match.groups(), strict=True)) for path in kept if (match := strict.fullmatch(path))]
-    if not values:
-        where = f"no file matches '{pattern}' in {folder}"
-        left_out = [path.removeprefix(before) for path in found if path not in kept]
-        loose = re.compile(re.escape(before) + _expression(pattern, _ANYTHING))
-        near = [path.removeprefix(before) for path in kept if loose.fullmatch(path)]
-        if near:
-            raise InputError(
-                f"{where}, but nearly {_some(near)}: next to other text in a name, a field is letters, digits and "
-                "'-' only; write more of the name out."
-            )
-        if left_out:
-            raise InputError(f"{where} but {_some(left_out)}, which exclude leaves out; change exclude.")
-        alike = _alike(folder, before, pattern)
-        raise InputError(f"{where}" + (f"; there is {_some(alike)}" if alike else "") + "; check the path.")
-    return values
+    if values:
+        return values
+    where = f"no file matches '{pattern}' in {folder}"
+    near = [path for path in kept if loose.fullmatch(path)]
+    if near:
+        raise InputError(
+            f"{where}, but nearly {_some(near)}: next to other text in a name, a field is letters, digits and '-' "
+            "only; write more of the name out."
+        )
+    if len(kept) < len(paths):
+        left_out = [path for path in paths if path not in kept]
+        raise InputError(f"{where} but {_some(left_out)}, which exclude leaves out; change exclude.")
+    alike = _alike(before, pattern)
+    raise InputError(f"{where}" + (f"; there is {_some(alike)}" if alike else "") + "; check the path.")
+
+
+def _glob(pattern: str) -> list[str]:
+    return sorted(path.replace(os.sep, "/") for path in glob.glob(pattern))
 
 
 def _expression(pattern: str, partial: str) -> str:
@@ -96,18 +99,17 @@ def _expression(pattern: str, partial: str) -> str:
     """
     components = [text for text in pattern.split("/") if _FIELD.search(text)]
     shared = {name for text in components if not _WHOLE.fullmatch(text) for name in _FIELD.findall(text)}
-    parts, last, seen = "", 0, []
+    expression, last, seen = "", 0, []
     for field in _FIELD.finditer(pattern):
         name = field.group(1)
-        value = partial if name in shared else _ANYTHING
-        parts += re.escape(pattern[last : field.start()])
+        expression += re.escape(pattern[last : field.start()])
         if name in seen:
-            parts += f"(?:\\{seen.index(name) + 1})"
+            expression += f"(?:\\{seen.index(name) + 1})"
         else:
-            parts += f"({value})"
+            expression += f"({partial if name in shared else _ANYTHING})"
             seen.append(name)
         last = field.end()
-    return parts + re.escape(pattern[last:])
+    return expression + re.escape(pattern[last:])
 
 
 def _excluded(path: str, exclude: Sequence[str]) -> bool:
@@ -115,13 +117,13 @@ def _excluded(path: str, exclude: Sequence[str]) -> bool:
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in exclude for name in names)
 
 
-def _alike(folder: Path, before: str, pattern: str) -> list[str]:
+def _alike(before: str, pattern: str) -> list[str]:
     """Files as deep in the folders as the pattern, with names like it."""
-    fixed = pattern[: _FIELD.search(pattern).start()].rpartition("/")[0]  # type: ignore[union-attr]
+    fixed = _FIELD.split(pattern)[0].rpartition("/")[0]
     below = glob.escape(before + fixed) + ("/" if fixed else "")
     deeper = "/".join("*" for _ in pattern.removeprefix(fixed).strip("/").split("/"))
-    found = sorted(path.replace(os.sep, "/") for path in glob.glob(below + deeper) if os.path.isfile(path))
-    return difflib.get_close_matches(pattern, [path.removeprefix(before) for path in found], n=_NAMED, cutoff=0.3)
+    paths = [path.removeprefix(before) for path in _glob(below + deeper) if os.path.isfile(path)]
+    return difflib.get_close_matches(pattern, paths, n=_NAMED, cutoff=0.3)
 
 
 def _some(paths: Sequence[str]) -> str:

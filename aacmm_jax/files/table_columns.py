@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from ..core.errors import InputError
 from ..core.text import quoted
@@ -15,8 +16,7 @@ _OF_JOINTS = re.compile("q|j|a|ax|axis|axes|achse|joints?|jnt|jpos|gelenk|theta|
 # Words in the names of other quantities that joints have.
 _OF_OTHERS = re.compile(
     "qd+|d+q|dtheta|vel|velocity|velocities|speed|acc|acceleration|tau|torques?|effort|moments?|force|currents?|"
-    "voltage|"
-    "power|temp|temperatures?|error|err|mode|limit|min|max|std|sigma|u|control|output|contact|collision|brake|tcp|pose|"
+    "voltage|power|temp|temperatures?|error|err|mode|limit|min|max|std|sigma|u|control|output|contact|collision|brake|tcp|pose|"
     "probe|direction"
 )
 # First words in the names of columns that hold no reading.
@@ -32,22 +32,33 @@ def _words(stem: str) -> list[str]:
     return re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", stem).casefold())
 
 
-def _numbered(table: TextTable) -> list[tuple[list[str], list[int]]]:
-    """Columns whose names differ in the last number only: the words of the names, and the columns from 0."""
-    found: dict[str, list[int]] = {}
-    words: dict[str, list[str]] = {}
-    for i, name in enumerate(table.header):
-        numbered = stem_and_number(name)
-        if numbered is not None:
-            found.setdefault(numbered[0].casefold(), []).append(i)
-            words.setdefault(numbered[0].casefold(), _words(numbered[0]))
-    return [(words[stem], columns) for stem, columns in found.items()]
+class _Family(NamedTuple):
+    """Columns whose names differ in the last number only."""
+
+    words: list[str]
+    columns: list[int]  # from 0
+    whole: bool  # whether they count to the number of joints, from 0 or 1
+
+    @property
+    def of_joints(self) -> bool:
+        """Whether the words are those of joint readings."""
+        return any(map(_OF_JOINTS.fullmatch, self.words)) and not any(map(_OF_OTHERS.fullmatch, self.words))
 
 
-def _is_whole(table: TextTable, columns: Sequence[int], joints: int) -> bool:
-    """Whether the names of columns count to the number of joints, from 0 or 1."""
-    numbers = sorted(found[1] for i in columns if (found := stem_and_number(table.header[i])) is not None)
-    return numbers in (list(range(joints)), list(range(1, joints + 1)))
+def _families(table: TextTable, joints: int) -> list[_Family]:
+    families: dict[str, list[tuple[str, int, int]]] = {}
+    for column, name in enumerate(table.header):
+        if (numbered := stem_and_number(name)) is not None:
+            families.setdefault(numbered[0].casefold(), []).append((*numbered, column))
+    whole = (list(range(joints)), list(range(1, joints + 1)))
+    return [
+        _Family(
+            _words(members[0][0]),
+            [column for *_, column in members],
+            sorted(number for _, number, _ in members) in whole,
+        )
+        for members in families.values()
+    ]
 
 
 def columns_of_joints(
@@ -58,27 +69,21 @@ def columns_of_joints(
     ``taken`` are columns that hold something else, and ``line`` is what states columns, for messages. Raises
     `InputError` where several sets of columns have such names, or their numbers do not ascend.
     """
-    sets = [
-        columns
-        for words, columns in _numbered(table)
-        if any(map(_OF_JOINTS.fullmatch, words))
-        and not any(map(_OF_OTHERS.fullmatch, words))
-        and not set(columns) & set(taken)
-    ]
-    whole = [columns for columns in sets if _is_whole(table, columns, joints)]
+    families = _families(table, joints)
+    named = [family for family in families if family.of_joints and not set(family.columns) & set(taken)]
+    whole = [family.columns for family in named if family.whole]
     if len(whole) > 1:
         choices = [f"{_line(line, columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
         raise InputError(f"{table.path} has several columns of each joint; add {' or '.join(choices[:4])}.")
-    for columns in [columns for columns in sets if len(columns) == joints and not whole]:
-        table.check_ascending(columns, line)  # one of them is there twice
+    # Where none is whole, one of as many columns is there twice.
+    for columns in whole or [family.columns for family in named if len(family.columns) == joints]:
+        table.check_ascending(columns, line)
     if whole:
-        table.check_ascending(whole[0], line)
         return whole[0], True
-    for _, columns in _numbered(table):
-        both = set(columns) & set(taken)
-        if 0 < len(both) < len(columns) and _is_whole(table, columns, joints):
-            check_not_taken(table, columns, taken)
-    return [], bool(sets)
+    for family in families:
+        if family.whole and 0 < len(set(family.columns) & set(taken)) < joints:
+            check_not_taken(table, family.columns, taken)
+    return [], bool(named)
 
 
 def check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[int]) -> None:
@@ -101,20 +106,14 @@ def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), li
         return columns
     temperature = table.pick([TEMPERATURE]) if table.has([TEMPERATURE]) else []
     free = [i for i in range(table.width) if i not in taken and i not in temperature]
-    foreign = [
-        i for i in free if table.header and any(map(_NO_JOINT.fullmatch, _words(bare_name(table.header[i]))[:1]))
-    ]
+    names, families = [bare_name(table.header[i]) for i in free if table.header], _families(table, joints)
+    foreign = any(map(_NO_JOINT.fullmatch, (word for name in names for word in _words(name)[:1])))
     if len(free) == joints and not foreign and not any_names and not table.misnumbered:
         table.check_ascending(free, line)
-        numbered = [columns for _, columns in _numbered(table) if len(columns) == joints]
-        nameless = joints == 1 or not any(bare_name(table.header[i]) for i in free if table.header)
-        if _is_whole(table, numbered[0], joints) if numbered else nameless:
+        alike = [family for family in families if len(family.columns) == joints]
+        if alike[0].whole if alike else joints == 1 or not any(names):
             return free
-    guess = [
-        columns
-        for _, columns in _numbered(table)
-        if _is_whole(table, columns, joints) and all(map(table.is_numeric, columns))
-    ]
+    guess = [family.columns for family in families if family.whole and all(map(table.is_numeric, family.columns))]
     of_ur = [[i for i, name in enumerate(table.header) if joint in name.casefold()] for joint in _OF_UR]
     if joints == len(_OF_UR) and all(len(columns) == 1 for columns in of_ur):
         guess = [[columns[0] for columns in of_ur]]
@@ -154,4 +153,5 @@ def find_named(
 
 def position_columns(table: TextTable) -> tuple[list[int], str | None] | None:
     """The columns of a position, and the unit that the header states."""
-    return next((found for names in _POSITIONS if (found := find_named(table, names, tuple(LENGTH_UNITS)))), None)
+    choices = (find_named(table, names, tuple(LENGTH_UNITS)) for names in _POSITIONS)
+    return next(filter(None, choices), None)

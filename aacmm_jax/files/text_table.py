@@ -11,17 +11,21 @@ import numpy as np
 
 from ..core.errors import InputError, nearest
 from ..core.text import is_number, number, quoted, shorten
-from .column_names import AMBIGUOUS, along_axes, plain_name, stem_and_number, unit_in
-from .header_lines import (
+from .column_names import (
+    AMBIGUOUS,
     Column,
+    along_axes,
     are_numbered,
     has_number,
     header_cells,
     is_row,
     matching,
     names_of_columns,
+    plain_name,
+    stem_and_number,
     stripped,
     trimmed,
+    unit_in,
 )
 from .text_lines import cells_of, delimiter_of, table_lines
 
@@ -53,117 +57,83 @@ class TextTable:
         skip: int = 0,
         wanted: Sequence[Column] = (),
     ):
-        self._path, self._decimal = path, decimal
+        self.path, self._decimal = path, decimal
         lines, self._ended = table_lines(path)
         if lines[skip : skip + 1] and (stated := re.fullmatch('"?sep=(.)"?', lines[skip])):  # of spreadsheets
             delimiter, skip = delimiter or stated[1], skip + 1
-        self._delimiter = delimiter or delimiter_of(lines[skip:], decimal)
-        self._rows: list[list[str]] = []
-        self._lines: list[int] = []
-        self._hashed: list[int] = []  # rows that begin like comments
+        delimiter = delimiter or delimiter_of(lines[skip:], decimal)
         words: list[tuple[int, list[str]]] = []
         comments: list[tuple[int, list[str]]] = []
+        rows: list[tuple[int, list[str]]] = []
+        hashed: set[int] = set()  # rows that begin like comments
         for line_number, line in enumerate(lines[skip:], start=skip + 1):
             if not line or line[0] in ' \t#"':
                 text = line.strip(' \t"')
                 if not text:
                     continue
                 if text[0] == "#":
-                    cells = cells_of(line, self._delimiter)
-                    if (words or self._rows) and has_number(stripped(cells[1:])):
-                        self._hashed.append(line_number)
-                    else:
-                        comments.append((line_number, header_cells(text[1:].strip(" \t"), self._delimiter)))
+                    if not (words or rows) or not has_number(stripped(cells_of(line, delimiter)[1:])):
+                        comments.append((line_number, header_cells(text[1:].strip(" \t"), delimiter)))
                         continue
-            cells = cells_of(line, self._delimiter)
+                    hashed.add(line_number)
+            cells = cells_of(line, delimiter)
             if not cells[0] and not any(cell.strip() for cell in cells):
                 continue
-            if len(self._rows) == len(self._hashed) and not is_row(stripped(cells)):
-                words.append((line_number, header_cells(line, self._delimiter)))
-                continue
-            self._rows.append(cells)
-            self._lines.append(line_number)
-        self._leave_out_comments()
-        if not self._rows:
+            if len(rows) == len(hashed) and not is_row(stripped(cells)):
+                words.append((line_number, header_cells(line, delimiter)))
+            else:
+                rows.append((line_number, cells))
+        if hashed:  # lines that begin with "#" and are not as wide as the rows are comments
+            width = next((len(cells) for number, cells in rows if number not in hashed), len(rows[0][1]))
+            rows = [(number, cells) for number, cells in rows if number not in hashed or len(cells) == width]
+        if not rows:
             raise InputError(f"{path} holds no numbers; give one line a pose.")
+        self._lines, self._rows = [number for number, _ in rows], [cells for _, cells in rows]
+        self._hashed = [number for number in self._lines if number in hashed]
         self._check_widths()
-        self._leave_out_trailing([cells for _, cells in words])
-        lines_of_words = [(line, trimmed(cells, self.width)) for line, cells in words]
-        self._title = lines_of_words[-1][1] if words else []  # a line of words that does not name the columns
-        names = names_of_columns(path, self.width, lines_of_words, comments, wanted)
-        self._header = [name.strip("\"'") for name in names]
-
-    def _check_widths(self) -> None:
-        if len(set(map(len, self._rows))) == 1:
-            return
-        width = len(self._rows[0])
-        wrong = next(i for i, row in enumerate(self._rows) if len(row) != width)
-        where = f"{self._path} line {self._lines[wrong]}"
-        if wrong == len(self._rows) - 1 > 0 and not self._ended and len(self._rows[wrong]) < width:
-            raise InputError(
-                f"{where}, the last, ends after {len(self._rows[wrong])} of {width} columns, and without the end of a "
-                "line, so the file is cut there; copy it again, or leave out that line."
-            )
-        earlier = wrong < _LONG and width < len(self._rows[wrong])
-        skip = f", or add skip = {self._lines[wrong] - 1} if the table begins there" if earlier else ""
-        raise InputError(
-            f"{where} has {len(self._rows[wrong])} columns, the lines before it {width}; give all the same{skip}."
-        )
-
-    def _leave_out_trailing(self, words: list[list[str]]) -> None:
-        """Columns at the end that are empty in all rows and without a name: lines that end with delimiters."""
-        named = max((len(trimmed(cells, 1)) for cells in words), default=0)
-        while self.width > max(1, named) and not any(row[-1].strip() for row in self._rows):
+        # Columns at the end that are empty in all rows and without a name: lines that end with delimiters.
+        named = max((len(trimmed(cells, 1)) for _, cells in words), default=0)
+        while len(self._rows[0]) > max(1, named) and not any(row[-1].strip() for row in self._rows):
             for row in self._rows:
                 row.pop()
+        self.width, self.length = len(self._rows[0]), len(self._rows)
+        words = [(number, trimmed(cells, self.width)) for number, cells in words]
+        self._title = words[-1][1] if words else []  # a line of words that does not name the columns
+        # Names of the columns; empty where the table has none.
+        self.header = [name.strip("\"'") for name in names_of_columns(path, self.width, words, comments, wanted)]
 
-    def _leave_out_comments(self) -> None:
-        """Leave out the lines that begin with "#" and are not as wide as the rows."""
-        if not self._hashed:
+    def _check_widths(self) -> None:
+        width = len(self._rows[0])
+        wrong = next((i for i, row in enumerate(self._rows) if len(row) != width), None)
+        if wrong is None:
             return
-        hashed, both = set(self._hashed), list(zip(self._rows, self._lines, strict=True))
-        width = next((len(row) for row, line in both if line not in hashed), len(both[0][0]))
-        kept = [(row, line) for row, line in both if line not in hashed or len(row) == width]
-        self._rows, self._lines = [row for row, _ in kept], [line for _, line in kept]
-        self._hashed = [line for _, line in kept if line in hashed]
-
-    @property
-    def path(self) -> str | os.PathLike:
-        """The file."""
-        return self._path
-
-    @property
-    def header(self) -> list[str]:
-        """Names of the columns; empty where the table has none."""
-        return self._header
+        where, given = f"{self.path} line {self._lines[wrong]}", len(self._rows[wrong])
+        if wrong == len(self._rows) - 1 > 0 and not self._ended and given < width:
+            raise InputError(
+                f"{where}, the last, ends after {given} of {width} columns, and without the end of a line, so the file "
+                "is cut there; copy it again, or leave out that line."
+            )
+        begins = f", or add skip = {self._lines[wrong] - 1} if the table begins there"
+        skip = begins if wrong < _LONG and width < given else ""
+        raise InputError(f"{where} has {given} columns, the lines before it {width}; give all the same{skip}.")
 
     @property
     def misnamed(self) -> bool:
         """Whether a line of several names is above the rows, but not one name for each column."""
-        return not self._header and len(self._title) > 1
+        return not self.header and len(self._title) > 1
 
     @property
     def misnumbered(self) -> bool:
         """Whether these are numbered, so that the order of the columns is not known."""
         return self.misnamed and are_numbered(self._title)
 
-    @property
-    def width(self) -> int:
-        """Number of columns."""
-        return len(self._rows[0])
-
-    @property
-    def length(self) -> int:
-        """Number of rows."""
-        return len(self._rows)
-
     def shown(self) -> str:
         """Its columns as a message shows them: names with their numbers."""
-        if not self._header:
+        if not self.header:
             others = f", but its header {len(self._title)} names" if self.misnamed else " without names"
             return f"{self.width} columns{others}"
         most = max(_LONG, 150 // self.width)
-        names = [f"{i} {quoted(name[:most])}" for i, name in enumerate(self._header, start=1)]
+        names = [f"{i} {quoted(name[:most])}" for i, name in enumerate(self.header, start=1)]
         return f"the columns {shorten(names, _LONG)}"
 
     def has(self, wanted: Sequence[Column]) -> bool:
@@ -172,7 +142,7 @@ class TextTable:
         if missing and len(missing) < len(wanted):
             others = shorten([str(column) for column in wanted if column not in missing])
             raise InputError(
-                f"{self._path} has no column {quoted(str(missing[0]))}, but columns {others}; correct its header, or "
+                f"{self.path} has no column {quoted(str(missing[0]))}, but columns {others}; correct its header, or "
                 "pick the columns by number."
             )
         return not missing
@@ -180,7 +150,7 @@ class TextTable:
     def _matching(self, column: Column) -> list[int]:
         if isinstance(column, int):
             return [column - 1] if 1 <= column <= self.width else []
-        return matching(self._header, column)
+        return matching(self.header, column)
 
     def unit(self, picked: Sequence[int], stated_unit: str | None = None, key: str = "q") -> str | None:
         """The unit that the header states for columns, counted from 0, or None.
@@ -188,46 +158,46 @@ class TextTable:
         ``stated_unit``, that of the manifest, decides what the ambiguous grad is; ``key`` is what the manifest calls
         the quantity in ``units``. Raises `InputError` where the header states several units, or one that is not clear.
         """
-        stated = {self._header[i]: unit_in(self._header[i]) for i in picked if self._header}
-        found = {unit: name for name, unit in stated.items() if unit is not None}
-        if len(found) > 1:
-            (one, first), (other, second), *_ = found.items()
+        names = {unit_in(self.header[i]): self.header[i] for i in picked if self.header}
+        names.pop(None, None)
+        if len(names) > 1:
+            (unit, name), (other_unit, other), *_ = names.items()
             raise InputError(
-                f"{self._path} mixes units: {quoted(first)} is in {one[:_LONG]}, {quoted(second)} in {other[:_LONG]}; "
-                "convert one of them, and change its header."
+                f"{self.path} mixes units: {quoted(name)} is in {str(unit)[:_LONG]}, {quoted(other)} in "
+                f"{str(other_unit)[:_LONG]}; convert one of them, and change its header."
             )
-        if AMBIGUOUS in found and stated_unit not in ("deg", "gon"):
+        if AMBIGUOUS in names and stated_unit not in ("deg", "gon"):
             but = f", but the manifest says {stated_unit}" if stated_unit else ""
             raise InputError(
-                f"{self._path}: the header says {quoted(found[AMBIGUOUS])}, and grad is deg in German and gon elsewhere"
+                f"{self.path}: the header says {quoted(names[AMBIGUOUS])}, and grad is deg in German and gon elsewhere"
                 f'{but}; add units = {{ {key} = "deg" }}, or "gon", or write it in the header.'
             )
-        return stated_unit if AMBIGUOUS in found else next(iter(found), None)
+        return stated_unit if AMBIGUOUS in names else next(iter(names), None)
 
     def pick(self, wanted: Sequence[Column]) -> list[int]:
         """Indices of columns, a pattern in the order of the header. Raises `InputError` for one that is not there."""
-        found: list[int] = []
+        picked: list[int] = []
         for column in wanted:
             indices = self._matching(column)
             if not indices:
-                raise InputError(f"{self._path} has {self._missing(column)}")
-            if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self._header):
+                raise InputError(f"{self.path} has {self._missing(column)}")
+            if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self.header):
                 numbers = shorten([str(i + 1) for i in indices])
                 raise InputError(
-                    f"{self._path} names the columns {numbers} all {quoted(column)}; give each name once, or pick them "
+                    f"{self.path} names the columns {numbers} all {quoted(column)}; give each name once, or pick them "
                     "by number."
                 )
             self.check_ascending(indices)
-            found += indices
-        if len(set(found)) < len(found):
-            raise InputError(f"{self._path}: one column is picked twice by {shorten([str(x)[:99] for x in wanted])}.")
-        return found
+            picked += indices
+        if len(set(picked)) < len(picked):
+            raise InputError(f"{self.path}: one column is picked twice by {shorten([str(x)[:99] for x in wanted])}.")
+        return picked
 
     def _missing(self, column: Column) -> str:
         if isinstance(column, int):
             return f"{self.width} columns, so there is no column {column}; pick others."
-        if self._header:
-            return f"no column {quoted(column)}{nearest(column, [quoted(name)[1:-1] for name in self._header[:999]])}"
+        if self.header:
+            return f"no column {quoted(column)}{nearest(column, [quoted(name)[1:-1] for name in self.header[:999]])}"
         if self._title:
             return (
                 f"no column {quoted(column)}: its header has {len(self._title)} names, but its rows {self.width} "
@@ -244,36 +214,31 @@ class TextTable:
 
     def check_ascending(self, picked: Sequence[int], line: str = "columns = [{}]") -> None:
         """Refuse columns whose names are numbered, or of axes, but not in their order; ``line``: what states it."""
-        axes = along_axes([self._header[i] for i in picked]) if self._header and len(picked) > 1 else None
-        if axes is not None and axes != sorted(axes):
-            names = shorten([quoted(self._header[i][:_LONG]) for i in picked], _LONG)
-            ordered = ", ".join(str(picked[i] + 1) for i in axes)
-            raise InputError(
-                f"{self._path} has its columns in the order {names}; pick them as a list, [{ordered}], in that of the "
-                "axes."
-            )
-        numbered = [stem_and_number(self._header[i]) for i in picked] if self._header else []
-        found = [x for x in numbered if x is not None]
-        if len(picked) < 2 or len(found) < len(picked) or len({stem.casefold() for stem, _ in found}) > 1:
+        if len(picked) < 2 or not self.header:
             return
-        numbers = [x for _, x in found]
+        columns = [self.header[i] for i in picked]
+        axes, numbered = along_axes(columns), [stem_and_number(name) for name in columns]
+        stems = {stem.casefold() for stem, _ in filter(None, numbered)}
+        numbers = [number for _, number in filter(None, numbered)] if len(stems) == 1 and all(numbered) else []
         if len(set(numbers)) < len(numbers):
-            twice = self._header[picked[next(i for i, x in enumerate(numbers) if numbers.count(x) > 1)]]
-            raise InputError(f"{self._path} names the column {quoted(twice)} twice; give each column once.")
-        if numbers != sorted(numbers):
-            ordered = line.format(", ".join(str(picked[i] + 1) for i in np.argsort(numbers)))
-            names = shorten([quoted(self._header[i][:_LONG]) for i in picked], _LONG)
-            raise InputError(
-                f"{self._path} has its columns in the order {names}; add {ordered} for that of their numbers, or the "
-                "order of the joints."
-            )
+            twice = next(name for name, number in zip(columns, numbers, strict=True) if numbers.count(number) > 1)
+            raise InputError(f"{self.path} names the column {quoted(twice)} twice; give each column once.")
+        order = axes or np.argsort(numbers).tolist()
+        if order == sorted(order):
+            return
+        ordered = ", ".join(str(picked[i] + 1) for i in order)
+        advice = f"add {line.format(ordered)} for that of their numbers, or the order of the joints."
+        if axes is not None:
+            advice = f"pick them as a list, [{ordered}], in that of the axes."
+        names = shorten([quoted(name[:_LONG]) for name in columns], _LONG)
+        raise InputError(f"{self.path} has its columns in the order {names}; {advice}")
 
     def numbers(self, picked: Sequence[int], *, measured: bool = False, stated: bool = False) -> np.ndarray:
         """The numbers of columns, counted from 0, ``(rows, columns)``; ``measured``: they are not numbers of columns,
         and no two of them are the same unless somebody ``stated`` the columns."""
         if self._hashed:
             raise InputError(
-                f"{self._path} line {self._hashed[0]} begins with #, but has as many columns as the rows; leave it out "
+                f"{self.path} line {self._hashed[0]} begins with #, but has as many columns as the rows; leave it out "
                 "if it is a comment, else write its first cell without #."
             )
         self._check_end(picked)
@@ -296,7 +261,7 @@ class TextTable:
         return np.array([self._number(i, index, cell.strip(" \t")) for i, cell in enumerate(cells)])
 
     def _number(self, row: int, index: int, cell: str) -> float:
-        place = f"{self._path} line {self._lines[row]} column {index + 1}: {quoted(cell)}"
+        place = f"{self.path} line {self._lines[row]} column {index + 1}: {quoted(cell)}"
         plain = cell
         if self._decimal == ",":
             if "." in cell:
@@ -348,7 +313,7 @@ class TextTable:
         order = ", ".join(str(i + 1) for i in sorted(picked, key=lambda i: int(self._rows[0][i])))
         add = f"add skip = {self._lines[0]}" + (f" and columns = [{order}]" if cells not in counted else "")
         raise InputError(
-            f"{self._path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; {add}, or "
+            f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; {add}, or "
             "write it with decimal points if it was measured."
         )
 
@@ -363,7 +328,7 @@ class TextTable:
             for part, last in enumerate(digits[-1])
         ):
             raise InputError(
-                f"{self._path} line {self._lines[-1]}: the last number, {quoted(cells[-1])}, has fewer digits than all "
+                f"{self.path} line {self._lines[-1]}: the last number, {quoted(cells[-1])}, has fewer digits than all "
                 "above it and no end of the line after it, so the file may be cut; copy it again, or end that line if "
                 "it is complete."
             )
@@ -375,6 +340,6 @@ class TextTable:
         for (i, one), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
             if np.ptp(one) > 0 and np.array_equal(one, other):
                 raise InputError(
-                    f"{self._path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
+                    f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
                     f"columns = [{', '.join(str(column + 1) for column in picked)}] if these are right."
                 )

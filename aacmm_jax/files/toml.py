@@ -36,7 +36,7 @@ class Strict(BaseModel):
         """Refuse true and false where a number is wanted, in one sentence for all kinds of numbers."""
         wanted = cls.model_fields[str(info.field_name)].annotation
         if wanted is not bool and any(isinstance(x, bool) for x in (value if isinstance(value, list) else [value])):
-            raise ValueError("true and false are no numbers; give a number.")
+            raise ValueError("expected a number, but it is true or false; give a number.")
         return value
 
 
@@ -70,32 +70,25 @@ def _check_text(path: str | os.PathLike, text: str) -> None:
         raise InputError(f"{path} line {line} has a key of more than {_DEEPEST} parts; correct it.")
 
 
-def _check_content(path: str | os.PathLike, content: dict[str, Any]) -> None:
+def _check_content(path: str | os.PathLike, value: Any, place: str = "", depth: int = 0) -> None:
     """Refuse depth, numbers and characters that no file of this package has, with the key at which they are."""
-    waiting: list[tuple[str, Any]] = [("", content)]
-    depths = [0]
-    while waiting:
-        (place, value), depth = waiting.pop(), depths.pop()
-        if depth > _DEEPEST:
-            raise InputError(f"{path} nests tables or lists too deeply; no such file has more than {_DEEPEST}.")
-        if isinstance(value, Mapping | list):
-            pairs = value.items() if isinstance(value, Mapping) else enumerate(value, start=1)
-            for key, item in pairs:
-                inside = f"{place} {key}" if isinstance(key, int) else f"{place}.{key}" if place else key
-                _check_characters(path, inside, str(key))
-                waiting.append((inside, item))
-                depths.append(depth + 1)
-        elif isinstance(value, str):
-            _check_characters(path, place, value)
-        elif isinstance(value, int | float) and _LARGEST < abs(value) < math.inf:
-            raise InputError(f"{path}: '{place}' is larger than any number that is meant; correct it.")
+    if depth > _DEEPEST:
+        raise InputError(f"{path} nests tables or lists too deeply; no such file has more than {_DEEPEST}.")
+    if isinstance(value, Mapping | list):
+        for key, item in value.items() if isinstance(value, Mapping) else enumerate(value, start=1):
+            inside = f"{place} {key}" if isinstance(key, int) else f"{place}.{key}" if place else key
+            _check_characters(path, inside, str(key))
+            _check_content(path, item, inside, depth + 1)
+    elif isinstance(value, str):
+        _check_characters(path, place, value)
+    elif isinstance(value, int | float) and _LARGEST < abs(value) < math.inf:
+        raise InputError(f"{path}: '{place}' is larger than any number that is meant; correct it.")
 
 
 def _check_characters(path: str | os.PathLike, place: str, text: str) -> None:
-    for character in text:
-        if is_control(character):
-            code = f"U+{ord(character):04X}"
-            raise InputError(f"{path}: {quoted(place)} holds the control character {code}; take it out.")
+    control = next(filter(is_control, text), None)
+    if control is not None:
+        raise InputError(f"{path}: {quoted(place)} holds the control character U+{ord(control):04X}; take it out.")
 
 
 def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Model:
@@ -107,7 +100,7 @@ def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Mod
         # list, compared with "not a number".
         worst = max(
             error.errors(),
-            key=lambda found: (found["type"] == "extra_forbidden", len(found["loc"]), found["type"] == "too_short"),
+            key=lambda item: (item["type"] == "extra_forbidden", len(item["loc"]), item["type"] == "too_short"),
         )
         raise InputError(f"{where}: {_explain(worst, model, content)}") from error
 
@@ -124,14 +117,10 @@ def _written(steps: Sequence[Any], content: Any) -> list[Any]:
     """The part of the path to an error that is in the file: other steps are pydantic's ("a number or a list")."""
     kept = []
     for step in steps:
-        inside = isinstance(content, list | tuple if isinstance(step, int) else Mapping)
-        inside = inside and (isinstance(step, int) or step in content)
-        if inside:
+        index = isinstance(step, int)
+        if isinstance(content, list | tuple) if index else isinstance(content, Mapping) and step in content:
             kept.append(step)
-            try:
-                content = content[step]
-            except (KeyError, IndexError):
-                content = None
+            content = None if index and step >= len(content) else content[step]
     return kept
 
 
@@ -152,21 +141,14 @@ def _explain(error: Any, model: Any, content: Any) -> str:
     if kind in ("too_short", "too_long"):
         limit = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
         return f"'{place}' has {len(given) or 'no'} entries; give {limit}."
-    shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else _short(given)
+    shown = quoted(given) if isinstance(given, str) else repr(given)
+    shown = "a table" if isinstance(given, dict) else "a list" if isinstance(given, list) else shown
     advice = f"; write [[{place}]]" if kind == "list_type" and isinstance(given, dict) else ""
-    wanted = {
-        "tuple_type": "must be a list of numbers",
-        "dict_type": "must be a table",
-        "model_type": "must be a table",
-    }.get(kind)
+    wanted = {"dict_type": "must be a table", "model_type": "must be a table", "tuple_type": "must be a list"}.get(kind)
+    wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]
     if context.get("class_name") == "Distribution":
         wanted = "must be a number, { uniform = ... } or { normal = ... }"
-    wanted = wanted or error["msg"].replace("Input should", "must").partition(", unable")[0]
     return f"'{place}' {wanted}, not {shown}{advice}."
-
-
-def _short(given: Any) -> str:
-    return quoted(given) if isinstance(given, str) else repr(given)
 
 
 def _known_keys(model: Any, steps: Sequence[Any]) -> list[str]:

@@ -12,6 +12,7 @@ import os
 import re
 
 import numpy as np
+from jaxtyping import Float
 
 from ..core.arrays import Numbers
 from ..core.errors import InputError
@@ -103,7 +104,11 @@ def _numbers(transform: Transform) -> str:
 def _of_origins(entries: dict[str, str]) -> Geometry:
     directions, points, frame = [], [], np.eye(4)
     for name in _JOINTS:
-        numbers = np.array([_number(entries, f"kinematics.{name}.{key}") for key in _COORDINATES])
+        names = [f"kinematics.{name}.{key}" for key in _COORDINATES]
+        missing = next((name for name in names if name not in entries), None)
+        if missing is not None:
+            raise InputError(f"'{missing}' is missing; a kinematics.yaml has it for each of six joints.")
+        numbers = np.concatenate([_numbers_of(entries, name, 1) for name in names])
         origin = np.eye(4)
         origin[:3, :3] = roll_pitch_yaw_matrix(numbers[3:])
         origin[:3, 3] = 1000 * numbers[:3]
@@ -117,52 +122,43 @@ def _of_origins(entries: dict[str, str]) -> Geometry:
 
 
 def _of_parameters(entries: dict[str, str]) -> Geometry:
-    rows = []
-    for name in _DH:
-        if name not in entries:
-            raise InputError(f"'{name}' is missing; add it.")
-        parts = entries[name].strip("[] ").replace(",", " ").split()
-        try:
-            rows.append([number(part) for part in parts])
-        except ValueError as error:
-            raise InputError(f"'{name}' is {quoted(entries[name])}; give six numbers.") from error
-        if len(parts) != len(_JOINTS):
-            raise InputError(f"'{name}' has {len(parts)} entries; give six numbers.")
-        if not np.all(np.abs(rows[-1]) < _LARGEST):
-            raise InputError(f"'{name}' is {quoted(entries[name])}; give finite numbers below {_LARGEST:g}, m and rad.")
-    theta, a, d, alpha = np.array(rows)
+    missing = next((name for name in _DH if name not in entries), None)
+    if missing is not None:
+        raise InputError(f"'{missing}' is missing; add it.")
+    theta, a, d, alpha = (_numbers_of(entries, name, len(_JOINTS)) for name in _DH)
     return Geometry(alpha, 1000 * a, 1000 * d, theta, None, np.zeros(3))
 
 
-def _number(entries: dict[str, str], name: str) -> float:
-    if name not in entries:
-        raise InputError(f"'{name}' is missing; a kinematics.yaml has it for each of six joints.")
+def _numbers_of(entries: dict[str, str], name: str, count: int) -> Float[np.ndarray, " k"]:
+    """The numbers of an entry, m and rad."""
+    asked = "a finite number" if count == 1 else "six finite numbers"
+    parts = entries[name].strip("[] ").replace(",", " ").split()
     try:
-        value = number(entries[name])
+        numbers = np.array([number(part) for part in parts])
     except ValueError:
-        value = math.nan
-    if not abs(value) < _LARGEST:
-        raise InputError(f"'{name}' is {quoted(entries[name])}; give a finite number below {_LARGEST:g}, m or rad.")
-    return value
+        numbers = np.array([math.nan])
+    if len(parts) != count or not np.all(np.abs(numbers) < _LARGEST):
+        raise InputError(f"'{name}' is {quoted(entries[name])}; give {asked} below {_LARGEST:g}, m or rad.")
+    return numbers
 
 
 def _entries(text: str) -> dict[str, str]:
     """The values of a YAML file of nested keys by dotted name, as text: the part of YAML that these files use."""
-    found: dict[str, str] = {}
+    entries: dict[str, str] = {}
     above: list[tuple[int, str]] = []
     for count, line in enumerate(text.split("\n"), start=1):
         if not line.strip() or line.lstrip().startswith(("#", "---")):
             continue
         match = _LINE.fullmatch(line)
         if match is None:
-            raise InputError(f"line {count} is no 'key: value', as kinematics.yaml has; correct it.")
+            raise InputError(f"line {count} is not of the form 'key: value'; correct it.")
         indent, key, value = len(match[1]), match[2], match[3] or ""
         while above and above[-1][0] >= indent:
             above.pop()
         name = ".".join([*(part for _, part in above), key])
-        if name in found:
+        if name in entries:
             raise InputError(f"line {count}: '{name}' is there twice; take one out.")
-        found[name] = value
+        entries[name] = value
         if not value:
             above.append((indent, key))
-    return found
+    return entries

@@ -1,73 +1,51 @@
 """Plans of calibrations: which poses to take in which sockets, and where to set up the reference length."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..core.arguments import with_options
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
-from ..data.arm_classes import small_arm_noise
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
+from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
-from ..kinematics.cones import TOOL_AXIS, Cone, Cones
-from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import SearchRegion, search_region, total_link_length
+from ..kinematics.cones import Cone, Cones
+from ..kinematics.workspace import reached
 from ..uncertainty.identifiability import observability
-from ..uncertainty.volume import default_length, sample_lengths
-from .fedorov_exchange import Kind, Objective, exchange
-from .motion import Motion, approaches, ordered_motion
-from .placement import (
-    FARTHEST,
-    LEAST_POSES,
+from .fedorov_exchange import Candidates, exchange
+from .information import (
+    LOOSE,
     DesignProblem,
-    FixturePlacement,
-    PlacementRegion,
     Pool,
-    Ranges,
+    Prediction,
     candidates_of,
-    designed_score,
-    in_order,
-    moved_pool,
-    neighbour,
-    placement_region,
     pool_at,
     pool_of,
-    random_placements,
-    random_scores,
+    prediction_of,
+    predictions,
 )
-from .plan_arguments import (
+from .motion import Motion, approaches, explained_place, ordered_motion
+from .options import (
+    LEAST_POSES,
+    Criterion,
+    FixturePlacement,
+    PlanOptions,
+    PlanTask,
     check_counts,
     check_ranges,
-    check_retract,
     checked_cones,
     given_placement,
-    planned_parameters,
-    with_table,
 )
+from .placement import best_placement, in_order
 from .pose_refinement import refined
-from .predictions import Prediction, prediction_of, predictions
-from .unreachable import explained
 
-Criterion = Literal["length", "A", "D", "E"]
-OBJECTIVES: dict[Criterion, tuple[Kind, float]] = {
-    "length": ("functions", 8.0),
-    "A": ("trace", 0.0),
-    "D": ("determinant", 8.0),
-    "E": ("trace", 8.0),
-}
-_OBJECTIVE_LENGTHS, _PREDICTION_LENGTHS = 300, 400  # predictions use other lengths than the objective
-# Random placements, those of them for which poses are chosen, tried neighbours of the best, and starts for each.
-_PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
-_BLOCK = 25  # placements scored together
+_CANDIDATES = 3000
 _LEAST_CANDIDATES, _ROUNDS = 20, 5  # in a socket, from so many rounds of random starts at most
-
-Progress = Callable[[str, float], None]
+_RANDOM_SETS, _LOOSE_SETS = 50, 10  # of poses, for predictions
 
 
 class Plan(NamedTuple):
@@ -103,6 +81,7 @@ class Plan(NamedTuple):
         return Capture({name: self.q[self.owner == i] for i, name in enumerate(self.sockets)}, self.lengths)
 
 
+@with_options(PlanOptions)
 def plan(
     arm: Arm,
     *,
@@ -111,23 +90,8 @@ def plan(
     length: float | tuple[float, float] = 500.0,
     u: float = 0.002,
     lengths: Sequence[tuple] = (),
-    region: Ranges | None = None,
-    farthest: float = FARTHEST,
-    space: Parameters | None = None,
-    noise: Noise | None = None,
-    criterion: Criterion = "length",
-    margin: float = math.radians(5),
-    above: float = 0.0,
-    limits: Sequence[Sequence[float]] | None = None,
     cone: Cone | Mapping[str, Cone] | None = None,
-    tool_axis: tuple[float, float, float] = TOOL_AXIS,
-    cell: Cell | None = None,
-    retract: float = 0.0,
-    unconstrained: bool = False,
-    candidates: int = 3000,
-    check_length: float | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> Plan:
     """Choose the poses that determine an arm best in a joint calibration weighted by ``noise``.
 
@@ -144,28 +108,10 @@ def plan(
         length: Reference length to place, mm; or a range (shortest, longest) to choose it from.
         u: Standard uncertainty of the reference length, mm.
         lengths: ``(start, end)`` or ``(start, end, u)`` for each length between given sockets.
-        region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for placed sockets, mm (default:
-            z at least 0).
-        farthest: Largest distance of placed sockets from the shoulder, as a part of the reach.
-        space: Free parameters (default: those of `Parameters.free_of`).
-        noise: Noise of the readings, which weights them; by default that of a small measuring arm.
-        criterion: "length" (largest uncertainty of a length over the volume); or "A", "D", "E" of the parameters'
-            covariance in natural steps (1 mm, 1 mrad).
-        margin: Distance of the joints from their limits, rad.
-        above: Height in the base frame below which no joint and no tip comes (the table), mm; ``-math.inf`` for none.
-            With a ``cell`` the body's capsules stay above it too.
-        limits: Lowest and highest reading of each joint, rad (default: the arm's own).
         cone: Directions from which the tool may come to the sockets: one `Cone` for all or socket name -> `Cone`; by
             default all directions, with (0, 0, 1) as the normal.
-        tool_axis: Axis of the last frame that points from the tool into a socket.
-        cell: The arm's body and the obstacles that it may not touch; by default nothing is checked.
-        retract: Distance along the normal from the socket to the approach point of each pose, mm; 0 for none.
-        unconstrained: Whether to predict also what poses in the same sockets without cones, cell and approach points
-            would give.
-        candidates: Number of candidate configurations.
-        check_length: Length that predictions are of, mm (as in `volumetric_uncertainty`).
-        seed: Seed of the search.
-        progress: Called with the name of the stage and the fraction of it that is done.
+        **options: Fields of `PlanOptions`, like all arguments that are not named here: ``noise``, ``region``,
+            ``margin``, ``cell``, ``candidates``, ``seed`` and others.
 
     Returns:
         The plan, with predicted uncertainties.
@@ -180,94 +126,77 @@ def plan(
         >>> print(planned.random.largest > 2 * planned.predicted.largest)  # with random poses about 0.1 mm
         True
     """
-    report = progress or (lambda stage, fraction: None)
-    if not is_single(arm):
-        raise InputError("plan takes one arm, not a batch; give one of its arms.")
-    space = planned_parameters(Parameters.free_of(arm) if space is None else space)
-    if arm.beta is None and space.base.beta is not None:  # free, and 0 so far
-        arm = arm.replace(beta=np.zeros(arm.joints))
-    check_length = default_length(arm) if check_length is None else check_length
-    noise = small_arm_noise() if noise is None else noise
-    check_plannable(arm, criterion, noise)
-    check_counts(sockets, poses, len(space.names), u, lengths)
-    check_retract(retract)
-    ranges = placement_region(to_numpy(arm), region, farthest)
-    own = (length, length) if isinstance(length, int | float) else length
+    task = PlanTask.of(arm, PlanOptions(**options))
+    options_of_all, ranges = task.options, task.placement_region()
+    check_counts(sockets, poses, len(task.space.names), u, lengths)
     if isinstance(sockets, Mapping):
         names, placement = given_placement(sockets, u, lengths)
     else:
         names = [chr(ord("A") + i) if sockets <= 26 else f"S{i + 1}" for i in range(sockets)]
         placement = None
-        check_ranges(arm, own, lengths, ranges.ranges)
-    cones = checked_cones(cone, names, tool_axis)
-    problem, functions = design_problem(
-        search_region(to_numpy(arm), limits, margin, above, seed, cones, with_table(cell, above)),
-        to_numpy(space),
-        to_numpy(noise),
-        criterion,
-        dict(length=check_length, limits=joint_limits(arm, limits)),
-        seed,
-    )
+    span = (length, length) if isinstance(length, int | float) else length
     if placement is None:
-        placement = _best_placement(problem, len(names), poses, own, u, ranges, report)
-    pool, q, owner = _chosen(problem, placement, names, poses, candidates, retract, report)
-    order, motion = ordered_motion(problem.region, q, owner, cones.normals[owner], retract)
+        check_ranges(task.arm, span, lengths, ranges.ranges)
+    cones = checked_cones(cone, names, options_of_all.tool_axis)
+    problem = DesignProblem.of(task, task.search_region(cones))
+    if placement is None:
+        placement = best_placement(problem, len(names), poses, span, u, ranges, options_of_all)
+    pool, q, owner = _chosen(problem, placement, names, poses, options_of_all)
+    order, motion = ordered_motion(problem.region, q, owner, cones.normals[owner], problem.retract)
+    # From here on sockets have the order in which the arm visits them.
     visited = np.array(list(dict.fromkeys(owner[order].tolist())))
-    q, owner = q[order], np.argsort(visited)[owner[order]]
-    placement, cones = in_order(placement, visited), cones.at(visited)
+    q, owner, place = q[order], np.argsort(visited)[owner[order]], np.argsort(visited)
+    placement, cones, pool = in_order(placement, visited), cones.at(visited), pool._replace(owner=place[pool.owner])
     if isinstance(sockets, Mapping) or isinstance(cone, Mapping):  # otherwise names are given out in their order
         names = [names[i] for i in visited]
     problem = problem._replace(region=problem.region._replace(cones=cones))
-    possible = candidates_of(problem, placement, pool._replace(owner=np.argsort(visited)[pool.owner]))
-    found = Plan(
-        arm=arm,
-        names=space.names,
+    planned = Plan(
+        arm=task.arm,
+        names=task.space.names,
         sockets={name: (x, y, z) for name, (x, y, z) in zip(names, placement.points.tolist(), strict=True)},
         q=q,
         owner=owner,
-        lengths=tuple(
-            ReferenceLength(names[a], names[b], float(np.linalg.norm(placement.points[b] - placement.points[a])), u)
-            for (a, b), u in zip(placement.ends, placement.u, strict=True)
-        ),
-        noise=noise,
-        criterion=criterion,
-        check_length=check_length,
-        **predictions(problem, placement, possible, q, owner, functions),
+        lengths=_reference_lengths(names, placement),
+        noise=task.noise,
+        criterion=options_of_all.criterion,
+        check_length=task.check_length,
+        **_predictions(problem, placement, pool, q, owner),
         unconstrained=None,
         cones=cones,
         cell=problem.region.cell,
-        retract=retract,
+        retract=problem.retract,
         motion=motion,
     )
-    unseen = observability(arm, found.capture(), space)
-    if unseen.rank < len(space.names):
+    unseen = observability(task.arm, planned.capture(), task.space)
+    if unseen.rank < len(task.space.names):
         raise InputError(f"no {poses} poses in these sockets determine the parameters. {' '.join(unseen.sentences())}")
-    if unconstrained:
+    if options_of_all.unconstrained:
         free = problem._replace(region=problem.region._replace(cones=None, cell=None))
-        _, q, owner = _chosen(free, placement, names, poses, candidates, 0.0, report)
-        at = candidates_of(free, placement, pool_of(free, q, owner))
-        found = found._replace(unconstrained=prediction_of(at, at.rows, functions))
-    return found
+        _, q, owner = _chosen(free, placement, names, poses, options_of_all)
+        planned = planned._replace(
+            unconstrained=prediction_of(free, candidates_of(free, placement, pool_of(free, q, owner)))
+        )
+    return planned
+
+
+def _reference_lengths(names: Sequence[str], placement: FixturePlacement) -> tuple[ReferenceLength, ...]:
+    distances = [float(np.linalg.norm(placement.points[b] - placement.points[a])) for a, b in placement.ends]
+    rows = zip(placement.ends, distances, placement.u, strict=True)
+    return tuple(ReferenceLength(names[a], names[b], distance, u) for (a, b), distance, u in rows)
 
 
 def _chosen(
-    problem: DesignProblem,
-    placement: FixturePlacement,
-    names: Sequence[str],
-    poses: int,
-    count: int,
-    retract: float,
-    report: Progress,
+    problem: DesignProblem, placement: FixturePlacement, names: Sequence[str], poses: int, options: PlanOptions
 ) -> tuple[Pool, Float[np.ndarray, "N n"], Int[np.ndarray, " N"]]:
     """The candidates for a placement, and the best poses found."""
-    region = problem.region
+    region, retract = problem.region, problem.retract
 
     def approachable(q: np.ndarray, owner: np.ndarray) -> Bool[np.ndarray, " c"]:
         if not retract or region.cones is None:
             return np.ones(len(q), dtype=bool)
         return approaches(region, q, region.cones.normals[owner], retract).possible
 
-    each, pools = max(count // len(names), 50), []
+    each, pools = max((options.candidates or _CANDIDATES) // len(names), 50), []
     for _ in range(_ROUNDS):
         drawn = pool_at(problem, placement.points, each)
         pools.append(drawn.at(approachable(drawn.q, drawn.owner)))
@@ -276,88 +205,40 @@ def _chosen(
         if not len(few):
             break
     else:
+        cones = None if region.cones is None else region.cones.at(few[:1])
         share = _LEAST_CANDIDATES / (_ROUNDS * each)
-        raise InputError(explained(region, names, placement.points, int(few[0]), share, retract))
-    possible = candidates_of(problem, placement, pool)
+        name, point = f"socket '{names[few[0]]}'", placement.points[few[0]]
+        raise InputError(explained_place(region._replace(cones=cones), name, point, share, retract))
     rows = exchange(
-        possible, poses, problem.objective, least=LEAST_POSES, progress=lambda done: report("Choosing poses", done)
+        candidates_of(problem, placement, pool),
+        poses,
+        problem.objective,
+        least=LEAST_POSES,
+        progress=lambda done: options.report("Choosing poses", done),
     )
     owner = pool.owner[rows]
-    q = refined(problem, placement, pool.q[rows], owner, lambda done: report("Moving poses", done), approachable)
-    return pool, q, owner
-
-
-def design_problem(
-    region: SearchRegion, space: Parameters, noise: Noise, criterion: Criterion, sampling: dict[str, Any], seed: int
-) -> tuple[DesignProblem, Float[np.ndarray, "v p"]]:
-    """The problem, and derivatives of other lengths than those of its objective, for predictions."""
-    of_objective, of_predictions = (
-        _length_derivatives(region.arm, space, *sample_lengths(region.arm, count, **sampling, seed=seed + offset))
-        for offset, count in ((1, _OBJECTIVE_LENGTHS), (2, _PREDICTION_LENGTHS))
+    moved = refined(
+        problem, placement, pool.q[rows], owner, lambda done: options.report("Moving poses", done), approachable
     )
-    kind, power = OBJECTIVES[criterion]
-    return DesignProblem(region, space, noise, Objective(kind, of_objective, power)), of_predictions
+    return pool, moved, owner
 
 
-def _length_derivatives(
-    arm: Arm, space: Parameters, start: Float[np.ndarray, "v n"], end: Float[np.ndarray, "v n"]
-) -> Float[np.ndarray, "v p"]:
-    """Derivatives of the lengths between configurations by the free parameters, in natural steps."""
-    between = np.asarray(arm.position(end)) - np.asarray(arm.position(start))
-    direction = between / np.linalg.norm(between, axis=1, keepdims=True)
-    jacobian = jacobian_at(arm, end, space.names) - jacobian_at(arm, start, space.names)
-    return np.einsum("vc,vcp->vp", direction, jacobian) * np.asarray(space.scale)
-
-
-def check_plannable(arm: Arm, criterion: str, noise: Noise) -> None:
-    """Raise `InputError` where there is nothing to plan, or no such criterion."""
-    if arm.joints < 3 or total_link_length(arm) == 0:
-        raise InputError("this arm reaches no volume: it needs three joints and a link; there is nothing to plan.")
-    if criterion not in OBJECTIVES:
-        raise InputError(f"criterion is '{criterion}'; it must be one of {', '.join(OBJECTIVES)}.")
-    noise.check(arm.joints)
-
-
-def _best_placement(
+def _predictions(
     problem: DesignProblem,
-    sockets: int,
-    poses: int,
-    length: tuple[float, float],
-    u: float,
-    ranges: PlacementRegion,
-    report: Progress,
-) -> FixturePlacement:
-    """The best placement found: random ones scored by random poses, the best few by chosen poses, then neighbours."""
-    stage = "Placing the sockets"
-    report(stage, 0.0)
-    placements = random_placements(problem, _PLACEMENTS, sockets, length, u, ranges)
-    scores: list[float] = []
-    while len(scores) < len(placements):
-        scores += random_scores(problem, placements[len(scores) : len(scores) + _BLOCK], poses)
-        report(stage, 0.4 * len(scores) / len(placements))
-    order = [i for i in np.argsort(scores) if np.isfinite(scores[i])][:_DESIGNED]
-    if not order:
-        limited = problem.region.cell is not None or (problem.region.cones is not None and problem.region.cones.any)
-        wider = ", wider cones, or fewer obstacles" if limited else ""
-        raise InputError(
-            "no placement was found that can be reached well; give a region nearer to the arm, or a shorter "
-            f"length{wider}."
-        )
-    each = _STARTS // sockets
-    best, best_pool, best_score = placements[order[0]], None, np.inf
-    tries = len(order) + _NEIGHBOURS
-    for number in range(tries):
-        report(stage, 0.4 + 0.6 * number / tries)
-        if best_pool is None or number < len(order):
-            placement = placements[order[min(number, len(order) - 1)]]
-            pool = pool_at(problem, placement.points, each)
-        else:
-            placement = neighbour(problem, best, ranges)
-            if placement is None:
-                continue
-            pool = moved_pool(problem, best_pool, best, placement, each)
-        score = designed_score(problem, placement, pool, poses)
-        if score < best_score:
-            best, best_pool, best_score = placement, pool, score
-    report(stage, 1.0)
-    return best
+    placement: FixturePlacement,
+    pool: Pool,
+    q: Float[np.ndarray, "N n"],
+    owner: Int[np.ndarray, " N"],
+) -> dict[str, Prediction]:
+    """For the plan, random poses in its sockets, imprecise poses, and ten more poses."""
+    planned = candidates_of(problem, placement, pool_of(problem, q, owner))
+
+    def loose() -> Iterator[Candidates]:
+        region, owners, many = problem.region, np.tile(owner, _LOOSE_SETS), np.tile(q, (_LOOSE_SETS, 1))
+        starts = many + LOOSE * region.random.normal(size=many.shape)
+        near, possible = reached(region, starts, placement.points[owners], sockets=owners)
+        poses = pool_of(problem, np.where(possible[:, None], near, many), owners)
+        for rows in np.split(candidates_of(problem, placement, poses).rows, _LOOSE_SETS):
+            yield planned._replace(rows=rows)
+
+    return predictions(problem, planned, candidates_of(problem, placement, pool), loose(), _RANDOM_SETS)

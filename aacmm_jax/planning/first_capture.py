@@ -15,7 +15,7 @@ from ..core.text import pluralise
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise, tip_covariances
 from ..data.observations.measured_points import MeasuredPoints
-from ..kinematics.arm import Arm, jacobian_at, joint_limits, parameter_names
+from ..kinematics.arm import Arm, joint_limits, parameter_names
 from ..kinematics.chain import joint_motion
 from ..kinematics.independence import generic_poses
 from ..kinematics.parameters import Parameters
@@ -23,7 +23,8 @@ from ..kinematics.workspace import search_region
 from ..uncertainty.identifiability import Observability, observability
 from ..uncertainty.volume import default_length, sample_lengths
 from .fedorov_exchange import Candidates, Objective, covariance_of
-from .placement import PRIOR, DesignProblem, FixturePlacement, candidates_of, pool_at, pool_of
+from .information import PRIOR, DesignProblem, candidates_of, length_derivatives, pool_at, pool_of
+from .options import FixturePlacement
 
 COUNTS = (10, 15, 20, 30, 40, 60, 80, 120, 160, 240)  # of poses
 _LENGTHS = 200  # that predictions are of
@@ -142,9 +143,7 @@ def first_capture(arm: Arm, noise: Noise, arm_class: str = "") -> FirstCapture:
     start, end = sample_lengths(arm, _LENGTHS, length=length, seed=1)
     between = np.asarray(arm.position(end)) - np.asarray(arm.position(start))
     along = between / np.linalg.norm(between, axis=1, keepdims=True)
-    functions = np.einsum(
-        "vc,vcp->vp", along, jacobian_at(arm, end, space.names) - jacobian_at(arm, start, space.names)
-    ) * np.asarray(space.scale)
+    functions = length_derivatives(arm, space, start, end)
     both = sum(np.asarray(tip_covariances(arm.geometry, joint_motion(arm.geometry, q), noise)) for q in (start, end))
     u_reading = float(np.median(np.sqrt(np.einsum("vc,cdv,vd->v", along, both, along))))
     problem = DesignProblem(

@@ -8,40 +8,38 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..calibration.evaluation import fit_geometry
+from ..core.arguments import with_options
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, to_numpy
-from ..data.arm_classes import small_arm_noise
+from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.simulated import AbstractSimulated
-from ..kinematics.arm import Arm, is_single, joint_limits
+from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
-from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
-from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import reached, search_region
+from ..kinematics.cones import Cone, cones_of
+from ..kinematics.workspace import reached
 from ..model.observed import Observed
 from ..uncertainty.identifiability import observability
 from ..uncertainty.linearisation import Linearisation
-from ..uncertainty.volume import default_length
-from .design import Criterion, Progress, check_plannable, design_problem
 from .fedorov_exchange import Candidates, covariance_of, exchange
+from .information import LOOSE, PRIOR, DesignProblem, Prediction, prediction_of, predictions
 from .kit_placement import KitItem, PlacedKit, approachable, place, region_of, set_up
 from .motion import Motion, ordered_motion
-from .placement import FARTHEST, PRIOR, DesignProblem, Ranges, check_region, placement_region
-from .plan_arguments import check_retract, planned_parameters, with_table
-from .predictions import MORE, Prediction, prediction_of
+from .options import Criterion, PlanOptions, PlanTask, check_region
 
+_CANDIDATES = 2000
 _LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weight
 _START_AGREES = 0.1  # mm or rad: a start of the geometry that is farther off is fitted
-_RANDOM_SETS, _LOOSE_SETS = 30, 5
-_LOOSE, _NEAR = math.radians(5), math.radians(12)
+_RANDOM_SETS, _LOOSE_SETS = 30, 5  # of poses, for predictions
+_NEAR = math.radians(12)  # of candidates near a chosen pose
 _ROUNDS, _NEIGHBOURS = 2, 12  # of the search about the chosen poses, and its candidates for each
+
+Observations = Sequence[AbstractObservation]
 
 
 class KitPlan(NamedTuple):
@@ -83,28 +81,8 @@ class KitPlan(NamedTuple):
         return Capture({}, (), self.observations)
 
 
-def plan_kit(
-    arm: Arm,
-    kit: Sequence[KitItem | AbstractSimulated],
-    *,
-    poses: int = 60,
-    region: Ranges | None = None,
-    farthest: float = FARTHEST,
-    space: Parameters | None = None,
-    noise: Noise | None = None,
-    criterion: Criterion = "length",
-    margin: float = math.radians(5),
-    above: float = 0.0,
-    limits: Sequence[Sequence[float]] | None = None,
-    tool_axis: tuple[float, float, float] = TOOL_AXIS,
-    cell: Cell | None = None,
-    retract: float = 0.0,
-    unconstrained: bool = False,
-    candidates: int = 2000,
-    check_length: float | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> KitPlan:
+@with_options(PlanOptions)
+def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int = 60, **options: Any) -> KitPlan:
     """Choose where to put artefacts, and the poses that determine an arm best with them and with instruments.
 
     Random placements are ranked by random poses and the best by relaxed designs, then moved a little; poses are chosen
@@ -115,24 +93,8 @@ def plan_kit(
         kit: What is at hand: observations to simulate, with their uncertainties, as they stand; or `KitItem`, which are
             placed. How many poses each has is chosen.
         poses: Number of poses in all.
-        region: Ranges of ``x``, ``y``, ``z`` and of the ``distance`` from the origin for the tip in what is placed, mm
-            (default: z at least 0).
-        farthest: Largest distance from the shoulder of the tip in what is placed, as a part of the reach.
-        space: Free parameters (default: those of `Parameters.free_of`).
-        noise: Noise of readings and seat; by default that of a small measuring arm.
-        criterion: As in `plan`.
-        margin: Distance of the joints from their limits, rad.
-        above: Height in the base frame below which no joint and no tip comes, mm.
-        limits: Lowest and highest reading of each joint, rad (default: the arm's own).
-        tool_axis: Axis of the last frame that points from the tool into a seat, for the cones of the items.
-        cell: The arm's body and the obstacles that it may not touch; by default nothing is checked.
-        retract: Distance of the approach points of items with a cone along their normal, mm; 0 for none.
-        unconstrained: Whether to predict also what poses in the same places without cones, cell and approach points
-            would give.
-        candidates: Number of candidate configurations.
-        check_length: Length that predictions are of, mm.
-        seed: Seed of the search.
-        progress: Called with the name of the stage and the fraction of it that is done.
+        **options: Fields of `PlanOptions`, like all arguments that are not named here: ``noise``, ``region``,
+            ``margin``, ``cell``, ``candidates``, ``seed`` and others.
 
     Returns:
         The plan, with predicted uncertainties, also without each part of the kit.
@@ -150,86 +112,66 @@ def plan_kit(
         >>> print(f"u of {planned.check_length:.0f} mm: at most {planned.predicted.largest:.2f} mm")
         u of 300 mm: at most 0.04 mm
     """
-    report = progress or (lambda stage, fraction: None)
-    if not is_single(arm):
-        raise InputError("plan_kit takes one arm, not a batch; give one of its arms.")
-    noise = small_arm_noise() if noise is None else noise
-    check_plannable(arm, criterion, noise)
-    items = _checked(kit)
-    ranges = placement_region(to_numpy(arm), region, farthest)
+    task = PlanTask.of(arm, PlanOptions(**options))
+    items, ranges = _checked(kit), task.placement_region()
     check_region(ranges.ranges)
-    check_retract(retract)
-    space = planned_parameters(Parameters.free_of(arm) if space is None else space)
-    check_length = default_length(arm) if check_length is None else check_length
-    problem, functions = design_problem(
-        search_region(
-            to_numpy(arm), limits, margin, above, seed, cones_of([Cone()], tool_axis), with_table(cell, above)
-        ),
-        to_numpy(space),
-        to_numpy(noise),
-        criterion,
-        dict(length=check_length, limits=joint_limits(arm, limits)),
-        seed,
-    )
-    placed = place(problem, items, poses, ranges, candidates_of_kit, report)
-    pool = _pool(problem, placed, candidates, retract)
+    problem = DesignProblem.of(task, task.search_region(cones_of([Cone()], task.options.tool_axis)))
+    count = task.options.candidates or _CANDIDATES
+    placed = place(problem, items, poses, ranges, candidates_of_kit, task.options.report)
+    pool = _pool(problem, placed, count)
     least = least_poses(pool)
     if poses < least.sum():
         raise InputError(
             f"{poses} poses are too few for this kit; give {least.sum()} at least, or leave something out."
         )
-    chosen = _chosen(problem, placed, pool, poses, least, retract, report)
-    chosen, motions = _in_order(problem, placed, chosen, retract)
-    capture = Capture({}, (), chosen)
-    unseen = observability(arm, capture, space)
-    if unseen.rank < len(space.names):
+    chosen, motions = _in_order(problem, placed, _chosen(problem, placed, pool, poses, least, task.options))
+    unseen = observability(arm, Capture({}, (), chosen), task.space)
+    if unseen.rank < len(task.space.names):
         raise InputError(f"this kit does not determine the parameters. {' '.join(unseen.sentences())}")
-    found = KitPlan(
+    planned = KitPlan(
         arm=arm,
-        names=space.names,
+        names=task.space.names,
         kit=placed.kit,
         parts=placed.parts,
         observations=tuple(chosen),
-        noise=noise,
-        criterion=criterion,
-        check_length=check_length,
-        **_predictions(problem, placed, pool, chosen, functions, report),
+        noise=task.noise,
+        criterion=task.options.criterion,
+        check_length=task.check_length,
+        **_predictions(problem, placed, pool, chosen, task.options),
         motions=motions,
         cell=problem.region.cell,
-        retract=retract,
+        retract=problem.retract,
     )
-    if unconstrained:
+    if task.options.unconstrained:
         free = problem._replace(region=problem.region._replace(cell=None))
         anywhere = placed._replace(items=tuple(item._replace(half_angle=math.pi) for item in placed.items))
-        pool = _pool(free, anywhere, candidates, 0.0)
-        at = candidates_of_kit(free, _chosen(free, anywhere, pool, poses, least, 0.0, report))
-        found = found._replace(unconstrained=prediction_of(at, at.rows, functions))
-    return found
+        poses_anywhere = _chosen(free, anywhere, _pool(free, anywhere, count), poses, least, task.options)
+        unconstrained = prediction_of(free, candidates_of_kit(free, poses_anywhere))
+        planned = planned._replace(unconstrained=unconstrained)
+    return planned
 
 
-def _pool(problem: DesignProblem, placed: PlacedKit, count: int, retract: float) -> list[AbstractObservation]:
+def _pool(problem: DesignProblem, placed: PlacedKit, count: int) -> list[AbstractObservation]:
     """Poses to choose from in everything."""
     each = count // len(placed.kit)
-    return [
-        set_up(problem.region, one, each, item=item, retract=retract)
-        for one, item in zip(placed.kit, placed.items, strict=True)
-    ]
+    things = zip(placed.kit, placed.items, strict=True)
+    return [set_up(problem.region, thing, each, item=item, retract=problem.retract) for thing, item in things]
 
 
 def _in_order(
-    problem: DesignProblem, placed: PlacedKit, chosen: Sequence[AbstractObservation], retract: float
+    problem: DesignProblem, placed: PlacedKit, chosen: Observations
 ) -> tuple[list[AbstractObservation], tuple[Motion, ...]]:
     """Each observation with its poses in the order in which to take them, place after place, and how the arm moves.
 
     What has no cone has no normal either, and its tilts are not numbers.
     """
     ordered, motions = [], []
-    for simulated, item, one in zip(placed.kit, placed.items, chosen, strict=True):
-        region, q = region_of(problem.region, simulated, item), np.asarray(one.q)
+    for simulated, item, poses in zip(placed.kit, placed.items, chosen, strict=True):
+        region, q = region_of(problem.region, simulated, item), np.asarray(poses.q)
         assert region.cones is not None
         normals = np.tile(region.cones.normals, (len(q), 1))
-        order, motion = ordered_motion(region, q, one.places, normals, retract if item.has_cone else 0.0)
-        ordered.append(one.select(order))
+        order, motion = ordered_motion(region, q, poses.places, normals, problem.retract if item.has_cone else 0.0)
+        ordered.append(poses.select(order))
         motions.append(motion if item.has_cone else motion._replace(tilt=np.full(len(q), np.nan)))
     return ordered, tuple(motions)
 
@@ -255,12 +197,12 @@ def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
 
 def least_poses(observations: Sequence[AbstractObservation]) -> Int[np.ndarray, " s"]:
     """For each place of each observation: as many as determine its own unknowns, and two at least."""
-    found = []
-    for one in observations:
-        unknowns = sum(len(units) for units in one.unknowns.values()) + (3 if one.target else 0)
-        places = int(one.places.max()) + 1
-        found += [max(2, math.ceil((unknowns + 1) / (one.rows * places)))] * places
-    return np.array(found)
+    least = []
+    for observation in observations:
+        unknowns = sum(len(units) for units in observation.unknowns.values()) + (3 if observation.target else 0)
+        places = int(observation.places.max()) + 1
+        least += [max(2, math.ceil((unknowns + 1) / (observation.rows * places)))] * places
+    return np.array(least)
 
 
 def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObservation]) -> Candidates:
@@ -294,25 +236,23 @@ def _chosen(
     pool: list[AbstractObservation],
     poses: int,
     least: Int[np.ndarray, " s"],
-    retract: float,
-    report: Progress,
+    options: PlanOptions,
 ) -> list[AbstractObservation]:
     """The best poses of the pool, then the best of these and of poses near them."""
     best, best_value = None, np.inf
     for number in range(1 + _ROUNDS):
+
+        def report(done: float, number: int = number) -> None:
+            options.report("Choosing poses", (number + done) / (1 + _ROUNDS))
+
         possible = candidates_of_kit(problem, pool)
-        rows = exchange(
-            possible, poses, problem.objective, least=least,
-            progress=lambda done, number=number: report("Choosing poses", (number + done) / (1 + _ROUNDS)),
-        )  # fmt: skip
+        rows = exchange(possible, poses, problem.objective, least=least, progress=report)
         value = problem.objective.value(covariance_of(possible.information(possible.rows[rows]), possible.parameters))
         if best is None or value < best_value:
             best, best_value = _taken(pool, rows), value
         if number < _ROUNDS:
-            pool = [
-                _near(problem, one, item, chosen, retract)
-                for one, item, chosen in zip(placed.kit, placed.items, best, strict=True)
-            ]
+            things = zip(placed.kit, placed.items, best, strict=True)
+            pool = [_near(problem, thing, item, chosen) for thing, item, chosen in things]
     assert best is not None
     return best
 
@@ -328,22 +268,17 @@ def _taken(pool: Sequence[AbstractObservation], rows: Int[np.ndarray, " N"]) -> 
 
 
 def _near(
-    problem: DesignProblem, simulated: AbstractSimulated, item: KitItem, chosen: AbstractObservation, retract: float
+    problem: DesignProblem, simulated: AbstractSimulated, item: KitItem, chosen: AbstractObservation
 ) -> AbstractObservation:
     """The poses of an observation, and others near each: joints changed, and the tip brought back."""
     region, q = region_of(problem.region, simulated, item), np.asarray(chosen.q)
     which = np.repeat(np.arange(len(q)), _NEIGHBOURS)
     starts = q[which] + _NEAR * region.random.normal(size=(len(which), q.shape[1]))
     moved, good = reached(region, starts, np.asarray(region.arm.position(q))[which])
-    good[good] = approachable(region, moved[good], item, retract)
+    good[good] = approachable(region, moved[good], item, problem.retract)
     rows = np.concatenate([np.arange(len(q)), which[good]])
     order = np.argsort(chosen.places[rows], kind="stable")
-    return with_readings(chosen.select(rows[order]), np.concatenate([q, moved[good]])[order])
-
-
-def with_readings(observation: AbstractObservation, q: Float[np.ndarray, "m n"]) -> AbstractObservation:
-    """The same observation read otherwise."""
-    return eqx.tree_at(lambda one: one.q, observation, q)
+    return chosen.select(rows[order]).changed(q=np.concatenate([q, moved[good]])[order])
 
 
 def _loosened(
@@ -351,8 +286,8 @@ def _loosened(
 ) -> AbstractObservation:
     """The same poses, with joints off by some degrees and the tip brought back."""
     region, q = region_of(problem.region, simulated, item), np.asarray(chosen.q)
-    moved, good = reached(region, q + _LOOSE * region.random.normal(size=q.shape), np.asarray(region.arm.position(q)))
-    return with_readings(chosen, np.where(good[:, None], moved, q))
+    moved, good = reached(region, q + LOOSE * region.random.normal(size=q.shape), np.asarray(region.arm.position(q)))
+    return chosen.changed(q=np.where(good[:, None], moved, q))
 
 
 def _predictions(
@@ -360,49 +295,22 @@ def _predictions(
     placed: PlacedKit,
     pool: list[AbstractObservation],
     chosen: list[AbstractObservation],
-    functions: Float[np.ndarray, "v p"],
-    report: Progress,
+    options: PlanOptions,
 ) -> dict[str, Any]:
     """For the plan, for random poses, for imprecise and more poses, and without each part of the kit."""
-    random, stage = problem.region.random, "Predicting"
-    report(stage, 0.0)
-
-    def predicted(candidates: Candidates, rows: Float[np.ndarray, "m r P"]) -> Prediction:
-        return prediction_of(candidates, rows, functions)
-
-    def typical(sets: list[Prediction]) -> Prediction:
-        return Prediction(*(float(np.median(column)) for column in zip(*sets, strict=True)))
-
-    def of(observations: Sequence[AbstractObservation]) -> Prediction:
-        candidates = candidates_of_kit(problem, observations)
-        return predicted(candidates, candidates.rows)
-
-    possible, planned = candidates_of_kit(problem, pool), candidates_of_kit(problem, chosen)
-    counts = np.bincount(planned.owner)
-    random_sets = []
-    for _ in range(_RANDOM_SETS):
-        rows = [random.choice(np.flatnonzero(possible.owner == i), count) for i, count in enumerate(counts)]
-        random_sets.append(predicted(possible, possible.rows[np.concatenate(rows)]))
-    loose_sets = [
-        of([_loosened(problem, *parts) for parts in zip(placed.kit, placed.items, chosen, strict=True)])
-        for _ in range(_LOOSE_SETS)
-    ]
-    report(stage, 0.3)
-    base = planned.information(planned.rows)
-    added = exchange(possible._replace(base=base), MORE, problem.objective, least=0, sweeps=1)
+    options.report("Predicting", 0.0)
+    planned, possible = candidates_of_kit(problem, chosen), candidates_of_kit(problem, pool)
+    things = list(zip(placed.kit, placed.items, chosen, strict=True))
+    loose = (candidates_of_kit(problem, [_loosened(problem, *thing) for thing in things]) for _ in range(_LOOSE_SETS))
+    predicted: dict[str, Any] = predictions(problem, planned, possible, loose, _RANDOM_SETS)
     without = {}
     parts = list(dict.fromkeys(placed.parts)) if len(set(placed.parts)) > 1 else []
     for number, part in enumerate(parts):
-        report(stage, 0.4 + 0.6 * number / len(parts))
-        left = [one for one, of_part in zip(chosen, placed.parts, strict=True) if of_part != part]
+        options.report("Predicting", 0.4 + 0.6 * number / len(parts))
+        left = [poses for poses, of_part in zip(chosen, placed.parts, strict=True) if of_part != part]
         seen = observability(problem.arm, Capture({}, (), left), problem.space)
         complete = seen.rank == len(problem.space.names)
-        without[part] = of(left) if complete else Prediction(math.inf, math.inf)
-    report(stage, 1.0)
-    return {
-        "predicted": predicted(planned, planned.rows),
-        "random": typical(random_sets),
-        "loose": typical(loose_sets),
-        "more": predicted(planned, np.concatenate([planned.rows, possible.rows[added]])),
-        "without": without,
-    }
+        open_ended = Prediction(math.inf, math.inf)
+        without[part] = prediction_of(problem, candidates_of_kit(problem, left)) if complete else open_ended
+    options.report("Predicting", 1.0)
+    return predicted | {"without": without}

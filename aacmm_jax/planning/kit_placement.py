@@ -16,9 +16,10 @@ from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.workspace import SearchRegion, reached, total_link_length
 from .fedorov_exchange import Candidates, relaxed_value
-from .motion import approaches
-from .placement import DesignProblem, PlacementRegion, inside
-from .unreachable import explained_place
+from .information import DesignProblem
+from .motion import approaches, explained_place
+from .options import PlacementRegion, inside
+from .placement import best_layout
 
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS = 120, 8, 60
 _STARTS, _DESIGN_STARTS = 120, 400  # random configurations for each thing: of the first score, and of the second
@@ -184,23 +185,14 @@ class _Search(NamedTuple):
                 "no placement of the kit was found that can be reached well; give a region nearer to the arm, or "
                 f"fewer places. In the last that was tried, {self._reason(layout)}"
             )
-        best, best_pools, best_value = None, None, np.inf
-        shortlist = [layout for _, _, layout in sorted(scored)[:_DESIGNED]]
-        tries = len(shortlist) + _NEIGHBOURS
-        for number in range(tries):
-            report(stage, 0.4 + 0.6 * number / tries)
-            if number < len(shortlist):
-                layout, pools = shortlist[number], None
-            else:
-                if best is None:
-                    break
-                layout, pools = self._neighbour(best), best_pools
-            pools = self._pools(layout, _DESIGN_STARTS, best if pools else None, pools)
-            value = np.inf if pools is None else self._value(pools, _ITERATIONS)
-            if value < best_value:
-                best, best_pools, best_value = layout, pools, value
-        report(stage, 1.0)
-        return sorted(scored)[0][2] if best is None else best
+        return best_layout(
+            [layout for _, _, layout in sorted(scored)[:_DESIGNED]],
+            lambda layout, best, pools: self._pools(layout, _DESIGN_STARTS, best, pools),
+            lambda layout, pools: self._value(pools, _ITERATIONS),
+            self._neighbour,
+            _NEIGHBOURS,
+            lambda fraction: report(stage, fraction),
+        )
 
     def _reason(self, layout: _Layout) -> str:
         """Why a placement cannot be reached well."""
@@ -265,8 +257,8 @@ class _Search(NamedTuple):
                 return frame
         raise InputError(f"'{item.simulated.name}' does not fit into the region; widen it.")
 
-    def _neighbour(self, layout: _Layout) -> _Layout:
-        """With one thing shifted and turned a little, where that stays in the region."""
+    def _neighbour(self, layout: _Layout) -> _Layout | None:
+        """With one thing shifted and turned a little, or None where that leaves the region."""
         random = self.problem.region.random
         which = random.choice([i for i, frame in enumerate(layout.frames) if frame is not None])
         item, frame = self.things[which][0], layout.frames[which]
@@ -278,7 +270,7 @@ class _Search(NamedTuple):
         shift = _SHIFT * total_link_length(self.problem.arm) * random.normal(size=3)
         new = _about(turn, local.mean(axis=0), old + shift)
         if not inside(turn.apply(local) + new[3:], self.ranges).all():
-            return layout
+            return None
         return self._layout([new if i == which else frame for i, frame in enumerate(layout.frames)])
 
 

@@ -1,64 +1,107 @@
-"""Placements of sockets and reference lengths, the information of configurations in them, and their scores."""
+"""Where to set up sockets and reference lengths: random placements, ranked by the poses that they allow, then moved."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
 from ..core.errors import InputError
-from ..core.linear_algebra import inverse_cholesky
-from ..core.numpy_or_jax import in_chunks, to_numpy
-from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm, jacobian_at
-from ..kinematics.chain import Geometry, joint_motion
-from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import SearchRegion, arm_reach, configurations_at, reached, total_link_length
-from .fedorov_exchange import Candidates, Objective, relaxed_value
+from ..core.numpy_or_jax import in_chunks
+from ..kinematics.workspace import reached, total_link_length
+from .fedorov_exchange import relaxed_value
+from .information import DesignProblem, Pool, candidates_of, pool_at, pool_of
+from .options import LEAST_POSES, FixturePlacement, PlacementRegion, PlanOptions, inside
 
-LEAST_POSES = 2  # in a socket: one shows no scatter
-_STARTS = 24  # random starts in each socket for the first score
+# Random placements, those of them for which poses are chosen, tried neighbours of the best, and starts for each.
+_PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
+_BLOCK = 25  # placements scored together
+_FEW_STARTS = 24  # in each socket for the first score
 _REACHED = 0.25  # fraction of them that must arrive
 _ROWS = 2048  # configurations computed at once
 _ITERATIONS = 8  # of the relaxed design: as good a ranking as by a sweep of exchange, in a tenth of the time
 _STEPS = 10  # of inverse kinematics, for a neighbour: enough for configurations that are moved along
 _SHIFT, _ROTATION = 0.05, 0.4  # of a neighbour: relative to the sum of the links; rad
-PRIOR = 1e-4  # parameters are known to 100 mm or 100 mrad in advance: makes the first information matrices invertible
 
-Ranges = Mapping[str, tuple[float, float]]  # of x, y, z and the distance from the origin, mm
-FARTHEST = 0.95  # part of the reach: beyond it an arm is stretched, and hardly any pose can be taken
-
-
-class PlacementRegion(NamedTuple):
-    """Where sockets and artefacts may be placed."""
-
-    ranges: Ranges
-    shoulder: Float[np.ndarray, " 3"]  # mm
-    farthest: float  # from the shoulder, mm
+Layout = TypeVar("Layout")
+Poses = TypeVar("Poses")
 
 
-class DesignProblem(NamedTuple):
-    """What all designs for one arm have in common."""
+def best_layout(
+    shortlist: Sequence[Layout],
+    poses_in: Callable[[Layout, Layout | None, Poses | None], Poses | None],
+    score: Callable[[Layout, Poses], float],
+    neighbour: Callable[[Layout], Layout | None],
+    tries: int,
+    report: Callable[[float], None],
+) -> Layout:
+    """The layout with the lowest score among some good ones and, then, neighbours of the best so far.
 
-    region: SearchRegion
-    space: Parameters
-    noise: Noise
-    objective: Objective
+    ``poses_in(layout, best, poses)`` are poses in a layout, which may reuse those in the best; None where it is not
+    reached. ``report`` is called with the fraction done.
+    """
+    best, best_poses, best_score = None, None, np.inf
+    for number in range(len(shortlist) + tries):
+        report(0.4 + 0.6 * number / (len(shortlist) + tries))
+        if number < len(shortlist):
+            layout, poses = shortlist[number], poses_in(shortlist[number], None, None)
+        elif best is None:
+            break
+        else:
+            layout = neighbour(best)
+            poses = None if layout is None else poses_in(layout, best, best_poses)
+        value = np.inf if layout is None or poses is None else score(layout, poses)
+        if value < best_score:
+            best, best_poses, best_score = layout, poses, value
+    report(1.0)
+    return shortlist[0] if best is None else best
 
-    @property
-    def arm(self) -> Arm:
-        """The arm."""
-        return self.region.arm
 
+def best_placement(
+    problem: DesignProblem,
+    sockets: int,
+    poses: int,
+    length: tuple[float, float],
+    u: float,
+    ranges: PlacementRegion,
+    options: PlanOptions,
+) -> FixturePlacement:
+    """The best placement found: random ones scored by random poses, the best few by chosen poses, then neighbours."""
 
-class FixturePlacement(NamedTuple):
-    """Positions of sockets, and which of them are the ends of reference lengths, of what standard uncertainty; mm."""
+    def report(fraction: float) -> None:
+        options.report("Placing the sockets", fraction)
 
-    points: Float[np.ndarray, "s 3"]
-    ends: tuple[tuple[int, int], ...]
-    u: tuple[float, ...]
+    report(0.0)
+    placements = random_placements(problem, _PLACEMENTS, sockets, length, u, ranges)
+    scores: list[float] = []
+    while len(scores) < len(placements):
+        scores += _random_scores(problem, placements[len(scores) : len(scores) + _BLOCK], poses)
+        report(0.4 * len(scores) / len(placements))
+    shortlist = [placements[i] for i in np.argsort(scores) if np.isfinite(scores[i])][:_DESIGNED]
+    if not shortlist:
+        limited = problem.region.cell is not None or (problem.region.cones is not None and problem.region.cones.any)
+        wider = ", wider cones, or fewer obstacles" if limited else ""
+        raise InputError(
+            "no placement was found that can be reached well; give a region nearer to the arm, or a shorter "
+            f"length{wider}."
+        )
+    each = _STARTS // sockets
+
+    def pool_in(placement: FixturePlacement, best: FixturePlacement | None, pool: Pool | None) -> Pool:
+        if best is None or pool is None:
+            return pool_at(problem, placement.points, each)
+        return _moved_pool(problem, pool, best, placement, each)
+
+    return best_layout(
+        shortlist,
+        pool_in,
+        lambda placement, pool: _designed_score(problem, placement, pool, poses),
+        lambda placement: _neighbour(problem, placement, ranges),
+        _NEIGHBOURS,
+        report,
+    )
 
 
 def in_order(placement: FixturePlacement, sockets: Int[np.ndarray, " s"]) -> FixturePlacement:
@@ -68,75 +111,22 @@ def in_order(placement: FixturePlacement, sockets: Int[np.ndarray, " s"]) -> Fix
     return FixturePlacement(placement.points[sockets], ends, placement.u)
 
 
-class Pool(NamedTuple):
-    """Configurations in sockets, and what each measures of the parameters: derivatives of the tip, whitened."""
-
-    q: Float[np.ndarray, "c n"]
-    owner: Int[np.ndarray, " c"]  # index of each one's socket
-    jacobian: Float[np.ndarray, "c 3 p"]  # by the parameters in natural steps, in standard deviations
-    roots: Float[np.ndarray, "c 3 3"]  # that whiten the tips
-
-    def at(self, rows: Any) -> "Pool":
-        """Some of these configurations."""
-        return Pool(*(part[rows] for part in self))
-
-    def fewest(self, sockets: int) -> int:
-        """The number of configurations in the socket that has the fewest."""
-        return int(np.bincount(self.owner, minlength=sockets).min())
-
-
-def pool_of(problem: DesignProblem, q: Float[np.ndarray, "c n"], owner: Int[np.ndarray, " c"]) -> Pool:
-    """Configurations with their whitened derivatives."""
-    geometry, noise = to_numpy((problem.arm.geometry, problem.noise))
-    roots = in_chunks(lambda block: _whitening(geometry, block, noise), q)
-    jacobian = jacobian_at(problem.arm, q, problem.space.names) * np.asarray(problem.space.scale)
-    return Pool(q, owner, roots @ jacobian, roots)
-
-
-def pool_at(problem: DesignProblem, points: Float[np.ndarray, "s 3"], each: int) -> Pool:
-    """Configurations that reach the points from ``each`` random starts a point."""
-    return pool_of(problem, *configurations_at(problem.region, points, each))
-
-
-def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Pool) -> Candidates:
-    """The information that each configuration would add, and that of the lengths alone."""
-    p, sockets = len(problem.space.names), len(placement.points)
-    unknowns = p + 3 * sockets
-    rows = np.zeros((len(pool.q), 3, unknowns))
-    rows[:, :, :p] = pool.jacobian
-    for axis in range(3):
-        rows[np.arange(len(pool.q)), :, p + 3 * pool.owner + axis] = -pool.roots[:, :, axis]
-    base = PRIOR * np.eye(unknowns)
-    for (start, end), u in zip(placement.ends, placement.u, strict=True):
-        between = placement.points[end] - placement.points[start]
-        row = np.zeros(unknowns)
-        direction = between / np.linalg.norm(between)
-        row[p + 3 * end : p + 3 * end + 3], row[p + 3 * start : p + 3 * start + 3] = direction, -direction
-        base += np.outer(row, row) / u**2
-    return Candidates(rows, pool.owner, base, p)
-
-
-def _whitening(geometry: Geometry, q: Float[np.ndarray, "c n"], noise: Noise) -> Float[np.ndarray, "c 3 3"]:
-    covariances = tip_covariances(geometry, joint_motion(geometry, q), noise)
-    return np.asarray(inverse_cholesky(np.moveaxis(np.asarray(covariances), -1, 0)))
-
-
-def random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:
+def _random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:
     """The objective for so many random poses in each placement; infinite if a socket is hard to reach."""
     sockets = len(placements[0].points)
-    pool = pool_at(problem, np.concatenate([placement.points for placement in placements]), _STARTS)
+    pool = pool_at(problem, np.concatenate([placement.points for placement in placements]), _FEW_STARTS)
     scores = []
     for number, placement in enumerate(placements):
         part = pool.at(pool.owner // sockets == number)
         part = part._replace(owner=part.owner % sockets)
-        enough = part.fewest(sockets) >= _REACHED * _STARTS
+        enough = part.fewest(sockets) >= _REACHED * _FEW_STARTS
         scores.append(
             relaxed_value(candidates_of(problem, placement, part), poses, problem.objective, 0) if enough else np.inf
         )
     return scores
 
 
-def designed_score(problem: DesignProblem, placement: FixturePlacement, pool: Pool, poses: int) -> float:
+def _designed_score(problem: DesignProblem, placement: FixturePlacement, pool: Pool, poses: int) -> float:
     """The objective for nearly the best poses; infinite if a socket is not reached."""
     if pool.fewest(len(placement.points)) < LEAST_POSES:
         return np.inf
@@ -148,7 +138,7 @@ def random_placements(
 ) -> list[FixturePlacement]:
     """Random placements of sockets within ranges, two by two as the ends of the reference length."""
     random = problem.region.random
-    found: list[FixturePlacement] = []
+    placements: list[FixturePlacement] = []
     pairs = sockets // 2
     ends = tuple((2 * i, 2 * i + 1) for i in range(pairs))
     for _ in range(60):
@@ -163,15 +153,15 @@ def random_placements(
         for i in range(min(len(both) // max(pairs, 1), len(single))):
             points = both[i * pairs : (i + 1) * pairs].reshape(-1, 3)
             points = np.concatenate([points, single[i : i + sockets % 2]])
-            found.append(FixturePlacement(points, ends, (u,) * pairs))
-            if len(found) == count:
-                return found
+            placements.append(FixturePlacement(points, ends, (u,) * pairs))
+            if len(placements) == count:
+                return placements
     raise InputError(
         "no placement of the sockets and the reference length was found in the region; widen it, or shorten the length."
     )
 
 
-def neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: PlacementRegion) -> FixturePlacement | None:
+def _neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: PlacementRegion) -> FixturePlacement | None:
     """A placement with one length, or single socket, shifted and rotated a little; None if that leaves the ranges."""
     random = problem.region.random
     points = placement.points.copy()
@@ -185,7 +175,7 @@ def neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: Place
     return placement._replace(points=points) if inside(points, ranges).all() else None
 
 
-def moved_pool(
+def _moved_pool(
     problem: DesignProblem, pool: Pool, before: FixturePlacement, after: FixturePlacement, each: int
 ) -> Pool:
     """The pool of a placement moved to another: what is in sockets that did not move stays; in the others the same
@@ -198,39 +188,7 @@ def moved_pool(
         new = problem.region.draw(max(each - len(followed), 0))
         starts += [followed, new]
         owner.append(np.full(len(followed) + len(new), socket))
-    of = np.concatenate(owner)
-    q, good = reached(problem.region, np.concatenate(starts), after.points[of], _STEPS, sockets=of)
-    moved = pool_of(problem, q[good], of[good])
+    sockets = np.concatenate(owner)
+    q, good = reached(problem.region, np.concatenate(starts), after.points[sockets], _STEPS, sockets=sockets)
+    moved = pool_of(problem, q[good], sockets[good])
     return Pool(*(np.concatenate(parts) for parts in zip(kept, moved, strict=True)))
-
-
-def check_region(ranges: Ranges) -> None:
-    """Raise `InputError` for ranges that are none, or of something else than x, y, z and the distance."""
-    for axis, (low, high) in ranges.items():
-        if not low < high:
-            raise InputError(
-                f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
-            )
-    unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
-    if unknown:
-        raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
-
-
-def placement_region(arm: Arm, ranges: Ranges | None, farthest: float) -> PlacementRegion:
-    """The region with the given ranges (default: z at least 0), no farther than a part of the reach."""
-    if not 0 < farthest <= 1:
-        raise InputError(
-            f"farthest is {farthest:g}; give a part of the reach, such as {FARTHEST:g}, or 1 for all of it."
-        )
-    reach = arm_reach(arm)
-    return PlacementRegion({"z": (0.0, np.inf)} if ranges is None else ranges, reach.shoulder, farthest * reach.radius)
-
-
-def inside(points: Float[np.ndarray, "... 3"], region: PlacementRegion) -> Bool[np.ndarray, "..."]:
-    """Which points are within the region."""
-    values = {"x": points[..., 0], "y": points[..., 1], "z": points[..., 2]}
-    values["distance"] = np.linalg.norm(points, axis=-1)
-    inside = np.linalg.norm(points - region.shoulder, axis=-1) <= region.farthest
-    for key, (low, high) in region.ranges.items():
-        inside &= (values[key] >= low) & (values[key] <= high)
-    return inside

@@ -12,7 +12,8 @@ from ..kinematics.chain import ForwardPass, forward_pass, joint_errors, joint_mo
 from ..kinematics.jacobian import moved_by_correction, reading_columns, readings_gradient
 from ..kinematics.workspace import reached
 from .fedorov_exchange import covariance_of
-from .placement import DesignProblem, FixturePlacement, candidates_of, pool_of
+from .information import DesignProblem, candidates_of, pool_of
+from .options import FixturePlacement
 
 _ITERATIONS = 80
 _NEWTON_STEPS, _ARRIVED = 8, 1e-9  # mm

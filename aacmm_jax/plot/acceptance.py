@@ -7,7 +7,7 @@ import numpy as np
 
 from ..acceptance.results import AcceptanceTest
 from ..core.errors import InputError
-from ..summaries.cells import format_number
+from ..summaries.tables import format_number
 from .charts import Chart, Marks, Plot, level, linear, names
 from .figures import draw
 

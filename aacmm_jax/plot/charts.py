@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..summaries.cells import Table
+from ..summaries.tables import Table
 
 Numbers = Sequence[float] | np.ndarray
 SHADES = 6  # of a sequential colour scale, from little to much

@@ -13,7 +13,7 @@ from ..core.units import DEG
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.corrections.kind import Term
 from ..pipeline.model_ladder import ComparedModels
-from ..summaries.cells import format_number
+from ..summaries.tables import format_number
 from .charts import Chart, Marks, Plot, borders, level, linear, names
 from .figures import TONES, draw
 

@@ -8,7 +8,7 @@ import numpy as np
 from ..acceptance.results import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
-from ..summaries.cells import format_number
+from ..summaries.tables import format_number
 from .charts import Axis, Chart, Marks, Plot, borders, level, linear
 from .figures import draw
 

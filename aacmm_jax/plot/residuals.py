@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..core.units import DEG
 from ..data.capture import Capture
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
-from ..summaries.cells import format_number
+from ..summaries.tables import format_number
 from .charts import SERIES, Axis, Chart, Marks, Plot, borders, level, logarithmic, round_ticks, thinned
 from .figures import draw, draw_all, save_figure
 from .parameters import error_plot

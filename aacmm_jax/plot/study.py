@@ -10,7 +10,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..study.results import Results
 from ..study.statistics import METRICS, correlation, factor_title, level_text, level_title, shown_unit
-from ..summaries.cells import format_number
+from ..summaries.tables import format_number
 from .charts import SERIES, Marks, Plot, level, linear, logarithmic, names, ordinates
 from .figures import draw, draw_all, save_figure
 from .uncertainty import correlation_plot

@@ -7,8 +7,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..diagnostics.tried_poses import TriedPoses
-from ..summaries.cells import format_number
-from ..summaries.tables import decimals_for
+from ..summaries.tables import decimals_for, format_number
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty

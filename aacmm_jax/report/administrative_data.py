@@ -1,5 +1,7 @@
 """The administrative data of a report: laboratory, customer, item, persons, dates; and what is not stated of them."""
 
+from collections.abc import Iterable
+
 from ..files.administrative_data import NOT_STATED, AdministrativeData
 
 # Group of rows: part, key, title, and whether it is shown where it is not stated.
@@ -38,46 +40,37 @@ def administrative_groups(given: AdministrativeData, tested: bool) -> Groups:
 
     def stated(part: str, key: str) -> str:
         value = getattr(getattr(given, part), key)
-        return "" if value is None else str(value)
+        return "" if value is None or value == "other" else str(value)
 
-    found: Groups = []
+    groups: Groups = []
     for group, rows in _ROWS.items():
         values = [(title, stated(part, key), always) for part, key, title, always in rows]
-        shown = [
-            (title, value or NOT_STATED) for title, value, always in values if always or (value and value != "other")
-        ]
+        shown = [(title, value or NOT_STATED) for title, value, always in values if always or value]
         if group in ("Laboratory", "Customer"):
-            address = ", ".join(filter(None, (stated(group.lower(), key) for key in _ADDRESS)))
+            address = _joined(stated(group.lower(), key) for key in _ADDRESS)
             shown += [("Address", address)] if address else []
-        found.append((group, shown))
-    found[-1][1].append(("Temperature", _temperature(given)))
-    found.append(("Reference artefacts", _artefacts(given)))
-    found.append(("Responsible", _persons(given)))
+        groups.append((group, shown))
+    temperature, u = given.certificate.temperature_celsius, given.certificate.temperature_u_celsius
+    celsius = NOT_STATED if temperature is None else f"{temperature:g} °C" + ("" if u is None else f", u = {u:g} °C")
+    groups[-1][1].append(("Temperature", celsius))
+    artefacts = [
+        _joined((part.name, part.manufacturer, part.model, part.serial_number,
+                 part.certificate_number and f"certificate {part.certificate_number}"))
+        for part in given.reference
+    ]  # fmt: skip
+    persons = [
+        _joined((person.name, person.role, "signs the certificate" if person.main_signer else None))
+        for person in given.person
+    ]
+    for title, lines in (("Reference artefacts", artefacts), ("Responsible", persons)):
+        groups.append((title, [("", line) for line in lines or [NOT_STATED]]))
     if given.conformity is not None:
         source = "" if tested else " (stated by the laboratory; this file contains no acceptance test)"
         conformity = given.conformity
         words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}{source}"
-        found.append(("Statement of conformity", [("", words)]))
-    return found
+        groups.append(("Statement of conformity", [("", words)]))
+    return groups
 
 
-def _temperature(given: AdministrativeData) -> str:
-    temperature, u = given.certificate.temperature_celsius, given.certificate.temperature_u_celsius
-    return NOT_STATED if temperature is None else f"{temperature:g} °C" + ("" if u is None else f", u = {u:g} °C")
-
-
-def _artefacts(given: AdministrativeData) -> list[tuple[str, str]]:
-    rows = []
-    for artefact in given.reference:
-        number = artefact.certificate_number and f"certificate {artefact.certificate_number}"
-        parts = (artefact.name, artefact.manufacturer, artefact.model, artefact.serial_number, number)
-        rows.append(("", ", ".join(filter(None, parts))))
-    return rows or [("", NOT_STATED)]
-
-
-def _persons(given: AdministrativeData) -> list[tuple[str, str]]:
-    rows = []
-    for person in given.person:
-        parts = (person.name, person.role, "signs the certificate" if person.main_signer else "")
-        rows.append(("", ", ".join(filter(None, parts))))
-    return rows or [("", NOT_STATED)]
+def _joined(parts: Iterable[str | None]) -> str:
+    return ", ".join(filter(None, parts))

@@ -11,6 +11,7 @@ from ..data.capture import Capture
 from ..data.observations.observation import POINT, offset_of
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach, skeleton
+from ..plot.charts import thinned
 from ..plot.residuals import Groups
 from .elements import ArmView
 
@@ -24,25 +25,17 @@ def view_of_arm(
     distances: Float[np.ndarray, " m"],
     geometry: Mapping[str, Float[AnyArray, " _"]] = _NO_GEOMETRY,
 ) -> ArmView:
-    """The calibrated arm in the poses of a capture.
-
-    The data are marks at the sockets and at the points of the geometry that was found (centres, pivots), and up to 150
-    poses as lines from joint to joint, mm, each with its residual.
+    """The calibrated arm in the poses of a capture: marks at sockets and at the points of the geometry (centres,
+    pivots), and up to 150 poses as lines from joint to joint, mm, each with its residual.
 
     Args:
         arm: The calibrated arm.
         capture: Its poses.
         distances: Distance of every pose from its socket's centroid or its geometry, mm; NaN where there is none.
         geometry: The parts of the unknown geometry, mm and rad, of a capture with observations besides sockets.
-
-    Returns:
-        The view.
     """
-    groups = Groups.of(capture)
-    owner, numbers, q = groups.owner, groups.numbers, np.asarray(capture.readings)
-    chosen = np.arange(len(owner))
-    if len(chosen) > _MOST:
-        chosen = np.unique(np.linspace(0, len(chosen) - 1, _MOST).round().astype(int))
+    groups, q = Groups.of(capture), np.asarray(capture.readings)
+    owner, numbers, chosen = groups.owner, groups.numbers, thinned(len(q), _MOST)
     tips = np.asarray(arm.position(capture.q))
     marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
     lines = skeleton(arm, q[chosen])
@@ -51,8 +44,9 @@ def view_of_arm(
         # A part with certified values has its numbers in a frame of its own.
         marks |= {part: geometry[part] for part in points if part not in observation.certified}
         if observation.target:
-            mine = owner[chosen] == i
-            lines[mine] = skeleton(arm.replace(probe=geometry[offset_of(observation.target)]), q[chosen[mine]])
+            of_target = owner[chosen] == i
+            held = arm.replace(probe=geometry[offset_of(observation.target)])
+            lines[of_target] = skeleton(held, q[chosen[of_target]])
     data: dict[str, Any] = {
         "marks": [{"name": name, "at": np.round(at, 1).tolist()} for name, at in marks.items()],
         "from": "geometry" if capture.observations else "socket's centroid",
@@ -65,13 +59,11 @@ def view_of_arm(
             for i, line in zip(chosen, lines, strict=True)
         ],
         "reach": round(arm_reach(arm).radius, 1),
-        "all": len(q),
     }
     description = (
         "Drag, or use the arrow keys, to rotate the view; plus and minus change its size. "
         "The slider goes through the poses."
     )
-    title = "The calibrated arm and its poses"
-    if marks:
-        title = f"The calibrated arm, its {'points' if capture.observations else 'sockets'} and its poses"
+    points = f", its {'points' if capture.observations else 'sockets'}" if marks else ""
+    title = f"The calibrated arm{points} and its poses"
     return ArmView("scene", title, description, data)

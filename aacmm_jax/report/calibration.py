@@ -14,13 +14,12 @@ from ..diagnostics.findings import case_of
 from ..plot.lengths import length_chart
 from ..plot.residuals import arms_chart, distances_by_arm
 from ..summaries.calibration import calibration_summary
-from ..summaries.cells import Cell, Table, format_number, number, table
 from ..summaries.observations import capture_words
-from ..summaries.tables import decimals_for, lengths_sentence, two_digits
+from ..summaries.tables import Cell, Table, decimals_for, format_number, lengths_sentence, listed, number, two_digits
 from ..summaries.uncertainty_sentences import shared_sentence
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
-from .elements import Block, Report, Section, with_table
+from .elements import Block, Report, Section
 from .observations import agreement_tables, observation_tables, other_poses_table, removed_tables
 from .tables import DRAWN, length_table, metrics_table, validation_tables
 
@@ -119,7 +118,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     if capture.names or not capture.observations:
         sockets = zip(capture.names, capture.sizes, strict=True)
         columns = {"socket": lambda row: row[0], "poses": lambda row: row[1]}
-        blocks.append(table("Sockets in which the tip was seated", sockets, columns))
+        blocks.append(listed("Sockets in which the tip was seated", sockets, columns))
     blocks += observation_tables(record)
     if capture.lengths or not capture.observations:
 
@@ -131,7 +130,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
             "calibrated value [mm]": lambda length: to_u(length.value, length.u),
             "u [mm]": lambda length: to_u(length.u, length.u),
         }
-        blocks.append(table("Reference lengths", capture.lengths, columns))
+        blocks.append(listed("Reference lengths", capture.lengths, columns))
     blocks += [*removed_tables(record), _traceability(summary["scale_from"])]
     return Section("data", "What was calibrated, and from which data", blocks)
 
@@ -186,7 +185,7 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
             words: lambda row, stage=stage: row[2] * summary["truth"][stage][row[0]] for stage, words in stages.items()
         }
         caption = "Against the true arm of the simulation"
-        blocks.append(table(caption, errors, {"": lambda row: row[1]} | columns))
+        blocks.append(listed(caption, errors, {"": lambda row: row[1]} | columns))
     return Section("stages", "Nominal and calibrated arm", blocks)
 
 
@@ -204,7 +203,7 @@ def _prior_table(prior: list[dict[str, Any]]) -> Table:
         "parameters": "parameters",
         "of these determined by the data": lambda row: number(row["effective_parameters"], 1),
     }
-    return table("Priors of the parameters, and effective parameters", prior, columns)
+    return listed("Priors of the parameters, and effective parameters", prior, columns)
 
 
 def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> Section:
@@ -223,7 +222,7 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
     if not single:
         between = [(row["from"], row["to"]) for row in rows]
         expanded = np.array([row["expanded_mm"] or np.nan for row in rows])
-        block = with_table(length_chart(between, stage1 | {"calibrated": errors["calibrated"]}, expanded), block)
+        block = length_chart(between, stage1 | {"calibrated": errors["calibrated"]}, expanded)._replace(table=block)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 

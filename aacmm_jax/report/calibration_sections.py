@@ -18,15 +18,27 @@ from ..plot.parameters import bounds_chart, change_chart
 from ..plot.patterns import pattern_charts
 from ..plot.residuals import Groups, distances_in, kinds_chart
 from ..plot.uncertainty import correlation_chart, singular_chart, tried_chart, volume_chart
-from ..summaries.cells import Cell, Columns, Table, number, table
 from ..summaries.harmonics import harmonics_by_joint, listed_apart
-from ..summaries.tables import decimals_for, encoders_in_words, factor_words, seat_in_words, two_digits, volume_rows
+from ..summaries.tables import (
+    Cell,
+    Table,
+    by_columns,
+    decimals_for,
+    encoders_in_words,
+    factor_words,
+    listed,
+    number,
+    numbers,
+    seat_in_words,
+    two_digits,
+    volume_rows,
+)
 from ..summaries.uncertainty_sentences import tried_sentence
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from .arm_view import view_of_arm
-from .elements import Block, Section, with_table
+from .elements import Block, Section
 from .observations import geometry_table, weights_table
 from .tables import DRAWN, pose_table, residual_chart, socket_table, with_u_digits
 
@@ -43,17 +55,17 @@ _FULL_TURN = 360.0
 
 def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     """Every parameter with its expanded uncertainty; hundreds of coefficients joint by joint, and on demand."""
-    listed, harmonics = listed_apart(summary["parameters"])
+    others, harmonics = listed_apart(summary["parameters"])
     introduction = (
         "U is the expanded uncertainty (95 %), with the coverage factor of each parameter's own degrees of freedom. A "
         "parameter on a bound, or one that the data determine only together with others, has none of its own."
     )
-    by_unit = {unit: [row for row in listed if row["unit"] == unit] for unit in ("mm", "rad")}
+    by_unit = {unit: [row for row in others if row["unit"] == unit] for unit in ("mm", "rad")}
     functions = functions_chart(record)
     blocks: list[Block] = [
         introduction,
         *(change_chart(unit, rows) for unit, rows in by_unit.items() if rows),
-        _parameter_table("Parameters", listed),
+        _parameter_table("Parameters", others),
         *([] if functions is None else [functions]),
     ]
     if harmonics:
@@ -98,7 +110,7 @@ def _parameter_table(caption: str, rows: list[Any]) -> Table:
         "nominal": nominal,
         "": state,
     }
-    return table(caption, rows, columns)
+    return listed(caption, rows, columns)
 
 
 def _by_joint(harmonics: list[Any]) -> Table:
@@ -112,7 +124,7 @@ def _by_joint(harmonics: list[Any]) -> Table:
         "its U": lambda row: _expanded(row, row["largest"]["expanded"]),
         "unit": lambda row: people_read(row["unit"])[1],
     }
-    return table("Harmonics of the joints", harmonics_by_joint(harmonics), columns)
+    return listed("Harmonics of the joints", harmonics_by_joint(harmonics), columns)
 
 
 def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
@@ -146,7 +158,7 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
     for unit, shown in values.items():
         chart, marked, of = kinds_chart(record, unit, far, DRAWN)
         if chart is not None:
-            blocks.append(with_table(chart, pose_table(of, shown, unit, None if unit == "deg" else marked)))
+            blocks.append(chart._replace(table=pose_table(of, shown, unit, None if unit == "deg" else marked)))
     introduction = (
         "The geometry that was unknown, as determined with the parameters: positions and frames in the base frame, "
         "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on "
@@ -187,22 +199,23 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
         f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
         f"expanded to 95 % ({factor_words(statistics)})."
     )
-    which = ("median", "95th percentile", "largest")
-    columns: Columns = {"": lambda row: row[0]}
-    columns |= {words: lambda row, i=i: with_u_digits(row[1][i]) for i, words in enumerate(which)}
-    caption = "Expanded uncertainty over the working volume [mm]"
-    u = {
-        "U of the tip [mm]": volume.expanded_tip,
-        f"U of a {volume.length:g} mm length [mm]": volume.expanded_length,
-        "with readings [mm]": volume.expanded_length_reading,
-    }
-    positions: Columns = {
-        f"{axis} [mm]": lambda i, k=k: number(float(volume.start[i, k]), 0) for k, axis in enumerate("xyz")
-    }
-    positions |= {name: lambda i, values=values: with_u_digits(float(values[i])) for name, values in u.items()}
-    every = table("All positions", range(len(volume.start)), positions)
-    chart = with_table(volume_chart(volume), every)
-    blocks = [introduction, table(caption, volume_rows(statistics), columns), chart, _noise_sentence(summary)]
+    rows = volume_rows(statistics)
+    columns: dict[str, Any] = {"": [title for title, _ in rows]}
+    for i, which in enumerate(("median", "95th percentile", "largest")):
+        columns[which] = [with_u_digits(values[i]) for _, values in rows]
+    positions = {f"{axis} [mm]": numbers(volume.start[:, k], 0) for k, axis in enumerate("xyz")}
+    for name, u in (
+        ("U of the tip [mm]", volume.expanded_tip),
+        (f"U of a {volume.length:g} mm length [mm]", volume.expanded_length),
+        ("with readings [mm]", volume.expanded_length_reading),
+    ):
+        positions[name] = [with_u_digits(float(value)) for value in u]
+    blocks = [
+        introduction,
+        by_columns("Expanded uncertainty over the working volume [mm]", columns),
+        volume_chart(volume)._replace(table=by_columns("All positions", positions)),
+        _noise_sentence(summary),
+    ]
     return Section("volume", "Uncertainty over the working volume", blocks)
 
 
@@ -248,13 +261,17 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
     units = np.where(slides, 1.0, DEG)
     limits, shown = np.asarray(joint_limits(arm, None)) / units[:, None], readings[:, : arm.joints] / units
-    low, high, x = shown.min(axis=0), shown.max(axis=0), np.arange(arm.joints)
-    columns = {"joint": lambda i: i + 1, "unit": lambda i: "mm" if slides[i] else "deg"} | {
-        heading: lambda i, values=values: number(float(values[i]), 1)
-        for heading, values in {
-            "lowest limit": limits[:, 0], "highest limit": limits[:, 1], "lowest reading": low, "highest reading": high
-        }.items()
-    } | {"travel tried [%]": lambda i: number(100 * _share(shown[:, i], limits[i], slides[i]), 0)}  # fmt: skip
+    x = np.arange(arm.joints)
+    used = [_share(*joint) for joint in zip(shown.T, limits, slides, strict=True)]
+    columns = {
+        "joint": (x + 1).tolist(),
+        "unit": ["mm" if slide else "deg" for slide in slides],
+        "lowest limit": numbers(limits[:, 0], 1),
+        "highest limit": numbers(limits[:, 1], 1),
+        "lowest reading": numbers(shown.min(axis=0), 1),
+        "highest reading": numbers(shown.max(axis=0), 1),
+        "travel tried [%]": numbers(100 * np.array(used), 0),
+    }
     drawn = shown[thinned(len(shown), _TRAVELLED)]
     marks = (
         Marks("travel", x, limits.mean(axis=1), "bars", "soft", low=limits[:, 0], high=limits[:, 1], size=14),
@@ -263,8 +280,7 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     axis = linear("reading [deg]" + (" or [mm]" if any(slides) else ""), limits, shown)
     plot = Plot(names("", [f"joint {i + 1}" for i in x]), axis, marks, height=260)
     description = "The travel of each joint within its limits, and the readings of the calibration in it."
-    by_joint = table("Travel by joint", x.tolist(), columns)
-    return Chart("travel", "Travel of the joints", description, (plot,), by_joint)
+    return Chart("travel", "Travel of the joints", description, (plot,), by_columns("Travel by joint", columns))
 
 
 def _share(readings: np.ndarray, limits: np.ndarray, slides: bool) -> float:
@@ -281,12 +297,12 @@ def monte_carlo(record: CalibrationRecord) -> list[Section]:
     if sampled is None:
         return []
     keys = {"value": "estimate", "u by Monte Carlo": "u", "u by propagation": "linear_u", "from": "low", "to": "high"}
-    columns: Columns = {"quantity": lambda i: str(sampled["quantity"][i])}
-    columns |= {name: lambda i, values=sampled[key]: number(float(values[i]), 6) for name, key in keys.items()}
-    agrees = sampled["agrees"]
-    columns["agree"] = lambda i: "yes" if agrees[i] else Cell("no", None, "unsure")
-    caption = "Quantities, in mm and rad; 95 % coverage intervals"
-    quantities = table(caption, range(len(sampled["quantity"])), columns)
+    columns = {
+        "quantity": map(str, sampled["quantity"]),
+        **{name: numbers(sampled[key], 6) for name, key in keys.items()},
+        "agree": ["yes" if agrees else Cell("no", None, "unsure") for agrees in sampled["agrees"]],
+    }
+    quantities = by_columns("Quantities, in mm and rad; 95 % coverage intervals", columns)
     return [Section("monte-carlo", "Monte Carlo (JCGM 101)", [record.sampled_says or "", quantities])]
 
 
@@ -297,8 +313,8 @@ def correlations(uncertainty: Uncertainty) -> Section:
         "with": lambda pair: pair[1],
         "correlation": lambda pair: number(pair[2], 3, signed=True),
     }
-    pairs = table("Pairs correlated by 0.5 or more", uncertainty.correlated(0.5), columns)
-    return Section("correlations", "Correlations", [with_table(correlation_chart(uncertainty), pairs)])
+    pairs = listed("Pairs correlated by 0.5 or more", uncertainty.correlated(0.5), columns)
+    return Section("correlations", "Correlations", [correlation_chart(uncertainty)._replace(table=pairs)])
 
 
 def observability(observability: Observability) -> Section:
@@ -314,12 +330,10 @@ def observability(observability: Observability) -> Section:
         ("condition", f"{observability.condition:.3g}", "of what is determined, columns scaled"),
         *((name, f"{x:.3g}", f"{_INDICES[name]}; larger is better") for name, x in observability.indices.items()),
     ]
-    metrics = table(
-        "Metrics", rows, {"": lambda row: row[0], "value": lambda row: row[1], "meaning": lambda row: row[2]}
-    )
-    singular = observability.singular.tolist()
-    columns = {"number": lambda i: i + 1, "value": lambda i: number(singular[i], 6)}
-    chart = with_table(singular_chart(observability), table("Singular values", range(len(singular)), columns))
+    metrics = by_columns("Metrics", dict(zip(("", "value", "meaning"), zip(*rows, strict=True), strict=True)))
+    values = observability.singular
+    columns = {"number": range(1, 1 + len(values)), "value": numbers(values, 6)}
+    chart = singular_chart(observability)._replace(table=by_columns("Singular values", columns))
     sentences = " ".join(observability.sentences() or [determined])
     return Section("observability", "Observability", [sentences, metrics, chart])
 
@@ -329,8 +343,8 @@ def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     vector, lower, upper = record.vectors()["calibrated"], np.asarray(record.lower), np.asarray(record.upper)
     active, stage1 = summary["active"], summary["active_stage1"]
     on_bound = sorted({*active, *stage1})
-    listed, harmonics = listed_apart(summary["parameters"])
-    shown = [*(row["parameter"] for row in listed), *(r["parameter"] for r in harmonics if r["parameter"] in on_bound)]
+    others, harmonics = listed_apart(summary["parameters"])
+    shown = [*(row["parameter"] for row in others), *(r["parameter"] for r in harmonics if r["parameter"] in on_bound)]
     index = [record.names.index(name) for name in shown]
 
     def in_unit(values: np.ndarray) -> Any:
@@ -359,4 +373,4 @@ def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         within = np.where(np.isfinite(width) & (width > 0), 2 * (vector - lower) / width - 1, math.nan)[index]
     on = np.array([name in on_bound for name in shown])
     chart = bounds_chart(shown, within, on, len(record.names) - len(shown))
-    return Section("bounds", "Bounds", [introduction, with_table(chart, table("Bounds", index, columns))])
+    return Section("bounds", "Bounds", [introduction, chart._replace(table=listed("Bounds", index, columns))])

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ..plot.charts import Chart
-from ..summaries.cells import Table
+from ..summaries.tables import Table
 
 
 class ArmView(NamedTuple):
@@ -40,8 +40,3 @@ class Report(NamedTuple):
     simulated: bool = False
     decision: str | None = None  # of its acceptance tests, all together
     administrative: Sequence[tuple[str, list[tuple[str, str]]]] = ()  # groups of titles and values
-
-
-def with_table(chart: Chart, table: Table, *, printed: bool = False) -> Chart:
-    """The chart with the table of its numbers; ``printed``: on paper as well."""
-    return chart._replace(table=table, printed=printed)

@@ -15,15 +15,14 @@ from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..plot.acceptance import metrics_chart
 from ..plot.lengths import reading_errors_chart
-from ..plot.residuals import distances_in
-from ..summaries.cells import Cell, Table, format_number, number, table
+from ..plot.residuals import arms_chart, distances_in
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
-from ..summaries.tables import decimals_for
+from ..summaries.tables import Cell, Table, decimals_for, format_number, listed, number
 from ..summaries.verdicts import overall_decision
 from .arm_view import view_of_arm
-from .elements import Block, Report, Section, with_table
-from .tables import length_table, metrics_table, residual_chart, socket_table, stages_chart, with_u_digits
+from .elements import Block, Report, Section
+from .tables import DRAWN, length_table, metrics_table, residual_chart, socket_table, with_u_digits
 
 _MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
@@ -88,7 +87,7 @@ def observation_tables(summary: dict[str, Any]) -> list[Table]:
         "calibrated, in standard deviations": lambda row: number(row["reduced_chi"], 2),
     }
     return [
-        table(f"{title}, RMS distance of poses from their geometry [mm]", rows, columns)
+        listed(f"{title}, RMS distance of poses from their geometry [mm]", rows, columns)
         for group, title in _GROUPS
         if (rows := (summary[group] or {}).get("observations"))
     ]
@@ -177,7 +176,7 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         "what it is": lambda row: METRICS[row["name"]],
     }
     for test in rows:
-        blocks.append(table(f"{test['called']}: {test['title']} [mm]", test["figures"], columns))
+        blocks.append(listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns))
         if test["missing"]:
             blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
     parts = [
@@ -187,7 +186,7 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         for part in metric.values
         if not limited or part.limit is not None
     ]
-    every = table(
+    every = listed(
         "Every part of every metric with a limit [mm]" if limited else "Every part of every metric [mm]",
         parts,
         {
@@ -200,7 +199,7 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
             "standard": lambda row: row[2].standard,
         },
     )
-    return [*blocks, with_table(metrics_chart(tests), every, printed=limited)]
+    return [*blocks, metrics_chart(tests)._replace(table=every, printed=limited)]
 
 
 def _expanded(value: float) -> Cell:
@@ -231,7 +230,7 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
         "u [mm]": lambda row: with_u_digits(row[2]),
         "used": lambda row: row[3],
     }
-    return [table("Artefacts", rows, columns)] if rows else []
+    return [listed("Artefacts", rows, columns)] if rows else []
 
 
 def _nominal_and_calibrated(
@@ -243,7 +242,9 @@ def _nominal_and_calibrated(
         for group, title in _GROUPS
         if (rows := summary[group]) is not None
     ]
-    blocks.append(stages_chart(record.recording.capture, evaluations))
+    capture = record.recording.capture
+    distances = {stage: distances_in(capture, evaluations[stage]) for stage in _STAGES}
+    blocks.append(arms_chart(capture, distances, most=DRAWN))
     if record.used:
         used = ", ".join(sorted(record.used))
         blocks.append(f"The calibration was identified from: {used}. All other data were held out.")

@@ -14,7 +14,7 @@ from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together, write_text
 from ..plot.charts import Chart
 from ..plot.svg import drawn, key, points
-from ..summaries.cells import Table
+from ..summaries.tables import Cell, Table
 from .administrative_data import administrative_groups
 from .elements import ArmView, Report
 
@@ -139,6 +139,7 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         is_arm_view=lambda block: isinstance(block, ArmView),
         plots=lambda chart: [drawn(plot, f"chart-{chart.id}") for plot in chart.plots],
         stacked_table=_stacked,
+        numbers=lambda cells, headings: [any(row[i].value is not None for row in cells) for i in range(len(headings))],
         keys=lambda chart: key(chart.plots),
         points={block.id: [points(plot) for plot in block.plots] for block in blocks if isinstance(block, Chart)},
         scenes={block.id: block.data for block in blocks if isinstance(block, ArmView)},
@@ -149,11 +150,11 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
     )
 
 
-def _stacked(table: Table) -> bool:
+def _stacked(table: Table, cells: list[list[Cell]]) -> bool:
     """Whether a narrow screen shows each row as a list: a table of few cells that has no room on a telephone."""
-    if len(table.rows) * len(table.columns) > _MOST_STACKED:
+    if len(cells) * len(table.headings) > _MOST_STACKED:
         return False
-    texts = [[column, *(row[i].text for row in table.rows)] for i, column in enumerate(table.columns)]
+    texts = [[heading, *(row[i].text for row in cells)] for i, heading in enumerate(table.headings)]
     words = [max((len(word) for text in column for word in text.split()), default=0) for column in texts]
     whole = [max(map(len, column[1:]), default=0) if i else 0 for i, column in enumerate(texts)]
     characters = sum(max(word, min(text, _LONGEST)) for word, text in zip(words, whole, strict=True))

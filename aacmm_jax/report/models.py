@@ -7,8 +7,7 @@ import numpy as np
 from ..core.text import pluralise
 from ..plot.charts import Chart, Marks, Plot, linear, names
 from ..plot.joint_models import models_chart
-from ..summaries.cells import Cell, Table, format_number, number, table
-from ..summaries.tables import difference_from_best
+from ..summaries.tables import Cell, Table, difference_from_best, format_number, listed, number
 from .elements import Report, Section
 
 _INTRODUCTION = (
@@ -74,7 +73,7 @@ def _model_table(models: list[dict[str, Any]]) -> Table:
         "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
         "CPU [s]": lambda row: number(row["cpu_seconds"], 1),
     }
-    return table("Models", models, columns)
+    return listed("Models", models, columns)
 
 
 def _by_region(summary: dict[str, Any]) -> Chart:
@@ -91,7 +90,7 @@ def _by_region(summary: dict[str, Any]) -> Chart:
         plots.append(Plot(*axes, (marks,), title=row["model"], height=170))
     columns = {"region": lambda i: regions[i], "poses": lambda i: models[0]["regions"][i]["poses"]}
     columns |= {row["model"]: lambda i, row=row: row["regions"][i]["rms"] for row in models}
-    by_region = table("RMS error by region [mm]", range(len(regions)), columns)
+    by_region = listed("RMS error by region [mm]", range(len(regions)), columns)
     description = (
         "The RMS error of each region, predicted from all the others; the recommended model in the other colour."
     )

@@ -8,9 +8,8 @@ from ..calibration.record import CalibrationRecord
 from ..core.text import pluralise
 from ..core.units import DEG
 from ..diagnostics.pose_residuals import observation_residuals
-from ..summaries.cells import Cell, Table, format_number, number, table
 from ..summaries.observations import capture_observations
-from ..summaries.tables import expanded_words, quantity_words
+from ..summaries.tables import Cell, Table, expanded_words, format_number, listed, number, quantity_words
 
 
 def observation_tables(record: CalibrationRecord) -> list[Table]:
@@ -40,8 +39,8 @@ def observation_tables(record: CalibrationRecord) -> list[Table]:
         "certified value": _words,
         "u [mm]": lambda quantity: "taken as exact" if quantity["u"] == 0 else number(quantity["u"]),
     }
-    tables = [table("Observations", rows, columns)]
-    return [*tables, *([table("Certified values", certified, of_certified)] if certified else [])]
+    tables = [listed("Observations", rows, columns)]
+    return [*tables, *([listed("Certified values", certified, of_certified)] if certified else [])]
 
 
 def removed_tables(record: CalibrationRecord) -> list[Table]:
@@ -58,7 +57,7 @@ def removed_tables(record: CalibrationRecord) -> list[Table]:
         "changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
     }
     caption = "Left out, because it contradicts the rest"
-    return [table(caption, record.removed, columns)] if record.removed else []
+    return [listed(caption, record.removed, columns)] if record.removed else []
 
 
 def _words(quantity: dict[str, Any], coverage: float | None = None) -> str:
@@ -76,7 +75,7 @@ def agreement_tables(summary: dict[str, Any]) -> list[Table]:
         "calibrated, in standard deviations": lambda row: number(row["reduced_chi"], 2),
     }
     by_kind, by_observation = (
-        table(f"RMS residuals by {first}", summary[f"{first}s"], {first: first, second: second} | columns)
+        listed(f"RMS residuals by {first}", summary[f"{first}s"], {first: first, second: second} | columns)
         for first, second in (("kind", "observations"), ("observation", "kind"))
     )
     # Where each kind was observed once, both say the same.
@@ -95,7 +94,7 @@ def other_poses_table(summary: dict[str, Any]) -> list[Table]:
         return []
     caption = f"{pluralise(other['poses'], 'other pose')}, not calibrated with: RMS {format_number(other['rms_mm'])} mm"
     columns = {"observation": "observation", "poses": "poses", "RMS [mm]": "rms_mm", "RMS [deg]": _in_degrees}
-    return [table(caption, other["observations"], columns)]
+    return [listed(caption, other["observations"], columns)]
 
 
 def weights_table(summary: dict[str, Any]) -> Table:
@@ -108,7 +107,7 @@ def weights_table(summary: dict[str, Any]) -> Table:
         "residual in standard deviations": lambda row: number(row["normalised"], 1),
     }
     caption = f"Poses that the robust loss ({summary['robust']}) took half of their weight from or more, and why"
-    return table(caption, summary["less_weight"], columns)
+    return listed(caption, summary["less_weight"], columns)
 
 
 def geometry_table(summary: dict[str, Any]) -> Table:
@@ -130,4 +129,4 @@ def geometry_table(summary: dict[str, Any]) -> Table:
         "U (95 %)": lambda row: expanded_words(row, factor),
         "largest difference from the certified values [mm]": "difference" if certified else None,
     }
-    return table("Geometry found", rows, columns)
+    return listed("Geometry found", rows, columns)

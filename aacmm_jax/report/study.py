@@ -10,7 +10,7 @@ from ..plot.charts import Chart
 from ..plot.study import metric_plots, metric_unit, runs_of_metric
 from ..study.results import Results
 from ..study.statistics import METRICS, factor_title, level_text, level_title, study_summary
-from ..summaries.cells import Cell, Table, format_number, number, table
+from ..summaries.tables import Cell, Table, format_number, listed, number
 from .elements import Report, Section
 
 _SHOWN = (
@@ -105,7 +105,7 @@ def _cell_table(summary: dict[str, Any]) -> Table:
         "truth within bounds [%]": lambda cell: number(100 * (cell["truth_inside"]["value"] or 0.0), 2),
         "mean evaluations": lambda cell: number(cell["steps_mean"], 1),
     }
-    return table("Trials by cell", summary["results"], columns)
+    return listed("Trials by cell", summary["results"], columns)
 
 
 def _metric_section(results: Results, summary: dict[str, Any], name: str) -> Section:
@@ -117,7 +117,7 @@ def _metric_section(results: Results, summary: dict[str, Any], name: str) -> Sec
         words: lambda cell, key=key: _statistic((cell["figures"].get(name) or {}).get(key), factor)
         for words, key in _STATISTICS.items()
     }
-    cells = table(f"{heading}; ± one Monte Carlo standard error", summary["results"][:_MOST_CELLS], columns)
+    cells = listed(f"{heading}; ± one Monte Carlo standard error", summary["results"][:_MOST_CELLS], columns)
     along, runs = runs_of_metric(results, _MOST_PLOTS)
     groups = [{words: chosen} for words, chosen in runs.items()]
     plots = metric_plots(results, name, along, groups, lambda chosen: factor * _ends(summary, name, chosen))
@@ -145,4 +145,4 @@ def _parameter_sections(summary: dict[str, Any]) -> list[Section]:
         for words, key in (("bias", "bias"), ("standard deviation", "spread"))
     }
     caption = "Errors of the parameters; ± one Monte Carlo standard error"
-    return [Section("parameters", "Parameters", [table(caption, rows, columns, folded=True)])] if rows else []
+    return [Section("parameters", "Parameters", [listed(caption, rows, columns, folded=True)])] if rows else []

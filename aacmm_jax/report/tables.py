@@ -10,9 +10,8 @@ from ..data.capture import Capture
 from ..diagnostics.pose_residuals import distances_of
 from ..model.metrics import pose_outliers
 from ..plot.charts import Chart
-from ..plot.residuals import Groups, Marked, arms_chart, distances_in, pose_chart
-from ..summaries.cells import Cell, Table, number, table
-from ..summaries.tables import METRICS, decimals_for
+from ..plot.residuals import Groups, Marked, distances_in, pose_chart
+from ..summaries.tables import METRICS, Cell, Table, by_columns, decimals_for, listed, number, numbers
 
 DRAWN, _LISTED = 1000, 400  # most poses in a chart, and in its table
 
@@ -32,7 +31,7 @@ def metrics_table(
 
     rows = [(key, title) for key, title in METRICS if key in summary[next(iter(stages))]]
     columns = {words: lambda row, stage=stage: value(stage, row[0]) for stage, words in stages.items()}
-    return table(caption, rows, {"": lambda row: row[1]} | columns)
+    return listed(caption, rows, {"": lambda row: row[1]} | columns)
 
 
 def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
@@ -40,18 +39,15 @@ def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
     scatter = evaluation.repeatability
     outliers, _ = pose_outliers(np.asarray(evaluation.distances), capture.sizes)
     far = np.bincount(capture.owner[outliers], minlength=len(capture.names)).tolist()
+    scattered = np.asarray(capture.sizes) > 1
     metrics = {"DE": scatter.socket_de, "Deltam": scatter.socket_deltam, "RMS": scatter.socket_rms}
     columns = {
-        name: lambda i, values=values: float(values[i]) if capture.sizes[i] > 1 else None
-        for name, values in metrics.items()
+        "socket": capture.names,
+        "poses": capture.sizes,
+        **{name: numbers(np.where(scattered, values, np.nan)) for name, values in metrics.items()},
+        "marked poses": [number(count, 0, mark="outlier" if count else "") for count in far],
     }
-    return table(
-        "Repeatability by socket [mm]",
-        range(len(capture.names)),
-        {"socket": lambda i: capture.names[i], "poses": lambda i: capture.sizes[i]}
-        | columns
-        | {"marked poses": lambda i: number(far[i], 0, mark="outlier" if far[i] else "")},
-    )
+    return by_columns("Repeatability by socket [mm]", columns)
 
 
 def residual_chart(capture: Capture, evaluation: Evaluation) -> Chart:
@@ -64,12 +60,6 @@ def residual_chart(capture: Capture, evaluation: Evaluation) -> Chart:
     return chart._replace(table=pose_table(groups, distances, "mm", (says, far)))
 
 
-def stages_chart(capture: Capture, evaluations: Mapping[str, Evaluation]) -> Chart:
-    """Distances of all poses by the nominal and the calibrated arm."""
-    distances = {arm: distances_in(capture, evaluations[arm]) for arm in ("nominal", "calibrated")}
-    return arms_chart(capture, distances, most=DRAWN)
-
-
 def pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked | None = None) -> Table:
     """The residual of every pose, or of those of very many that have the largest; and which are marked, and why."""
     chosen, caption = np.arange(len(residuals)), "Every pose"
@@ -78,7 +68,7 @@ def pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked | N
         caption = f"The {_LISTED} farthest of {len(residuals)} poses"
     owner, numbers = groups.owner, groups.numbers
     says, marked = ("", set()) if far is None else (far[0], set(np.asarray(far[1]).tolist()))
-    return table(
+    return listed(
         caption,
         chosen.tolist(),
         {
@@ -104,7 +94,7 @@ def length_table(
     def error(i: int, value: float) -> Cell:
         return number(value, decimals_for(rows[i]["expanded_mm"]), signed=True)
 
-    return table(
+    return listed(
         caption,
         range(len(rows)),
         {
@@ -145,4 +135,4 @@ def validation_tables(summary: Mapping[str, Any]) -> list[Table]:
         "": lambda row: "disagrees" if row["disagrees"] else "",
     }
     rows = summary.get("left_out")
-    return [table(caption, pooled, columns), *([table("Groups held out [mm]", rows, groups)] if rows else [])]
+    return [listed(caption, pooled, columns), *([listed("Groups held out [mm]", rows, groups)] if rows else [])]

@@ -12,12 +12,15 @@ Example:
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Integral
 from typing import Any, NamedTuple
 
 from ..core.text import pluralise
 
 _MOST_DECIMALS = 6  # of a quantity that was found
 _MOST = 1e9  # from here on decimals mean nothing
+_ZERO = 1e-9  # mm: smaller numbers are rounding errors
+_STYLES = {"good": "green", "unsure": "yellow", "bad": "red", "outlier": "red"}  # of the terminal
 
 # Repeatability and errors of lengths, by their keys in a summary.
 METRICS = (
@@ -37,29 +40,89 @@ class Styled(NamedTuple):
     style: str = "bold"
 
 
+class Cell(NamedTuple):
+    """A number that is shown with decimals of its own, or a text that is marked."""
+
+    text: str
+    value: float | None = None  # what a column is sorted by; None: the text
+    mark: str = ""  # "good", "bad", "unsure", "outlier"
+
+
 Line = str | Styled | Sequence[str | Styled]
 
 
 class Table(NamedTuple):
-    """A table: a cell is a text, a number (of mm, with four decimals), or None for what there is not."""
+    """A table: a cell is a text, a number (of mm, with four decimals), a `Cell`, or None for what there is not."""
 
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[Any]]
     left: Sequence[int] = (0,)  # columns that are set flush left
     keys: int = 1  # columns that are repeated where a table is too wide for its page
+    folded: bool = False  # a page shows it on demand only, and does not print it
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """All cells as a page shows them."""
+        return [[_cell(cell) for cell in row] for row in self.rows]
 
 
 def listed(
-    title: str, rows: Iterable[Any], columns: Mapping[str, str | Callable[[Any], Any]], *, left: Sequence[int] = (0,)
+    title: str,
+    rows: Iterable[Any],
+    columns: Mapping[str, str | Callable[[Any], Any] | None],
+    *,
+    left: Sequence[int] = (0,),
+    folded: bool = False,
 ) -> Table:
-    """A table of rows: each column is a key of the row, or a function of the row."""
-    read = [getter if callable(getter) else lambda row, key=getter: row[key] for getter in columns.values()]
-    return Table(title, list(columns), [[cell(row) for cell in read] for row in rows], left)
+    """A table of rows: each column is a key of the row, or a function of the row; None: there is no such column."""
+    read = {
+        heading: getter if callable(getter) else lambda row, key=getter: row.get(key)
+        for heading, getter in columns.items()
+        if getter is not None
+    }
+    return Table(title, list(read), [[cell(row) for cell in read.values()] for row in rows], left, folded=folded)
+
+
+def by_columns(title: str, columns: Mapping[str, Iterable[Any]]) -> Table:
+    """A table of columns that are known as a whole: heading -> the cells from above."""
+    return Table(title, list(columns), list(zip(*columns.values(), strict=True)))
+
+
+def _cell(cell: Any) -> Cell:
+    if isinstance(cell, Cell):
+        return cell
+    return Cell(cell) if isinstance(cell, str) else number(cell, 0 if isinstance(cell, Integral) else 4)
+
+
+def number(
+    value: float | None, decimals: int = 4, *, signed: bool = False, mark: str = "", rounded: bool = False
+) -> Cell:
+    """A cell with a number; a dash for None and NaN. ``rounded``: to these decimals of its U, even to 0."""
+    if value is None or not math.isfinite(value):
+        return Cell("–" if value is None or math.isnan(value) else "not determined", None, mark)
+    shown = round(value, decimals) if rounded else value
+    return Cell(format_number(shown, decimals, signed=signed), float(value), mark)
+
+
+def numbers(values: Iterable[float], decimals: int = 4) -> list[Cell]:
+    """A cell for each number of an array."""
+    return [number(float(value), decimals) for value in values]
+
+
+def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> str:
+    """A number with a fixed number of decimals, or in powers of ten if these would not show it; with a true minus."""
+    sign = "+" if signed else ""
+    if abs(value) < _ZERO:
+        value = 0.0
+    small = value != 0 and abs(value) < 0.5 * 10**-decimals
+    return (f"{value:{sign}.1e}" if small else f"{value:{sign}.{decimals}f}").replace("-", "−")
 
 
 def shown(cell: Any) -> str | Styled:
     """A cell as it is printed."""
+    if isinstance(cell, Cell):
+        return Styled(cell.text, _STYLES[cell.mark]) if cell.mark else cell.text
     if isinstance(cell, str | Styled):
         return cell
     if isinstance(cell, bool):
@@ -71,7 +134,7 @@ def formatted(value: float | None, decimals: int = 4) -> str:
     """A number of mm with a fixed number of decimals, or in scientific notation if too small or too large for them."""
     if value is None:
         return "-"
-    if abs(value) < 1e-9:  # mm: rounding
+    if abs(value) < _ZERO:
         value = 0.0
     if not abs(value) < _MOST:
         return f"{value:.6g}"
@@ -87,8 +150,7 @@ def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:") -> list[Line
 def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
     """What a result is good for, in one line."""
     verdict = summary.get("verdict")
-    style = {"good": "green", "unsure": "yellow", "bad": "red"}
-    return [Styled(verdict["says"], style.get(verdict["mark"], "bold"))] if verdict else []
+    return [Styled(verdict["says"], _STYLES.get(verdict["mark"], "bold"))] if verdict else []
 
 
 def limits_of(summary: Mapping[str, Any]) -> list[Line]:

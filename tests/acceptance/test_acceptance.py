@@ -247,7 +247,7 @@ def test_limits_that_cannot_be_are_refused(texts, said):
         (lambda: unwrap(checked_limits)({"E_Bi": 0.05}), "opposite directions cannot be recorded"),
         (lambda: run(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
         (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": Limit(1, -1000)}), "K at least"),
-        (lambda: run(Measured({"A": np.eye(3)}), u_test=-1), "standard uncertainty of the test"),
+        (lambda: run(Measured({"A": np.eye(3)}), u_test=-1), "u_test is -1 mm; it must be zero or positive"),
         (
             lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probing", (PLACE + AXES,), math.nan),))),
             "sphere 'S'",

@@ -67,9 +67,12 @@ def test_every_kind_is_here():
 
 @pytest.mark.parametrize("name", ALL)
 def test_shapes_and_derivatives(name):
-    """Analytic derivatives by the tips, their orientation and every unknown agree with central differences."""
     observation = to_numpy(ALL[name])
-    unknowns = unknowns_of(observation)
+    check_derivatives(observation, unknowns_of(observation))
+
+
+def check_derivatives(observation, unknowns):
+    """Analytic derivatives by the tips, their orientation and every unknown agree with central differences."""
     rows = observation.residual(TIPS, unknowns)
     assert rows.values.shape == (observation.rows, POSES)
     assert rows.measured.shape == (POSES, observation.rows, observation.rows)

@@ -264,7 +264,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + LENGTH.replace("200.0", '"long"'), ["'length 1.value' must be a valid number, not 'long'"]),
         (SMALL + LENGTH + "u = -1", ["'length 1.u' must be greater than or equal to 0, not -1"]),
         (SMALL + LENGTH.replace('"b"', '"{x}"'), ["from 'a' to '{x}'", "field that no [[socket]] has"]),
-        (SMALL + LENGTH.replace("200.0", "true"), ["length 1.value: true and false are no numbers"]),
+        (SMALL + LENGTH.replace("200.0", "true"), ["length 1.value: expected a number, but it is true or false"]),
         (SMALL + SOCKET.replace("file", 'name = "b"\nfile') + 2 * LENGTH, ["from 'a' to 'b' of 200 mm is given twice"]),
         (
             HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = ["a.csv", "a.csv"]',
@@ -320,7 +320,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
             SMALL.replace('"rad"', '"rad"\ncolumns = ["1", 2, 3, 4, 5, 6]'),
             ["a.csv has no column '1'; it has no header: give numbers"],
         ),
-        (SMALL.replace('"rad"', '"rad"\noffset = true'), ["angles.offset: true and false are no numbers"]),
+        (SMALL.replace('"rad"', '"rad"\noffset = true'), ["angles.offset: expected a number, but it is true or false"]),
         (SMALL + LENGTH.replace("200.0", "1e300"), ["'length 1.value' is larger than any number that is meant"]),
         (SMALL + LENGTH + "u = inf", ["'length 1.u' must be a finite number"]),
         (SMALL + LENGTH.replace("200.0", "9" * 5001), ["holds a number of thousands of digits"]),

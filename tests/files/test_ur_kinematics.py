@@ -99,11 +99,11 @@ def test_origins_of_a_published_table(tmp_path):
     [
         ("kinematics:\n  shoulder:\n    x: 0\n", ["'kinematics.shoulder.y' is missing"]),
         (PARAMETERS.replace("dh_a:", "dh_b:"), ["'dh_a' is missing"]),
-        (PARAMETERS.replace("439.140974079901", "four"), ["'dh_d' is", "six numbers"]),
-        (PARAMETERS.replace("439.140974079901", ""), ["'dh_d' has 5 entries"]),
+        (PARAMETERS.replace("439.140974079901", "four"), ["'dh_d' is", "six finite numbers"]),
+        (PARAMETERS.replace("439.140974079901", ""), ["'dh_d' is", "give six finite numbers"]),
         (PARAMETERS.replace("439.140974079901", "1e300"), ["'dh_d' is", "below 100000"]),
         (PARAMETERS + PARAMETERS, ["'dh_theta' is there twice"]),
-        ("kinematics: [1, 2\nx y\n", ["line 2 is no 'key: value'"]),
+        ("kinematics: [1, 2\nx y\n", ["line 2 is not of the form 'key: value'"]),
         ("", ["is missing"]),
     ],
 )

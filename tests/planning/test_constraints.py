@@ -10,7 +10,8 @@ import aacmm_jax as aj
 from aacmm_jax.files.plans import kit_csv, plan_csv, plan_manifest
 from aacmm_jax.kinematics import Box, Cell, Cone, HalfSpace, body_along_links
 from aacmm_jax.kinematics.workspace import skeleton
-from aacmm_jax.planning import design, kit_placement, pose_refinement
+from aacmm_jax.planning import kit_placement, pose_refinement
+from aacmm_jax.planning import placement as placements
 from aacmm_jax.summaries.planning import kit_plan_summary, plan_summary
 
 SOCKETS = {"A": (450, 100, 200), "B": (450, -300, 200), "C": (600, 0, 300)}
@@ -134,7 +135,7 @@ def test_files_and_summary(constrained):
 def test_sockets_are_placed_within_their_own_cones(panda, monkeypatch):
     """Through all stages: random placements, their neighbours, chosen and moved poses; the names keep their cones."""
     for name, value in {"_PLACEMENTS": 12, "_NEIGHBOURS": 20, "_DESIGNED": 1, "_STARTS": 200}.items():
-        monkeypatch.setattr(design, name, value)
+        monkeypatch.setattr(placements, name, value)
     monkeypatch.setattr(pose_refinement, "_ITERATIONS", 10)
     normals = {"A": (0.0, 0.0, 1.0), "B": (0.8, 0.0, 0.6)}
     found = aj.planning.plan(

@@ -9,10 +9,9 @@ from aacmm_jax.data import observations as kinds
 from aacmm_jax.files.plans import kit_manifest, save_plan
 from aacmm_jax.kinematics.workspace import search_region
 from aacmm_jax.planning import KitItem, KitPlan, kit_placement, plan_kit
-from aacmm_jax.planning.design import Prediction
 from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, _best, covariance_of, exchange
+from aacmm_jax.planning.information import DesignProblem, Prediction
 from aacmm_jax.planning.kit import candidates_of_kit, least_poses
-from aacmm_jax.planning.placement import DesignProblem
 from aacmm_jax.summaries.planning import kit_plan_summary
 
 from ..calibration.test_observed import BAR, BOX, FRAME, NOISE, SIMULATED

@@ -10,9 +10,11 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.files.plans import plan_csv, plan_manifest, save_plan
 from aacmm_jax.kinematics.workspace import search_region
-from aacmm_jax.planning import design, pose_refinement
+from aacmm_jax.planning import placement as placements
+from aacmm_jax.planning import pose_refinement
 from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, covariance_of, exchange, relaxed_value
-from aacmm_jax.planning.placement import DesignProblem, FixturePlacement, inside, placement_region, pool_at
+from aacmm_jax.planning.information import DesignProblem, pool_at
+from aacmm_jax.planning.options import FixturePlacement, inside, placement_region
 from aacmm_jax.summaries.planning import plan_summary
 
 FUNCTIONS = np.random.default_rng(5).normal(size=(12, 3))
@@ -140,7 +142,7 @@ def test_the_gradient_of_the_refinement_is_exact(paper_arm, kind, model, size):
 def quick(monkeypatch) -> None:
     """Fewer placements, and less refinement."""
     for name, value in {"_PLACEMENTS": 12, "_NEIGHBOURS": 2, "_DESIGNED": 2, "_STARTS": 200}.items():
-        monkeypatch.setattr(design, name, value)
+        monkeypatch.setattr(placements, name, value)
     monkeypatch.setattr(pose_refinement, "_ITERATIONS", 4)
 
 

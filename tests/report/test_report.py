@@ -17,8 +17,7 @@ from aacmm_jax.plot import charts, svg
 from aacmm_jax.plot.uncertainty import tried_shades
 from aacmm_jax.report import elements, write_report
 from aacmm_jax.report.html_page import _origin
-from aacmm_jax.summaries.cells import Table, format_number, number
-from aacmm_jax.summaries.tables import decimals_for
+from aacmm_jax.summaries.tables import Table, decimals_for, format_number, number
 from tests.refusals import assert_refused
 from tests.written_study import write_study
 
@@ -194,7 +193,7 @@ def tables_of(report):
         for block in section.blocks:
             table = block.table if isinstance(block, charts.Chart) else block
             if isinstance(table, Table):
-                found[table.caption] = table
+                found[table.title] = SimpleNamespace(columns=list(table.headings), rows=table.cells)
     return found
 
 
@@ -294,7 +293,7 @@ def test_a_report_says_what_was_left_out(observed_record):
 
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     record = observed_record._replace(removed=(removed,))
-    (row,) = removed_tables(record)[0].rows
+    (row,) = removed_tables(record)[0].cells
     expected = ["T2", "station", "T2/day, T2/night", "45.6", "6 and 60", "< 0.0001", "0.2000", "0.1000"]
     assert [cell.text for cell in row] == [*expected, "theta_3, by 12.0 u"]
     assert removal(record.removed[0]).says.startswith("Left out: station T2")
@@ -369,7 +368,7 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
     assert len(chart.table.rows) == 400
     assert len(chart.plots[0].marks[0].x) <= 1001
     distances = np.asarray(aj.evaluate(arm, capture).distances)
-    assert chart.table.rows[0][2].value == pytest.approx(distances.max())
+    assert chart.table.cells[0][2].value == pytest.approx(distances.max())
 
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
@@ -384,7 +383,7 @@ def test_poses_alone_in_their_socket_show_no_scatter(written):
     distances = [pose["distance"] for pose in view.data["poses"]]
     assert distances[10] is None
     assert None not in distances[:10]
-    assert [cell.text for cell in socket_table(capture, evaluation).rows[1]][2:5] == ["–"] * 3
+    assert [cell.text for cell in socket_table(capture, evaluation).cells[1]][2:5] == ["–"] * 3
     assert len(residual_chart(capture, evaluation).plots[0].marks[0].x) == 10
     single = aj.Capture({"B": q[:1]})
     assert "no scatter" in residual_chart(single, aj.evaluate(arm, single)).description
@@ -443,9 +442,9 @@ def test_observations_of_an_evaluation_stand_beside_their_prediction():
     unseen = row | {"rms_predicted_mm": 0.03, "reduced_chi": 0.67}
     used = {"observations": [row | {"reduced_chi": 0.9}]}
     first, second = observation_tables({"held_out": {"observations": [unseen]}, "identified_from": used})
-    assert "Held-out data" in first.caption
-    assert [cell.text for cell in first.rows[0]] == ["bar", "artefact", "20", "1.2500", "0.0200", "0.0300", "0.67"]
-    assert "used for identification" in second.caption
+    assert "Held-out data" in first.title
+    assert [cell.text for cell in first.cells[0]] == ["bar", "artefact", "20", "1.2500", "0.0200", "0.0300", "0.67"]
+    assert "used for identification" in second.title
     assert observation_tables({"held_out": None, "identified_from": {"observations": []}}) == []
 
 

@@ -62,9 +62,9 @@ def record():
 @pytest.mark.slow
 def test_the_report_shows_functions_and_folds_coefficients(record):
     report, summary = calibration_report(record), calibration_summary(record)
-    blocks = {getattr(block, "caption", getattr(block, "title", block)): block for section in report.sections
+    blocks = {getattr(block, "title", block): block for section in report.sections
               for block in section.blocks}  # fmt: skip
-    names = [row[0].text for row in blocks["Parameters"].rows]
+    names = [row[0].text for row in blocks["Parameters"].cells]
     assert "a_1" in names
     assert not any(name.startswith("cos") for name in names)
     assert blocks["Coefficients of harmonics"].folded

@@ -1,7 +1,7 @@
 """Artefacts of certified points: ball bars, plates of balls or holes, tetrahedra; in each of their placements."""
 
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,11 +10,11 @@ from ...core.arrays import Numbers
 from ...core.errors import InputError, nearest
 from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
-from ...core.rotations import fitted_frame, rotation_matrix, rotation_vector
-from .declared import NAME, checked_readings, count, derived, is_exact, number, points, text
-from .frames import each_pose, moved, no_covariance, placed
-from .observation import FRAME, AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
-from .simulated import AbstractSimulated
+from ...core.rotations import fitted_frame, rotation_matrix
+from .declared import NAME, checked_readings, count, derived, is_exact, number, part, points, text
+from .frames import each_pose, no_covariance, placed
+from .observation import FRAME, POINT, AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
+from .simulated import AbstractSimulated, Readings, Transforms
 
 
 class Artefact(AbstractObservation):
@@ -54,6 +54,10 @@ class Artefact(AbstractObservation):
     placement: str = text("name of its placement", default=NAME, of_session=True)
     index: str | None = text("index of the platform that carries it", default=None, of_session=True)
     free: bool = derived()  # whether the coordinates are unknowns with certified values
+    frame = part("placement {placement}", *FRAME)
+    platform = part("index {index}", *FRAME, when="index")
+    shape = part("coordinates of {artefact}", *POINT, when="free", repeated="coordinates")
+    stacks = False  # it has points of its own
 
     def __init__(self, name: str, points: Mapping[str, Numbers], q: Mapping[str, Numbers], **options: Any):
         where = f"artefact '{name}'"
@@ -82,27 +86,6 @@ class Artefact(AbstractObservation):
         """Index of the point of each pose, ``(m,)``."""
         numbers = {name: i for i, name in enumerate(self.names)}
         return np.array([numbers[point] for point in self.point])
-
-    @property
-    def frame(self) -> str:
-        """Name of the frame of its placement."""
-        return f"placement {self.placement}"
-
-    @property
-    def platform(self) -> str:
-        """Name of the platform's frame at this index."""
-        return f"index {self.index}"
-
-    @property
-    def shape(self) -> str:
-        """Name of the coordinates, where they are unknowns with certified values."""
-        return f"coordinates of {self.artefact}"
-
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        platform = {} if self.index is None else {self.platform: FRAME}
-        shape = {self.shape: ("mm",) * self.coordinates.size} if self.free else {}
-        return {self.frame: FRAME} | platform | shape
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         if part != self.shape:
@@ -184,29 +167,20 @@ class SimulatedArtefact(AbstractSimulated):
     table = "artefact"
     points: dict[str, Float[np.ndarray, "3"]] = points("true coordinates of each point")
     poses: int = count("number of poses")
-    frame: Float[np.ndarray, "6"] = number("frame of the artefact in the base frame", "mm", default=(0.0,) * 6)
+    frame: Float[np.ndarray, "6"] = number(
+        "frame of the artefact in the base frame", "mm", default=(0.0,) * 6, moves="frame"
+    )
     errors: Float[np.ndarray, "c 3"] | None = number("errors of the certified coordinates", "mm", default=None)
     u: float = number("their standard uncertainty", "mm", default=0.0)
-    artefact: str | None = text("name of the artefact", default=None)
+    artefact: str = text("name of the artefact", default=NAME)
     placement: str | None = text("name of the placement", default=None)
     index: str | None = text("name of the index of a platform", default=None)
-
-    @property
-    def orientation(self) -> Float[np.ndarray, "3 3"]:
-        return np.asarray(rotation_matrix(self.frame[:3]))
-
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
-        turned = rotation_matrix(frame[:3]) @ rotation_matrix(self.frame[:3])
-        whole = np.concatenate([rotation_vector(turned), moved(frame, self.frame[3:])])
-        return self.changed(name=name, artefact=self.artefact or self.name, frame=whole)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         coordinates = np.repeat(np.array(list(self.points.values())), self.poses, axis=0)
         return coordinates @ rotation_matrix(self.frame[:3]).T + self.frame[3:]
 
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> Artefact:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Artefact:
         certified = np.array(list(self.points.values())) + (0.0 if self.errors is None else self.errors)
         blocks = q.reshape(len(self.points), self.poses, -1)
         names = dict(artefact=self.artefact, placement=self.placement, index=self.index)

@@ -1,8 +1,8 @@
 """A cylinder: the tip touches it, so it is at one distance from an unknown axis."""
 
 import math
-from collections.abc import Hashable, Mapping
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,13 +11,13 @@ from ...core.arrays import is_concrete
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import rotation_matrix
-from .declared import count, is_exact, number, truth
+from .declared import count, is_exact, number, part, truth
 from .fits import distances_from_axis, fitted_cylinder
-from .frames import moved, variances
+from .frames import variances
 from .observation import Parts, Quantity, Rows, Tips, Unknowns
+from .simulated import Readings, Transforms
 from .sphere import AbstractRound, AbstractSimulatedRound
 
-AXIS = ("rad", "rad", "mm", "mm")
 _SMALLEST_ARC = 30.0  # degrees from its middle: below it, axis and radius can hardly be told apart
 _LEAST_HEIGHT = 0.05  # standard deviation of the heights, in radii, below which the axis can tilt
 _LEAST_SINGULAR = 0.02  # smallest singular value of the touches' directions, of root m
@@ -56,6 +56,10 @@ class Cylinder(AbstractRound):
     )
     inside: bool = truth("whether the ball was inside")
     form: Float[AnyArray, ""] = number("standard deviation of the surface about its cylinder", "mm", default=0.0)
+    # Two components of the rotation vector that turns z to the axis' direction, and where the axis meets the plane
+    # through the origin across it, along the x and y axes that are turned likewise.
+    axis = part("axis of {name}", "rad", "rad", "mm", "mm")
+    size = part("radius of {name}", "mm", when="free")
 
     def completed(self, where: str) -> Mapping[str, Any]:
         radius = self.radius
@@ -64,17 +68,7 @@ class Cylinder(AbstractRound):
                 f"{where} has a stylus of {self.stylus:g} mm inside a diameter of {self.diameter:g} mm; give the "
                 "diameters of the bore and of the ball that fits into it, in mm."
             )
-        return {"free": radius is None or not is_exact(self.u)}
-
-    @property
-    def axis(self) -> str:
-        """Name of the unknown axis: two components of the rotation vector that turns z to its direction, and where it
-        meets the plane through the origin across it, along the x and y axes that are turned likewise."""
-        return f"axis of {self.name}"
-
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.axis: AXIS} | ({self.size: ("mm",)} if self.free else {})
+        return {"free": radius is None or not is_exact(self.u), "fixes_scale": radius is not None}
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         if part != self.axis:
@@ -82,10 +76,6 @@ class Cylinder(AbstractRound):
         turned = np.asarray(rotation_matrix(np.append(values[:2], 0.0)))
         point = turned[:, :2] @ values[2:]
         return (Quantity("direction of the axis", turned[:, 2], "1"), Quantity("point of the axis", point, "mm"))
-
-    @property
-    def alike(self) -> Hashable | None:
-        return self.inside, self.free, self.diameter is None
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         axis, radius = fitted_cylinder(tips.position, self.radius)
@@ -155,13 +145,10 @@ class SimulatedCylinder(AbstractSimulatedRound):
     """
 
     table = "touched_cylinder"
-    ends: Float[np.ndarray, "2 3"] = number("both ends of the axis in the base frame", "mm")
+    ends: Float[np.ndarray, "2 3"] = number("both ends of the axis in the base frame", "mm", moves="point")
     diameter: float = number("true diameter", "mm")
     poses: int = count("number of poses")
     inside: bool = truth("whether the ball is inside")
-
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
-        return self.changed(name=name, ends=np.stack([moved(frame, end) for end in self.ends]))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         along = self.ends[1] - self.ends[0]
@@ -170,8 +157,6 @@ class SimulatedCylinder(AbstractSimulatedRound):
         radius = (self.diameter - self.stylus if self.inside else self.diameter + self.stylus) / 2
         return self.ends[0] + random.uniform(size=(self.poses, 1)) * along + radius * directions
 
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> Cylinder:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Cylinder:
         certificate = self.certificate(random)
         return Cylinder(self.name, q, **certificate, inside=bool(certificate) and self.inside)

@@ -9,7 +9,7 @@ import abc
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import FrozenInstanceError
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,7 @@ class Entry(NamedTuple):
     spread: bool = False  # of an array: one number for all poses is enough
     raw: bool = False  # checked by `completed` of the class
     of_session: bool = False  # a name that means something else in another session
+    moves: Literal["", "point", "vector", "frame"] = ""  # with what is simulated, where that is placed elsewhere
     name: str = ""
     annotation: Any = None
 
@@ -47,6 +48,20 @@ class Entry(NamedTuple):
 
 class Derived(NamedTuple):
     """A field that `completed` makes of the data; it fixes a compiled program."""
+
+
+class Part:
+    """A part of the unknown geometry: its name, made of the fields in braces, is the value of the attribute."""
+
+    def __init__(self, label: str, units: tuple[str, ...], when: str = "", repeated: str = ""):
+        self.label, self.units, self.when, self.repeated = label, units, when, repeated
+
+    def __get__(self, thing: Any, owner: Any = None) -> Any:
+        return self if thing is None else self.label.format_map(vars(thing))
+
+    def units_of(self, thing: Any) -> tuple[str, ...]:
+        """The unit, mm or rad, of each of its numbers."""
+        return self.units * getattr(thing, self.repeated).shape[0] if self.repeated else self.units
 
 
 def number(says: str, unit: str = "", *dimensions: str, **options: Any) -> Any:
@@ -79,6 +94,12 @@ def derived() -> Any:
     return Derived()
 
 
+def part(label: str, *units: str, when: str = "", repeated: str = "") -> Any:
+    """Declares a part of the unknown geometry, of numbers with these units: repeated for each row of one field, and
+    only where another field is true."""
+    return Part(label, units, when, repeated)
+
+
 class Declared(abc.ABC):
     """A frozen object with a name and with what its class declares.
 
@@ -89,6 +110,7 @@ class Declared(abc.ABC):
 
     entries: ClassVar[tuple[Entry, ...]] = ()
     derived_fields: ClassVar[tuple[str, ...]] = ()
+    parts: ClassVar[dict[str, Part]] = {}
     noun: ClassVar[str] = "observation"  # in messages
     keyword_only: ClassVar[bool] = True  # what has a default
     name: str
@@ -110,6 +132,7 @@ class Declared(abc.ABC):
         inherited = {entry.name: entry for base in reversed(cls.__mro__[1:]) for entry in getattr(base, "entries", ())}
         # What all kinds may have comes last.
         cls.entries = tuple(sorted((inherited | entries).values(), key=lambda e: e.name in ("target", "place")))
+        cls.parts = cls.parts | {name: value for name, value in vars(cls).items() if isinstance(value, Part)}
         cls.derived_fields = (*cls.derived_fields, *(declared.keys() - entries.keys()))
         cls._parameters = _signature(cls.entries, cls.keyword_only)
         parameters = list(cls._parameters.parameters.values())
@@ -138,7 +161,7 @@ class Declared(abc.ABC):
     def __setattr__(self, name: str, value: Any) -> None:
         raise FrozenInstanceError(f"cannot assign to field '{name}'")
 
-    def changed(self, **fields: Any) -> Self:
+    def changed(self, **fields: Any) -> Any:
         """The same object with other values of some fields, which are not checked."""
         other = object.__new__(type(self))
         vars(other).update(vars(self) | fields)
@@ -180,6 +203,8 @@ def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
     value = checked(value, entry.annotation, what, sizes)
     if entry.dimensions[:1] == ("pose",) and len(value) != sizes["m"]:
         raise InputError(f"{what} has {len(value)} values; give one for each of the {sizes['m']} poses.")
+    if entry.content == "points":
+        return {name: tuple(map(float, point)) for name, point in value.items()}
     if entry.content == "count":
         Range(least=1, most=MOST_POSES)(value, what, sizes)
     elif entry.content == "number" and value is not None and not np.ndim(value) and not entry.dimensions:

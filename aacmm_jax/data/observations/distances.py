@@ -1,7 +1,7 @@
 """Distances of the tip from an unknown pivot: a telescoping ball bar, a draw wire."""
 
-from collections.abc import Hashable, Mapping
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,10 +10,10 @@ from ...core.arrays import is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import length_and_direction, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace
-from .declared import number, truth
-from .frames import moved, variances
+from .declared import number, part, truth
+from .frames import variances
 from .observation import POINT, AbstractObservation, Parts, Rows, Tips, Unknowns
-from .simulated import AbstractInBox
+from .simulated import AbstractInBox, Readings, Transforms
 
 
 class Distances(AbstractObservation):
@@ -40,33 +40,14 @@ class Distances(AbstractObservation):
     values: Float[AnyArray, " m"] = number("measured distance from the pivot", "mm", "pose")
     u: Float[AnyArray, " m"] = number("standard uncertainty of a distance", "mm", "pose", default=0.0, spread=True)
     constant: bool = truth("whether an unknown constant is added to all distances")
+    pivot = part("pivot of {name}", *POINT)
+    zero = part("constant of {name}", "mm", when="constant")
+    fixes_scale = True
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if not self.constant and is_concrete(self.values) and np.any(np.asarray(self.values) <= 0):
             raise InputError(f"{where} has a distance that is not positive; give distances in mm, or constant=True.")
         return {}
-
-    @property
-    def pivot(self) -> str:
-        """Name of the unknown pivot."""
-        return f"pivot of {self.name}"
-
-    @property
-    def zero(self) -> str:
-        """Name of the unknown constant."""
-        return f"constant of {self.name}"
-
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.pivot: POINT} | ({self.zero: ("mm",)} if self.constant else {})
-
-    @property
-    def fixes_scale(self) -> bool:
-        return True
-
-    @property
-    def alike(self) -> Hashable | None:
-        return ()
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         xp = namespace(tips, self.values)
@@ -116,14 +97,9 @@ class SimulatedDistances(AbstractInBox):
     """
 
     table = "distances"
-    pivot: Float[np.ndarray, "3"] = number("pivot in the base frame", "mm")
+    pivot: Float[np.ndarray, "3"] = number("pivot in the base frame", "mm", moves="point")
     u: float = number("standard uncertainty of each distance", "mm", default=0.0)
 
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
-        return self.changed(name=name, pivot=moved(frame, self.pivot))
-
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> Distances:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Distances:
         true = np.linalg.norm(transforms[:, :3, 3] - self.pivot, axis=1)
         return Distances(self.name, q, true + self.u * random.normal(size=len(q)), u=self.u)

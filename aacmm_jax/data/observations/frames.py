@@ -66,11 +66,6 @@ def seen_from(frame: Float[AnyArray, " 6"], points: Float[AnyArray, "m 3"]) -> F
     return (points - frame[3:]) @ rotation_matrix(frame[:3])
 
 
-def moved(frame: Float[np.ndarray, " 6"], point: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
-    """A point turned by a frame's rotation and moved by its origin, mm."""
-    return np.asarray(rotation_matrix(frame[:3])) @ point + frame[3:]
-
-
 def rotation_logarithm(
     matrix: Float[AnyArray, "3 3 m"],
 ) -> tuple[Float[AnyArray, "3 m"], Float[AnyArray, "3 3 m"], Float[AnyArray, "3 3 m"]]:

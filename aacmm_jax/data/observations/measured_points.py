@@ -1,8 +1,8 @@
 """Points of the tip as an instrument saw them: a laser tracker, a coordinate measuring machine, a camera."""
 
 import abc
-from collections.abc import Hashable, Mapping
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +11,11 @@ from ...core.arrays import Numbers, as_floats, is_concrete
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.rotations import fitted_frame
-from .declared import NAME, number, text
+from .declared import NAME, number, part, text
 from .fits import frame_and_offset
 from .frames import each_pose, placed, seen_from, turned_covariances
 from .observation import FRAME, AbstractObservation, Parts, Rows, Tips, Unknowns, offset_of
-from .simulated import AbstractInBox, AbstractOfTarget
+from .simulated import AbstractInBox, AbstractOfTarget, Readings, Transforms
 
 _FLAT = 1e-6  # second singular value of points on a line, of the first
 _SAME = 1e-9  # mm
@@ -30,6 +30,8 @@ class AbstractMeasured(AbstractObservation):
         "covariance of a point", "mm^2", "pose", "axis", "axis_2", default=None, raw=True
     )
     station: str = text("station of the instrument", default=NAME, of_session=True)
+    frame = part("frame of {station}", *FRAME)
+    fixes_scale = True
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if self.u is not None and self.covariance is not None:
@@ -40,21 +42,8 @@ class AbstractMeasured(AbstractObservation):
         # Residuals are weighted by covariances, so these are kept in place of u.
         return {"covariance": _on_diagonals(np.zeros((poses, 3)) if self.u is None else self.u), "u": None}
 
-    @property
-    def frame(self) -> str:
-        """Name of the unknown frame of the station."""
-        return f"frame of {self.station}"
-
-    @property
-    def fixes_scale(self) -> bool:
-        return True
-
-    @property
-    def alike(self) -> Hashable | None:
-        return ()
-
     @abc.abstractmethod
-    def without_errors(self, tips: Tips, unknowns: Parts) -> Self:
+    def without_errors(self, tips: Tips, unknowns: Parts) -> "AbstractMeasured":
         """The same observation, had the instrument measured exactly these tips."""
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -86,10 +75,6 @@ class MeasuredPoints(AbstractMeasured):
 
     kind, table, rows = "points", "points", 3
 
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.frame: FRAME}
-
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         if not self.target:
             return {self.frame: fitted_frame(self.points.T, tips.position)}
@@ -106,7 +91,7 @@ class MeasuredPoints(AbstractMeasured):
             measured=turned_covariances(seen.rotation, self.covariance),
         )
 
-    def without_errors(self, tips: Tips, unknowns: Parts) -> Self:
+    def without_errors(self, tips: Tips, unknowns: Parts) -> "MeasuredPoints":
         return self.changed(points=seen_from(unknowns[self.frame], tips.position.T))
 
 
@@ -167,8 +152,6 @@ class SimulatedPoints(AbstractInBox, AbstractOfTarget):
     frame: Float[np.ndarray, "6"] = number("frame of the instrument in the base frame", "mm", default=(0.0,) * 6)
     u: float = number("standard uncertainty of each coordinate", "mm", default=0.0)
 
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> MeasuredPoints:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> MeasuredPoints:
         points = seen_from(self.frame, transforms[:, :3, 3]) + self.u * random.normal(size=(len(q), 3))
         return MeasuredPoints(self.name, q, points, u=self.u, target=self.target)

@@ -1,7 +1,7 @@
 """Transforms of a target on the last frame, positions and orientations, as an instrument saw them."""
 
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,12 +11,12 @@ from ...core.errors import InputError
 from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import rotation_and_derivative, rotation_derivative, rotation_matrix, rotation_vector
-from .declared import NAME, number, text
+from .declared import NAME, number, part, text
 from .fits import frame_and_offset
 from .frames import each_pose, placed, rotation_logarithm, seen_from, turned_covariances, variances
 from .measured_points import AbstractMeasured
 from .observation import FRAME, Parts, Rows, Tips, Unknowns, offset_of
-from .simulated import AbstractInBox
+from .simulated import AbstractInBox, Readings, Transforms
 
 
 class MeasuredTransforms(AbstractMeasured):
@@ -55,6 +55,7 @@ class MeasuredTransforms(AbstractMeasured):
         "standard uncertainty of an orientation about each axis", "rad", positive=True
     )
     target: str = text("target that was seen", default=NAME)
+    orientation = part("orientation of {target}", *FRAME[:3])  # of the target in the last frame
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if is_concrete(self.rotations):
@@ -63,15 +64,6 @@ class MeasuredTransforms(AbstractMeasured):
             if not orthogonal or np.any(np.linalg.det(matrices) < 0):
                 raise InputError(f"{where} has a matrix that is no rotation; give right-handed unit axes as columns.")
         return super().completed(where)
-
-    @property
-    def orientation(self) -> str:
-        """Name of the rotation of the target in the last frame."""
-        return f"orientation of {self.target}"
-
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.frame: FRAME, self.orientation: ("rad",) * 3}
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         xp = namespace(tips, self.points)
@@ -111,7 +103,7 @@ class MeasuredTransforms(AbstractMeasured):
             by_rotation=xp.concatenate([none, left]),
         )
 
-    def without_errors(self, tips: Tips, unknowns: Parts) -> Self:
+    def without_errors(self, tips: Tips, unknowns: Parts) -> "MeasuredTransforms":
         xp, frame = namespace(tips, unknowns), unknowns[self.frame]
         station, target = rotation_matrix(frame[:3]), rotation_matrix(unknowns[self.orientation])
         axes = xp.moveaxis(xp.stack(tips.axes, axis=1), -1, 0)  # (m, 3, 3)
@@ -149,9 +141,7 @@ class SimulatedTransforms(AbstractInBox):
     def offset(self) -> Float[np.ndarray, " 3"] | None:
         return self.offset_and_orientation[:3]
 
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> MeasuredTransforms:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> MeasuredTransforms:
         station, target = rotation_matrix(self.frame[:3]), rotation_matrix(self.offset_and_orientation[3:])
         points = seen_from(self.frame, transforms[:, :3, 3]) + self.u * random.normal(size=(len(q), 3))
         errors = self.u_angle * random.normal(size=(len(q), 3))

@@ -13,7 +13,7 @@ import itertools
 import pkgutil
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -69,7 +69,11 @@ class AbstractObservation(Declared):
     kind: ClassVar[str]
     table: ClassVar[str]  # name of its tables in a manifest
     rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
+    stacks: ClassVar[bool] = True  # whether it can be evaluated together with others of the kind: see `alike`
     rows: int  # residuals of a pose
+    # Whether the residual is linear in all unknowns, with derivatives that do not depend on tips and unknowns.
+    linear: bool = False
+    fixes_scale: bool = False  # whether it determines the scale of the arm
     q: Float[AnyArray, "m n"] = number("joint reading", "rad", "pose", "joint")
     target: str = text("tip that was held or seen; empty: the arm's own probe", default="")
 
@@ -89,12 +93,6 @@ class AbstractObservation(Declared):
 
     # What a kind says.
 
-    @property
-    @abc.abstractmethod
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        """Names of the parts of the unknown geometry, and the unit, mm or rad, of each of its numbers. A name that
-        several observations use is one geometry."""
-
     @abc.abstractmethod
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         """The unknowns from nearly right tips; ``offset`` is the arm's own probe in the last frame, mm."""
@@ -107,25 +105,9 @@ class AbstractObservation(Declared):
         its `stated` numbers, too, as one for all poses or one each."""
 
     @property
-    def fixes_scale(self) -> bool:
-        """Whether the observation determines the scale of the arm."""
-        return False
-
-    @property
     def certified(self) -> Certified:
         """Unknowns that have a certified value: the values, and their standard uncertainties."""
         return {}
-
-    @property
-    def linear(self) -> bool:
-        """Whether the residual is linear in all unknowns, with derivatives that do not depend on tips and unknowns."""
-        return False
-
-    @property
-    def alike(self) -> Hashable | None:
-        """What observations of this class, with as many unknowns of the same units, must have in common to be `stacked`
-        and evaluated together; None for one that is evaluated alone."""
-        return None
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         """A part of the unknown geometry as a person reads it; a kind whose numbers need another form says so itself,
@@ -136,6 +118,23 @@ class AbstractObservation(Declared):
         """Raise `InputError` where nearly right tips (mm) cannot determine the unknown geometry."""
 
     # What follows from it.
+
+    @property
+    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
+        """Names of the parts of the unknown geometry, and the unit, mm or rad, of each of its numbers. A name that
+        several observations use is one geometry."""
+        present = {name: one for name, one in self.parts.items() if not one.when or getattr(self, one.when)}
+        return {getattr(self, name): one.units_of(self) for name, one in present.items()}
+
+    @property
+    def alike(self) -> Hashable | None:
+        """What observations of this class, with as many unknowns of the same units, must have in common to be `stacked`
+        and evaluated together; None for one that is evaluated alone."""
+        if not self.stacks:
+            return None
+        choices = [*self.derived_fields, *(entry.name for entry in self.entries if entry.content == "truth")]
+        absent = tuple(name for name in self.stated if getattr(self, name) is None)
+        return (*(getattr(self, name) for name in choices), absent)
 
     @property
     def by_pose(self) -> tuple[str, ...]:
@@ -149,7 +148,7 @@ class AbstractObservation(Declared):
         return tuple(entry.name for entry in self.entries if entry.content == "number" and not entry.dimensions)
 
     @classmethod
-    def stacked(cls, observations: Sequence[Self]) -> Self:
+    def stacked(cls, observations: Sequence["AbstractObservation"]) -> "AbstractObservation":
         """The poses of observations that are `alike` as those of one, whose residual takes a column of unknowns for
         each pose, by the names of the first observation: the unknowns of all have one order.
 
@@ -168,7 +167,7 @@ class AbstractObservation(Declared):
         return first.changed(**fields)
 
     @classmethod
-    def rebuilt(cls, name: str, stored: Mapping[str, Any]) -> Self:
+    def rebuilt(cls, name: str, stored: Mapping[str, Any]) -> "AbstractObservation":
         """An observation of this kind from the values of its entries, which are checked; place after place, where its
         poses belong to several."""
         made, stored = object.__new__(cls), dict(stored)
@@ -192,7 +191,7 @@ class AbstractObservation(Declared):
 
     def with_errors(
         self, q: Float[AnyArray, "*batch m n"], shift: Float[AnyArray, "*batch r m"], values: Mapping[str, AnyArray]
-    ) -> Self:
+    ) -> "AbstractObservation":
         """The same observation with other errors than it was recorded with: other readings, rad, a constant added to
         each residual, mm and rad, and other certified values, by the names of the certified parts."""
         return self.changed(q=q, shift=shift, drawn=dict(values))
@@ -203,14 +202,14 @@ class AbstractObservation(Declared):
             return self.certified
         return {name: (self.drawn[name], u) for name, (_, u) in self.certified.items()}
 
-    def in_session(self, session: str, probe: str) -> Self:
+    def in_session(self, session: str, probe: str) -> "AbstractObservation":
         """The same observation in a session of several: with its name, and its own probe where there is one."""
         names = {label: getattr(self, label) for label in ("name", *(e.name for e in self.entries if e.of_session))}
         target = f"{session}/{self.target}" if self.target else probe
         here = {label: f"{session}/{name}" for label, name in names.items() if name is not None}
         return self.changed(**here, target=target)
 
-    def select(self, poses: Sequence[int] | np.ndarray) -> Self:
+    def select(self, poses: Sequence[int] | np.ndarray) -> "AbstractObservation":
         """The same observation with some of its poses, in their order."""
         fields = {field: getattr(self, field) for field in self.by_pose}
         rows = np.asarray(poses)
@@ -289,15 +288,22 @@ def offset_of(target: str) -> str:
     return f"offset of {target}"
 
 
+OTHER_KINDS: list[type[Declared]] = []  # observations and what simulates them, from elsewhere than this folder
+
+
 def kinds() -> dict[str, type[AbstractObservation]]:
-    """Every kind of observations by its name: those of the files of this folder."""
+    """Every kind of observations by its name: those of the files of this folder, and others."""
     found = {one.__name__: one for one in classes() if issubclass(one, AbstractObservation)}
     return {found[name].kind: found[name] for name in sorted(found)}
 
 
-@functools.cache
 def classes() -> list[type[Declared]]:
-    """The classes of the files of this folder that are not abstract, observations and what simulates them."""
+    """The classes of observations, and of what simulates them, that are not abstract."""
+    return [*_classes_of_files(), *OTHER_KINDS]
+
+
+@functools.cache
+def _classes_of_files() -> list[type[Declared]]:
     names = [f"{__package__}.{module.name}" for module in pkgutil.iter_modules([str(Path(__file__).parent)])]
     members = [one for name in names for one in vars(importlib.import_module(name)).values() if isinstance(one, type)]
     return [one for one in dict.fromkeys(members) if issubclass(one, Declared) and not inspect.isabstract(one)]

@@ -1,7 +1,7 @@
 """Planes: the tip touches one, or two parallel ones at a certified distance."""
 
-from collections.abc import Hashable, Mapping
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,12 +11,13 @@ from ...core.errors import InputError
 from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross, rotation_and_derivative, rotation_matrix
-from .declared import checked_readings, count, derived, is_exact, number, text, truth
+from .declared import checked_readings, count, derived, is_exact, number, part, text, truth
 from .fits import fitted_plane
-from .frames import moved, variances
+from .frames import variances
 from .observation import AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
-from .simulated import AbstractSimulated
+from .simulated import AbstractSimulated, Readings, Transforms
 
+# Two components of the rotation vector that turns z to the normal, and the distance from the origin.
 PLANE = ("rad", "rad", "mm")
 SIDES = ("one", "other")
 
@@ -41,20 +42,7 @@ class Plane(AbstractObservation):
 
     kind, table, noun, rows = "plane", "plane", "plane", 1
     form: Float[AnyArray, ""] = number("standard deviation of the surface about its plane", "mm", default=0.0)
-
-    @property
-    def place(self) -> str:
-        """Name of the unknown plane: two components of the rotation vector that turns z to its normal, and its distance
-        from the origin."""
-        return f"plane {self.name}"
-
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.place: PLANE}
-
-    @property
-    def alike(self) -> Hashable | None:
-        return ()
+    place = part("plane {name}", *PLANE)
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         return _normal_and_distance(values)
@@ -103,6 +91,9 @@ class ParallelPlanes(AbstractObservation):
     inside: bool = truth("whether the ball was between the planes")
     form: Float[AnyArray, ""] = number("standard deviation of the surface about its plane", "mm", default=0.0)
     free: bool = derived()  # whether the distance is an unknown with a certified value
+    place = part("plane {name}", *PLANE)  # of the first side
+    separation = part("distance of {name}", "mm", when="free")
+    fixes_scale, stacks = True, False  # which way the other plane is follows from all of its poses
 
     def __init__(self, name: str, one: Numbers, other: Numbers, distance: Numbers, **options: Any):
         readings = [
@@ -127,16 +118,6 @@ class ParallelPlanes(AbstractObservation):
         return {"free": not is_exact(self.u)}
 
     @property
-    def place(self) -> str:
-        """Name of the first of the unknown planes."""
-        return f"plane {self.name}"
-
-    @property
-    def separation(self) -> str:
-        """Name of the distance."""
-        return f"distance of {self.name}"
-
-    @property
     def between(self) -> Float[AnyArray, "*batch"]:
         """Certified distance of the tip's centres on both planes, mm."""
         return self.distance - self.stylus if self.inside else self.distance + self.stylus
@@ -146,19 +127,11 @@ class ParallelPlanes(AbstractObservation):
         """Whether each pose is on the other plane, ``(m,)``."""
         return np.array(self.side) == SIDES[1]
 
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.place: PLANE} | ({self.separation: ("mm",)} if self.free else {})
-
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         if part == self.separation and float(self.stylus):
             ball = float(self.stylus)
             return (Quantity("without the tip's ball", values + ball if self.inside else values - ball, "mm"),)
         return _normal_and_distance(values) if part == self.place else super().quantities(part, values)
-
-    @property
-    def fixes_scale(self) -> bool:
-        return True
 
     @property
     def certified(self) -> Certified:
@@ -240,15 +213,11 @@ class SimulatedPlanes(AbstractSimulated):
     """
 
     table = "planes"
-    corner: Float[np.ndarray, "3"] = number("corner of the (first) rectangle in the base frame", "mm")
-    sides: Float[np.ndarray, "2 3"] = number("its two sides as vectors", "mm")
+    corner: Float[np.ndarray, "3"] = number("corner of the (first) rectangle in the base frame", "mm", moves="point")
+    sides: Float[np.ndarray, "2 3"] = number("its two sides as vectors", "mm", moves="vector")
     poses: int = count("number of poses")
     distance: float | None = number("true distance to the second plane", "mm", default=None)
     u: float = number("standard uncertainty of the certified distance", "mm", default=0.0)
-
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
-        turned = self.sides @ rotation_matrix(frame[:3]).T
-        return self.changed(name=name, corner=moved(frame, self.corner), sides=turned)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         planes = 1 if self.distance is None else 2
@@ -258,9 +227,7 @@ class SimulatedPlanes(AbstractSimulated):
             places[self.poses :] += self.distance * normal / np.linalg.norm(normal)
         return places
 
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> Plane | ParallelPlanes:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Plane | ParallelPlanes:
         if self.distance is None:
             return Plane(self.name, q)
         distance = self.distance + self.u * random.normal()

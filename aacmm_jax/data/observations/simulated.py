@@ -2,14 +2,18 @@
 
 import abc
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from ...core.errors import InputError
+from ...core.rotations import rotation_matrix, rotation_vector
 from .declared import Declared, count, number, text
 from .observation import AbstractObservation, classes
+
+Readings = Float[np.ndarray, "m n"]
+Transforms = Float[np.ndarray, "m 4 4"]
 
 
 class AbstractSimulated(Declared):
@@ -28,24 +32,32 @@ class AbstractSimulated(Declared):
         """The true place of the target in the last frame, mm; None for the arm's own probe."""
         return None
 
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self | None:
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "AbstractSimulated | None":
         """The same thing under another name and moved rigidly: by a rotation vector (rad) about the base's origin, and
         then by a translation (mm). None where there is nothing to place, such as for an instrument that sees all."""
-        return None
+        turn, moving = np.asarray(rotation_matrix(frame[:3])), [entry for entry in self.entries if entry.moves]
+        moved = {}
+        for entry in moving:
+            value = getattr(self, entry.name)
+            if entry.moves == "frame":
+                whole = turn @ np.asarray(rotation_matrix(value[:3]))
+                moved[entry.name] = np.concatenate([rotation_vector(whole), turn @ value[3:] + frame[3:]])
+            else:
+                moved[entry.name] = value @ turn.T + (frame[3:] if entry.moves == "point" else 0.0)
+        return self.changed(name=name, **moved) if moving else None
 
     @property
     def orientation(self) -> Float[np.ndarray, "3 3"]:
         """Rotation of its own frame in the base frame; the identity where it has none."""
-        return np.eye(3)
+        frames = [getattr(self, entry.name) for entry in self.entries if entry.moves == "frame"]
+        return np.asarray(rotation_matrix(frames[0][:3])) if frames else np.eye(3)
 
     @abc.abstractmethod
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         """Where the tip is, mm, without the noise of the seat."""
 
     @abc.abstractmethod
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> AbstractObservation:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> AbstractObservation:
         """The observation from the readings, and from the true transforms of the tip."""
 
 

@@ -1,16 +1,15 @@
 """A socket: the tip is at one point, whose position is unknown."""
 
-from collections.abc import Hashable, Mapping
-from typing import Self
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
 
 from ...core.numpy_or_jax import AnyArray, namespace
-from .declared import count, number
-from .frames import each_pose, moved, no_covariance
+from .declared import count, number, part
+from .frames import each_pose, no_covariance
 from .observation import POINT, AbstractObservation, Parts, Rows, Tips, Unknowns
-from .simulated import AbstractOfTarget
+from .simulated import AbstractOfTarget, Readings, Transforms
 
 
 class Socket(AbstractObservation):
@@ -30,24 +29,8 @@ class Socket(AbstractObservation):
         (40, 6) ['position of hole']
     """
 
-    kind, table, noun, rows = "socket", "socket", "socket", 3
-
-    @property
-    def position(self) -> str:
-        """Name of the unknown position."""
-        return position_of(self.name)
-
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.position: POINT}
-
-    @property
-    def linear(self) -> bool:
-        return True
-
-    @property
-    def alike(self) -> Hashable | None:
-        return ()
+    kind, table, noun, rows, linear = "socket", "socket", "socket", 3, True
+    position = part("position of {name}", *POINT)
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         return {self.position: namespace(tips).mean(tips.position, axis=1)}
@@ -89,16 +72,11 @@ class SimulatedSocket(AbstractOfTarget):
     """
 
     table = "socket"
-    point: Float[np.ndarray, "3"] = number("position in the base frame", "mm")
+    point: Float[np.ndarray, "3"] = number("position in the base frame", "mm", moves="point")
     poses: int = count("number of poses")
-
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
-        return self.changed(name=name, point=moved(frame, self.point))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         return np.tile(self.point, (self.poses, 1))
 
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> Socket:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Socket:
         return Socket(self.name, q, target=self.target)

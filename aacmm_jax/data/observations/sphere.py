@@ -1,7 +1,7 @@
 """A sphere: the tip touches it, so it is at one distance from an unknown centre."""
 
-from collections.abc import Hashable, Mapping
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,11 +10,11 @@ from ...core.arrays import is_concrete
 from ...core.errors import InputError
 from ...core.linear_algebra import length_and_direction
 from ...core.numpy_or_jax import AnyArray, namespace
-from .declared import count, derived, is_exact, number, truth
+from .declared import count, derived, is_exact, number, part, truth
 from .fits import fitted_sphere
-from .frames import each_pose, moved, no_covariance
+from .frames import each_pose, no_covariance
 from .observation import POINT, AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
-from .simulated import AbstractSimulated
+from .simulated import AbstractSimulated, Readings, Transforms
 
 _SMALLEST_CAP = 20.0  # degrees from its middle: below it, centre and radius can hardly be told apart
 
@@ -27,6 +27,8 @@ class AbstractRound(AbstractObservation):
     u: Float[AnyArray, ""] = number("standard uncertainty of the diameter", "mm", default=0.0)
     stylus: Float[AnyArray, ""] = number("diameter of the tip's ball", "mm", default=0.0)
     free: bool = derived()  # whether the radius is an unknown
+    fixes_scale: bool = derived()
+    size: str
     inside = False
 
     @property
@@ -36,18 +38,9 @@ class AbstractRound(AbstractObservation):
             return None
         return (self.diameter - self.stylus if self.inside else self.diameter + self.stylus) / 2
 
-    @property
-    def size(self) -> str:
-        """Name of the unknown radius."""
-        return f"radius of {self.name}"
-
     def radius_at(self, unknowns: Unknowns) -> Any:
         """The radius in a residual."""
         return unknowns[self.size][0] if self.free else self.radius
-
-    @property
-    def fixes_scale(self) -> bool:
-        return self.radius is not None
 
     @property
     def certified(self) -> Certified:
@@ -82,41 +75,24 @@ class Sphere(AbstractRound):
     """
 
     kind, table, noun = "sphere", "touched_sphere", "sphere"
-    rows: int = derived()  # of a sphere of radius 0 all three coordinates, else the distance
+    # A sphere whose radius is exactly 0 is a point, as a socket is: its rows are the three coordinates, not a distance.
+    rows: int = derived()
+    linear: bool = derived()
+    centre = part("centre of {name}", *POINT)
+    size = part("radius of {name}", "mm", when="free")
 
     def completed(self, where: str) -> Mapping[str, Any]:
         exact, radius = is_exact(self.u), self.radius
         point = radius is not None and is_concrete(radius) and exact and float(radius) == 0
-        return {"free": radius is None or not exact, "rows": 3 if point else 1}
-
-    @property
-    def is_point(self) -> bool:
-        """Whether its radius is exactly 0, as that of a socket."""
-        return self.rows == 3
-
-    @property
-    def centre(self) -> str:
-        """Name of the unknown centre."""
-        return f"centre of {self.name}"
-
-    @property
-    def unknowns(self) -> Mapping[str, tuple[str, ...]]:
-        return {self.centre: POINT} | ({self.size: ("mm",)} if self.free else {})
-
-    @property
-    def fixes_scale(self) -> bool:
-        return super().fixes_scale and not self.is_point
-
-    @property
-    def linear(self) -> bool:
-        return self.is_point
-
-    @property
-    def alike(self) -> Hashable | None:
-        return self.is_point, self.free, self.diameter is None
+        return {
+            "free": radius is None or not exact,
+            "fixes_scale": radius is not None and not point,
+            "rows": 3 if point else 1,
+            "linear": point,
+        }
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
-        if self.is_point:
+        if self.linear:
             return {self.centre: namespace(tips).mean(tips.position, axis=1)}
         centre, radius = fitted_sphere(tips.position)
         size = radius if self.radius is None else self.radius
@@ -125,7 +101,7 @@ class Sphere(AbstractRound):
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.u), self.q.shape[0]
         between = tips.position - unknowns[self.centre]
-        if self.is_point:
+        if self.linear:
             identity = each_pose(xp.asarray(np.eye(3)), m)
             return Rows(between, identity, {self.centre: -identity}, no_covariance(3, m))
         distance, towards = length_and_direction(between)
@@ -136,7 +112,7 @@ class Sphere(AbstractRound):
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         where = f"sphere '{self.name}'"
-        if self.is_point:
+        if self.linear:
             return
         needed = 4 if self.radius is None else 3
         if tips.shape[1] < needed:
@@ -189,19 +165,14 @@ class SimulatedSphere(AbstractSimulatedRound):
     """
 
     table = "touched_sphere"
-    centre: Float[np.ndarray, "3"] = number("centre in the base frame", "mm")
+    centre: Float[np.ndarray, "3"] = number("centre in the base frame", "mm", moves="point")
     diameter: float = number("true diameter", "mm")
     poses: int = count("number of poses")
-
-    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> Self:
-        return self.changed(name=name, centre=moved(frame, self.centre))
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         directions = random.normal(size=(self.poses, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         return self.centre + (self.diameter + self.stylus) / 2 * directions
 
-    def recorded(
-        self, q: Float[np.ndarray, "m n"], transforms: Float[np.ndarray, "m 4 4"], random: np.random.Generator
-    ) -> Sphere:
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Sphere:
         return Sphere(self.name, q, **self.certificate(random))
