@@ -30,12 +30,12 @@ def parameters(node: ast.AST) -> int:
     assert isinstance(node, FUNCTIONS)
     arguments = node.args
     every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
-    return len([one for one in every if one.arg not in ("self", "cls")])
+    return len([argument for argument in every if argument.arg not in ("self", "cls")])
 
 
 def imports(path: Path) -> set[Path]:
     """Modules of the package that a module imports."""
-    found = set()
+    imported = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if not isinstance(node, ast.ImportFrom) or not node.level:
             continue
@@ -44,9 +44,9 @@ def imports(path: Path) -> set[Path]:
         for alias in node.names:
             for target in (base / alias.name, base):
                 if target.with_suffix(".py").is_file():
-                    found.add(target.with_suffix(".py"))
+                    imported.add(target.with_suffix(".py"))
                     break
-    return found
+    return imported
 
 
 def comments(path: Path) -> tuple[int, int]:
@@ -69,7 +69,12 @@ def main() -> None:
         lines[parts[0] if len(parts) > 1 else "."] += len(path.read_text().splitlines())
     for folder, count in sorted(lines.items()):
         print(f"{count:7,} {folder}")
+    texts = [path.read_text() for path in MODULES]
+    written = [line for text in texts for line in text.splitlines()]
+    statements = sum(isinstance(node, ast.stmt) for text in texts for node in ast.walk(ast.parse(text)))
     print(f"{sum(lines.values()):7,} lines in {len(MODULES)} modules")
+    characters = sum(map(len, written)) / len(written)
+    print(f"{statements / len(written):7.3f} statements and {characters:.1f} characters a line")
     users = defaultdict(set)
     for path in MODULES:
         for target in imports(path):
@@ -93,7 +98,7 @@ def main() -> None:
         if path.is_relative_to(chosen):
             print(f"      {path.relative_to(PACKAGE)} by {next(iter(users[path])).relative_to(PACKAGE)}")
     both = [comments(path) for path in MODULES if path.relative_to(PACKAGE).parts[0] in COMMENTED]
-    commented, code = (sum(each) for each in zip(*both, strict=True))
+    commented, code = (sum(counts) for counts in zip(*both, strict=True))
     print(f"\n{100 * commented / code:.1f} lines with a comment per 100 lines of code in {', '.join(COMMENTED)}")
 
 

@@ -236,3 +236,15 @@ def test_every_import_of_another_package_is_declared():
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 imported.add(node.module.split(".")[0])
     assert imported - set(sys.stdlib_module_names) - needed == set()
+
+
+def test_the_reading_path_exists_and_is_short():
+    """Every file that the page names is there, and the modules of its numbered list are read in an afternoon."""
+    page = (ROOT / "docs" / "explanation" / "reading_the_code.md").read_text()
+    steps = re.findall(r"^\d+\. `(\w+/\w+\.py)`", page, flags=re.MULTILINE)
+    assert 6 <= len(steps) <= 8
+    assert sum(len((PACKAGE / step).read_text().splitlines()) for step in steps) <= 3000
+    names = {path.name for path in MODULES}
+    missing = [path for path in re.findall(r"`([\w/]+\.py)`", page) if Path(path).name not in names]
+    missing += [path for path in re.findall(r"`(\w+/\w+\.py)`", page) if not (PACKAGE / path).is_file()]
+    assert not missing

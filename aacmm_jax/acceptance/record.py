@@ -64,7 +64,7 @@ class EvaluationRecord(NamedTuple):
     rule: Rule | None = None  # None: that of each standard
 
     def arms(self) -> dict[str, ArmSpecification]:
-        """The arm as found (nominal) and as left (calibrated)."""
+        """The nominal and the calibrated arm."""
         return {"nominal": self.recording.nominal, "calibrated": self.calibrated}
 
     def held_out_lengths(self) -> list[int]:
@@ -101,7 +101,7 @@ class EvaluationRecord(NamedTuple):
         return tuple(name for name in names_in(self.recording.capture) if name not in self.used)
 
     def acceptance(self) -> dict[str, list[AcceptanceTest]]:
-        """The tests of ``standards``, and those with a limit, as far as the capture allows; as found and as left."""
+        """The tests of ``standards``, and those with a limit, as far as the capture allows; of both arms."""
         arms = self.arms() if self.standards or self.limits else {}
         tests = {
             stage: run(self.measured(arm.arm), self.limits, self.u_test, influences=self.influences, rule=self.rule)

@@ -8,7 +8,10 @@ from ..acceptance.record import EvaluationRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from .xml_elements import MILLIMETRE, element, english, equipment_quantity, method, named, real, software, text
 
-_STAGES = {"nominal": ("as found", "beforeAdjustment"), "calibrated": ("as left", "afterAdjustment")}
+_STAGES = {
+    "nominal": ("nominal parameters", "beforeAdjustment"),
+    "calibrated": ("calibrated parameters", "afterAdjustment"),
+}
 _DECIMALS = 5  # of values without an uncertainty, mm
 
 

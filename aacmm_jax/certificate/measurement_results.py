@@ -51,8 +51,8 @@ def results_of(record: CalibrationRecord, given: AdministrativeData, command: st
     after = "The same readings, evaluated with the calibrated parameters, which were identified from them."
     nominal, calibrated = record.recording.nominal.arm, record.calibrated.arm
     for stage in (
-        _Stage("As found", "beforeAdjustment", before, nominal, evaluations["nominal"], False),
-        _Stage("As left", "afterAdjustment", after, calibrated, evaluations["calibrated"], True),
+        _Stage("Nominal parameters", "beforeAdjustment", before, nominal, evaluations["nominal"], False),
+        _Stage("Calibrated parameters", "afterAdjustment", after, calibrated, evaluations["calibrated"], True),
     ):
         yield named(
             "measurementResult",

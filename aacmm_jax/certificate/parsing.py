@@ -17,7 +17,7 @@ class CertifiedValue(NamedTuple):
 
     Example:
         >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
-        >>> found = aj.certificate.parse_dcc(text)["As found", "Repeatability", "DE"]
+        >>> found = aj.certificate.parse_dcc(text)["Nominal parameters", "Repeatability", "DE"]
         >>> print(found.value, found.expanded)
         1.8803 None
     """
@@ -35,14 +35,14 @@ def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
 
     Returns:
         The values by the names of measurement result, result, list and quantity, such as
-        ``("As left", "Denavit-Hartenberg parameters", "a_2")``; of several with the same names, the last.
+        ``("Calibrated parameters", "Denavit-Hartenberg parameters", "a_2")``; of several with the same names, the last.
 
     Raises:
         InputError: If the text is no XML, no DCC, or has a document type, whose entities could name other files.
 
     Example:
         >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
-        >>> a_3 = aj.certificate.parse_dcc(text)["As left", "Denavit-Hartenberg parameters", "a_3"]
+        >>> a_3 = aj.certificate.parse_dcc(text)["Calibrated parameters", "Denavit-Hartenberg parameters", "a_3"]
         >>> print(a_3.value, "mm, U =", a_3.expanded, "mm")
         -0.3224 mm, U = 0.0039 mm
     """

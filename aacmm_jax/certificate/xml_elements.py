@@ -8,6 +8,7 @@ https://ptb.de/si/v2.2.1/SI_Format.xsd.
 
 from collections.abc import Iterable, Sequence
 from importlib import metadata
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -17,7 +18,7 @@ DCC, SI, XSI = "https://ptb.de/dcc", "https://ptb.de/si", "http://www.w3.org/200
 LEVEL = 0.95  # coverage probability of every expanded uncertainty
 MILLIMETRE, RADIAN, ONE, CELSIUS = r"\milli\metre", r"\radian", r"\one", r"\degreecelsius"
 
-Child = Element | str | None | Iterable["Child"]
+Child = Element | str | None | Iterable[Any]  # whose items are children, too
 
 
 def element(tag: str, *children: Child, ref_type: str | None = None, prefix: str = "dcc") -> Element:

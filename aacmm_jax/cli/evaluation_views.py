@@ -135,7 +135,7 @@ def _acceptance(summary: dict[str, Any]) -> View:
             cells += [metric["limit_mm"], decision(metric)] if limited else []
             # Summaries that earlier versions stored name the standard only.
             rows.append((test.get("called", test["standard"]), metric["name"], *cells, metric["where"]))
-    headings = ["standard", "result", *(["as found"] if before else []), "as left" if before else "value", "U (k=2)"]
+    headings = ["standard", "result", *(["nominal"] if before else []), "calibrated" if before else "value", "U (k=2)"]
     headings += [*(["MPE", "decision"] if limited else []), "worst at"]
     yield Table("\nAcceptance tests, single readings [mm]", headings, rows, left=(0, 1, -1), keys=2)
     symbols = [metric["symbol"] for metric in metrics if metric.get("symbol", metric["name"]) != metric["name"]]
@@ -152,7 +152,6 @@ def _acceptance(summary: dict[str, Any]) -> View:
         + (" and of the test (--test-u-mm, --expansion)" if of_test else "")
         + "."
         + (f" Decisions: {'; '.join(rules)}." if limited else "")
-        + (" As found: the nominal arm; as left: the calibrated one." if before else "")
     )
 
 

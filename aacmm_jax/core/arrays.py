@@ -57,10 +57,10 @@ def joined(rows: Sequence[Array | np.ndarray], axis: int = 0, new: bool = False)
     Outside jit a call of NumPy costs microseconds, and one of JAX a compiled kernel: 5 to 30 ms in every process.
     """
     check_x64()
-    known = is_concrete(*rows)
-    tools: Any = np if known else jnp
+    concrete = is_concrete(*rows)
+    tools: Any = np if concrete else jnp
     whole = (tools.stack if new else tools.concatenate)(rows, axis=axis)
-    return jax.device_put(whole) if known else whole
+    return jax.device_put(whole) if concrete else whole
 
 
 def as_floats(value: Numbers, what: str) -> AnyArray:

@@ -15,7 +15,6 @@ import os
 import stat
 import sys
 import warnings
-import zlib
 from importlib import import_module
 from pathlib import Path
 
@@ -45,10 +44,10 @@ def set_up() -> None:
         unsafe = _unsafe(folder)
     except OSError:  # there is none, and it cannot be made
         return
+    usable = None if unsafe else str(folder)
     if unsafe:
         os.environ.pop(_FOLDER, None)
         os.environ[_TURNED_OFF] = "0"  # for processes started from here
-        folder_set = None
         warnings.warn_explicit(
             f"the compilation cache {folder} is not used, because {unsafe}, and what is read there is run; remove the "
             f"folder, which is then made anew, or set {_FOLDER} to one that only you can write to.",
@@ -57,8 +56,7 @@ def set_up() -> None:
             1,
         )
     else:
-        folder_set = str(folder)
-        os.environ[_FOLDER] = folder_set
+        os.environ[_FOLDER] = str(folder)
     if given is None and not unsafe:
         with contextlib.suppress(OSError):  # read-only, or another process was faster
             _remove_damaged(folder)
@@ -66,7 +64,7 @@ def set_up() -> None:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", float(_LEAST_SECONDS))
         os.environ.setdefault(_SHORTEST, _LEAST_SECONDS)
     if jax is not None:
-        jax.config.update("jax_compilation_cache_dir", folder_set)
+        jax.config.update("jax_compilation_cache_dir", usable)
 
 
 def _default_folder() -> Path | None:
@@ -85,26 +83,26 @@ def _unsafe(folder: Path) -> str:
     if not POSIX:
         return ""
     folder = folder.resolve()
-    found = folder.stat()
-    if not is_ours(found):
+    status = folder.stat()
+    if not is_ours(status):
         return "it belongs to another user"
-    if found.st_mode & 0o022:
-        return f"others may write to it (mode {stat.S_IMODE(found.st_mode):04o})"
-    owner, others_may_enter = found.st_uid, found.st_mode & 0o011
+    if status.st_mode & 0o022:
+        return f"others may write to it (mode {stat.S_IMODE(status.st_mode):04o})"
+    owner, others_may_enter = status.st_uid, status.st_mode & 0o011
     # Whoever can rename a folder above can put another one there.
     for above in folder.parents:
-        found = above.stat()
-        if found.st_uid != 0 and not is_ours(found):
+        status = above.stat()
+        if status.st_uid != 0 and not is_ours(status):
             return f"{above} belongs to another user"
-        if others_may_rename(found):
-            return f"others may write to {above} (mode {stat.S_IMODE(found.st_mode):04o})"
+        if others_may_rename(status):
+            return f"others may write to {above} (mode {stat.S_IMODE(status.st_mode):04o})"
     # What was put there while others could: JAX reads it by its name, and a link leads to where others may write now.
     with os.scandir(folder) as entries:
         for entry in entries:  # of which there may be thousands: 2 microseconds each
             with contextlib.suppress(FileNotFoundError):  # another process has removed it
-                found = entry.stat(follow_symlinks=False)
-                changeable = others_may_enter and found.st_mode & 0o022 and others_may_write(found)
-                if found.st_uid != owner or changeable or entry.is_symlink():
+                status = entry.stat(follow_symlinks=False)
+                changeable = others_may_enter and status.st_mode & 0o022 and others_may_write(status)
+                if status.st_uid != owner or changeable or entry.is_symlink():
                     return f"others can have written {entry.name} in it"
     return ""
 
@@ -130,17 +128,12 @@ def _remove_damaged(folder: Path) -> None:
 
 def _complete(content: bytes) -> bool:
     """Whether an entry of the cache can be decompressed; also true where this process lacks what tells it."""
-    if not content or content.startswith(_ZLIB):
-        try:
-            zlib.decompress(content)
-        except zlib.error:
-            return False
-        return True
-    for name in ("compression.zstd", "zstandard"):  # the first is Python's own since 3.14
+    modules = ("zlib",) if not content or content.startswith(_ZLIB) else ("compression.zstd", "zstandard")
+    for name in modules:  # Zstandard is Python's own since 3.14
         with contextlib.suppress(ImportError):
-            zstandard = import_module(name)
+            module = import_module(name)
             try:
-                zstandard.decompress(content)
-            except zstandard.ZstdError:
+                module.decompress(content)
+            except getattr(module, "error" if name == "zlib" else "ZstdError"):
                 return False
     return True

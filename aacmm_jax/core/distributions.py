@@ -22,8 +22,8 @@ def student_tail(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarra
     from scipy import special
 
     many = np.asarray(degrees_of_freedom) > _NORMAL
-    finite = special.stdtr(np.where(many, 1.0, degrees_of_freedom), -np.abs(value)) if not np.all(many) else 0.0
-    return 2 * np.where(many, special.ndtr(-np.abs(value)), finite)
+    tail = special.stdtr(np.where(many, 1.0, degrees_of_freedom), -np.abs(value))
+    return 2 * np.where(many, special.ndtr(-np.abs(value)), tail)
 
 
 def student_density(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
@@ -33,8 +33,8 @@ def student_density(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.nda
     many = np.asarray(degrees_of_freedom) > _NORMAL
     half = 0.5 * np.where(many, 1.0, degrees_of_freedom)
     factor = np.exp(special.gammaln(half + 0.5) - special.gammaln(half)) / np.sqrt(2 * np.pi * half)
-    finite = factor * np.exp(-(half + 0.5) * np.log1p(value**2 / (2 * half)))
-    return np.where(many, np.exp(-0.5 * value**2) / np.sqrt(2 * np.pi), finite)
+    density = factor * np.exp(-(half + 0.5) * np.log1p(value**2 / (2 * half)))
+    return np.where(many, np.exp(-0.5 * value**2) / np.sqrt(2 * np.pi), density)
 
 
 def chi_square_quantile(probability: float, degrees_of_freedom: float) -> float:
@@ -58,12 +58,12 @@ def f_tail(value: float, numerator: float, denominator: float) -> float:
     return float(special.fdtrc(numerator, denominator, value))
 
 
-def chance(found: float, predicted: float, degrees_of_freedom: float, of_prediction: float) -> float:
-    """Probability of a root mean square of at least ``found`` where ``predicted`` is right, by the F distribution; by
+def chance(rms: float, predicted: float, degrees_of_freedom: float, of_prediction: float) -> float:
+    """Probability of a root mean square of at least ``rms`` where ``predicted`` is right, by the F distribution; by
     the chi-square distribution where the prediction is exact (infinite degrees of freedom). NaN where it is unknown."""
-    if not (0 < predicted < np.inf and np.isfinite(found) and np.isfinite(degrees_of_freedom)):
+    if not (0 < predicted < np.inf and np.isfinite(rms) and np.isfinite(degrees_of_freedom)):
         return float("nan")
-    ratio = (found / predicted) ** 2
+    ratio = (rms / predicted) ** 2
     if np.isinf(of_prediction):
         return chi_square_tail(ratio * degrees_of_freedom, degrees_of_freedom)
     return f_tail(ratio, degrees_of_freedom, of_prediction)

@@ -53,11 +53,11 @@ def naming(where: object) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from error
 
 
-def nearest(word: str, known: Iterable[str], most: int = 12) -> str:
-    """A hint ``; did you mean 'x'?`` for a misspelt word, or ``most`` of what is known when nothing is near."""
-    known = list(known)
-    matches = difflib.get_close_matches(word[:_COMPARED], known, n=1, cutoff=0.5)
+def nearest(word: str, names: Iterable[str], most: int = 12) -> str:
+    """A hint ``; did you mean 'x'?`` for a misspelt word, or ``most`` of the names when nothing is near."""
+    names = list(names)
+    matches = difflib.get_close_matches(word[:_COMPARED], names, n=1, cutoff=0.5)
     if matches:
         return f"; did you mean {quoted(matches[0])}?"
-    shown = ", ".join(quoted(name)[1:-1] for name in known[:most]) + (", ..." if len(known) > most else "")
-    return f"; known are {shown}." if known else "."
+    shown = ", ".join(quoted(name)[1:-1] for name in names[:most]) + (", ..." if len(names) > most else "")
+    return f"; known are {shown}." if names else "."

@@ -20,18 +20,17 @@ def user_name(number: int) -> str:
         return f"user {number}"
 
 
-def is_ours(found: os.stat_result) -> bool:
+def is_ours(status: os.stat_result) -> bool:
     """Whether this process's user owns a file."""
-    return not POSIX or found.st_uid == os.geteuid()
+    return not POSIX or status.st_uid == os.geteuid()
 
 
-def others_may_write(found: os.stat_result) -> bool:
+def others_may_write(status: os.stat_result) -> bool:
     """Whether anybody but the owner may write to a file or a folder: all users, or a group that is not theirs alone."""
-    if not POSIX or stat.S_ISLNK(found.st_mode):
+    mode = status.st_mode
+    if not POSIX or stat.S_ISLNK(mode):
         return False
-    return bool(found.st_mode & stat.S_IWOTH) or bool(
-        found.st_mode & stat.S_IWGRP and not _is_private(found.st_gid, found.st_uid)
-    )
+    return bool(mode & stat.S_IWOTH or (mode & stat.S_IWGRP and not _is_private(status.st_gid, status.st_uid)))
 
 
 def others_may_rename(folder: os.stat_result) -> bool:
@@ -70,7 +69,7 @@ def _is_private(group: int, user: int) -> bool:
         name, entry = pwd.getpwuid(user).pw_name, grp.getgrgid(group)
     except KeyError:
         return False
-    alone = entry.gr_name == name or {one.pw_name for one in pwd.getpwall() if one.pw_gid == group} == {name}
+    alone = entry.gr_name == name or {entry.pw_name for entry in pwd.getpwall() if entry.pw_gid == group} == {name}
     return alone and set(entry.gr_mem) <= {name}
 
 
@@ -79,7 +78,7 @@ def keeps_owners(folder: str | os.PathLike) -> bool:
     file that is made in the folder, for nobody else, is ours and nobody else's. True where none can be made."""
     try:
         with tempfile.TemporaryFile(dir=folder) as probe:
-            found = os.fstat(probe.fileno())
+            status = os.fstat(probe.fileno())
     except OSError:
         return True
-    return is_ours(found) and not found.st_mode & 0o077
+    return is_ours(status) and not status.st_mode & 0o077

@@ -44,8 +44,8 @@ def products_by_column(
         flat = matrices[:, :, 0] @ columns.reshape(len(columns), -1)
         return flat.reshape(len(flat), *columns.shape[1:])
     rows, components, p = matrices.shape
-    each = matrices.reshape(rows, components, *(1,) * (columns.ndim - 2), p)
-    products = [each[:, i] * columns[i][None] for i in range(components)]
+    matrices = matrices.reshape(rows, components, *(1,) * (columns.ndim - 2), p)
+    products = [matrices[:, i] * columns[i][None] for i in range(components)]
     return sum(products[1:], products[0])
 
 
@@ -67,11 +67,11 @@ def _solve(matrix: Float[Array, "*batch p p"], right: Float[Array, "*batch p"]) 
     filled = jnp.zeros((*right.shape, -(p + 1) % 4))
     rows = _triangular(jnp.concatenate([matrix, right[..., None], filled], axis=-1))
 
-    def substitute(i: Array, known: Array) -> Array:
+    def substitute(i: Array, solution: Array) -> Array:
         k = p - 1 - i
         row = lax.dynamic_index_in_dim(rows, k, -2, keepdims=False)
-        value = -jnp.sum(row * known, axis=-1, keepdims=True) / lax.dynamic_slice_in_dim(row, k, 1, -1)
-        return lax.dynamic_update_slice_in_dim(known, value, k, -1)
+        value = -jnp.sum(row * solution, axis=-1, keepdims=True) / lax.dynamic_slice_in_dim(row, k, 1, -1)
+        return lax.dynamic_update_slice_in_dim(solution, value, k, -1)
 
     # The right side is column p of the triangle, so its factor is -1 throughout.
     start = jnp.zeros(rows.shape[:-2] + rows.shape[-1:]).at[..., p].set(-1.0)
@@ -99,7 +99,7 @@ def inverse_cholesky(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "
     except np.linalg.LinAlgError:
         if matrix.ndim == 2:
             return np.full_like(matrix, np.nan)
-        return np.stack([inverse_cholesky(one) for one in matrix])
+        return np.stack([inverse_cholesky(part) for part in matrix])
     if matrix.ndim == 2 and len(matrix) > _LARGE:
         from scipy.linalg import get_lapack_funcs
 

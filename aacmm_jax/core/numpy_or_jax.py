@@ -58,8 +58,8 @@ def to_jax(tree: Tree) -> Tree:
     check_x64()
     leaves, structure = jax.tree.flatten(tree)
     # A leaf that occurs twice, as those of stage 1 in a joint result, is transferred once.
-    known = {id(leaf): leaf for leaf in leaves if isinstance(leaf, (np.ndarray, np.generic))}
-    moved = dict(zip(known, jax.device_put(list(known.values())), strict=True))
+    arrays = {id(leaf): leaf for leaf in leaves if isinstance(leaf, (np.ndarray, np.generic))}
+    moved = dict(zip(arrays, jax.device_put(list(arrays.values())), strict=True))
     return jax.tree.unflatten(structure, [moved.get(id(leaf), leaf) for leaf in leaves])
 
 
@@ -89,11 +89,11 @@ def numpy_if_known(function: Function) -> Function:
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        known = to_numpy((args, kwargs))
-        if namespace(known) is jnp:
+        given = to_numpy((args, kwargs))
+        if namespace(given) is jnp:
             return function(*args, **kwargs)
         with np.errstate(all="ignore"):
-            values = function(*known[0], **known[1])
+            values = function(*given[0], **given[1])
         return values if namespace(args, kwargs) is np else to_jax(values)
 
     return call  # pyright: ignore[reportReturnType]

@@ -53,7 +53,7 @@ def in_short(sentence: str) -> str:
 
     Names without blanks are cut first, so that what the sentence says of them remains.
     """
-    sentence = _LONG_NAME.sub(lambda found: _middle_out(found[0], _LONGEST_NAME), sentence)
+    sentence = _LONG_NAME.sub(lambda name: _middle_out(name[0], _LONGEST_NAME), sentence)
     return _middle_out(sentence, _LONGEST_SENTENCE)
 
 

@@ -37,14 +37,9 @@ def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geom
     standard D-H would put the next frame hundreds of metres away. The last frame has the orientation of the tip, by
     alpha, theta and beta of the last joint. Source: Hayati and Mirmirani 1985.
 
-    Args:
-        axes: Joint axes and tip, mm.
-        keep_points: Whether ``d`` between nearly parallel axes is such that the next frame is at the given point of its
-            axis; otherwise it is 0.
-
-    Returns:
-        The first D-H frame in the frame of the base (the same frame where the first axis is its z axis), and the
-        parameters, mm and rad; ``beta`` is None where it is not needed.
+    With ``keep_points``, ``d`` between nearly parallel axes is such that the next frame is at the given point of its
+    axis; otherwise it is 0. Returned are the first D-H frame in the frame of the base (the same frame where the first
+    axis is its z axis), and the parameters, mm and rad; ``beta`` is None where it is not needed.
     """
     base = _first_frame(axes.directions[0], axes.points[0])
     frame, rows = base, []
@@ -111,16 +106,12 @@ def without_far_frames(arm: Arm) -> Arm:
     geometry = geometry_of(arm)
     frames = dh_frames(geometry, np.eye(4))
     directions, points = (np.array([frame[:3, i] for frame in frames[:-1]]) for i in (2, 3))
-    _, found = dh_of_axes(Axes(directions, points, frames[-1]), keep_points=False)
-    return arm_of(found._replace(probe=found.probe + geometry.probe, kinds=geometry.kinds), arm.limits)
+    _, near = dh_of_axes(Axes(directions, points, frames[-1]), keep_points=False)
+    return arm_of(near._replace(probe=near.probe + geometry.probe, kinds=geometry.kinds), arm.limits)
 
 
 def geometry_of(arm: Arm) -> Geometry:
-    """The parameters of an arm as NumPy arrays, for formats that know nothing else.
-
-    Raises:
-        InputError: The arm has joint corrections, which such a format cannot hold.
-    """
+    """The parameters of an arm as NumPy arrays, or `InputError` for joint corrections: for formats without these."""
     if arm.corrections is not None:
         raise InputError(
             "the arm has joint corrections, which this format cannot hold; write TOML, the joint zero offsets alone "
@@ -146,14 +137,11 @@ def calibrated_frames(
     a prismatic joint moves on along its axis with d_i, for the same reason (anywhere else would do as well). An origin
     that does not change comes back as it was, to the bit.
 
-    Args:
-        origins: Nominal origins, joint by joint, mm; the first in the frame of the base.
-        nominal: The parameters that `dh_of_axes` gave.
-        calibrated: The calibrated parameters.
-        base: The first D-H frame in the frame of the base; calibration does not change it.
+    The first nominal origin is in the frame of the base, and ``base`` the first D-H frame in it, which calibration does
+    not change; ``nominal`` are the parameters that `dh_of_axes` gave. All in mm.
     """
     before, after = dh_frames(nominal, base), dh_frames(calibrated, base)
-    was, now, found = np.eye(4), np.eye(4), []
+    was, now, changed = np.eye(4), np.eye(4), []
     for i, origin in enumerate(origins):
         was = was @ origin
         expected = now @ origin
@@ -164,10 +152,10 @@ def calibrated_frames(
         offset = float(calibrated.d[i] - nominal.d[i]) if slides else 0.0
         frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis + offset) * axis
         unchanged = same_transform(frame, expected)
-        found.append(origin if unchanged else inverse(now) @ frame)
-        # Not the product with what was found: an inverse by transposition doubles the rounding from joint to joint.
+        changed.append(origin if unchanged else inverse(now) @ frame)
+        # Not the product of what is returned: an inverse by transposition doubles the rounding from joint to joint.
         now = expected if unchanged else frame
-    return found
+    return changed
 
 
 def canonical_origins(geometry: Geometry) -> list[Transform]:
@@ -186,11 +174,10 @@ def canonical_origins(geometry: Geometry) -> list[Transform]:
     return [*origins, tip]
 
 
-def same_transform(one: Transform, other: Transform) -> bool:
+def same_transform(first: Transform, second: Transform) -> bool:
     """Whether two transforms are the same to rounding."""
-    length, angle = _UNCHANGED
-    shift, turn = np.abs(one[:3, 3] - other[:3, 3]), np.abs(one[:3, :3] - other[:3, :3])
-    return bool(shift.max() <= length and turn.max() <= angle)
+    (length, angle), difference = _UNCHANGED, np.abs(first - second)
+    return bool(difference[:3, 3].max() <= length and difference[:3, :3].max() <= angle)
 
 
 def _first_frame(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"]) -> Transform:

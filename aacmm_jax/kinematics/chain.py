@@ -126,9 +126,7 @@ def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion
     Cosines and sines are half of the time of a forward pass. Of the geometry, only what an identification does not
     change matters: the kinds of the joints, and the nominal arm of its corrections.
 
-    Args:
-        geometry: The chain, whose parameters may be anything.
-        q: Readings ``(..., n)``, rad, or mm of prismatic joints; ``(..., n + 1)`` with a thermometer, C.
+    ``q`` is ``(..., n)``, rad, or mm of prismatic joints; ``(..., n + 1)`` with a thermometer, C.
     """
     return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
 

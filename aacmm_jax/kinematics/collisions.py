@@ -98,13 +98,7 @@ def checked_cell(arm: Arm, cell: Cell, limits: Float[np.ndarray, "n 2"]) -> Cell
     A body touches itself at its joints, and its foot touches what it stands on. Pairs of capsules that touch in half of
     random configurations, more than any arm does, and capsules that touch an obstacle in all of them, are left out.
 
-    Args:
-        arm: The arm.
-        cell: Its body and obstacles.
-        limits: Lowest and highest reading of each joint, rad.
-
-    Raises:
-        InputError: An obstacle has no extent, or two have one name.
+    Raises `InputError` for an obstacle without extent, or two of one name.
     """
     names = [obstacle.name for obstacle in cell.obstacles]
     for obstacle in cell.obstacles:
@@ -158,15 +152,15 @@ def _distances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[list[tu
     start, end = capsule_ends(body, frames_at(arm, q))
     first, second = body.pairs.T
     between = segment_distance(start[first], end[first], start[second], end[second])
-    found = [between - xp.asarray(body.radius[first] + body.radius[second])[:, None]]
+    distances = [between - xp.asarray(body.radius[first] + body.radius[second])[:, None]]
     names = [(body.names[i], body.names[j]) for i, j in body.pairs]
     for obstacle in cell.obstacles:
         pairs = [(name, obstacle.name) for name in body.names]
         chosen = np.array([pair not in cell.unchecked for pair in pairs])
         part = body._replace(radius=body.radius[chosen])
-        found.append(_from_obstacle(obstacle, part, start[chosen], end[chosen]))
+        distances.append(_from_obstacle(obstacle, part, start[chosen], end[chosen]))
         names += [pair for pair in pairs if pair not in cell.unchecked]
-    return names, xp.concatenate(found)
+    return names, xp.concatenate(distances)
 
 
 def _from_obstacle(

@@ -98,9 +98,6 @@ def into_cones(
         limits: Lowest and highest angle of each joint, rad.
         cones: A cone for each configuration.
         steps: Most steps.
-
-    Returns:
-        The configurations, and which of them arrived within their cones.
     """
     geometry = to_numpy(arm.geometry)
     low, high = limits[:, :1], limits[:, 1:]
@@ -131,15 +128,15 @@ def into_cones(
     def moved(rows: np.ndarray) -> np.ndarray:
         start, targets, normals, half_angles = np.split(rows.T, [arm.joints, arm.joints + 3, arm.joints + 6])
         wanted = np.maximum(half_angles - _INSIDE, 0.0)[0]
-        found = repeated(step, start, [targets, normals, wanted], steps)
-        forward = forward_pass(geometry, joint_motion(geometry, found.T))
+        q = repeated(step, start, [targets, normals, wanted], steps)
+        forward = forward_pass(geometry, joint_motion(geometry, q.T))
         arrived = np.linalg.norm(targets - forward.tip, axis=0) <= ARRIVED
         arrived &= _angle(_directions(forward, cones.tool_axis).T, normals.T) <= half_angles[0]
-        return np.column_stack([found.T, arrived])
+        return np.column_stack([q.T, arrived])
 
     with np.errstate(all="ignore"):
-        found = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), ROWS)
-    return found[:, :-1], found[:, -1] > 0
+        solved = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), ROWS)
+    return solved[:, :-1], solved[:, -1] > 0
 
 
 def _directions(forward: ForwardPass, axis: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 N"]:

@@ -133,10 +133,6 @@ def least_motion(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " N
     A rotation of the last frame counts as what it moves at 500 mm, with six joints or more. It is 0 in a singular
     configuration, where two axes of a wrist align or an arm is stretched: readings of a pose are not unique there, or
     poses near it have none.
-
-    Args:
-        arm: One arm.
-        q: Readings, rad and mm.
     """
     geometry = to_numpy(arm.geometry)
     forward = forward_pass(geometry, joint_motion(geometry, q))
@@ -158,15 +154,7 @@ def solve_to_poses(
     """Damped least-norm steps to the poses, within the limits; for any jit, vmap or loop. A row does not depend on the
     other rows.
 
-    Args:
-        geometry: The arm's ``geometry``.
-        q: Joint readings to begin with ``(c, n)``, rad.
-        poses: The pose wanted for each ``(c, 4, 4)``, mm.
-        limits: Lowest and highest reading of each joint ``(n, 2)``, rad.
-        steps: Most steps.
-
-    Returns:
-        The readings ``(c, n)``, rad; the distances ``(c,)``, mm, and the angles ``(c,)``, rad, that remain.
+    Returned are the readings, and the distances (mm) and angles (rad) that remain.
     """
     xp, whole = namespace(geometry, q, poses), q.shape[-1] >= FULL_POSE
     low, high = limits[:, :1], limits[:, 1:]

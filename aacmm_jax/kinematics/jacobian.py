@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..core._compat import SymbolicZero
-from ..core.numpy_or_jax import AnyArray, compiled, namespace
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, set_at
 from .chain import (
     ForwardPass,
     Geometry,
@@ -199,19 +199,17 @@ class SharedColumns(NamedTuple):
 
     few: tuple[tuple[str, int], ...]  # parameters whose columns are needed
     source: Int[np.ndarray, " p"]  # of which of them each parameter's column is a multiple
-    functions: Int[np.ndarray, " k"]  # of the parameters that are coefficients
-    others: Int[np.ndarray, " c"]  # the other parameters
-    order: Int[np.ndarray, " p"] | None  # of others and coefficients among all; None where they are in order
+    coefficients: Int[np.ndarray, " c"]  # the parameters that are coefficients of joints
+    functions: Int[np.ndarray, " c"]  # their functions
 
     def multiplied(self, columns: Float[AnyArray, "b r m"], forward: Any, rows: Any) -> Float[AnyArray, "p r m"]:
         """Columns of all parameters at some of the configurations, from the few."""
         if not len(self.functions):
             return columns
         assert forward.errors is not None
-        of_functions = np.delete(self.source, self.others)
-        products = columns[of_functions] * forward.errors.by_coefficient[self.functions][..., rows]
-        both = namespace(columns, forward).concatenate([columns[self.source[self.others]], products])
-        return both if self.order is None else both[self.order]
+        by_function = forward.errors.by_coefficient[self.functions][..., rows]
+        factors = namespace(columns, forward).ones((len(self.source), *by_function.shape[1:]))
+        return columns[self.source] * set_at(factors, self.coefficients, by_function)
 
 
 @lru_cache(maxsize=32)
@@ -219,17 +217,14 @@ def shared_columns(functions: KnownFunctions | None, indices: tuple[tuple[str, i
     """How the columns of some parameters follow from fewer, for an arm with these corrections."""
     # Thermal expansion moves no joint (-1): its column is its own.
     moved = [-1 if functions is None or kind != "coefficients" else int(functions.moved[i]) for kind, i in indices]
-    of_functions = np.array(moved, dtype=int) >= 0
     wanted = [("q", joint) if joint >= 0 else index for joint, index in zip(moved, indices, strict=True)]
     few = {index: place for place, index in enumerate(dict.fromkeys(wanted))}
-    others, coefficients = np.flatnonzero(~of_functions), np.flatnonzero(of_functions)
-    order = np.argsort(np.concatenate([others, coefficients]))
+    coefficients = np.flatnonzero(np.array(moved, dtype=int) >= 0)
     return SharedColumns(
         few=tuple(few),
         source=np.array([few[index] for index in wanted], dtype=int),
+        coefficients=coefficients,
         functions=np.array([indices[i][1] for i in coefficients], dtype=int),
-        others=others,
-        order=None if np.array_equal(order, np.arange(len(order))) else order,
     )
 
 

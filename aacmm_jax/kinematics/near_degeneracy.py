@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .arm import is_length
 from .corrections.kinds import unit_of_coefficient
@@ -93,35 +93,23 @@ def trade_offs(
     fixed = np.isin(np.arange(len(names)), leading)
     # The best imitation of one step of each by all that do not lead a trade-off themselves.
     imitations = np.linalg.lstsq(rows[:, ~fixed], rows[:, leading], rcond=_ZERO)[0].T
-    found = [
-        _trade_off(i, amounts, fixed, movements, names, whitened, half_widths)
-        for i, amounts in zip(leading, imitations, strict=True)
-    ]
-    return tuple(sorted(found, key=lambda item: item.movement))
+    directions = np.zeros((len(leading), len(names)))
+    directions[:, ~fixed], directions[np.arange(len(leading)), leading] = -imitations, 1.0
 
+    def trade_off(i: int, direction: Float[np.ndarray, " p"]) -> TradeOff:
+        largest = np.abs(np.delete(direction, i)).max(initial=0.0)
+        by_size = [int(j) for j in np.argsort(-np.abs(direction), kind="stable")]
+        order = [j for j in by_size if j != i and abs(direction[j]) > _PARTNER * largest]
+        return TradeOff(
+            names=tuple(names[j] for j in (i, *order)),
+            amounts=(1.0, *(float(-direction[j]) for j in order)),
+            movement=float(np.linalg.norm(movements @ direction)),
+            u=np.inf if whitened is None else float(1 / max(np.linalg.norm(whitened @ direction), 1e-300)),
+            half_width=np.inf if half_widths is None else float(half_widths[i]),
+        )
 
-def _trade_off(
-    i: int,
-    amounts: Float[np.ndarray, " free"],
-    fixed: Bool[np.ndarray, " p"],
-    movements: Float[np.ndarray, "r p"],
-    names: Sequence[str],
-    whitened: Float[np.ndarray, "w p"] | None,
-    half_widths: Float[np.ndarray, " p"] | None,
-) -> TradeOff:
-    """The trade-off of parameter i with those that imitate it by these amounts."""
-    direction = np.zeros(len(names))
-    direction[~fixed], direction[i] = -amounts, 1.0
-    largest = np.abs(amounts).max(initial=0.0)
-    by_size = [int(j) for j in np.argsort(-np.abs(direction), kind="stable")]
-    order = [j for j in by_size if j != i and abs(direction[j]) > _PARTNER * largest]
-    return TradeOff(
-        names=tuple(names[j] for j in (i, *order)),
-        amounts=(1.0, *(float(-direction[j]) for j in order)),
-        movement=float(np.linalg.norm(movements @ direction)),
-        u=np.inf if whitened is None else float(1 / max(np.linalg.norm(whitened @ direction), 1e-300)),
-        half_width=np.inf if half_widths is None else float(half_widths[i]),
-    )
+    weakest = [trade_off(i, direction) for i, direction in zip(leading, directions, strict=True)]
+    return tuple(sorted(weakest, key=lambda item: item.movement))
 
 
 def reduced_echelon(basis: Float[np.ndarray, "p r"]) -> tuple[Float[np.ndarray, "p r"], list[int]]:

@@ -26,7 +26,13 @@ _SOLVE = CalibrationOptions()
 
 
 class CaptureOptions(NamedTuple):
-    """How `calibrate_capture` calibrates: its keyword arguments, described there, and their defaults."""
+    """How `calibrate_capture` calibrates: its keyword arguments, described there, and their defaults.
+
+    Example:
+        >>> options = aj.pipeline.CaptureOptions(noise=noise, cross_validate=False)
+        >>> print(aj.calibrate_capture(aj.Recording(two_bars, nominal), **options._asdict()).method)
+        two-stage
+    """
 
     method: Literal["two-stage", "joint"] | None = _SOLVE.method
     robust: LossName | None = _SOLVE.robust
@@ -86,7 +92,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     Example:
         >>> calibrated = aj.calibrate_capture(aj.Recording(two_bars, nominal), noise=noise)
         >>> print(calibrated.method, f"{calibrated.validation.rms:.3f} mm in unseen placements")
-        joint 0.016 mm in unseen placements
+        two-stage 0.015 mm in unseen placements
     """
     chosen = CaptureOptions(**options)
     if chosen.leave_out and not chosen.cross_validate:
@@ -177,9 +183,10 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
         InputError: the nominal arms differ, or as `join_sessions` does.
 
     Example:
-        >>> one = aj.Recording(aj.simulate(true, {"A": (400, 200, 300)}, poses=5), nominal)
-        >>> print(aj.pipeline.join_recordings({"monday": one, "friday": one}).capture.names)
-        ('monday/A',)
+        >>> drawn = [aj.simulate(true, {"A": (400, 200, 300)}, poses=5, seed=seed) for seed in (1, 2)]
+        >>> monday, friday = (aj.Recording(part, nominal) for part in drawn)
+        >>> print(aj.pipeline.join_recordings({"monday": monday, "friday": friday}).capture.sessions)
+        ('monday', 'friday')
     """
     first, *rest = recordings.values()
     if not rest:
@@ -189,6 +196,8 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
         same = jax.tree.structure(first.nominal.arm) == jax.tree.structure(recording.nominal.arm)
         if not same or not all(map(np.array_equal, *arms)):
             raise InputError(f"'{name}' has another nominal arm than the first session; import both with the same arm.")
-    capture = join_sessions({name: each.capture for name, each in recordings.items()}, own_probe=not same_probe)
+    capture = join_sessions(
+        {name: recording.capture for name, recording in recordings.items()}, own_probe=not same_probe
+    )
     sources = tuple(source for recording in recordings.values() for source in recording.sources)
     return first._replace(capture=capture, true=None, seed=None, spheres=(), sources=sources)

@@ -33,14 +33,15 @@ from .options import (
     LEAST_POSES,
     Criterion,
     FixturePlacement,
+    PlacementRegion,
     PlanOptions,
     PlanTask,
     check_counts,
-    check_ranges,
+    check_length,
     checked_cones,
     given_placement,
 )
-from .placement import best_placement, in_order
+from .placement import best_placement
 from .pose_refinement import refined
 
 _CANDIDATES = 3000
@@ -127,7 +128,8 @@ def plan(
         True
     """
     task = PlanTask.of(arm, PlanOptions(**options))
-    options_of_all, ranges = task.options, task.placement_region()
+    options_of_all = task.options
+    ranges = PlacementRegion.of(task.arm, options_of_all.region, options_of_all.farthest)
     check_counts(sockets, poses, len(task.space.names), u, lengths)
     if isinstance(sockets, Mapping):
         names, placement = given_placement(sockets, u, lengths)
@@ -136,7 +138,7 @@ def plan(
         placement = None
     span = (length, length) if isinstance(length, int | float) else length
     if placement is None:
-        check_ranges(task.arm, span, lengths, ranges.ranges)
+        check_length(task.arm, span, lengths)
     cones = checked_cones(cone, names, options_of_all.tool_axis)
     problem = DesignProblem.of(task, task.search_region(cones))
     if placement is None:
@@ -146,7 +148,7 @@ def plan(
     # From here on sockets have the order in which the arm visits them.
     visited = np.array(list(dict.fromkeys(owner[order].tolist())))
     q, owner, place = q[order], np.argsort(visited)[owner[order]], np.argsort(visited)
-    placement, cones, pool = in_order(placement, visited), cones.at(visited), pool._replace(owner=place[pool.owner])
+    placement, cones, pool = placement.in_order(visited), cones.at(visited), pool._replace(owner=place[pool.owner])
     if isinstance(sockets, Mapping) or isinstance(cone, Mapping):  # otherwise names are given out in their order
         names = [names[i] for i in visited]
     problem = problem._replace(region=problem.region._replace(cones=cones))

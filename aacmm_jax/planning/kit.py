@@ -9,12 +9,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
-from ..calibration.evaluation import fit_geometry
 from ..core.arguments import with_options
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
@@ -23,18 +21,14 @@ from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
 from ..kinematics.cones import Cone, cones_of
 from ..kinematics.workspace import reached
-from ..model.observed import Observed
 from ..uncertainty.identifiability import observability
-from ..uncertainty.linearisation import Linearisation
-from .fedorov_exchange import Candidates, covariance_of, exchange
-from .information import LOOSE, PRIOR, DesignProblem, Prediction, prediction_of, predictions
-from .kit_placement import KitItem, PlacedKit, approachable, place, region_of, set_up
+from .fedorov_exchange import covariance_of, exchange
+from .information import LOOSE, DesignProblem, Prediction, prediction_of, predictions
+from .kit_placement import KitItem, PlacedKit, approachable, candidates_of_kit, least_poses, place, region_of, set_up
 from .motion import Motion, ordered_motion
-from .options import Criterion, PlanOptions, PlanTask, check_region
+from .options import Criterion, PlacementRegion, PlanOptions, PlanTask
 
 _CANDIDATES = 2000
-_LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weight
-_START_AGREES = 0.1  # mm or rad: a start of the geometry that is farther off is fitted
 _RANDOM_SETS, _LOOSE_SETS = 30, 5  # of poses, for predictions
 _NEAR = math.radians(12)  # of candidates near a chosen pose
 _ROUNDS, _NEIGHBOURS = 2, 12  # of the search about the chosen poses, and its candidates for each
@@ -113,11 +107,10 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         u of 300 mm: at most 0.04 mm
     """
     task = PlanTask.of(arm, PlanOptions(**options))
-    items, ranges = _checked(kit), task.placement_region()
-    check_region(ranges.ranges)
+    items, ranges = _checked(kit), PlacementRegion.of(task.arm, task.options.region, task.options.farthest)
     problem = DesignProblem.of(task, task.search_region(cones_of([Cone()], task.options.tool_axis)))
     count = task.options.candidates or _CANDIDATES
-    placed = place(problem, items, poses, ranges, candidates_of_kit, task.options.report)
+    placed = place(problem, items, poses, ranges, task.options.report)
     pool = _pool(problem, placed, count)
     least = least_poses(pool)
     if poses < least.sum():
@@ -193,41 +186,6 @@ def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
     if twice:
         raise InputError(f"two things of the kit have the name '{twice[0]}'; give each a name of its own.")
     return items
-
-
-def least_poses(observations: Sequence[AbstractObservation]) -> Int[np.ndarray, " s"]:
-    """For each place of each observation: as many as determine its own unknowns, and two at least."""
-    least = []
-    for observation in observations:
-        unknowns = sum(len(units) for units in observation.unknowns.values()) + (3 if observation.target else 0)
-        places = int(observation.places.max()) + 1
-        least += [max(2, math.ceil((unknowns + 1) / (observation.rows * places)))] * places
-    return np.array(least)
-
-
-def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObservation]) -> Candidates:
-    """The information that each pose of the observations would add, and that of certified values alone."""
-    observed, space = Observed.of(Capture({}, (), observations), problem.arm), problem.space
-    vector, p = np.asarray(space.vector()), len(space.names)
-
-    def linear_at(geometry: Float[AnyArray, " g"]) -> Linearisation:
-        z = np.concatenate([vector, np.asarray(geometry)])
-        return Linearisation.at(observed, space, z, noise=problem.noise, least=_LEAST_U)
-
-    linear = linear_at(observed.start(space, vector))
-    if max(np.abs(rows.values).max() for rows in linear.point.rows) > _START_AGREES:
-        linear = linear_at(fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
-    parts = linear.dense()
-    rows = np.zeros((len(observed.q), max(3, *(part.shape[1] for part in parts)), len(linear.z)))
-    owner = np.empty(len(observed.q), dtype=int)
-    places = 0
-    for observation, part, poses in zip(observed.observations, parts, observed.slices, strict=True):
-        rows[poses, : part.shape[1]] = np.moveaxis(np.asarray(part) * linear.steps[:, None, None], 0, 2).swapaxes(0, 1)
-        owner[poses] = places + observation.places
-        places = owner[poses].max() + 1
-    relations, _, u = linear.relations()
-    scaled = relations * linear.steps / np.maximum(u, _LEAST_U)[:, None]
-    return Candidates(rows, owner, PRIOR * np.eye(len(linear.z)) + scaled.T @ scaled, p)
 
 
 def _chosen(

@@ -5,20 +5,24 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from ..calibration.evaluation import fit_geometry
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.rotations import rotation_vector
+from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
 from ..data.observations.simulated import AbstractSimulated
 from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.workspace import SearchRegion, reached, total_link_length
+from ..model.observed import Observed
+from ..uncertainty.linearisation import Linearisation
 from .fedorov_exchange import Candidates, relaxed_value
-from .information import DesignProblem
+from .information import PRIOR, DesignProblem
 from .motion import approaches, explained_place
-from .options import PlacementRegion, inside
+from .options import PlacementRegion
 from .placement import best_layout
 
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS = 120, 8, 60
@@ -26,10 +30,10 @@ _STARTS, _DESIGN_STARTS = 120, 400  # random configurations for each thing: of t
 _ITERATIONS = 8  # of the relaxed design
 _REACHED = 0.25  # fraction of the starts that must arrive in every place of what is placed
 _LEAST_CANDIDATES = 8  # of every place of what stands where it is
+_LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weight
+_START_AGREES = 0.1  # mm or rad: a start of the geometry that is farther off is fitted
 _TRIES = 200
 _SHIFT, _ROTATION = 0.06, 0.4  # of a neighbour: relative to the sum of the links; rad
-
-CandidatesOf = Callable[[DesignProblem, Sequence[AbstractObservation]], Candidates]
 
 
 class KitItem(NamedTuple):
@@ -57,18 +61,24 @@ class KitItem(NamedTuple):
 
 
 class PlacedKit(NamedTuple):
-    """Things in their places, and the item of the kit that each is."""
+    """Things in their places."""
 
+    items: tuple[KitItem, ...]  # of which each is a placement
     kit: tuple[AbstractSimulated, ...]
-    parts: tuple[str, ...]
-    items: tuple[KitItem, ...]
+    frames: tuple[Float[np.ndarray, " 6"] | None, ...]  # None of what stands where it is
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The name of the item of each."""
+        return tuple(item.simulated.name for item in self.items)
 
-class _Layout(NamedTuple):
-    """One placement of everything: frames of what is placed, None for what stands."""
-
-    kit: tuple[AbstractSimulated, ...]
-    frames: tuple[Float[np.ndarray, " 6"] | None, ...]
+    def placed(self, frames: Sequence[Float[np.ndarray, " 6"] | None]) -> "PlacedKit":
+        """The same things elsewhere."""
+        things = zip(self.items, self.kit, frames, strict=True)
+        kit: list[Any] = [
+            thing if frame is None else item.simulated.placed(thing.name, frame) for item, thing, frame in things
+        ]
+        return PlacedKit(self.items, tuple(kit), tuple(frames))
 
 
 class _WithoutErrors(np.random.Generator):
@@ -105,8 +115,8 @@ def set_up(
     constraint leaves too few, unless ``explain`` is False.
     """
     own = region_of(region, simulated, item)
-    each = len(_repeated(simulated, 1).tips(np.random.default_rng(0)))
-    many = _repeated(simulated, max(starts // each, 2 * _LEAST_CANDIDATES))
+    each = len(simulated.changed(poses=1).tips(np.random.default_rng(0)))
+    many = simulated.changed(poses=max(starts // each, 2 * _LEAST_CANDIDATES))
     tips = many.tips(region.random)
     q, good = reached(own, own.draw(len(tips)), tips, scattered=True)
     if item is not None:
@@ -136,47 +146,77 @@ def approachable(
     return approaches(region, q, np.tile(region.cones.normals, (len(q), 1)), retract).possible
 
 
+def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObservation]) -> Candidates:
+    """The information that each pose of the observations would add, and that of certified values alone."""
+    observed, space = Observed.of(Capture({}, (), observations), problem.arm), problem.space
+    vector, p = np.asarray(space.vector()), len(space.names)
+
+    def linear_at(geometry: Float[AnyArray, " g"]) -> Linearisation:
+        z = np.concatenate([vector, np.asarray(geometry)])
+        return Linearisation.at(observed, space, z, noise=problem.noise, least=_LEAST_U)
+
+    linear = linear_at(observed.start(space, vector))
+    if max(np.abs(rows.values).max() for rows in linear.point.rows) > _START_AGREES:
+        linear = linear_at(fit_geometry(problem.arm, observed, {}, problem.noise).geometry)
+    parts = linear.dense()
+    rows = np.zeros((len(observed.q), max(3, *(part.shape[1] for part in parts)), len(linear.z)))
+    owner = np.empty(len(observed.q), dtype=int)
+    places = 0
+    for observation, part, poses in zip(observed.observations, parts, observed.slices, strict=True):
+        rows[poses, : part.shape[1]] = np.moveaxis(np.asarray(part) * linear.steps[:, None, None], 0, 2).swapaxes(0, 1)
+        owner[poses] = places + observation.places
+        places = owner[poses].max() + 1
+    relations, _, u = linear.relations()
+    scaled = relations * linear.steps / np.maximum(u, _LEAST_U)[:, None]
+    return Candidates(rows, owner, PRIOR * np.eye(len(linear.z)) + scaled.T @ scaled, p)
+
+
+def least_poses(observations: Sequence[AbstractObservation]) -> Int[np.ndarray, " s"]:
+    """For each place of each observation: as many as determine its own unknowns, and two at least."""
+    least = []
+    for observation in observations:
+        unknowns = sum(len(units) for units in observation.unknowns.values()) + (3 if observation.target else 0)
+        places = int(observation.places.max()) + 1
+        least += [max(2, math.ceil((unknowns + 1) / (observation.rows * places)))] * places
+    return np.array(least)
+
+
 def place(
     problem: DesignProblem,
     items: Sequence[KitItem],
     poses: int,
     ranges: PlacementRegion,
-    candidates_of: CandidatesOf,
     report: Callable[[str, float], None],
 ) -> PlacedKit:
     """The best placement found of what is to be placed; the rest stands where it is."""
-    parts, movable = [], []
+    of_things, kit = [], []
     for item in items:
-        frames = np.zeros(6)
-        if item.places and item.simulated.placed(item.simulated.name, frames) is None:
-            raise InputError(
-                f"'{item.simulated.name}' is an instrument that is not placed; leave out its number of places."
-            )
-        parts += [item.simulated.name] * max(item.places, 1)
-        movable += [(item, f"{item.simulated.name}/{i + 1}" if item.places > 1 else item.simulated.name)
-                    for i in range(max(item.places, 1))]  # fmt: skip
-    standing = tuple(item.simulated for item in items)
-    owners = tuple(item for item, _ in movable)
+        name = item.simulated.name
+        if item.places and item.simulated.placed(name, np.zeros(6)) is None:
+            raise InputError(f"'{name}' is an instrument and has no placements; remove its number of places.")
+        names = [f"{name}/{i + 1}" for i in range(item.places)] if item.places > 1 else [name]
+        kit += [item.simulated.changed(name=one) for one in names]
+        of_things += [item] * len(names)
+    standing = PlacedKit(tuple(of_things), tuple(kit), (None,) * len(kit))
     if not any(item.places for item in items):
-        return PlacedKit(standing, tuple(parts), owners)
-    search = _Search(problem, movable, poses, ranges, candidates_of)
-    return PlacedKit(search.best(report).kit, tuple(parts), owners)
+        return standing
+    return _Search(problem, standing, poses, ranges).best(report)
 
 
 class _Search(NamedTuple):
     problem: DesignProblem
-    things: list[tuple[KitItem, str]]  # each with the name of its observation
+    standing: PlacedKit
     poses: int
     ranges: PlacementRegion
-    candidates_of: CandidatesOf
 
-    def best(self, report: Callable[[str, float], None]) -> _Layout:
+    def best(self, report: Callable[[str, float], None]) -> PlacedKit:
         """Random placements scored by random poses, the best few by relaxed designs, then neighbours of the best."""
         stage = "Placing the kit"
-        scored: list[tuple[float, int, _Layout]] = []
+        scored: list[tuple[float, int, PlacedKit]] = []
         for number in range(_PLACEMENTS):
             report(stage, 0.4 * number / _PLACEMENTS)
-            layout = self._random()
+            frames = [self._random_frame(item) if item.places else None for item in self.standing.items]
+            layout = self.standing.placed(frames)
             pools = self._pools(layout, _STARTS)
             if pools is not None:
                 scored.append((self._value(pools, 0), number, layout))
@@ -194,9 +234,9 @@ class _Search(NamedTuple):
             lambda fraction: report(stage, fraction),
         )
 
-    def _reason(self, layout: _Layout) -> str:
+    def _reason(self, layout: PlacedKit) -> str:
         """Why a placement cannot be reached well."""
-        for simulated, (item, _) in zip(layout.kit, self.things, strict=True):
+        for simulated, item in zip(layout.kit, layout.items, strict=True):
             try:
                 set_up(self.problem.region, simulated, _STARTS, _REACHED, item)
             except InputError as error:
@@ -204,42 +244,30 @@ class _Search(NamedTuple):
         return "single poses of it are hard to reach."
 
     def _value(self, pools: Sequence[AbstractObservation], iterations: int) -> float:
-        candidates = self.candidates_of(self.problem, pools)
+        candidates = candidates_of_kit(self.problem, pools)
         return relaxed_value(candidates, self.poses, self.problem.objective, iterations)
 
     def _pools(
         self,
-        layout: _Layout,
+        layout: PlacedKit,
         starts: int,
-        before: _Layout | None = None,
+        before: PlacedKit | None = None,
         known: Sequence[AbstractObservation] | None = None,
     ) -> list[AbstractObservation] | None:
         """Poses in everything, those of what has not moved kept; None where something is hard to reach."""
-        found = []
-        for i, (simulated, frame, (item, _)) in enumerate(zip(layout.kit, layout.frames, self.things, strict=True)):
+        pools = []
+        for i, (item, simulated, frame) in enumerate(zip(*layout, strict=True)):
             if before is not None and known is not None and frame is before.frames[i]:
-                found.append(known[i])
+                pools.append(known[i])
                 continue
             try:
                 share, stands = (0.0, True) if frame is None else (_REACHED, False)
-                found.append(set_up(self.problem.region, simulated, starts, share, item, explain=stands))
+                pools.append(set_up(self.problem.region, simulated, starts, share, item, explain=stands))
             except InputError:
                 if frame is None:
                     raise
                 return None
-        return found
-
-    def _random(self) -> _Layout:
-        frames = [self._random_frame(item) if item.places else None for item, _ in self.things]
-        return self._layout(frames)
-
-    def _layout(self, frames: Sequence[Float[np.ndarray, " 6"] | None]) -> _Layout:
-        kit = []
-        for (item, name), frame in zip(self.things, frames, strict=True):
-            one = item.simulated if frame is None else item.simulated.placed(name, frame)
-            assert one is not None
-            kit.append(one)
-        return _Layout(tuple(kit), tuple(frames))
+        return pools
 
     def _random_frame(self, item: KitItem) -> Float[np.ndarray, " 6"]:
         """A rotation, and the middle of the thing where the tip of a random configuration is."""
@@ -253,15 +281,15 @@ class _Search(NamedTuple):
             }[item.turned]
             middle = np.asarray(self.problem.arm.position(self.problem.region.draw(1)))[0]
             frame = _about(turn, local.mean(axis=0), middle)
-            if inside(turn.apply(local) + frame[3:], self.ranges).all():
+            if self.ranges.contains(turn.apply(local) + frame[3:]).all():
                 return frame
         raise InputError(f"'{item.simulated.name}' does not fit into the region; widen it.")
 
-    def _neighbour(self, layout: _Layout) -> _Layout | None:
+    def _neighbour(self, layout: PlacedKit) -> PlacedKit | None:
         """With one thing shifted and turned a little, or None where that leaves the region."""
         random = self.problem.region.random
         which = random.choice([i for i, frame in enumerate(layout.frames) if frame is not None])
-        item, frame = self.things[which][0], layout.frames[which]
+        item, frame = layout.items[which], layout.frames[which]
         assert frame is not None
         axes = {"any": [1, 1, 1], "vertical": [0, 0, 1], "not": [0, 0, 0]}[item.turned]
         turn = Rotation.from_rotvec(_ROTATION * random.normal(size=3) * axes) * Rotation.from_rotvec(frame[:3])
@@ -269,19 +297,14 @@ class _Search(NamedTuple):
         old = Rotation.from_rotvec(frame[:3]).apply(local.mean(axis=0)) + frame[3:]
         shift = _SHIFT * total_link_length(self.problem.arm) * random.normal(size=3)
         new = _about(turn, local.mean(axis=0), old + shift)
-        if not inside(turn.apply(local) + new[3:], self.ranges).all():
+        if not self.ranges.contains(turn.apply(local) + new[3:]).all():
             return None
-        return self._layout([new if i == which else frame for i, frame in enumerate(layout.frames)])
+        return layout.placed([new if i == which else frame for i, frame in enumerate(layout.frames)])
 
 
 def _extent(simulated: AbstractSimulated) -> Float[np.ndarray, "m 3"]:
     """Some of the points of a thing, where it stands."""
-    return _repeated(simulated, 20).tips(np.random.default_rng(0))
-
-
-def _repeated(simulated: AbstractSimulated, poses: int) -> AbstractSimulated:
-    """With another number of poses in each place."""
-    return simulated.changed(poses=poses)
+    return simulated.changed(poses=20).tips(np.random.default_rng(0))
 
 
 def _about(turn: Rotation, middle: Float[np.ndarray, " 3"], to: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 6"]:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from ..core.arguments import Count, Range, checked_fields
 from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import to_numpy
@@ -25,7 +26,6 @@ LEAST_POSES = 2  # in a socket: one shows no scatter
 FARTHEST = 0.95  # part of the reach: beyond it an arm is stretched, and hardly any pose can be taken
 TABLE = "table"
 _U_RANGE = (1e-6, 100.0)  # mm
-_LARGEST_RETRACT = 1000.0  # mm
 
 Criterion = Literal["length", "A", "D", "E"]
 Ranges = Mapping[str, tuple[float, float]]  # of x, y, z and the distance from the origin, mm
@@ -67,15 +67,15 @@ class PlanOptions(NamedTuple):
     noise: Noise | None = None
     criterion: Criterion = "length"
     region: Ranges | None = None
-    farthest: float = FARTHEST
+    farthest: Annotated[float, Range(above=0, most=1)] = FARTHEST
     limits: Sequence[Sequence[float]] | None = None
     margin: float = math.radians(5)
     above: float = 0.0
     tool_axis: tuple[float, float, float] = TOOL_AXIS
     cell: Cell | None = None
-    retract: float = 0.0
+    retract: Annotated[float, Range(least=0, most=1000, unit="mm")] = 0.0
     unconstrained: bool = False
-    candidates: int | None = None
+    candidates: Count | None = None
     check_length: float | None = None
     seed: int = 0
     progress: Callable[[str, float], None] | None = None
@@ -104,6 +104,7 @@ class PlanTask(NamedTuple):
         """
         if not is_single(arm):
             raise InputError("plans are for one arm, not a batch; give one of its arms.")
+        options = checked_fields(options)
         space = Parameters.free_of(arm) if options.space is None else options.space
         # Plans are at 20 C, so they say nothing of thermal expansion.
         space = Parameters(space.base, tuple(name for name in space.names if name != Expansion.words[0]))
@@ -112,28 +113,19 @@ class PlanTask(NamedTuple):
         length = default_length(arm) if options.check_length is None else options.check_length
         if arm.joints < 3 or total_link_length(arm) == 0:
             raise InputError("this arm reaches no volume: it needs three joints and a link; there is nothing to plan.")
-        if options.criterion not in (known := ("length", "A", "D", "E")):
-            raise InputError(f"criterion is '{options.criterion}'; it must be one of {', '.join(known)}.")
-        if not 0 <= options.retract <= _LARGEST_RETRACT:
-            raise InputError(
-                f"approach points {options.retract:g} mm above the sockets cannot be planned; give 0, for none, to "
-                f"{_LARGEST_RETRACT:g} mm."
-            )
         noise = small_arm_noise() if options.noise is None else options.noise
         noise.check(arm.joints)
         return cls(arm, space, noise, length, options)
 
     def search_region(self, cones: Cones) -> SearchRegion:
         """The configurations that may be taken in seats with these cones."""
-        options = self.options
-        cell = with_table(options.cell, options.above)
+        options, cell = self.options, self.options.cell
+        if cell is not None and np.isfinite(options.above) and TABLE not in [one.name for one in cell.obstacles]:
+            table = HalfSpace(TABLE, (0.0, 0.0, 1.0), (0.0, 0.0, options.above))
+            cell = cell._replace(obstacles=(table, *cell.obstacles))
         return search_region(
             to_numpy(self.arm), options.limits, options.margin, options.above, options.seed, cones, cell
         )
-
-    def placement_region(self) -> "PlacementRegion":
-        """Where sockets and artefacts may be placed."""
-        return placement_region(to_numpy(self.arm), self.options.region, self.options.farthest)
 
 
 class PlacementRegion(NamedTuple):
@@ -143,6 +135,29 @@ class PlacementRegion(NamedTuple):
     shoulder: Float[np.ndarray, " 3"]  # mm
     farthest: float  # from the shoulder, mm
 
+    @classmethod
+    def of(cls, arm: Arm, ranges: Ranges | None, farthest: float) -> "PlacementRegion":
+        """The region with the given ranges (default: z at least 0), no farther than a part of the reach."""
+        ranges = {"z": (0.0, np.inf)} if ranges is None else ranges
+        for axis, (low, high) in ranges.items():
+            if not low < high:
+                raise InputError(
+                    f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
+                )
+            if axis not in ("x", "y", "z", "distance"):
+                raise InputError(f"the region has no '{axis}'; give ranges of x, y, z and distance, in mm.")
+        reach = arm_reach(to_numpy(arm))
+        return cls(ranges, reach.shoulder, farthest * reach.radius)
+
+    def contains(self, points: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:
+        """Which points are within the region."""
+        values = {"x": points[..., 0], "y": points[..., 1], "z": points[..., 2]}
+        values["distance"] = np.linalg.norm(points, axis=-1)
+        inside = np.linalg.norm(points - self.shoulder, axis=-1) <= self.farthest
+        for key, (low, high) in self.ranges.items():
+            inside &= (values[key] >= low) & (values[key] <= high)
+        return inside
+
 
 class FixturePlacement(NamedTuple):
     """Positions of sockets, and which of them are the ends of reference lengths, of what standard uncertainty; mm."""
@@ -150,6 +165,12 @@ class FixturePlacement(NamedTuple):
     points: Float[np.ndarray, "s 3"]
     ends: tuple[tuple[int, int], ...]
     u: tuple[float, ...]
+
+    def in_order(self, sockets: Int[np.ndarray, " s"]) -> "FixturePlacement":
+        """The same sockets in another order."""
+        place = np.argsort(sockets).tolist()
+        ends = tuple((place[start], place[end]) for start, end in self.ends)
+        return FixturePlacement(self.points[sockets], ends, self.u)
 
 
 def check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple]) -> None:
@@ -198,11 +219,10 @@ def given_placement(
     return names, FixturePlacement(np.array(list(points.values())), ends, each_u)
 
 
-def check_ranges(arm: Arm, length: tuple[float, float], lengths: Sequence[tuple], ranges: Ranges) -> None:
-    """Raise `InputError` where the sockets cannot be placed."""
+def check_length(arm: Arm, length: tuple[float, float], lengths: Sequence[tuple]) -> None:
+    """Raise `InputError` where the reference length cannot be placed."""
     if lengths:
         raise InputError("lengths are between sockets that are given; with a number of sockets, give length and u.")
-    check_region(ranges)
     low, high = length
     if not 0 < low <= high < 2 * total_link_length(arm):
         raise InputError(
@@ -220,42 +240,3 @@ def checked_cones(
                 raise InputError(f"a cone is given for the unknown socket '{name}'{nearest(str(name), names)}")
     by_name = cone if isinstance(cone, Mapping) else dict.fromkeys(names, cone or Cone())
     return cones_of([by_name.get(name, Cone()) for name in names], tool_axis)
-
-
-def with_table(cell: Cell | None, above: float) -> Cell | None:
-    """The cell with the table, where nothing in it has that name."""
-    if cell is None or not np.isfinite(above) or any(obstacle.name == TABLE for obstacle in cell.obstacles):
-        return cell
-    return cell._replace(obstacles=(HalfSpace(TABLE, (0.0, 0.0, 1.0), (0.0, 0.0, above)), *cell.obstacles))
-
-
-def check_region(ranges: Ranges) -> None:
-    """Raise `InputError` for ranges that are none, or of something else than x, y, z and the distance."""
-    for axis, (low, high) in ranges.items():
-        if not low < high:
-            raise InputError(
-                f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
-            )
-    unknown = sorted(set(ranges) - {"x", "y", "z", "distance"})
-    if unknown:
-        raise InputError(f"the region has no '{unknown[0]}'; give ranges of x, y, z and distance, in mm.")
-
-
-def placement_region(arm: Arm, ranges: Ranges | None, farthest: float) -> PlacementRegion:
-    """The region with the given ranges (default: z at least 0), no farther than a part of the reach."""
-    if not 0 < farthest <= 1:
-        raise InputError(
-            f"farthest is {farthest:g}; give a part of the reach, such as {FARTHEST:g}, or 1 for all of it."
-        )
-    reach = arm_reach(arm)
-    return PlacementRegion({"z": (0.0, np.inf)} if ranges is None else ranges, reach.shoulder, farthest * reach.radius)
-
-
-def inside(points: Float[np.ndarray, "... 3"], region: PlacementRegion) -> Bool[np.ndarray, "..."]:
-    """Which points are within the region."""
-    values = {"x": points[..., 0], "y": points[..., 1], "z": points[..., 2]}
-    values["distance"] = np.linalg.norm(points, axis=-1)
-    inside = np.linalg.norm(points - region.shoulder, axis=-1) <= region.farthest
-    for key, (low, high) in region.ranges.items():
-        inside &= (values[key] >= low) & (values[key] <= high)
-    return inside

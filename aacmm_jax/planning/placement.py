@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
 from ..core.errors import InputError
@@ -13,7 +12,7 @@ from ..core.numpy_or_jax import in_chunks
 from ..kinematics.workspace import reached, total_link_length
 from .fedorov_exchange import relaxed_value
 from .information import DesignProblem, Pool, candidates_of, pool_at, pool_of
-from .options import LEAST_POSES, FixturePlacement, PlacementRegion, PlanOptions, inside
+from .options import LEAST_POSES, FixturePlacement, PlacementRegion, PlanOptions
 
 # Random placements, those of them for which poses are chosen, tried neighbours of the best, and starts for each.
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
@@ -104,13 +103,6 @@ def best_placement(
     )
 
 
-def in_order(placement: FixturePlacement, sockets: Int[np.ndarray, " s"]) -> FixturePlacement:
-    """The same sockets in another order."""
-    place = np.argsort(sockets).tolist()
-    ends = tuple((place[start], place[end]) for start, end in placement.ends)
-    return FixturePlacement(placement.points[sockets], ends, placement.u)
-
-
 def _random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:
     """The objective for so many random poses in each placement; infinite if a socket is hard to reach."""
     sockets = len(placements[0].points)
@@ -148,8 +140,8 @@ def random_placements(
         size = np.exp(random.uniform(math.log(length[0]), math.log(length[1]), len(middle)))[:, None]
         half = 0.5 * size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         both = np.stack([middle - half, middle + half], axis=1)
-        both = both[inside(both, ranges).all(axis=1)]
-        single = middle[inside(middle, ranges)]
+        both = both[ranges.contains(both).all(axis=1)]
+        single = middle[ranges.contains(middle)]
         for i in range(min(len(both) // max(pairs, 1), len(single))):
             points = both[i * pairs : (i + 1) * pairs].reshape(-1, 3)
             points = np.concatenate([points, single[i : i + sockets % 2]])
@@ -172,7 +164,7 @@ def _neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: Plac
     shift = random.normal(size=3) * _SHIFT * total_link_length(problem.arm)
     rotation = Rotation.from_rotvec(random.normal(size=3) * _ROTATION)
     points[moved] = middle + shift + rotation.apply(points[moved] - middle)
-    return placement._replace(points=points) if inside(points, ranges).all() else None
+    return placement._replace(points=points) if ranges.contains(points).all() else None
 
 
 def _moved_pool(

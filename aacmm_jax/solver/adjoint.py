@@ -33,8 +33,8 @@ class EquilibratedPseudoInverse(lx.AbstractLinearSolver):
 
     def compute(self, state, vector, options):
         (u, s, v), row, column, structures = state
-        known = s > self.rcond * s[0]
-        inverse = jnp.where(known, 1 / jnp.where(known, s, 1.0), 0.0)
+        determined = s > self.rcond * s[0]
+        inverse = jnp.where(determined, 1 / jnp.where(determined, s, 1.0), 0.0)
         solution = column * (v @ (inverse * (u.T @ (row * ravel_pytree(vector)[0]))))
         like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), structures.value[0])
         return ravel_pytree(like)[1](solution), lx.RESULTS.successful, {}

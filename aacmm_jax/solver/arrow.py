@@ -77,6 +77,7 @@ class Arrow(NamedTuple):
         head = _damped(self.head, head_fixed, damping)
         followers = []
         for crossed, own, still, part in zip(self.crossed, self.own, fixed_of, rights, strict=True):
+            # Schur complement by whitened blocks: with W D W^T = I, C^T D^-1 C = (W C)^T (W C).
             whitening = inverse_cholesky(_damped(own, still, damping[..., None]))
             crossed = xp.where(still[..., None] | head_fixed[..., None, None, :], 0.0, crossed)
             by_head, alone = whitening @ crossed, (whitening @ part[..., None])[..., 0]
@@ -85,12 +86,13 @@ class Arrow(NamedTuple):
             head = head - transposed @ flat
             head_right = head_right - (transposed @ alone.reshape(*alone.shape[:-2], -1)[..., None])[..., 0]
             followers.append((whitening, by_head, alone))
-        found = solve_positive_definite(head, head_right)
+        # Substitution: x_block = D^-1 (r_block - C x_head), with D^-1 = W^T W.
+        solution = solve_positive_definite(head, head_right)
         below = []
         for whitening, by_head, alone in followers:
-            rest = alone - (by_head @ found[..., None, :, None])[..., 0]
+            rest = alone - (by_head @ solution[..., None, :, None])[..., 0]
             below.append((xp.swapaxes(whitening, -1, -2) @ rest[..., None])[..., 0])
-        return joined(found, *below)
+        return joined(solution, *below)
 
 
 def split(

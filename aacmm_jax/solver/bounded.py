@@ -9,7 +9,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ..core.arguments import whole_number
+from ..core.arguments import Count, checked
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
 from ..core.x64 import check_x64
@@ -49,19 +49,19 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return Rules(self.rtol, self.atol, self.gtol, self.initial_damping)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
-        flat, _ = ravel_pytree(y)
-        if options.get("normal") is None:
-            return begin(flat, box_of(y, options))
-        form = jax.eval_shape(options["normal"], y, args).gram
-        return begin(flat, box_of(y, options), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form))
+        form = None
+        if options.get("normal") is not None:
+            form = jax.eval_shape(options["normal"], y, args).gram
+            form = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
+        return begin(ravel_pytree(y)[0], box_of(y, options), form)
 
     def step(self, fn, y, args, options, state, tags):
         unravel: Callable = ravel_pytree(y)[1]
-        normal = options.get("normal")
-        if normal is None:
-            evaluated, aux = _evaluate(fn, unravel, state.step.trial, args)
+        trial = state.step.trial
+        if options.get("normal") is None:
+            evaluated, aux = _evaluate(fn, unravel, trial, args)
         else:
-            evaluated, aux = normal(unravel(state.step.trial), args), None
+            evaluated, aux = options["normal"](unravel(trial), args), None
         state = advance(state, evaluated, box_of(y, options), self.rules)
         return unravel(state.y), state, aux
 
@@ -142,24 +142,16 @@ def least_squares(
     y0 = jax.tree.map(lambda leaf: jnp.asarray(as_array(leaf, "the start")), y0)
     if not sum(leaf.size for leaf in jax.tree.leaves(y0)):
         raise InputError("the start holds no number, so nothing is unknown; give at least one.")
-    whole_number(max_steps, "max_steps")
-    if max_steps < 1:
-        raise InputError(f"max_steps is {max_steps}; give at least 1.")
-    given = {"lower": (lower, -jnp.inf), "upper": (upper, jnp.inf), "scale": (scale, 1.0)}
+    checked(max_steps, Count, "max_steps")
     options = {
-        what: tree if tree is None else _expanded(y0, tree, absent, what) for what, (tree, absent) in given.items()
+        "lower": _expanded(y0, lower, -jnp.inf, "lower"),
+        "upper": _expanded(y0, upper, jnp.inf, "upper"),
+        "scale": _expanded(y0, scale, 1.0, "scale"),
     }
     _check_box(y0, options["lower"], options["upper"])
-    solution = optx.least_squares(
-        fn,
-        solver,
-        y0,
-        args,
-        options | {"normal": normal},
-        max_steps=max_steps,
-        adjoint=BoundedAdjoint(),
-        throw=False,
-    )
+    options |= {"normal": normal}
+    steps = {"max_steps": max_steps, "adjoint": BoundedAdjoint(), "throw": False}
+    solution = optx.least_squares(fn, solver, y0, args, options, **steps)
     if not throw:
         return solution
     failed = solution.result != optx.RESULTS.successful
@@ -171,12 +163,12 @@ def least_squares(
 
 
 def _expanded(y0: PyTree[Array], tree: PyTree, absent: float, what: str) -> PyTree[Array]:
+    if tree is None:
+        return None
     try:
         return expand(y0, tree, absent)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{what} does not fit the start; give a number, or a PyTree like the start ({error})."
-        ) from error
+        raise InputError(f"{what} does not fit the start; give a number, or a PyTree like it ({error}).") from error
 
 
 def _check_box(y0: PyTree, lower: PyTree, upper: PyTree) -> None:

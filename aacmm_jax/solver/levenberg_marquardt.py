@@ -53,20 +53,10 @@ def begin(y: Flat, box: Box, gram: Any = None) -> Progress:
     Gram matrices to come, by default that of a dense one."""
     y, xp = box.clip(y), namespace(y)
     zero, none = xp.zeros(y.shape[:-1]), xp.zeros(y.shape[:-1], dtype=np.int64)
-    return Progress(
-        y=y,
-        model=QuadraticModel(
-            zero + np.inf, xp.zeros_like(y), xp.zeros((*y.shape, y.shape[-1])) if gram is None else gram
-        ),
-        optimality=zero + np.inf,
-        step=Step(y, zero, zero + np.inf),
-        damping=zero,
-        growth=zero + 2.0,
-        curvature=xp.zeros_like(y),
-        steps=none,
-        accepted=none,
-        reason=xp.full(y.shape[:-1], RUNNING, dtype=np.int32),
-    )
+    gram = xp.zeros((*y.shape, y.shape[-1])) if gram is None else gram
+    model, step = QuadraticModel(zero + np.inf, xp.zeros_like(y), gram), Step(y, zero, zero + np.inf)
+    reason = xp.full(y.shape[:-1], RUNNING, dtype=np.int32)
+    return Progress(y, model, zero + np.inf, step, zero, zero + 2.0, xp.zeros_like(y), none, none, reason)
 
 
 def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rules) -> Progress:
@@ -114,18 +104,8 @@ def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rule
     ended = xp.where((largest > 0) | (model.cost == 0), GRADIENT, STALLED)
     reason = xp.where(optimality <= rules.gtol, ended, reason)
     reason = xp.where(first & ~finite, NONFINITE, reason).astype(np.int32)
-    return Progress(
-        y=y,
-        model=model,
-        optimality=optimality,
-        step=step,
-        damping=damping,
-        growth=growth,
-        curvature=curvature,
-        steps=progress.steps + 1,
-        accepted=progress.accepted + xp.where(accept, 1, 0),
-        reason=reason,
-    )
+    steps, accepted = progress.steps + 1, progress.accepted + xp.where(accept, 1, 0)
+    return Progress(y, model, optimality, step, damping, growth, curvature, steps, accepted, reason)
 
 
 def minimise(

@@ -34,16 +34,8 @@ class Reason(eqx.Enumeration):
 
 # Their numbers, which the steps of a solve compute with.
 RUNNING, GRADIENT, STEP, ROUNDING, MAX_STEPS, STALLED, NONFINITE = (
-    int(_compat.member_numbers(reason))
-    for reason in (
-        Reason.running,
-        Reason.gradient,
-        Reason.step,
-        Reason.rounding,
-        Reason.max_steps,
-        Reason.stalled,
-        Reason.nonfinite,
-    )
+    int(_compat.member_numbers(getattr(Reason, name)))
+    for name in ("running", "gradient", "step", "rounding", "max_steps", "stalled", "nonfinite")
 )
 
 

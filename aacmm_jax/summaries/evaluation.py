@@ -205,7 +205,7 @@ def influences_row(influences: Influences) -> dict[str, Any]:
 
 
 def acceptance_summary(tests: list[AcceptanceTest], before: list[AcceptanceTest] | None = None) -> list[dict[str, Any]]:
-    """Acceptance tests; ``before``: those of the arm as found, whose metrics are added."""
+    """Acceptance tests; ``before``: those of the nominal arm, whose metrics are added."""
     earlier = {(test.title, metric.name): metric for test in before or () for metric in test.metrics}
     return [
         {

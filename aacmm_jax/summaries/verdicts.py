@@ -121,10 +121,10 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
         before = {metric["name"]: metric["as_found_decision"] for metric in metrics}
-        says = f"Conforms{' as left' if any(before.values()) else ''}: every limit given is kept"
+        says = f"Conforms{' (calibrated arm)' if any(before.values()) else ''}: every limit given is kept"
         says += f" ({shorten(list(dict.fromkeys(names)))})" if names else ""
         failed = [name for name, decision in before.items() if decision == "fails"]
-        says += f"; as found, it fails ({shorten(failed)})" if failed else ""
+        says += f"; the nominal arm fails ({shorten(failed)})" if failed else ""
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
         says += "; a procedure was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)

@@ -13,7 +13,7 @@ from ..core.text import pluralise
 from ..kinematics.arm import Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections.gear_ratio import GearRatio
+from ..kinematics.corrections.gears import GearRatio
 from ..kinematics.corrections.gravity import Gravity
 from ..kinematics.corrections.kind import Term
 

@@ -97,7 +97,7 @@ HOSTILE = ("<script>alert('1')</script>", 'a]]><b>"&amp;&lt;', "tab\té Ж 測 �
 
 @pytest.fixture(scope="module")
 def record(paper_arm) -> aj.calibration.CalibrationRecord:
-    """A calibration of an arm that is off, so as found and as left differ. One of its two lengths is exact."""
+    """A calibration of an arm that is off, so that nominal and calibrated differ. One of its two lengths is exact."""
     nominal = aj.kinematics.ArmSpecification(paper_arm, "small & fine")
     bounds = nominal.bounds()
     true = bounds.space.arm(np.asarray(bounds.space.vector()) + np.where(bounds.space.lengths, 0.4, 0.001))
@@ -290,7 +290,7 @@ def test_numbers_read_back(record):
     coverage = {name: {x.text for x in ElementTree.fromstring(text).iter(f"{SI}coverage{name}")} for name in COVERAGE}
     assert coverage["Probability"] == {"0.95"}
     assert {f"{factor:.4g}" for factor in factors.values()} <= coverage["Factor"]
-    arms = {"As found": record.recording.nominal.arm, "As left": record.calibrated.arm}
+    arms = {"Nominal parameters": record.recording.nominal.arm, "Calibrated parameters": record.calibrated.arm}
     for stage, arm in arms.items():
         kinds = (("alpha", RAD), ("a", MM), ("d", MM), ("theta", RAD))
         numbers = {f"{kind}_{i + 1}": (float(getattr(arm, kind)[i]), unit) for kind, unit in kinds for i in range(6)}
@@ -298,7 +298,7 @@ def test_numbers_read_back(record):
         for name, (number, unit) in numbers.items():
             found = values[stage, PARAMETERS, name]
             assert found.unit == unit
-            if stage == "As left" and name not in record.held:
+            if stage == "Calibrated parameters" and name not in record.held:
                 i = record.names.index(name)
                 two_digits(found, number, factors[name] * math.sqrt(record.covariance[i, i]))
             else:
@@ -320,7 +320,7 @@ def test_numbers_read_back(record):
             assert row["measured value"].value == pytest.approx(float(metrics.measured[i]), abs=digits)
     stated = ElementTree.fromstring(text).iterfind(f".//{DCC}results//{SI}valueStandardMU")
     assert [element.text for element in stated] == ["0.01"] * 2  # that of the first; the second is exact
-    k = values["As left", "Scale", "k"]
+    k = values["Calibrated parameters", "Scale", "k"]
     two_digits(k, record.k, uncertainty.expanded_k())
     # Three metrics, three numbers for each of two lengths, and 27 parameters, twice; and the scale.
     assert len(values) == 2 * (3 + 6 + 27) + 1
@@ -330,7 +330,7 @@ def test_the_covariance_matrix_is_a_table(record, certificates):
     """A row a parameter, with the units of the products; enough digits to be symmetric and positive definite."""
     root = ElementTree.fromstring(certificates["nothing stated"])
     tables = [item for item in root.iter(f"{DCC}list") if contents_of(item, "name") == ["Covariance"]]
-    assert len(tables) == 1  # as left only
+    assert len(tables) == 1  # of the calibrated parameters only
     rows = {contents_of(row, "name")[0]: row for row in tables[0].iterfind(f"{DCC}quantity")}
     assert tuple(rows) == record.names
     matrix = np.array([row.findtext(f".//{SI}valueXMLList").split() for row in rows.values()], dtype=float)
@@ -353,7 +353,7 @@ def contents_of(element, tag: str) -> list[str]:
 
 def test_acceptance_results_have_their_conformity_beside_them(evaluation, certificates):
     values = parse_dcc(certificates["all stated"])
-    for stage, name in (("nominal", "as found"), ("calibrated", "as left")):
+    for stage, name in (("nominal", "nominal parameters"), ("calibrated", "calibrated parameters")):
         for test in evaluation.acceptance()[stage]:
             for metric in test.metrics:
                 for number, value in enumerate(metric.values, start=1):
@@ -436,13 +436,13 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
     values = parse_dcc(text)
     found = observed_record.observed
     for i, name in enumerate(found.names):
-        row = ("As left", "Observations", f"{i + 1}: {name}")
+        row = ("Calibrated parameters", "Observations", f"{i + 1}: {name}")
         assert values[*row, "RMS residual"][:2] == (pytest.approx(found.rms_after[i], abs=5.1e-6), MM)
         chi = values[*row, "RMS residual in standard deviations"].value
         assert chi == pytest.approx(found.reduced_chi[i], abs=5.1e-4)
-        assert values["As found", *row[1:], "RMS residual"].value > 0.3
-    assert ("As left", "Observations", "3: tracker", "RMS residual of the orientation") in values
-    assert ("As left", "Scale", "k") not in values
+        assert values["Nominal parameters", *row[1:], "RMS residual"].value > 0.3
+    assert ("Calibrated parameters", "Observations", "3: tracker", "RMS residual of the orientation") in values
+    assert ("Calibrated parameters", "Scale", "k") not in values
     said = " ".join(contents(text, "*/dcc:statements"))
     assert "comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact):" in said
     assert "robust loss 'tukey'" in text
@@ -451,12 +451,14 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
 @pytest.mark.parametrize("value", [5e-324, -0.0, 1e-5, 0.1, 1 / 3, -123456789.125, 1e99])
 def test_any_number_reads_back(record, value):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
-    k = f"<si:value>{parse_dcc(text)['As left', 'Scale', 'k'].value!r}</si:value>"
+    k = f"<si:value>{parse_dcc(text)['Calibrated parameters', 'Scale', 'k'].value!r}</si:value>"
     assert text.count(k) == 1
     parent = ElementTree.Element("x")
     parent.append(xml_elements.real(value, MM))
     again = ElementTree.fromstring(xml_elements.xml_text(parent).replace("si:", ""))[0]
-    read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))["As left", "Scale", "k"].value
+    read = parse_dcc(text.replace(k, f"<si:value>{again.findtext('value')}</si:value>"))[
+        "Calibrated parameters", "Scale", "k"
+    ].value
     assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
 
 
@@ -479,14 +481,14 @@ def test_parameters_without_an_uncertainty_of_their_own_say_why(record, certific
     }
     for name, word in words.items():
         assert word in left[name]
-        assert values["As left", PARAMETERS, name].expanded is None
+        assert values["Calibrated parameters", PARAMETERS, name].expanded is None
         assert found[name] is None
     assert all(
         "divided" not in text for text in left.values() if text
     )  # d_1 only says where the base is, the others are 0
     others = set(record.names) - set(words)
     assert others
-    assert all(left[name] is None and values["As left", PARAMETERS, name].expanded for name in others)
+    assert all(left[name] is None and values["Calibrated parameters", PARAMETERS, name].expanded for name in others)
 
 
 def test_priors_and_joint_corrections_are_stated(record):
@@ -520,7 +522,7 @@ def test_a_fixed_length_says_so(record):
     )
     assert dcc_model.faults(text) == []
     assert "Not identified: fixed at its nominal value" in text
-    assert parse_dcc(text)["As left", PARAMETERS, "probe_z"].expanded is None
+    assert parse_dcc(text)["Calibrated parameters", PARAMETERS, "probe_z"].expanded is None
 
 
 def test_what_is_stated_is_in_the_certificate(certificates, full):
@@ -557,7 +559,7 @@ def test_what_is_stated_is_in_the_certificate(certificates, full):
     assert "a.h5, <b>.toml" in contents(text, "*/dcc:statements")
     equipment = "*/dcc:measurementResult[1]/dcc:measuringEquipments/dcc:measuringEquipment"
     assert contents(text, f"{equipment}/dcc:name") == ["ball bar", "Reference lengths"]
-    assert parse_dcc(text)["As left", "Scale", "k"].expanded
+    assert parse_dcc(text)["Calibrated parameters", "Scale", "k"].expanded
     temperature = root.find(f"*/{DCC}measurementResult/{DCC}influenceConditions//{SI}real")
     assert temperature is not None
     assert [item.text for item in temperature.iter() if item.text and item.text.strip()] == [
@@ -647,7 +649,7 @@ def test_hostile_names_stay_text(record, name):
     record = renamed_sockets(record, name, "B", "C")
     record = record._replace(recording=record.recording._replace(nominal=record.recording.nominal._replace(name=name)))
     text = dcc_xml(record, AdministrativeData(), created=CREATED, command=name)
-    assert ("As left", "Reference lengths", f"1: {name} - B", "error") in parse_dcc(text)
+    assert ("Calibrated parameters", "Reference lengths", f"1: {name} - B", "error") in parse_dcc(text)
     assert contents(text, "*/dcc:items/dcc:item/dcc:name")[0] == name
     assert name in contents(text, "*/dcc:measurementResult/dcc:usedSoftware")
     assert all(element.tag.startswith((DCC, SI)) for element in ElementTree.fromstring(text).iter())
@@ -785,10 +787,12 @@ def test_what_is_no_certificate_is_refused(text, parts):
 
 def test_a_certificate_whose_number_was_edited_is_refused(record):
     text = dcc_xml(record, AdministrativeData(), created=CREATED)
-    k = f"<si:value>{parse_dcc(text)['As left', 'Scale', 'k'].value!r}</si:value>"
+    k = f"<si:value>{parse_dcc(text)['Calibrated parameters', 'Scale', 'k'].value!r}</si:value>"
     numbers = (f"<si:value>{number}</si:value>" for number in ("1_0", "\u0663", "NaN", "INF", "1e300", "9" * 5001))
     for edited in (k.replace(".", ","), "", *numbers):
-        assert_refused(lambda edited=edited: parse_dcc(text.replace(k, edited)), "'As left / Scale / k'", "no number")
+        assert_refused(
+            lambda edited=edited: parse_dcc(text.replace(k, edited)), "'Calibrated parameters / Scale / k'", "no number"
+        )
 
 
 @pytest.mark.parametrize("kind", kinds.all_kinds(), ids=lambda kind: kind.model)

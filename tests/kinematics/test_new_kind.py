@@ -16,7 +16,7 @@ from aacmm_jax.files.priors import prior_of_text
 from aacmm_jax.kinematics import default_prior, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.corrections import kinds
-from aacmm_jax.kinematics.corrections.kind import AbstractCorrection, Sought, Term
+from aacmm_jax.kinematics.corrections.kind import AbstractCorrection, Sought
 from aacmm_jax.report import write_report
 from aacmm_jax.summaries.calibration import arm_summary
 
@@ -29,25 +29,11 @@ class Bow(AbstractCorrection):
     model: ClassVar[str] = "bow"
     words: ClassVar[tuple[str, ...]] = ("bow",)
     description: ClassVar[str] = "bows of scales"
-    rows: ClassVar[int] = 1
+    unit: ClassVar[str] = "1/rad"
+    usual_size: ClassVar[float] = 1e-4
     of_own_reading: ClassVar[bool] = True
     sought: ClassVar[tuple[Sought, ...]] = (Sought("bow", "", "the square of q_{i}", "a bent scale"),)
     shared: ClassVar[str | None] = ""
-
-    def terms(self, joints, option, loads):
-        return tuple(Term(self, "bow", 0, joint) for joint in range(1, joints + 1))
-
-    def option_of(self, terms):
-        return ""
-
-    def wrong(self, term, joints):
-        return "has a number, and takes none" if term.number else ""
-
-    def unit_of(self, term):
-        return "1/rad"
-
-    def usual(self, terms):
-        return {"bow": 1e-4}
 
     def values(self, terms, q, forward):
         return q[np.array([term.joint - 1 for term in terms])] ** 2

@@ -206,7 +206,7 @@ REFUSED = {
     ),
     "approach": ({"retract": 990.0}, "by way of its approach point 990 mm along its normal"),
     "unknown": ({"cone": {"Q": Cone()}}, "unknown socket 'Q'"),
-    "retract": ({"retract": -1.0}, "approach points -1 mm"),
+    "retract": ({"retract": -1.0}, "retract is -1 mm; it must be"),
     "tool": ({"tool_axis": (0.0, 0.0, 0.0)}, "tool.s axis has the length 0"),
 }
 

@@ -11,7 +11,7 @@ from aacmm_jax.kinematics.workspace import search_region
 from aacmm_jax.planning import KitItem, KitPlan, kit_placement, plan_kit
 from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, _best, covariance_of, exchange
 from aacmm_jax.planning.information import DesignProblem, Prediction
-from aacmm_jax.planning.kit import candidates_of_kit, least_poses
+from aacmm_jax.planning.kit_placement import candidates_of_kit, least_poses
 from aacmm_jax.summaries.planning import kit_plan_summary
 
 from ..calibration.test_observed import BAR, BOX, FRAME, NOISE, SIMULATED
@@ -176,7 +176,7 @@ def test_least_poses():
     [
         ([], {}, "the kit is empty"),
         ([EVERYTHING[3], EVERYTHING[3]], {}, "two things of the kit have the name 'ball'"),
-        ([KitItem(EVERYTHING[1], places=2)], {}, "'tracker' is an instrument that is not placed"),
+        ([KitItem(EVERYTHING[1], places=2)], {}, "'tracker' is an instrument and has no placements"),
         ([kinds.SimulatedSphere("far", (5000, 0, 0), 50.0, 5)], {}, "'far' at .* cannot be reached"),
         ([EVERYTHING[1]], {"poses": 2}, "2 poses are too few for this kit; give 3"),
         ([EVERYTHING[3]], {"region": {"w": (0, 1)}}, "no 'w'"),

@@ -14,7 +14,7 @@ from aacmm_jax.planning import placement as placements
 from aacmm_jax.planning import pose_refinement
 from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, covariance_of, exchange, relaxed_value
 from aacmm_jax.planning.information import DesignProblem, pool_at
-from aacmm_jax.planning.options import FixturePlacement, inside, placement_region
+from aacmm_jax.planning.options import FixturePlacement, PlacementRegion
 from aacmm_jax.summaries.planning import plan_summary
 
 FUNCTIONS = np.random.default_rng(5).normal(size=(12, 3))
@@ -227,11 +227,11 @@ def test_placements_keep_off_the_end_of_the_reach(paper_arm):
     """By default off the last 5 %, in whatever ranges are given."""
     reach = aj.kinematics.arm_reach(paper_arm)
     along = reach.shoulder + reach.radius * np.outer([0.94, 0.96, 1.0], [1.0, 0.0, 0.0])
-    defaults = inspect.signature(unwrap(aj.planning.plan)).parameters["farthest"].default
+    defaults = inspect.signature(aj.planning.plan).parameters["farthest"].default
     for ranges in (None, {"x": (-5000.0, 5000.0)}):
-        assert inside(along, placement_region(paper_arm, ranges, defaults)).tolist() == [True, False, False]
-        assert inside(along, placement_region(paper_arm, ranges, 1.0)).tolist() == [True, True, True]
-    assert inspect.signature(unwrap(aj.planning.plan_kit)).parameters["farthest"].default == defaults
+        assert PlacementRegion.of(paper_arm, ranges, defaults).contains(along).tolist() == [True, False, False]
+        assert PlacementRegion.of(paper_arm, ranges, 1.0).contains(along).tolist() == [True, True, True]
+    assert inspect.signature(aj.planning.plan_kit).parameters["farthest"].default == defaults
 
 
 def test_the_same_seed_gives_the_same_plan(paper_arm, quick):
@@ -268,7 +268,7 @@ def test_readings_taken_by_the_plan_come_back_through_its_manifest(paper_arm, gi
 REFUSED = {
     "too few": ({"poses": 5}, "too few for 4 sockets"),
     "equations": ({"poses": 9, "sockets": 4}, "take 11 at least"),
-    "criterion": ({"criterion": "B"}, "must be one of length, A, D, E"),
+    "criterion": ({"criterion": "B"}, "criterion is 'B'; known are length, A, D, E"),
     "margin": ({"margin": 4.0}, "no range within its limits"),
     "u": ({"u": 0.0}, "u of a reference length is 0 mm"),
     "length": ({"length": 9000.0}, "does not fit this arm"),
@@ -293,7 +293,7 @@ REFUSED = {
         {"sockets": {"A": (400, 200, 300), "B": (400, 200, 300)}, "lengths": [("A", "B")]},
         "in the same position",
     ),
-    "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; give a part of the reach"),
+    "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; it must be"),
     "no range": ({"region": {"z": (10.0, 0.0)}}, "which is no range"),
     "under the table": ({"above": 2000.0}, "can be reached well"),
     "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "determine the parameters.*the scale"),

@@ -82,8 +82,13 @@ def held_out(probability, predicted=0.1):
     [
         (evaluated("conforms"), 0, "good", "Conforms: every limit given is kept (E_0)."),
         (evaluated("conforms", None), 0, "good", "kept (E_0); no limit was given for E_1."),
-        (evaluated("conforms", found="conforms"), 0, "good", "Conforms as left: every limit given is kept (E_0)."),
-        (evaluated("conforms", found="fails"), 0, "good", "kept (E_0); as found, it fails (E_0)."),
+        (
+            evaluated("conforms", found="conforms"),
+            0,
+            "good",
+            "Conforms (calibrated arm): every limit given is",
+        ),
+        (evaluated("conforms", found="fails"), 0, "good", "kept (E_0); the nominal arm fails (E_0)."),
         (evaluated("conforms"), 1, "unsure", "Conforms"),
         (evaluated("conforms", missing=["more bars"]), 0, "unsure", "a procedure was not complete"),
         (evaluated("conforms", "fails", "undecided"), 0, "bad", "Fails: E_1 is over its limit."),

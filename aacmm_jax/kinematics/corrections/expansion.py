@@ -9,7 +9,6 @@ from typing import ClassVar
 
 from jaxtyping import Float
 
-from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray
 from ..chain import ForwardPass
 from .kind import AbstractCorrection, Loads, Sought, Term
@@ -26,26 +25,16 @@ class Expansion(AbstractCorrection):
     model: ClassVar[str] = "expansion"
     words: ClassVar[tuple[str, ...]] = ("expansion",)
     description: ClassVar[str] = "thermal expansion of all lengths"
-    rows: ClassVar[int] = 1
+    unit: ClassVar[str] = "1/K"
+    usual_size: ClassVar[float] = 2e-5  # steel has 1.15e-5, aluminium 2.3e-5
     of_arm: ClassVar[bool] = True
     sought: ClassVar[tuple[Sought, ...]] = (Sought("thermal expansion", "", "temperature", "an arm that expands"),)
 
-    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
-        if option:
-            raise InputError(f"expansion takes no option such as '{option}'; write expansion alone.")
+    def all_terms(self, joints: int, loads: Loads | None) -> tuple[Term, ...]:
         return (Term(self, "expansion", 0, 0),)
-
-    def option_of(self, terms: Sequence[Term]) -> str:
-        return ""
 
     def wrong(self, term: Term, joints: int) -> str:
         return "is of the whole arm and has no number" if term.number or term.joint else ""
-
-    def unit_of(self, term: Term) -> str:
-        return "1/K"
-
-    def usual(self, terms: Sequence[Term]) -> dict[str, float]:
-        return {self.model: 2e-5}  # steel has 1.15e-5, aluminium 2.3e-5
 
     def values(
         self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass

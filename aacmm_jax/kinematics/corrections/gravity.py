@@ -4,13 +4,14 @@ The moment of a mass m at c about the axis z through o is m g . (z x (c - o)): l
 that its three components are functions of the readings alone.
 """
 
+import functools
+import operator
 from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
-from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross
 from ..chain import ForwardPass
@@ -18,7 +19,6 @@ from .kind import AbstractCorrection, Loads, Sought, Term
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
 _METRE = 1e-3  # m/mm
-_BY_LINK = 1e-3  # rad/m, usual: 1 mrad for links with levers of 1 m
 _BY_MASS = 1e-2  # rad/(kN m), usual: 1 mrad for 100 N m
 _KILONEWTON = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
 
@@ -34,6 +34,9 @@ class Gravity(AbstractCorrection):
     model: ClassVar[str] = "gravity"
     words: ClassVar[tuple[str, ...]] = ("compliance",)
     description: ClassVar[str] = "compliances under the moment of gravity"
+    unit: ClassVar[str] = "rad/m"
+    unit_alone: ClassVar[str] = "rad/(kN m)"
+    usual_size: ClassVar[float] = 1e-3  # 1 mrad for links with levers of 1 m
     rows: ClassVar[int] = 3
     sought: ClassVar[tuple[Sought, ...]] = (
         Sought("gravity", "", "gravity about joint {i}", "a joint or link that bends under its load"),
@@ -41,28 +44,19 @@ class Gravity(AbstractCorrection):
     shared: ClassVar[str | None] = ""
     usual_of_slide: ClassVar[float | None] = 0.05
 
-    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
-        if option:
-            raise InputError(f"gravity takes no option such as '{option}'; write gravity alone.")
+    def all_terms(self, joints: int, loads: Loads | None) -> tuple[Term, ...]:
+        numbers = range(1, joints + 1)
         if loads is not None:
-            return tuple(Term(self, "compliance", 0, joint, loads) for joint in range(1, joints + 1))
-        return tuple(
-            Term(self, "compliance", link, joint) for joint in range(1, joints + 1) for link in range(joint, joints + 1)
-        )
-
-    def option_of(self, terms: Sequence[Term]) -> str:
-        return ""
+            return tuple(Term(self, "compliance", 0, joint, loads) for joint in numbers)
+        return tuple(Term(self, "compliance", link, joint) for joint in numbers for link in range(joint, joints + 1))
 
     def wrong(self, term: Term, joints: int) -> str:
         if term.number and not term.joint <= term.number <= joints:
             return f"is of a link from {term.joint} to {joints}, as compliance{term.joint}_{term.joint} is"
         return ""
 
-    def unit_of(self, term: Term) -> str:
-        return "rad/m" if term.number else "rad/(kN m)"
-
     def usual(self, terms: Sequence[Term]) -> dict[str, float]:
-        return {self.model: _BY_LINK if all(term.number for term in terms) else _BY_MASS}
+        return {self.model: self.usual_size if all(term.number for term in terms) else _BY_MASS}
 
     def values(
         self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
@@ -81,20 +75,19 @@ def _pull(term: Term, forward: ForwardPass) -> tuple[float, Float[AnyArray, "...
     if term.number:
         return 1.0, forward.tip if term.number == len(forward.origin) else forward.origin[term.number - 1]
     assert term.loads is not None
-    centres, each = _centres(forward, term.loads), _KILONEWTON * _STANDARD_GRAVITY * np.array(term.loads.mass)
-    pull = each[term.joint - 1] * centres[term.joint - 1]
-    for j in range(term.joint, len(centres)):
-        pull = pull + each[j] * centres[j]
-    return float(each[term.joint - 1 :].sum()), pull
+    weights = _KILONEWTON * _STANDARD_GRAVITY * np.array(term.loads.mass)[term.joint - 1 :]
+    centres = _centres(forward, term.loads)[term.joint - 1 :]
+    pulls = [weight * centre for weight, centre in zip(weights, centres, strict=True)]
+    return float(weights.sum()), functools.reduce(operator.add, pulls)
 
 
 def _centres(forward: ForwardPass, loads: Loads) -> list[Float[AnyArray, "... 3 N"]]:
     """Centres of mass of the links in the base frame, mm."""
-    links, found = len(forward.origin), []
+    links, centres = len(forward.origin), []
     for j in range(links):
         z = forward.z_before[j + 1] if j + 1 < links else forward.frame[2]
         # Hayati's angle turns x and z about y, so that y = z x x holds before it, and x = y x z after it.
         y = cross(z, forward.x[j]) if forward.y is None else forward.y[j]
         axes = (cross(y, z), y, z)
-        found.append(forward.origin[j] + sum(loads.centre[j][k] * axes[k] for k in range(3)))
-    return found
+        centres.append(forward.origin[j] + sum(loads.centre[j][k] * axes[k] for k in range(3)))
+    return centres

@@ -17,18 +17,17 @@ from ..chain import ForwardPass
 from .kind import AbstractCorrection, Loads, Sought, Term
 
 HIGHEST = 99
-_USUAL = 5e-5  # rad: 10 arcsec
 
 
 def orders_of(option: str) -> tuple[int, ...] | None:
     """The orders that an option such as ``1-3+8`` names, each once; None where it names none from 1 to the highest."""
-    found: set[int] = set()
+    orders: set[int] = set()
     for part in option.split("+"):
         ends = re.fullmatch(r"([1-9]\d?)(?:-([1-9]\d?))?", part)
         if ends is None or int(ends[2] or ends[1]) < int(ends[1]):
             return None
-        found |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
-    return tuple(sorted(found))
+        orders |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
+    return tuple(sorted(orders))
 
 
 class Harmonics(AbstractCorrection):
@@ -37,7 +36,8 @@ class Harmonics(AbstractCorrection):
     model: ClassVar[str] = "harmonics"
     words: ClassVar[tuple[str, ...]] = ("cos", "sin")
     description: ClassVar[str] = "harmonics of encoders"
-    rows: ClassVar[int] = 1
+    unit: ClassVar[str] = "rad"
+    usual_size: ClassVar[float] = 5e-5  # 10 arcsec
     of_own_reading: ClassVar[bool] = True
     sought: ClassVar[tuple[Sought, ...]] = (
         Sought("first harmonic", "1", "cos q_{i}", "an eccentric encoder or a bending link"),
@@ -67,28 +67,23 @@ class Harmonics(AbstractCorrection):
     def wrong(self, term: Term, joints: int) -> str:
         return "" if 1 <= term.number <= HIGHEST else f"has no order from 1 to {HIGHEST}"
 
-    def unit_of(self, term: Term) -> str:
-        return "rad"
-
     def usual(self, terms: Sequence[Term]) -> dict[str, float]:
         octaves = [(2**k, min(2 ** (k + 1) - 1, HIGHEST)) for k in range(HIGHEST.bit_length())]
-        return {f"{self.model}={low}" + (f"-{high}" if high > low else ""): _USUAL for low, high in octaves}
+        return {f"{self.model}={low}" + (f"-{high}" if high > low else ""): self.usual_size for low, high in octaves}
 
     def values(
         self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
     ) -> Float[AnyArray, "rows ... 1 N"]:
         xp, joints = namespace(q), sorted({term.joint for term in terms})
-        own = q[np.array(joints) - 1]
-        cos, sin = xp.cos(own)[None], xp.sin(own)[None]
+        readings = q[np.array(joints) - 1]
+        cos, sin = xp.cos(readings)[None], xp.sin(readings)[None]
         highest = max(term.number for term in terms)
         while len(cos) < highest:
-            # Orders k + 1 to 2k from 1 to k: three times as fast as the cosine of every multiple, and as exact.
-            more = min(len(cos), highest - len(cos))
-            more_cos, more_sin = (
-                cos[-1:] * cos[:more] - sin[-1:] * sin[:more],
-                sin[-1:] * cos[:more] + cos[-1:] * sin[:more],
-            )
-            cos, sin = xp.concatenate([cos, more_cos]), xp.concatenate([sin, more_sin])
+            # Orders k + 1 to 2k from 1 to k by addition of angles: three times as fast as the cosine of every multiple,
+            # and as exact.
+            c, s, more = cos[-1:], sin[-1:], min(len(cos), highest - len(cos))
+            next_cos, next_sin = c * cos[:more] - s * sin[:more], s * cos[:more] + c * sin[:more]
+            cos, sin = xp.concatenate([cos, next_cos]), xp.concatenate([sin, next_sin])
         both = xp.concatenate([cos, sin])
         order = np.array([term.number - 1 + highest * (term.word == "sin") for term in terms])
         return both[order, np.array([joints.index(term.joint) for term in terms])]

@@ -16,40 +16,27 @@ from typing import ClassVar, NamedTuple
 
 from jaxtyping import Float
 
+from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray
 from ..chain import ForwardPass
 
 
 class Loads(NamedTuple):
-    """What pulls at the arm, for functions of gravity.
+    """What pulls at the arm, for functions of gravity."""
 
-    Args:
-        mass: Of each link, kg.
-        centre: Its centre of mass in its own D-H frame, mm.
-    """
-
-    mass: tuple[float, ...]
-    centre: tuple[tuple[float, float, float], ...]
+    mass: tuple[float, ...]  # of each link, kg
+    centre: tuple[tuple[float, float, float], ...]  # of mass, in the link's own D-H frame, mm
 
 
 class Sought(NamedTuple):
-    """Functions of a kind that residuals are searched for, all those of one joint at once.
+    """Functions of a kind that residuals are searched for, all those of one joint at once."""
 
-    Args:
-        name: What results call it: "first harmonic".
-        option: That of the model with these functions: "1" of ``harmonics=1``.
-        follows: What residuals follow then, of joint {i}: "cos q_{i}".
-        cause: What usually causes it, with its article: "an eccentric encoder".
-        of_slides: Whether prismatic joints have it as well.
-        relative: Whether its size is the coefficient, a ratio, rather than what it adds over the poses.
-    """
-
-    name: str
-    option: str
-    follows: str
-    cause: str
-    of_slides: bool = False
-    relative: bool = False
+    name: str  # what results call it: "first harmonic"
+    option: str  # of the model with these functions: "1" of ``harmonics=1``
+    follows: str  # what residuals follow then, of joint {i}: "cos q_{i}"
+    cause: str  # what usually causes it, with its article: "an eccentric encoder"
+    of_slides: bool = False  # whether prismatic joints have it as well
+    relative: bool = False  # whether its size is the coefficient, a ratio, rather than what it adds over the poses
 
 
 @dataclass(frozen=True)
@@ -59,17 +46,18 @@ class AbstractCorrection(abc.ABC):
     model: ClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
     words: ClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
     description: ClassVar[str]  # what its coefficients are, in the plural: "errors of gear ratios"
-    rows: ClassVar[int]  # of `values`: 3 for a function of gravity, one for each component of its direction
+    unit: ClassVar[str]  # of a coefficient of a revolute joint; in place of rad, mm of a prismatic one
+    unit_alone: ClassVar[str] = ""  # where it differs: of a coefficient whose name has no number
+    usual_size: ClassVar[float]  # about how large coefficients usually are, in this unit
+    usual_of_slide: ClassVar[float | None] = None  # the same where a joint is prismatic, mm; None: as of others
+    rows: ClassVar[int] = 1  # of `values`: 3 for a function of gravity, one for each component of its direction
     of_arm: ClassVar[bool] = False  # whether it scales all lengths of the arm: its terms are of joint 0
     of_own_reading: ClassVar[bool] = False  # whether each function is of its joint's reading alone, and can be drawn
     sought: ClassVar[tuple[Sought, ...]] = ()  # what residuals of a calibration without it are searched for
-    # Option of the model whose functions poses may share errors by; None: none of them.
-    shared: ClassVar[str | None] = None
-    usual_of_slide: ClassVar[float | None] = None  # mm: like `usual`, where a joint is prismatic; None: the same
+    shared: ClassVar[str | None] = None  # option of the model whose functions poses may share errors by; None: none
 
-    @abc.abstractmethod
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple["Term", ...]:
-        """The terms of a model with this option: ``harmonics=2`` has the option "2".
+        """The terms of a model with an option, ``harmonics=2`` has the option "2"; by default there is none.
 
         Args:
             joints: Number of joints of the arm.
@@ -79,29 +67,25 @@ class AbstractCorrection(abc.ABC):
         Raises:
             InputError: The option means nothing here.
         """
+        if option:
+            raise InputError(f"{self.model} takes no option such as '{option}'; write {self.model} alone.")
+        return self.all_terms(joints, loads)
 
-    @abc.abstractmethod
+    def all_terms(self, joints: int, loads: Loads | None) -> tuple["Term", ...]:
+        """The terms of a model without an option: by default one for each joint."""
+        return tuple(Term(self, self.words[0], 0, joint) for joint in range(1, joints + 1))
+
     def option_of(self, terms: Sequence["Term"]) -> str:
         """The option of the model that has these terms, and as few others as can be: the inverse of `terms`."""
+        return ""
 
-    @abc.abstractmethod
     def wrong(self, term: "Term", joints: int) -> str:
         """What is wrong with a term of this kind for an arm of so many joints, in a few words; empty if nothing is."""
+        return "has a number, and takes none" if term.number else ""
 
-    @abc.abstractmethod
-    def unit_of(self, term: "Term") -> str:
-        """Unit of a term's coefficient: of a revolute joint; in place of rad, mm of a prismatic one."""
-
-    @abc.abstractmethod
     def usual(self, terms: Sequence["Term"]) -> dict[str, float]:
-        """About how large coefficients usually are: the groups of the default prior with their standard deviations.
-
-        Args:
-            terms: Those of an arm that are of this kind.
-
-        Returns:
-            By name of a group (`Prior`), in the unit of the coefficients.
-        """
+        """The groups of the default prior with their standard deviations, for an arm with these terms of this kind."""
+        return {self.model: self.usual_size}
 
     @abc.abstractmethod
     def values(
@@ -117,21 +101,13 @@ class AbstractCorrection(abc.ABC):
 
 
 class Term(NamedTuple):
-    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3.
-
-    Args:
-        kind: What it is one of.
-        word: Which function.
-        number: Which of them: an order, a link, another joint; 0 where there is only one.
-        joint: The joint that it moves, from 1; 0 where it scales all lengths of the arm.
-        loads: Masses of the arm, where the function needs them.
-    """
+    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3."""
 
     kind: AbstractCorrection
-    word: str
-    number: int
-    joint: int
-    loads: Loads | None = None
+    word: str  # which function
+    number: int  # which of them: an order, a link, another joint; 0 where there is only one
+    joint: int  # that it moves, from 1; 0 where it scales all lengths of the arm
+    loads: Loads | None = None  # masses of the arm, where the function needs them
 
     @property
     def name(self) -> str:
@@ -141,7 +117,7 @@ class Term(NamedTuple):
     @property
     def unit(self) -> str:
         """Unit of the coefficient."""
-        return self.kind.unit_of(self)
+        return self.kind.unit if self.number else self.kind.unit_alone or self.kind.unit
 
     @property
     def rows(self) -> int:

@@ -20,7 +20,7 @@ _KINDS: dict[str, AbstractCorrection] = {}  # by what a model calls them
 
 
 def all_kinds() -> tuple[AbstractCorrection, ...]:
-    """Every kind that has a file in this folder, in the order of the files' names, and those registered besides."""
+    """Every kind in a file of this folder, by name, and those registered besides."""
     return tuple(_KINDS.values())
 
 
@@ -32,8 +32,7 @@ def is_kind(name: str) -> bool:
 def register(kind: AbstractCorrection) -> None:
     """Make a kind known that has no file in this folder.
 
-    Raises:
-        InputError: What a model calls it, or a word of its coefficients, is another kind's, or no lowercase letters.
+    Raises `InputError` where what a model calls it, or a word of its coefficients, is another kind's.
     """
     for name in (kind.model, *kind.words):
         taken = any(name in (other.model, *other.words) for other in all_kinds())
@@ -53,18 +52,17 @@ def unregister(kind: AbstractCorrection) -> None:
 
 
 def _forget() -> None:
-    for kept in (coefficient_of, unit_of_coefficient, term_of, terms_of):
-        kept.cache_clear()
+    for cached in (coefficient_of, unit_of_coefficient, term_of, terms_of):
+        cached.cache_clear()
 
 
 def _register_files() -> None:
-    """Whatever kinds the modules of this folder define."""
-    for module in sorted(each.name for each in pkgutil.iter_modules([str(Path(__file__).parent)])):
-        if module in ("kind", "kinds"):
-            continue
-        for value in vars(import_module(f"{__package__}.{module}")).values():
-            if isinstance(value, type) and issubclass(value, AbstractCorrection) and value is not AbstractCorrection:
-                register(value())  # pyright: ignore[reportCallIssue] - a final kind has no fields
+    """Whatever kinds the modules of this folder define, by name."""
+    modules = [module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]) if module.name != "kinds"]
+    for module in modules:
+        import_module(f"{__package__}.{module}")
+    for kind in sorted(AbstractCorrection.__subclasses__(), key=lambda kind: kind.model):
+        register(kind())  # pyright: ignore[reportAbstractUsage]
 
 
 class Coefficient(NamedTuple):
@@ -79,18 +77,18 @@ class Coefficient(NamedTuple):
 @lru_cache(_KEPT)
 def coefficient_of(name: str) -> Coefficient | None:
     """What the name of a coefficient says, of whichever arm it is; None for every other parameter."""
-    found = _COEFFICIENT.fullmatch(name)
-    kind = None if found is None else next((kind for kind in all_kinds() if found[1] in kind.words), None)
-    if found is None or kind is None:
+    parts = _COEFFICIENT.fullmatch(name)
+    kind = None if parts is None else next((kind for kind in all_kinds() if parts[1] in kind.words), None)
+    if parts is None or kind is None:
         return None
-    return Coefficient(kind, found[1], int(found[2] or 0), int(found[3] or 0))
+    return Coefficient(kind, parts[1], int(parts[2] or 0), int(parts[3] or 0))
 
 
 @lru_cache(_KEPT)
 def unit_of_coefficient(name: str) -> str:
     """Unit of a joint correction's coefficient, of a joint that rotates; empty for other parameters."""
-    found = coefficient_of(name)
-    return "" if found is None else found.kind.unit_of(Term(*found))
+    coefficient = coefficient_of(name)
+    return "" if coefficient is None else Term(*coefficient).unit
 
 
 def all_sought() -> dict[str, tuple[AbstractCorrection, Sought]]:
@@ -105,9 +103,9 @@ def shared_model() -> str:
 
 def model_of(terms: Iterable[Term]) -> str:
     """The model that has all these terms: "dh,gear,harmonics=1-3"; "dh" alone for none."""
-    given = tuple(terms)
-    of_kinds = [(kind, [term for term in given if term.kind.model == kind.model]) for kind in all_kinds()]
-    return ",".join(["dh", *(model_with(kind, kind.option_of(own)) for kind, own in of_kinds if own)])
+    terms = tuple(terms)
+    by_kind = [(kind, [term for term in terms if term.kind.model == kind.model]) for kind in all_kinds()]
+    return ",".join(["dh", *(model_with(kind, kind.option_of(chosen)) for kind, chosen in by_kind if chosen)])
 
 
 def model_with(kind: AbstractCorrection, option: str) -> str:
@@ -119,14 +117,14 @@ def model_with(kind: AbstractCorrection, option: str) -> str:
 def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     """The term that a coefficient belongs to, or None where this is no coefficient's name.
 
-    Raises:
-        InputError: It is one, but not of an arm with so many joints.
+    Raises `InputError` where it is one, but not of an arm with so many joints.
     """
-    found = coefficient_of(name)
-    if found is None:
+    coefficient = coefficient_of(name)
+    if coefficient is None:
         return None
-    term = Term(*found, loads if found.kind.rows == 3 and not found.number else None)
-    wrong = f"is of a joint from 1 to {joints}" if _is_outside(term, joints) else found.kind.wrong(term, joints)
+    kind = coefficient.kind
+    term = Term(*coefficient, loads if kind.rows == 3 and not coefficient.number else None)
+    wrong = f"is of a joint from 1 to {joints}" if _is_outside(term, joints) else kind.wrong(term, joints)
     if wrong:
         raise InputError(f"the coefficient '{name}' {wrong}; correct its name.")
     return term
@@ -136,16 +134,10 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
 def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term, ...]:
     """The terms of a model: kinds with their options, separated by commas, such as "dh,gravity,harmonics=1".
 
-    Args:
-        model: Names of kinds, each with an option after "=" if need be; "dh" stands for the arm itself, "functions"
-            for harmonics=1-31.
-        joints: Number of joints of the arm.
-        loads: Masses of the arm, where known.
-
-    Raises:
-        InputError: A kind is unknown or there twice, or an option means nothing.
+    Raises `InputError` where a kind is unknown or there twice, or an option means nothing. "dh" stands for the arm
+    itself, "functions" for harmonics=1-31; ``loads`` are the masses of the arm, where known.
     """
-    found: list[Term] = []
+    all_terms: list[Term] = []
     seen: set[str] = set()
     for given in model.split(","):
         part = _SHORT_FORMS.get(given.strip(), given.strip())
@@ -157,15 +149,14 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
             continue
         kind = _KINDS.get(name)
         if kind is None:
-            known = ["dh", *_KINDS, *_SHORT_FORMS]
-            raise InputError(f"unknown model '{name}'{nearest(name, known)}")
+            raise InputError(f"unknown model '{name}'{nearest(name, ['dh', *_KINDS, *_SHORT_FORMS])}")
         terms = kind.terms(joints, option, loads)
         for term in terms:
             wrong = kind.wrong(term, joints)
             if wrong or _is_outside(term, joints):
                 raise InputError(f"{part} {wrong or f'names joint {term.joint} of {joints}'}; correct it.")
-        found += terms
-    return tuple(dict.fromkeys(found))
+        all_terms += terms
+    return tuple(dict.fromkeys(all_terms))
 
 
 def _is_outside(term: Term, joints: int) -> bool:

@@ -1,4 +1,4 @@
-"""Coupled joints: a motor or a belt that turns one joint moves another a little, too."""
+"""Gear ratios and couplings: joints that move in proportion to readings, their own or another's."""
 
 import re
 from collections.abc import Sequence
@@ -10,16 +10,40 @@ from jaxtyping import Float
 from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray
 from ..chain import ForwardPass
-from .kind import AbstractCorrection, Loads, Term
+from .kind import AbstractCorrection, Loads, Sought, Term
+
+
+class GearRatio(AbstractCorrection):
+    """The reading itself: a joint that turns, or a carriage that moves, by a little more or less than it reads."""
+
+    model: ClassVar[str] = "gear"
+    words: ClassVar[tuple[str, ...]] = ("gear",)
+    description: ClassVar[str] = "relative errors of gear ratios"
+    unit: ClassVar[str] = "1"
+    usual_size: ClassVar[float] = 2e-4
+    of_own_reading: ClassVar[bool] = True
+    sought: ClassVar[tuple[Sought, ...]] = (
+        Sought("gear ratio", "", "q_{i} (gear ratio)", "a wrong gear ratio", of_slides=True, relative=True),
+    )
+    shared: ClassVar[str | None] = ""
+
+    def values(
+        self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
+    ) -> Float[AnyArray, "rows ... 1 N"]:
+        return q[np.array([term.joint - 1 for term in terms])]
 
 
 class Coupling(AbstractCorrection):
-    """The reading of another joint: ``coupled=2-3`` lets the reading of joint 2 move joint 3; by default the next."""
+    """The reading of another joint: a motor or a belt that turns one joint moves another a little, too.
+
+    ``coupled=2-3`` lets the reading of joint 2 move joint 3; by default each joint moves the next.
+    """
 
     model: ClassVar[str] = "coupled"
     words: ClassVar[tuple[str, ...]] = ("coupled",)
     description: ClassVar[str] = "parts of other joints' readings"
-    rows: ClassVar[int] = 1
+    unit: ClassVar[str] = "1"
+    usual_size: ClassVar[float] = 2e-4
     usual_of_slide: ClassVar[float | None] = 0.05
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
@@ -37,12 +61,6 @@ class Coupling(AbstractCorrection):
         if not 1 <= term.number <= joints:
             return f"is of the reading of another joint from 1 to {joints}, as coupled2_3 is"
         return "is of its own reading, which gear is" if term.number == term.joint else ""
-
-    def unit_of(self, term: Term) -> str:
-        return "1"
-
-    def usual(self, terms: Sequence[Term]) -> dict[str, float]:
-        return {self.model: 2e-4}
 
     def values(
         self, terms: Sequence[Term], q: Float[AnyArray, "n ... 1 N"], forward: ForwardPass
