@@ -1,7 +1,7 @@
 """Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..core.arguments import checked_arguments
+from ..core.arguments import OneOf, Range, checked_arguments
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
@@ -26,6 +26,8 @@ from .batch import calibrate_many
 from .record import uncertainty_of
 from .redrawn import batch_of_captures, trials_of, truth_of
 from .results import Calibration, ManyCalibrations
+
+Level = Annotated[float, Range(above=0, most=0.9999)]  # coverage probability
 
 _LENGTHS = 24  # lengths over the working volume whose distribution is found with those of the parameters and k
 _LEAST = 10  # trials that converge, of which a distribution is made
@@ -98,8 +100,8 @@ def monte_carlo(
     result: Calibration,
     capture: Capture,
     *,
-    level: float = 0.95,
-    digits: int = 1,
+    level: Level = 0.95,
+    digits: Annotated[int, OneOf((1, 2))] = 1,
     most: int = 1_000_000,
     lengths: tuple[np.ndarray, np.ndarray] | None = None,
     noise: Noise | None = None,
@@ -139,9 +141,6 @@ def monte_carlo(
         >>> print(f"d_3: u = {sampled.u[at]:.3f} mm; by the linear propagation {sampled.linear_u[at]:.3f} mm")
         d_3: u = 0.010 mm; by the linear propagation 0.010 mm
     """
-    if digits not in (1, 2):
-        raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
-    _check_level(level)
     random_generator(seed)
     if noise is not None:
         noise.check(result.arm.joints)
@@ -181,8 +180,8 @@ def bootstrap(
     result: Calibration,
     capture: Capture,
     *,
-    trials: int = 2000,
-    level: float = 0.95,
+    trials: Annotated[int, Range(least=100)] = 2000,
+    level: Level = 0.95,
     robust: LossName | None = None,
     seed: int = 0,
 ) -> Sampled:
@@ -213,9 +212,6 @@ def bootstrap(
         >>> print(sampled.trials, f"trials: probe_z from {sampled.low[at]:.3f} to {sampled.high[at]:.3f} mm")
         100 trials: probe_z from 102.497 to 102.503 mm
     """
-    if trials < 100:
-        raise InputError(f"{trials} trials are too few; use at least 100.")
-    _check_level(level)
     random = random_generator(seed)
     task = _RepeatedTask.of(result, capture, None, robust)
     if result.method == "joint":
@@ -236,11 +232,6 @@ def bootstrap(
 def _check_some(values: np.ndarray, trials: int, what: str, remedy: str) -> None:
     if len(values) < _LEAST:
         raise InputError(f"{len(values)} of {trials} {what} trials converged; {remedy}.")
-
-
-def _check_level(level: float) -> None:
-    if not 0 < level <= 0.9999:
-        raise InputError(f"level is {level:g}; give a probability between 0 and 0.9999, for example 0.95.")
 
 
 def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:

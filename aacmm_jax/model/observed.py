@@ -158,7 +158,7 @@ class Observed:
         """Derivatives by the geometry as those by the head, with so many parameters, and by components; natural
         steps."""
         xp = namespace(derivatives)
-        head, components = split(derivatives * self.steps, self.layout.shared, self.layout.classes)
+        head, components = split(derivatives * self.steps[None], self.layout.shared, self.layout.classes)
         return xp.concatenate([xp.zeros((len(derivatives), parameters)), head], axis=1), components
 
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
