@@ -6,23 +6,11 @@ from typing import Any, Literal
 
 from ..core.errors import InputError
 from ..files.outputs import together
-from ..summaries.tables import Styled, Table, formatted, listed, warnings_of, written_of
-from . import calibration_views
-from .app import (
-    BASE_LINK,
-    JSON,
-    TIP_LINK,
-    USUAL_ENCODER_NOISE,
-    USUAL_SEATING_NOISE,
-    app,
-    argument,
-    examples,
-    numbers_option,
-    option,
-    show_summary,
-    with_spinner,
-)
+from ..summaries.tables import Styled, formatted, listed, number, warnings_of, written_of
+from . import calibration_views, options
+from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View
+from .options import argument, numbers_option, option
 from .plan_assumptions import assumed_noise
 
 
@@ -52,13 +40,13 @@ def arm(
         None, "Unit of the readings in a table. Default: as its header says, else by their size."
     ),
     figure: Path | None = option("FILE.png", "Draw the arm at zero readings, and its reach (.png, .svg, .pdf)."),
-    encoder_arcsec: float | None = USUAL_ENCODER_NOISE,
-    seating_mm: float | None = USUAL_SEATING_NOISE,
+    encoder_arcsec: float | None = options.USUAL_ENCODER_NOISE,
+    seating_mm: float | None = options.USUAL_SEATING_NOISE,
     model: str | None = option("MODEL", "Model of the joints, as for calibrate: gravity,harmonics=1."),
-    base: str | None = BASE_LINK,
-    tip: str | None = TIP_LINK,
+    base: str | None = options.BASE_LINK,
+    tip: str | None = options.TIP_LINK,
     probe: str | None = option("X,Y,Z", "Tip of a tool in the last link of a URDF or kinematics.yaml, mm."),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Look at an arm before its first calibration.
 
@@ -147,13 +135,13 @@ def survey(summary: dict[str, Any]) -> View:
     rows = [
         (
             "tip" if row["joint"] is None else row["joint"],
-            *(formatted(x, 3) for x in row["origin_mm"]),
-            *(f"{round(x, 4) + 0.0:.4f}" for x in row["axis"]),
+            *(number(x, 3) for x in row["origin_mm"]),
+            *(number(x, 4, rounded=True) for x in row["axis"]),
         )
         for row in summary["frames"]
     ]
     headings = ("joint", "through x [mm]", "y [mm]", "z [mm]", "direction x", "y", "z")
-    yield Table("\nAxes at zero readings", headings, rows)
+    yield listed("Axes at zero readings", rows, headings)
     reach = summary["reach_mm"]
     yield (
         f"\nReach: {reach['nearest']:.0f} to {reach['farthest']:.0f} mm from the shoulder, on the first axis at "
@@ -183,7 +171,7 @@ def _determined(summary: dict[str, Any]) -> View:
     for i in summary["parallel"]:
         yield f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} takes the place of d_{i}."
     columns = {"data": "data", "parameters": "determined", "well": "well_determined", "scale": "scale"}
-    yield listed("\nWhat data determine at their best", summary["determined"], columns)
+    yield listed("What data determine at their best", summary["determined"], columns)
     yield f"To be freed, of sockets with a length: {len(summary['free'])}: {', '.join(summary['free'])}."
     yield ["\n", Styled("Where a joint stays still in all poses")]
 
@@ -192,7 +180,7 @@ def _determined(summary: dict[str, Any]) -> View:
             return "(the tip can hardly stay in a socket then)"
         return ", ".join(row["lost"]) or "-"
 
-    yield listed("", summary["still"], {"joint": "joint", "no longer determined well": lost}, left=(0, 1))
+    yield listed("", summary["still"], {"joint": "joint", "no longer determined well": lost})
 
 
 def _needed(arm_class: dict[str, Any]) -> View:
@@ -208,7 +196,7 @@ def _needed(arm_class: dict[str, Any]) -> View:
         for row in arm_class["rows"]
     ]
     counts = (f"{count} poses" for count in arm_class["rows"][0]["u_mm"])
-    yield Table("", ("data", *counts, "enough"), rows)
+    yield listed("", rows, ("data", *counts, "enough"))
     yield (
         f"Medians over the volume, of encoders of {arm_class['encoder_arcsec']:.3g} arcsec and a seat of "
         f"{arm_class['seating_mm']:.3g} mm ({arm_class['noise_source']}), reference lengths of "

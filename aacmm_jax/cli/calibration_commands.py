@@ -8,38 +8,15 @@ from typing import Any, Literal
 import typer
 
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.text import number
+from ..core.text import number as number_of
 from ..core.units import DEG
 from ..files.outputs import reading, together
 from ..model.loss_names import LossName
-from ..summaries.tables import (
-    Styled,
-    Table,
-    difference_from_best,
-    formatted,
-    warnings_of,
-    written_of,
-)
-from .app import (
-    JSON,
-    KNOWN_ENCODER_NOISE,
-    KNOWN_SEATING_NOISE,
-    LINEAR_ENCODER_NOISE,
-    ONLY,
-    WITHOUT,
-    app,
-    argument,
-    bad_option,
-    examples,
-    flag,
-    names_option,
-    option,
-    output,
-    seed,
-    show_summary,
-    with_spinner,
-)
+from ..summaries.tables import Styled, difference_from_best, listed, number, warnings_of, written_of
+from . import options
+from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View, calibration
+from .options import argument, bad_option, flag, names_option, option, output, seed
 
 
 @app.command(
@@ -86,8 +63,8 @@ def calibrate(
         "Length that anchors the scale in stage 1: a parameter, 'longest', or 'none' as in the paper.",
         default="longest",
     ),
-    only: list[str] | None = ONLY,
-    without: list[str] | None = WITHOUT,
+    only: list[str] | None = options.ONLY,
+    without: list[str] | None = options.WITHOUT,
     held: str | None = option(
         "NAMES", "Fix these parameters, separated by commas. Default: the list in the arm's file."
     ),
@@ -97,9 +74,9 @@ def calibrate(
     bound: list[str] | None = option(
         "NAME=WIDTH", "Half-width of the bounds of one parameter, in mm or deg; repeatable."
     ),
-    encoder_arcsec: float | None = KNOWN_ENCODER_NOISE,
-    linear_encoder_mm: float | None = LINEAR_ENCODER_NOISE,
-    seating_mm: float | None = KNOWN_SEATING_NOISE,
+    encoder_arcsec: float | None = options.KNOWN_ENCODER_NOISE,
+    linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
+    seating_mm: float | None = options.KNOWN_SEATING_NOISE,
     keep_noise: bool = flag(
         "--keep-noise", "Do not re-estimate the noise of an encoder found to be noisier than stated."
     ),
@@ -126,7 +103,7 @@ def calibrate(
     ),
     figure: Path | None = option("FILE", "Plot the residual of every pose: PNG, SVG or PDF by the name."),
     max_steps: int = option("N", "Largest number of steps of each solve.", default=300, min=1, max=1_000_000),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Identify the parameters of an arm from captures.
 
@@ -139,7 +116,7 @@ def calibrate(
     from ..pipeline.capture_calibration import CaptureOptions, calibrate_capture
     from ..summaries.calibration import calibration_summary
 
-    options = CaptureOptions(
+    chosen = CaptureOptions(
         method=method,
         robust=robust,
         scale=scale,
@@ -168,8 +145,8 @@ def calibrate(
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         nominal = _with_model(recording.nominal, model)
         nominal = _bounded(nominal, (held, free), length_bound_mm, angle_bound_deg, bound or [])
-        options = options._replace(prior=_prior(nominal, prior, model))
-        record = calibrate_capture(recording._replace(nominal=nominal), **options._asdict())
+        chosen = chosen._replace(prior=_prior(nominal, prior, model))
+        record = calibrate_capture(recording._replace(nominal=nominal), **chosen._asdict())
         summary = calibration_summary(record)
         save_calibration(output, record, summary)
         if figure is not None:
@@ -225,7 +202,7 @@ def _bounded(
         if name in widths:
             raise InputError(f"--bound gives {name} two half-widths; give it one.")
         try:
-            value = number(width.strip())
+            value = number_of(width.strip())
         except ValueError:
             bad_option("--bound", text, "NAME=WIDTH, in mm or deg")
         widths[name] = value if is_length(name) else value * DEG
@@ -285,13 +262,13 @@ def compare_models(
     ),
     only_poses: int | None = option("N", "Use N poses drawn at random, to save time.", min=1),
     seed: int = seed("--only-poses"),
-    only: list[str] | None = ONLY,
-    without: list[str] | None = WITHOUT,
-    encoder_arcsec: float | None = KNOWN_ENCODER_NOISE,
-    linear_encoder_mm: float | None = LINEAR_ENCODER_NOISE,
-    seating_mm: float | None = KNOWN_SEATING_NOISE,
+    only: list[str] | None = options.ONLY,
+    without: list[str] | None = options.WITHOUT,
+    encoder_arcsec: float | None = options.KNOWN_ENCODER_NOISE,
+    linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
+    seating_mm: float | None = options.KNOWN_SEATING_NOISE,
     output: Path | None = output("FILE.h5", "Comparison to write (HDF5), for show and report.", None),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Compare models of the joints by unseen regions.
 
@@ -344,25 +321,25 @@ def compared_models(summary: dict[str, Any]) -> View:
     headings = ("model", "parameters", "determined", "inside", "outside", "u", "to best", "u", "ratio", "evidence")
     rows = [
         (
-            *(row["model"], row["parameters"], f"{row['effective_parameters']:.1f}"),
+            *(row["model"], row["parameters"], number(row["effective_parameters"], 1)),
             *(row[key] for key in ("rms_inside", "rms_outside", "u_outside")),
             *difference_from_best(row, least),
-            formatted(row["ratio"], 2),
-            f"{row['log_evidence'] - most_probable:.1f}",
-            f"{row['cpu_seconds']:.1f}",
+            number(row["ratio"], 2),
+            number(row["log_evidence"] - most_probable, 1),
+            number(row["cpu_seconds"], 1),
         )
         for row in models
     ]
-    yield Table(
-        "\nRMS distance from the geometry [mm]; to best: outside, less that of the best outside, compared region by "
+    yield listed(
+        "RMS distance from the geometry [mm]; to best: outside, less that of the best outside, compared region by "
         "region; u: standard errors by the scatter of the regions; ratio: mean of (error / predicted standard "
         "deviation)^2 outside; evidence: its logarithm, less the largest",
-        (*headings, "CPU [s]"),
         rows,
+        (*headings, "CPU [s]"),
     )
     by_region = [
         (label, models[0]["regions"][i]["poses"], *(row["regions"][i]["rms"] for row in models))
         for i, label in enumerate(summary["regions"])
     ]
-    yield Table("\nRMS error of each region [mm]", ("region", "poses", *(row["model"] for row in models)), by_region)
+    yield listed("RMS error of each region [mm]", by_region, ("region", "poses", *(row["model"] for row in models)))
     yield from written_of(summary)

@@ -10,30 +10,9 @@ from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
 from ..files.outputs import together
-from .app import (
-    BASE_LINK,
-    CAPTURE_OUTPUT,
-    ENCODER_NOISE,
-    JSON,
-    LINEAR_ENCODER_NOISE,
-    NOMINAL_ARM,
-    REFERENCE_LENGTHS,
-    SEATING_NOISE,
-    TIP_LINK,
-    app,
-    argument,
-    bad_option,
-    examples,
-    flag,
-    length_option,
-    numbers_option,
-    option,
-    output,
-    seed,
-    show_summary,
-    sockets_option,
-    with_spinner,
-)
+from . import options
+from .app import app, examples, show_summary, with_spinner
+from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
 
 _U_ARTEFACT = 0.001  # mm
 _POSES = 70  # in each socket
@@ -44,7 +23,7 @@ _DIGITS = 9
 def demo(
     folder: Path = typer.Argument(Path("aacmm-demo"), help="Folder for the files; made if it does not exist."),
     seed: int = seed("the noise"),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Calibrate a simulated arm and compare it with the truth.
 
@@ -65,20 +44,20 @@ def demo(
     )
 )
 def simulate(
-    arm: str = NOMINAL_ARM,
-    output: Path = CAPTURE_OUTPUT,
+    arm: str = options.NOMINAL_ARM,
+    output: Path = options.CAPTURE_OUTPUT,
     socket: list[str] | None = option("NAME=X,Y,Z", "Simulate a socket at this position, mm; repeatable."),
     poses: list[str] | None = option(
         "[NAME=]N", f"Number of poses in each socket, or in the named one; repeatable. Default: {_POSES}."
     ),
-    length: list[str] | None = REFERENCE_LENGTHS,
-    encoder_arcsec: float = ENCODER_NOISE,
+    length: list[str] | None = options.REFERENCE_LENGTHS,
+    encoder_arcsec: float = options.ENCODER_NOISE,
     resolution_arcsec: float = option("ARCSEC", "Round joint readings to multiples of this.", default=0.0, min=0),
-    linear_encoder_mm: float | None = LINEAR_ENCODER_NOISE,
+    linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     linear_resolution_mm: float = option(
         "MM", "Round readings of prismatic joints to multiples of this.", default=0.0, min=0
     ),
-    seating_mm: float = SEATING_NOISE,
+    seating_mm: float = options.SEATING_NOISE,
     temperature_c: str | None = option(
         "LOWEST[,HIGHEST]", "Temperature of an arm with a thermometer, or limits to draw it between, C. Default: 20."
     ),
@@ -96,10 +75,10 @@ def simulate(
         "Simulate the acceptance test that 'aacmm plan --acceptance' plans, by ASME B89.4.22 or ISO 10360-12, in place "
         "of sockets; artefacts have u = 0.001 mm.",
     ),
-    base: str | None = BASE_LINK,
-    tip: str | None = TIP_LINK,
+    base: str | None = options.BASE_LINK,
+    tip: str | None = options.TIP_LINK,
     seed: int = seed("poses and noise"),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Make a capture with a simulated arm."""
     from ..data.noise import Noise
@@ -189,7 +168,7 @@ def import_(
         "Compare the readings with the arm: order, signs, zeros and units of the columns; joints that stand still; "
         "commanded against measured readings where the tables have both. Exit code 1 where nothing fits.",
     ),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Read recorded joint readings into a capture."""
     if output is None and not check:

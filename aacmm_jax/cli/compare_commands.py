@@ -10,9 +10,11 @@ from ..core.units import people_read, people_read_change
 from ..files.hdf5 import read_tables
 from ..files.outputs import together, write_text
 from ..summaries.harmonics import listed_apart
-from ..summaries.tables import Styled, Table, decimals_for, limits_of, warnings_of, written_of
-from .app import JSON, app, argument, examples, option, show_summary, with_spinner
+from ..summaries.tables import Cell, Styled, Table, decimals_for, limits_of, listed, number, warnings_of, written_of
+from . import options
+from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View
+from .options import argument, option
 
 _COLUMNS = 9  # calibrations side by side
 
@@ -40,7 +42,7 @@ def compare(
     max_length_change_mm: float | None = option(
         "MM", "Exit code 1 where a length changes by more than this from the first to the last.", min=0
     ),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Compare calibrations of one arm.
 
@@ -59,8 +61,8 @@ def compare(
         records = [load_calibration(file) for file in files]
         created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
         labels = [str(file) for file in files]
-        options = {"level": level, "length": length_mm, "labels": labels}
-        trend = with_spinner("Comparing", lambda: _compared(records, created, options))
+        settings = {"level": level, "length": length_mm, "labels": labels}
+        trend = with_spinner("Comparing", lambda: _compared(records, created, settings))
         trend = trend._replace(dated_by_file=tuple(not records[i].recording.measured for i in trend.order))
         summary: dict[str, Any] = compared_summary(trend, labels, records[0].recording.nominal.name)
         summary["kept"], summary["failed"] = change_exceeded(trend.drifts[-1].lengths, max_length_change_mm)
@@ -76,14 +78,14 @@ def compare(
         raise typer.Exit(1)
 
 
-def _compared(records: list, created: list[str], options: dict[str, Any]) -> Any:
+def _compared(records: list, created: list[str], settings: dict[str, Any]) -> Any:
     """The trend over all files; of two, in the order in which they are named, whatever their dates."""
     from ..drift.comparison import compare, moment, trend
     from ..drift.results import Trend
 
-    labels = options["labels"]
+    labels = settings["labels"]
     if len(records) > 2:
-        by_date = trend(records, created, **options)
+        by_date = trend(records, created, **settings)
         if list(by_date.order) == sorted(by_date.order):
             return by_date
         warning = (
@@ -92,7 +94,7 @@ def _compared(records: list, created: list[str], options: dict[str, Any]) -> Any
         )
         first, *others = by_date.drifts
         return by_date._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *others))
-    drift = compare(*records, **options)
+    drift = compare(*records, **settings)
     old, new = (moment(date) for date in created)
     if new < old:
         warning = (
@@ -117,10 +119,10 @@ def comparison(summary: dict[str, Any]) -> View:
     yield from _parameters(summary)
     lengths = summary["lengths"]
     keys = ("rms_mm", "rms_by_chance_mm", "percentile_95_mm", "largest_mm", "mean_mm")
-    yield Table(
-        f"\nLengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
-        ("RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean"),
+    yield listed(
+        f"Lengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
         [["not determined" if lengths[key] is None else lengths[key] for key in keys]],
+        ("RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean"),
     )
     if len(summary["trend"]) > 2:
         yield _trend(summary["trend"])
@@ -137,13 +139,13 @@ def _parameters(summary: dict[str, Any]) -> View:
         expanded = row["expanded"]
         decimals = decimals_for(None if expanded is None else factor * expanded, 5)
         small = decimals_for(None if expanded is None else fine * expanded, 2)
-        old, new = (f"{factor * row[which]:.{decimals}f}" for which in ("old", "new"))
-        change = f"{fine * row['change']:+.{small}f}"
-        u = "-" if expanded is None else f"{fine * expanded:.{small}f}"
-        mark = row["without"] or (Styled("* beyond U") if row["moved"] else "")
+        old, new = (number(factor * row[which], decimals, rounded=True) for which in ("old", "new"))
+        change = number(fine * row["change"], small, signed=True, rounded=True)
+        u = number(None if expanded is None else fine * expanded, small)
+        mark = row["without"] or Cell("* beyond U" if row["moved"] else "", None, "outlier")
         rows.append((row["parameter"], unit, old, new, small_unit, change, u, mark))
-    title = f"\nParameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)"
-    yield Table(title, ("parameter", "unit", "old", "new", "unit", "change", "U", ""), rows)
+    title = f"Parameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)"
+    yield listed(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
     left_out = len(summary["parameters"]) - len(names)
     if left_out > 0:
         yield f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv."
@@ -157,23 +159,23 @@ def _listed(tables: list[list[dict[str, Any]]]) -> set[str]:
 
 def _trend(calibrations: list[dict[str, Any]]) -> Table:
     rows = []
-    for number, row in enumerate(calibrations, start=1):
+    for i, row in enumerate(calibrations, start=1):
         cells: list[Any] = [None] * 6
-        if number > 1:
+        if i > 1:
             lengths, p = row["lengths"], row["p"]
             probability = "-" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
             numbers = (lengths[key] for key in ("rms_mm", "rms_by_chance_mm", "largest_mm"))
-            cells = [row["moved"], probability, *numbers, f"{lengths['mean_um_per_m']:+.1f}"]
-        rows.append((number, row["calibration"], _day(row["created"]), *cells))
+            cells = [row["moved"], probability, *numbers, number(lengths["mean_um_per_m"], 1, signed=True)]
+        rows.append((str(i), row["calibration"], _day(row["created"]), *cells))
     headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
-    title = "\nEach calibration against the first (whose own error is in all of them)"
-    return Table(title, (*headings, "mean [um/m]"), rows, left=(0, 1))
+    title = "Each calibration against the first (whose own error is in all of them)"
+    return listed(title, rows, (*headings, "mean [um/m]"))
 
 
 def _changes(calibrations: list[dict[str, Any]]) -> View:
     """Change of every parameter from the first calibration; of many calibrations, the last ones."""
     shown = list(enumerate(calibrations, start=1))[1:][-_COLUMNS:]
-    title = "\nChange from the first calibration (*: beyond its uncertainty)"
+    title = "Change from the first calibration (*: beyond its uncertainty)"
     if len(calibrations) - 1 > len(shown):
         title += f", the last {_COLUMNS}; --csv and --json have all"
     names, rows = _listed([row["parameters"] for _, row in shown]), []
@@ -182,8 +184,10 @@ def _changes(calibrations: list[dict[str, Any]]) -> View:
         name = of_parameter[0]["parameter"]
         if name in names:
             fine, unit = people_read_change(of_parameter[0]["unit"])
-            rows.append((name, unit, *(f"{fine * row['change']:+.1f}{marks[row['moved']]}" for row in of_parameter)))
-    yield Table(title, ("parameter", "unit", *(str(number) for number, _ in shown)), rows)
+            changes = (fine * row["change"] for row in of_parameter)
+            texts = (Cell(f"{x:+.1f}{marks[row['moved']]}", x) for x, row in zip(changes, of_parameter, strict=True))
+            rows.append((name, unit, *texts))
+    yield listed(title, rows, ("parameter", "unit", *(str(i) for i, _ in shown)))
     if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
         yield "?: without an uncertainty, since it is fixed, on a bound or not determined in one of the two."
 

@@ -11,20 +11,10 @@ from ..core.text import pluralise
 from ..files.inputs import InputFile
 from ..files.outputs import together
 from ..summaries.tables import formatted, listed, warnings_of, written_of
-from .app import (
-    CALIBRATION_FILE,
-    JSON,
-    app,
-    argument,
-    examples,
-    names_option,
-    numbers_option,
-    option,
-    output,
-    show_summary,
-    warn_of_unusable,
-)
+from . import options
+from .app import app, examples, show_summary, warn_of_unusable
 from .calibration_views import View
+from .options import argument, names_option, numbers_option, option, output
 
 _MOST_ROWS = 20  # that are printed
 
@@ -36,7 +26,7 @@ _MOST_ROWS = 20  # that are printed
     )
 )
 def correct(
-    calibration: Path = CALIBRATION_FILE,
+    calibration: Path = options.CALIBRATION_FILE,
     poses: Path = argument(
         "POSES.csv",
         "A row for each commanded pose: the joint readings (columns q_1, q_2, ..., or no others); or position x, y, z "
@@ -68,7 +58,7 @@ def correct(
     temperature: float | None = option(
         "C", "Temperature of an arm that was calibrated with its thermal expansion. Default: column temperature_C."
     ),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Turn commanded poses into corrected joint readings.
 
@@ -180,7 +170,7 @@ def corrections(summary: dict[str, Any]) -> View:
             yield f"Largest change of a {what}: {row[f'change_{unit}']:.4f} {unit} {where}."
     if missed:
         first = f", the first {_MOST_ROWS}, all by --json" if len(missed) > _MOST_ROWS else ""
-        yield listed(f"\nNot reached{first}", missed[:_MOST_ROWS], {
+        yield listed(f"Not reached{first}", missed[:_MOST_ROWS], {
             "row": "row",
             "distance left [mm]": "distance_mm",
             "angle left [deg]": "angle_deg",

@@ -8,12 +8,13 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from ..summaries.tables import Line, Styled, Table, shown
+from ..summaries.tables import STYLES, Cell, Line, Styled, Table
 
 _DEFAULT = 110  # columns of what is not a terminal, where COLUMNS does not say
 _LEAST = 20  # columns: fewer than these cannot be meant
 _GAP = 2  # between columns
 _LONGEST_WORD = 24  # a longer one (a path) is broken over lines
+_PLAIN = str.maketrans("−–\u00a0", "-- ", "✓✗")  # signs of typography that not every terminal has
 
 
 def new_console() -> Console:
@@ -41,25 +42,28 @@ def print_table(console: Console, table: Table) -> None:
     Cells wrap between words where the console is narrow. Where even that is not enough, the columns are printed in
     several blocks, each of which begins with the first ``keys`` columns.
     """
-    rows = [[Text(heading) for heading in table.headings]]
-    rows += [[Text.assemble(shown(cell)) for cell in row] for row in table.rows]
+    cells = table.cells
+    rows = [[Text(heading) for heading in table.headings], *([_text(cell) for cell in row] for row in cells)]
     columns = list(zip(*rows, strict=True))
+    numeric = [any(row[i].value is not None for row in cells) for i in range(len(columns))]
     texts = [[cell.plain for cell in column] for column in columns]
     natural = [max(cell_len(line) for cell in cells for line in cell.split("\n")) for cells in texts]
     words = [max((cell_len(word) for cell in cells for word in cell.split()), default=0) for cells in texts]
     least = [min(word, _LONGEST_WORD) for word in words]
-    left = {number % len(columns) for number in table.left}
     for number, block in enumerate(_blocks(least, console.width, table.keys)):
         widths = _fitted([natural[i] for i in block], [least[i] for i in block], console.width)
-        title = Text(table.title) if table.title and number == 0 else None
+        title = Text(f"\n{table.title}") if table.title and number == 0 else None
         part = RichTable(title=title, title_justify="left", title_style="bold", box=None)
         part.pad_edge, part.padding = False, (0, _GAP, 0, 0)
         for i, width in zip(block, widths, strict=True):
-            justify = "left" if i in left else "right"
-            part.add_column(columns[i][0], justify=justify, width=width, overflow="fold")
+            part.add_column(columns[i][0], justify="right" if numeric[i] else "left", width=width, overflow="fold")
         for row in rows[1:]:
             part.add_row(*(row[i] for i in block))
         console.print(part, no_wrap=False)
+
+
+def _text(cell: Cell) -> Text:
+    return Text(cell.text.translate(_PLAIN).strip(), STYLES.get(cell.mark, ""))
 
 
 def _blocks(least: list[int], available: int, keys: int) -> list[list[int]]:

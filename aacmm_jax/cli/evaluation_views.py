@@ -3,20 +3,23 @@
 from typing import Any
 
 from ..core.text import pluralise
+from ..summaries.result_tables import BY_CONSTRUCTION, acceptance_tables, metrics_table, observations_table
 from ..summaries.tables import (
+    Cell,
     Styled,
     Table,
     decimals_for,
     formatted,
     limits_of,
     listed,
+    number,
     verdict_of,
     warnings_of,
     written_of,
 )
-from .calibration_views import View, by_stage, lengths, orientations
+from .calibration_views import View, lengths, orientations
 
-_STYLES = {"conforms": "green", "fails": "red", "undecided": "yellow", None: "default"}
+_ARMS = {"nominal": "nominal", "calibrated": "calibrated"}
 _GROUPS = {
     "held_out": "Held-out data, which the calibration has not used",
     "identified_from": "Data used for identification",
@@ -37,7 +40,7 @@ def evaluation(summary: dict[str, Any]) -> View:
         if part is None:
             continue
         fitted = part["fixed_by_one_length"]
-        yield by_stage(f"\n{text} [mm]", part, ("nominal", "calibrated"), fitted=fitted)
+        yield metrics_table(f"{text} [mm]", part, _ARMS, fixed_scale=fitted)
         predicted = part.get("predicted")
         of_prediction = {} if predicted is None else {"predicted [mm]": "rms_predicted_mm"}
         if part["sockets"]:
@@ -47,51 +50,54 @@ def evaluation(summary: dict[str, Any]) -> View:
         if part["lengths"] and predicted is not None:
             yield _predicted_lengths(part["lengths"], fitted)
         elif part["lengths"]:
-            yield lengths(part["lengths"], fitted=fitted)
+            yield lengths(part["lengths"], fixed_scale=fitted)
     yield from written_of(summary)
 
 
 def _observations(part: dict[str, Any], predicted: bool) -> View:
     """Residuals of the other observations; of held-out ones also by kind, and by what shares a geometry or a length."""
-    numbers: dict[str, Any] = {"RMS": "rms_mm"} | ({"predicted": "rms_predicted_mm"} if predicted else {})
-    numbers["in s.d."] = lambda row: formatted(row["reduced_chi"], 2)
     rows = part["observations"]
     if rows:
-        columns = {"observation": "observation", "kind": "kind", "poses": "poses", "nominal": "nominal_rms_mm"}
-        yield listed("\nObservations, RMS distance of poses from their geometry [mm]", rows, columns | numbers)
+        yield observations_table("Observations, RMS distance of poses from their geometry [mm]", rows)
         yield from orientations(rows)
     if not predicted:
         return
     kinds, groups = part["kinds"], part["groups"]
+    numbers: dict[str, Any] = {"poses": "poses", "RMS": "rms_mm", "predicted": "rms_predicted_mm"}
+    numbers["in standard deviations"] = lambda row: number(row["reduced_chi"], 2)
     if len(kinds) > 1 and rows:
-        yield listed("\nBy kind [mm]", kinds, {"kind": "kind", "poses": "poses"} | numbers)
+        yield listed("By kind [mm]", kinds, {"kind": "kind"} | numbers)
     if len(groups) > 1 and any(len(row["members"]) > 1 for row in groups):
-        title = "\nGroups that share a length or an unknown geometry [mm]"
-        yield listed(title, groups, {"group": "group", "poses": "poses"} | numbers)
+        title = "Groups that share a length or an unknown geometry [mm]"
+        yield listed(title, groups, {"group": "group"} | numbers)
     poses = part["predicted"]["poses"]
     if poses["rms_mm"] is not None:
         prediction = poses["rms_predicted_mm"]
         yield (
             f"All held-out poses: RMS {formatted(poses['rms_mm'])} mm, predicted "
             + (f"{formatted(prediction)} mm" if prediction is not None else "not, because something is not determined")
-            + " by the uncertainty of the calibration"
-            + (" and the noise (in s.d.: in standard deviations)." if rows else " and the noise.")
+            + " by the uncertainty of the calibration and the noise."
         )
 
 
 def _predicted_lengths(rows: list[dict[str, Any]], fitted: bool) -> Table:
     """Held-out reference lengths: U contains the uncertainty of the calibration and of the length, and the noise."""
-    cells = []
-    for row in rows:
-        ratio, decimals = row["error_over_expanded"], decimals_for(row["expanded_mm"])
-        measured, error, expanded = (formatted(row[f"{key}_mm"], decimals) for key in ("measured", "error", "expanded"))
-        mark: str | Styled = "-" if ratio is None or fitted else f"{ratio:+.2f}"
-        if ratio is not None and abs(ratio) > 1 and not fitted:
-            mark = Styled(mark, "red")
-        ends = f"{row['from']} - {row['to']}"
-        cells.append((ends, row["value_mm"], measured, "fixed the scale" if fitted else error, expanded, mark))
-    headings = ("between", "value", "measured", "error", "U", "error / U")
-    return Table("\nReference lengths [mm]; U: 95 %", headings, cells)
+
+    def to_u_digits(key: str) -> Any:
+        return lambda row: number(row[key], decimals_for(row["expanded_mm"]))
+
+    def ratio(row: dict[str, Any]) -> Cell:
+        value = None if fitted else row["error_over_expanded"]
+        return number(value, 2, signed=True, mark="bad" if value is not None and abs(value) > 1 else "")
+
+    return listed("Reference lengths [mm]; U: 95 %", rows, {
+        "between": lambda row: f"{row['from']} - {row['to']}",
+        "value": "value_mm",
+        "measured": to_u_digits("measured_mm"),
+        "error": (lambda row: BY_CONSTRUCTION) if fitted else to_u_digits("error_mm"),
+        "U": to_u_digits("expanded_mm"),
+        "error / U": ratio,
+    })  # fmt: skip
 
 
 def report(summary: dict[str, Any]) -> View:
@@ -117,36 +123,15 @@ def _acceptance(summary: dict[str, Any]) -> View:
     if not tests:
         yield "No acceptance test applies: there is no socket with several poses, no length and no sphere for it."
         return
-    metrics = [metric for test in tests for metric in test["figures"]]
-    before = any(metric["as_found_mm"] is not None for metric in metrics)
-    limited = any(metric["limit_mm"] is not None for metric in metrics)
-
-    def decision(metric: dict[str, Any]) -> Styled:
-        failing, parts = metric["failing"], len(metric["parts"])
-        count = f" ({failing} of {parts})" if failing and parts > 1 else ""
-        return Styled((metric["decision"] or "-") + count, _STYLES[metric["decision"]])
-
-    rows = []
-    for test in tests:
-        for metric in test["figures"]:
-            decimals = decimals_for(metric["expanded_mm"])
-            cells = [formatted(metric["as_found_mm"], decimals)] if before else []
-            cells += [formatted(metric["value_mm"], decimals), formatted(metric["expanded_mm"] or None, decimals)]
-            cells += [metric["limit_mm"], decision(metric)] if limited else []
-            # Summaries that earlier versions stored name the standard only.
-            rows.append((test.get("called", test["standard"]), metric["name"], *cells, metric["where"]))
-    headings = ["standard", "result", *(["nominal"] if before else []), "calibrated" if before else "value", "U (k=2)"]
-    headings += [*(["MPE", "decision"] if limited else []), "worst at"]
-    yield Table("\nAcceptance tests, single readings [mm]", headings, rows, left=(0, 1, -1), keys=2)
-    symbols = [metric["symbol"] for metric in metrics if metric.get("symbol", metric["name"]) != metric["name"]]
-    if symbols:
-        yield f"Symbols: {', '.join(symbols)}."
-    for test in tests:
+    yield "\nAcceptance tests, single readings"
+    for test, metrics in zip(tests, acceptance_tables(tests, brief=True), strict=True):
+        yield metrics
         if test["missing"]:
-            yield f"{test.get('called', test['standard'])}, {test['title']}: not the full procedure."
+            yield "Not the full procedure:"
             yield from (f"  - {sentence}" for sentence in test["missing"])
-    rules = dict.fromkeys(test.get("rule", "ISO 14253-1") for test in tests if test.get("decision", limited))
-    of_test = summary["u_test_mm"] or any(summary.get("influences", {}).values())
+    limited = any(metric["limit_mm"] is not None for test in tests for metric in test["figures"])
+    rules = dict.fromkeys(test["rule"] for test in tests if test["decision"])
+    of_test = summary["u_test_mm"] or any(summary["influences"].values())
     yield (
         "U: the uncertainty of the artefacts"
         + (" and of the test (--test-u-mm, --expansion)" if of_test else "")
@@ -178,7 +163,7 @@ def procedure(summary: dict[str, Any]) -> View:
         name = row["name"] if other is None else bar
         rows.append((row["test"], name, row["group"], _at(row["position_mm"]), end, f"{row['poses']}{poses}"))
     headings = ("test", "name", "group", "at (x, y, z) [mm]", "to (x, y, z) [mm]", "poses")
-    yield Table("", headings, rows, left=(0, 1))
+    yield listed("", rows, headings)
     yield (
         "Checked: joint limits, reach, that nothing comes below the table, and that spheres are touched from outside. "
         "Not checked: obstacles, collisions of the arm with itself, and how artefacts are mounted."

@@ -12,7 +12,9 @@ from ..core.errors import InputError
 from ..core.text import printable, shorten
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
-from .app import CALIBRATION_FILE, app, examples, option, output, warn_of_unusable
+from . import options
+from .app import app, examples, warn_of_unusable
+from .options import option, output
 from .result_commands import ABOUT
 
 _FORMATS = {".urdf": "urdf", ".json": "json", ".csv": "csv", ".yaml": "ur", ".yml": "ur", ".py": "python"}
@@ -29,7 +31,7 @@ Exported = tuple[str, tuple[str, ...]]  # a text, and what is to be said with it
     )
 )
 def export(
-    calibration: Path = CALIBRATION_FILE,
+    calibration: Path = options.CALIBRATION_FILE,
     form: Literal["toml", "json", "csv", "dcc", "urdf", "table", "offsets", "ur", "python"] | None = option(
         None,
         "toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf: "

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from ..core.errors import InputError
 from ..core.text import number
-from .app import bad_option
+from .options import bad_option
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 

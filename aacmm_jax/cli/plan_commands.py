@@ -11,28 +11,9 @@ from ..core.errors import InputError
 from ..core.text import number
 from ..core.units import DEG
 from ..files.outputs import together
-from .app import (
-    BASE_LINK,
-    JSON,
-    LINEAR_ENCODER_NOISE,
-    NOMINAL_ARM,
-    REFERENCE_LENGTHS,
-    TIP_LINK,
-    USUAL_ENCODER_NOISE,
-    USUAL_SEATING_NOISE,
-    app,
-    bad_option,
-    examples,
-    flag,
-    length_option,
-    names_option,
-    option,
-    output,
-    seed,
-    show_summary,
-    sockets_option,
-    with_spinner,
-)
+from . import options
+from .app import app, examples, show_summary, with_spinner
+from .options import bad_option, flag, length_option, names_option, option, output, seed, sockets_option
 from .plan_assumptions import planned_arm
 
 _CONTEXT: Any = typer.Context.__base__  # what Typer passes: its own class is a subclass that nothing is of
@@ -63,7 +44,7 @@ _OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
 )
 def plan(
     context: _CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
-    arm: str = NOMINAL_ARM,
+    arm: str = options.NOMINAL_ARM,
     output: Path = output("FILE.csv", "Plan to write: one row a pose, in the order to take them."),
     poses: int = option("N", "Number of poses, all sockets together.", default=30, min=2, max=10_000),
     sockets: int | None = option(
@@ -73,7 +54,7 @@ def plan(
         max=1000,
     ),
     socket: list[str] | None = option("NAME=X,Y,Z", "Use a socket at this given position instead, mm; repeatable."),
-    length: list[str] | None = REFERENCE_LENGTHS,
+    length: list[str] | None = options.REFERENCE_LENGTHS,
     length_mm: str = option(
         "L[:M]", "Reference length to position; of a range, the best length is chosen.", default="500"
     ),
@@ -85,9 +66,9 @@ def plan(
         "NAMES",
         "Fix these parameters, as for calibrate, separated by commas. Default: the list in the arm's file.",
     ),
-    encoder_arcsec: float | None = USUAL_ENCODER_NOISE,
-    linear_encoder_mm: float | None = LINEAR_ENCODER_NOISE,
-    seating_mm: float | None = USUAL_SEATING_NOISE,
+    encoder_arcsec: float | None = options.USUAL_ENCODER_NOISE,
+    linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
+    seating_mm: float | None = options.USUAL_SEATING_NOISE,
     cone_deg: list[str] | None = option(
         "[NAME=]DEG",
         "Largest tilt of the tool from the normal of a socket (of all, or of one by name); 180 for any direction. "
@@ -159,10 +140,10 @@ def plan(
     manifest: Path | None = option(
         "FILE.toml", "Write a manifest, for the import of the readings once they are recorded."
     ),
-    base: str | None = BASE_LINK,
-    tip: str | None = TIP_LINK,
+    base: str | None = options.BASE_LINK,
+    tip: str | None = options.TIP_LINK,
     seed: int = seed("the random choices"),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Choose the poses to take, before measuring.
 

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from ..core.text import pluralise
-from ..summaries.tables import Line, Styled, Table, listed, written_of
+from ..summaries.tables import Cell, Line, Styled, listed, number, written_of
 from .calibration_views import View
 
 _PREDICTED = {
@@ -46,8 +46,8 @@ def plan(summary: dict[str, Any]) -> View:
         "socket": "socket",
         **_position(),
         "poses": "poses",
-        "cone [deg]": lambda row: "any" if row["cone_deg"] >= 180 else f"{row['cone_deg']:.0f}",
-        "largest tilt [deg]": lambda row: f"{row['largest_tilt_deg']:.0f}",
+        "cone [deg]": lambda row: "any" if row["cone_deg"] >= 180 else number(row["cone_deg"], 0),
+        "largest tilt [deg]": lambda row: number(row["largest_tilt_deg"], 0),
     })  # fmt: skip
     for row in summary["lengths"]:
         ends = f"{row['from']} - {row['to']}"
@@ -61,10 +61,10 @@ def kit_plan(summary: dict[str, Any]) -> View:
     yield [Styled(summary["arm"]), f": {pluralise(summary['poses'], 'pose')}"]
     rows = []
     for row in summary["observations"]:
-        for number, place in enumerate(row["places"]):
-            names = (row["observation"], row["kind"]) if number == 0 else ("", "")
-            rows.append((*names, *(f"{value:.0f}" for value in place["position_mm"]), place["poses"]))
-    yield Table("", ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"), rows)
+        for i, place in enumerate(row["places"]):
+            names = (row["observation"], row["kind"]) if i == 0 else ("", "")
+            rows.append((*names, *(number(value, 0) for value in place["position_mm"]), place["poses"]))
+    yield listed("", rows, ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"))
     yield "Positions are those of the points of an artefact; elsewhere the middle of the tips."
 
     def poses_without(name: str) -> int:
@@ -80,8 +80,8 @@ def kit_plan(summary: dict[str, Any]) -> View:
     yield from written_of(summary)
 
 
-def _position() -> dict[str, Callable[[dict[str, Any]], str]]:
-    return {f"{axis} [mm]": lambda row, i=i: f"{row['position_mm'][i]:.0f}" for i, axis in enumerate("xyz")}
+def _position() -> dict[str, Callable[[dict[str, Any]], Cell]]:
+    return {f"{axis} [mm]": lambda row, i=i: number(row["position_mm"][i], 0) for i, axis in enumerate("xyz")}
 
 
 def _predictions(summary: dict[str, Any], random: str, others: Sequence[tuple[str, Any]] = ()) -> View:
@@ -97,7 +97,7 @@ def _predictions(summary: dict[str, Any], random: str, others: Sequence[tuple[st
         (text, *(("not determined", "") if u is None else (2 * u["median_mm"], 2 * u["largest_mm"])))
         for text, u in (*named, *others)
     ]
-    yield Table("", ("", "median", "largest"), rows)
+    yield listed("", rows, ("", "median", "largest"))
     yield _noise(summary)
     yield from _motion(summary)
 

@@ -31,8 +31,9 @@ def check_arm(specification: Any, path: Path, unit: str | None, as_json: bool) -
 
 def check_recording(specification: Any, recording: Any, manifest: Path | None) -> dict[str, Any]:
     """What a check of a recording finds, with the lines of its manifest that correct it, where it has one."""
+    from ..diagnostics.joint_travel import standing_rows
+    from ..diagnostics.reading_check import check_capture
     from ..files.reading_checks import positions_unit
-    from ..summaries.reading_check import check_capture, standing_rows
 
     check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
     summary = _summary(
@@ -52,8 +53,8 @@ def check_recording(specification: Any, recording: Any, manifest: Path | None) -
 
 
 def _summary(specification: Any, check: Any, unit: str | None, positions: str, manifest: Path | None) -> dict[str, Any]:
+    from ..diagnostics.reading_words import reading_check_summary
     from ..files.reading_checks import angles_toml, units_toml
-    from ..summaries.reading_check import reading_check_summary
 
     best = check.best
     summary = reading_check_summary(check, specification.name, unit=unit, positions=positions)
@@ -80,9 +81,9 @@ def _of_capture(specification: Any, path: Path) -> dict[str, Any]:
 def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
     from ..data.capture import Capture
     from ..data.observations.measured_points import MeasuredPoints
+    from ..diagnostics.joint_travel import standing_rows
     from ..diagnostics.reading_check import check_readings
     from ..files.commanded_poses import read_known_poses
-    from ..summaries.reading_check import standing_rows
 
     table = read_known_poses(InputFile(path), specification.arm.joints, unit=unit)
     positions, rotations = table.positions, table.rotations
@@ -106,7 +107,7 @@ def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any
 
 def view(summary: dict[str, Any]) -> View:
     """Readings compared with an arm."""
-    from ..summaries.reading_check import alternatives_sentence
+    from ..diagnostics.reading_words import alternatives_sentence
 
     yield Styled(summary["sentence"], "green" if summary["fits"] else "yellow" if summary["explained"] else "red")
     if summary["tip"]:

@@ -12,21 +12,9 @@ from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
 from ..files.sense import check_shown
-from .app import (
-    BASE_LINK,
-    JSON,
-    ONLY,
-    TIP_LINK,
-    WITHOUT,
-    app,
-    argument,
-    examples,
-    option,
-    output,
-    prepare_jax,
-    show_summary,
-    with_spinner,
-)
+from . import options
+from .app import app, examples, prepare_jax, show_summary, with_spinner
+from .options import argument, option, output
 
 _ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
 ABOUT = option("FILE.toml", "Administrative data of a certificate: laboratory, customer, item, persons, dates.")
@@ -55,8 +43,8 @@ def evaluate(
     ),
     capture: Path | None = argument("CAPTURE.h5", "Capture, written by import or simulate.", None),
     output: Path | None = output("FILE.h5", "Evaluation to write (HDF5), for aacmm report.", None),
-    only: list[str] | None = ONLY,
-    without: list[str] | None = WITHOUT,
+    only: list[str] | None = options.ONLY,
+    without: list[str] | None = options.WITHOUT,
     mpe: list[str] | None = option(
         "NAME=A[+L/K]",
         "Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where one is not "
@@ -89,7 +77,7 @@ def evaluate(
     max_rms_mm: float | None = option("MM", "Exit code 1 where the RMS distance is larger.", min=0),
     max_deltam_mm: float | None = option("MM", "Exit code 1 where Deltam is larger.", min=0),
     max_length_error_mm: float | None = option("MM", "Exit code 1 where the error of any length is larger.", min=0),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Test a calibration on a capture that it has not seen.
 
@@ -166,13 +154,13 @@ def _evaluated(
 def _refuse_options_of_tests(of_test: dict[str, Any], measuring_range: float | None) -> None:
     """Raise `InputError` where options are given that only acceptance tests have, and none was made."""
     influences = of_test["influences"]
-    options = {
+    of_tests = {
         "--rule": of_test["rule"] is not None,
         "--test-u-mm": of_test["u_test"] > 0 or influences.u_relative > 0,
         "--expansion": influences.artefact is not None or influences.arm is not None,
         "--range-mm": measuring_range is not None,
     }
-    given = [name for name, there in options.items() if there]
+    given = [name for name, there in of_tests.items() if there]
     if given:
         raise InputError(
             f"{shorten(given)} applies to acceptance tests only; this capture supports none, or none was requested: "
@@ -215,7 +203,7 @@ def report(
     file: Path = argument("FILE.h5", "File to report: a calibration, evaluation, study or model comparison."),
     output: Path = output("FILE.html", "Report to write: one HTML file that needs no network connection."),
     about: Path | None = ABOUT,
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Write a report of a result as one HTML file.
 
@@ -240,9 +228,9 @@ def show(
     ),
     cell: int | None = option("N", "Show this cell of a study in full.", min=1),
     figures: Path | None = option("FOLDER", "Write the figures of a study (PNG) to this folder."),
-    base: str | None = BASE_LINK,
-    tip: str | None = TIP_LINK,
-    as_json: bool = JSON,
+    base: str | None = options.BASE_LINK,
+    tip: str | None = options.TIP_LINK,
+    as_json: bool = options.JSON,
 ) -> None:
     """Print the content of a file."""
     path = Path(file)

@@ -12,8 +12,9 @@ from typing import Any
 
 from ..core.errors import InputError
 from ..files.outputs import together
-from . import INTERRUPTED, INTERRUPTED_SENTENCE
-from .app import JSON, Stopped, app, argument, examples, flag, option, output, show_summary, with_spinner
+from . import INTERRUPTED, INTERRUPTED_SENTENCE, options
+from .app import Stopped, app, examples, show_summary, with_spinner
+from .options import argument, flag, option, output
 
 
 @app.command(
@@ -45,7 +46,7 @@ def study(
     keep_parts: bool = flag(
         "--keep-parts", "Leave the workers' files in their folder at the end: for results too large to copy."
     ),
-    as_json: bool = JSON,
+    as_json: bool = options.JSON,
 ) -> None:
     """Run a Monte Carlo study of simulated calibrations.
 
@@ -69,9 +70,9 @@ def study(
     if shards and dask is None:
         raise InputError("--shards is for the workers of --dask; leave it out, or name a cluster.")
 
-    options = {"chunk": chunk, "shards": shards, "keep_parts": keep_parts}
+    settings = {"chunk": chunk, "shards": shards, "keep_parts": keep_parts}
     with _leaving_threads():
-        outcome = _run(asked, output, dask, workers, options)
+        outcome = _run(asked, output, dask, workers, settings)
         summary = {
             "kind": "study",
             "written": str(output),
@@ -103,7 +104,7 @@ def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
     return Study(changed, asked.nominal, asked.recording)
 
 
-def _run(asked: Any, output: Path, dask: str | None, workers: int | None, options: dict[str, Any]) -> Any:
+def _run(asked: Any, output: Path, dask: str | None, workers: int | None, settings: dict[str, Any]) -> Any:
     from ..study.executors import dask_executor
     from ..study.runner import run_study
 
@@ -112,7 +113,7 @@ def _run(asked: Any, output: Path, dask: str | None, workers: int | None, option
         _progress_display() as show,
         here if dask is None else dask_executor(dask, workers) as (executor, count),
     ):
-        return run_study(asked, output, executor=executor, workers=count, watch=show, **options)
+        return run_study(asked, output, executor=executor, workers=count, watch=show, **settings)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from typing import Any
 
 from ..core.units import error_unit
 from ..study.statistics import METRICS, concise, factor_title, level_text, level_title, metric_title, shown_unit
-from ..summaries.tables import Styled, Table
+from ..summaries.tables import Cell, Styled, listed, number
 from .calibration_views import View
 
 _MOST = 40  # cells in a table
@@ -31,10 +31,12 @@ _FAILED = {
 }
 
 
-def _both(pair: dict[str, Any] | None, factor: float = 1.0) -> str:
+def _both(pair: dict[str, Any] | None, factor: float = 1.0) -> Cell:
+    """A mean with its standard error."""
     if pair is None or pair["value"] is None:
-        return "-"
-    return concise(factor * pair["value"], None if pair["se"] is None else factor * pair["se"])
+        return number(None)
+    value = factor * pair["value"]
+    return Cell(concise(value, None if pair["se"] is None else factor * pair["se"]), value)
 
 
 def study(summary: dict[str, Any]) -> View:
@@ -55,13 +57,13 @@ def study(summary: dict[str, Any]) -> View:
         )
         for cell in shown
     ]
-    yield Table("\nMeans over converged trials", ("cell", *factors, *metrics.values()), rows)
+    yield listed("Means over converged trials", rows, ("cell", *factors, *metrics.values()))
     for name in ("length_error", "angle_error") if len(cells) > 1 else ():
         name = name if fixed else f"{name}_stage1"
         title = metric_title(name)
         rows = [(cell["cell"], *_distribution(cell, name)) for cell in shown if name in cell["figures"]]
         if rows:
-            yield Table(f"\n{title[0].upper()}{title[1:]}", ("cell", *_DISTRIBUTION.values()), rows)
+            yield listed(f"{title[0].upper()}{title[1:]}", rows, ("cell", *_DISTRIBUTION.values()))
     if len(cells) > len(shown):
         yield f"\n{len(cells) - len(shown)} more cells: see them with --json, or aacmm_jax.study.open_study."
     yield (
@@ -110,7 +112,7 @@ def _identified(cells: list[dict[str, Any]], factors: list[str]) -> View:
         )
         for cell, parameter in zip(cells, often, strict=True)
     ]
-    yield Table("\nIdentifications", [*headings, *(["most often"] if any(often) else [])], rows)
+    yield listed("Identifications", rows, [*headings, *(["most often"] if any(often) else [])])
     for reason, words in _FAILED.items():
         count = sum(cell["reasons"][reason] for cell in cells)
         if count:
@@ -125,24 +127,24 @@ def _most_often_on_a_bound(cell: dict[str, Any]) -> str:
     worst = max(cell["parameters"], key=lambda row: row["on_a_bound"]["value"], default=None)
     if worst is None or not worst["on_a_bound"]["value"]:
         return ""
-    return f"{worst['parameter']} {_both(worst['on_a_bound'], 100.0)} %"
+    return f"{worst['parameter']} {_both(worst['on_a_bound'], 100.0).text} %"
 
 
-def _distribution(cell: dict[str, Any], metric: str) -> list[str]:
+def _distribution(cell: dict[str, Any], metric: str) -> list[Cell]:
     return [_both(cell["figures"][metric].get(key), shown_unit(metric)[1]) for key in _DISTRIBUTION]
 
 
 def _full(cell: dict[str, Any]) -> View:
     """Every metric of a cell, and every parameter's error."""
     rows = [(metric_title(name), *_distribution(cell, name)) for name in METRICS if name in cell["figures"]]
-    yield Table("\nMetrics over converged trials", ("", *_DISTRIBUTION.values()), rows)
+    yield listed("Metrics over converged trials", rows, ("", *_DISTRIBUTION.values()))
     rows = []
     for row in cell["parameters"]:
         factor, unit = error_unit(row["unit"])
         numbers = _both(row["bias"], factor), _both(row["spread"], factor), _both(row["on_a_bound"], 100.0)
         rows.append((row["parameter"], unit, *numbers))
     headings = ("parameter", "unit", "bias", "standard deviation", "on a bound [%]")
-    yield Table("\nParameters: estimate less truth", headings, rows)
+    yield listed("Parameters: estimate less truth", rows, headings)
 
 
 def _written(summary: dict[str, Any]) -> View:

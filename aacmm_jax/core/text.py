@@ -85,6 +85,12 @@ def shorten(items: Sequence[str], most: int = 5) -> str:
     return ", ".join(items[:most]) + (f" and {len(items) - most} more" if len(items) > most else "")
 
 
+def listed(items: Iterable[str]) -> str:
+    """Different items in words: "a, b and c"."""
+    *first, last = dict.fromkeys(items)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def common_labels(groups: Sequence[Sequence[str]]) -> list[str]:
     """What the names of each group have in common before the last "/", such as a placement; the first of the names
     where they have nothing in common, or another group has the same."""

@@ -11,18 +11,21 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..core.arguments import checked_arguments
-from ..core.arrays import Numbers, as_array
+from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.units import DEG, INCH, M
+from ..data.capture import Capture
+from ..data.observations.measured_points import AbstractMeasured
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.jacobian import tip_position
 from ..kinematics.workspace import total_link_length
 from .joint_travel import standing_joints
 from .reading_fit import Explanation, ReadingFit
-from .reading_search import Evidence, Found, Hypothesis, as_recorded, search
+from .reading_search import Evidence, Hypothesis, Searched, as_recorded, search
 
 _EXPLAINED = 0.003  # of the arm's size: a smaller residual is left by a nominal arm, once its parameters are adjusted
 _AS_GOOD = 2.0  # the factor by which residuals of two explanations must differ to tell them apart
@@ -70,11 +73,11 @@ class ReadingCheck(NamedTuple):
 @checked_arguments
 def check_readings(
     arm: Arm,
-    q: Numbers,
+    q: Float[AnyArray, "poses joints"],
     *,
     sockets: Numbers | None = None,
-    positions: Numbers | None = None,
-    rotations: Numbers | None = None,
+    positions: Float[AnyArray, "poses 3"] | None = None,
+    rotations: Float[AnyArray, "poses 3 3"] | None = None,
     own_frame: bool = False,
     free_tip: bool = False,
 ) -> ReadingCheck:
@@ -106,16 +109,16 @@ def check_readings(
         False (1, 0, 2, 3, 4, 5)
     """
     arm = to_numpy(arm)
-    evidence = _evidence(arm, q, sockets, positions, rotations, own_frame)
+    evidence = _evidence(arm, q, positions, rotations, sockets, own_frame)
     size = max(total_link_length(arm), 1e-9)
     fit = ReadingFit(arm, evidence, size, free_tip)
     given = fit.explanation(as_recorded(arm.joints), 1.0, 1.0)
     candidates, tried = [], 0
     for angle, length in _units(arm, evidence, size):
-        found = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
-        tried += found.tried
-        for members in _groups(found, size):
-            members.sort(key=lambda one: (fit.outside(one, angle) > 0, one.changes))
+        searched = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
+        tried += searched.tried
+        for members in _groups(searched, size):
+            members.sort(key=lambda hypothesis: (fit.outside(hypothesis, angle) > 0, hypothesis.changes))
             candidates.append((members, angle, length, *fit.with_free_zeros(members[0], angle, length)))
     possible = float(np.abs(evidence.q).max()) <= _NEVER
     bound = _bound(min([rms for *_, rms in candidates] + [given.rms_fitted] * possible), fit)
@@ -124,14 +127,37 @@ def check_readings(
         for members, angle, length, zeros, rms in candidates
         if rms <= bound
     ]
-    every = [one for _, one in good] + [given] * (possible and given.rms_fitted <= bound)
-    explained = min(one.rms_fitted for one in every) <= _EXPLAINED * size
-    simplest = min(every, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
-    best = simplest if explained else min(every, key=lambda one: one.rms_fitted)
+    explanations = [one for _, one in good] + [given] * (possible and given.rms_fitted <= bound)
+    explained = min(one.rms_fitted for one in explanations) <= _EXPLAINED * size
+    simplest = min(explanations, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
+    best = simplest if explained else min(explanations, key=lambda one: one.rms_fitted)
     others, equal = _others(fit, best, good) if explained else ((), 0)
     best = best if best == given else fit.within_limits(best)
-    return ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)._replace(
-        rms_with_tip=fit.with_tip_found(best) if own_frame else None, free_tip=free_tip
+    check = ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)
+    return check._replace(rms_with_tip=fit.with_tip_found(best) if own_frame else None, free_tip=free_tip)
+
+
+def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
+    """`check_readings` of what was recorded in sockets, or as one station of an instrument saw it.
+
+    Raises:
+        InputError: There is neither a socket of two poses nor a measured point.
+    """
+    if any(size > 1 for size in capture.sizes):
+        return check_readings(arm, np.asarray(capture.q)[:, : arm.joints], sockets=capture.owner)
+    measured = [observation for observation in capture.observations if isinstance(observation, AbstractMeasured)]
+    if not measured:
+        raise InputError(
+            "readings are checked against poses in a socket, at least two, or measured points; the capture has neither."
+        )
+    station, target = measured[0].station, measured[0].target
+    seen = [part for part in measured if (part.station, part.target) == (station, target)]
+    return check_readings(
+        arm,
+        np.concatenate([np.asarray(part.q)[:, : arm.joints] for part in seen]),
+        positions=np.concatenate([np.asarray(part.points) for part in seen]),
+        own_frame=True,
+        free_tip=bool(target),
     )
 
 
@@ -141,39 +167,33 @@ def _bound(rms: float, fit: ReadingFit) -> float:
 
 
 def _evidence(
-    arm: Arm, q: Numbers, sockets: Numbers | None, positions: Numbers | None, rotations: Numbers | None, own: bool
+    arm: Arm,
+    q: AnyArray,
+    positions: AnyArray | None,
+    rotations: AnyArray | None,
+    sockets: Numbers | None,
+    own_frame: bool,
 ) -> Evidence:
     """What was recorded, checked; poses sorted by socket."""
     if not is_single(arm):
         raise InputError("check_readings takes one arm, not a batch; give one of its arms.")
-    values = np.asarray(as_array(q, "q", like=arm.alpha))
-    if values.ndim != 2 or values.shape[1] != arm.joints or not len(values):
-        raise InputError(f"q has shape {values.shape}; give a row for each pose and {arm.joints} columns.")
+    q = np.asarray(q)
+    if q.shape[1] != arm.joints or not len(q):
+        raise InputError(f"q has shape {q.shape}; give a row for each pose and {arm.joints} columns.")
     if (sockets is None) == (positions is None):
         raise InputError("give either the sockets of the poses or the positions of the tip.")
-    if not np.all(np.isfinite(values)):
-        raise InputError("a reading is not finite; correct it.")
-    if sockets is not None:
-        names, owner = np.unique(np.asarray(sockets), return_inverse=True)
-        if owner.shape != (len(values),):
-            raise InputError(
-                f"sockets has shape {owner.shape}; give one number or name for each of {len(values)} poses."
-            )
-        if np.bincount(owner, minlength=len(names)).max() < 2:
-            raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
-        order = np.argsort(owner, kind="stable")
-        return Evidence(values[order], owner[order])
-    points = np.asarray(as_array(positions, "positions", like=arm.alpha))  # pyright: ignore[reportArgumentType]
-    turned = None if rotations is None else np.asarray(as_array(rotations, "rotations", like=arm.alpha))
-    for what, part, shape in (("positions", points, (3,)), ("rotations", turned, (3, 3))):
-        if part is not None and (part.shape != (len(values), *shape) or not np.all(np.isfinite(part))):
-            raise InputError(f"{what} has shape {part.shape}; give finite numbers of shape {(len(values), *shape)}.")
-    if own and (len(values) < 4 or turned is not None):
-        raise InputError(
-            "in a frame of their own four positions are needed, and orientations are not used; give more, or positions "
-            "in the base frame."
-        )
-    return Evidence(values, np.zeros(len(values), dtype=int), points, turned, own)
+    if positions is not None:
+        if own_frame and (len(q) < 4 or rotations is not None):
+            raise InputError("in an instrument's own frame, give at least four positions, and no orientations.")
+        turned = None if rotations is None else np.asarray(rotations)
+        return Evidence(q, np.zeros(len(q), dtype=int), np.asarray(positions), turned, own_frame)
+    names, owner = np.unique(np.asarray(sockets), return_inverse=True)
+    if owner.shape != (len(q),):
+        raise InputError(f"sockets has shape {owner.shape}; give one number or name for each of {len(q)} poses.")
+    if np.bincount(owner, minlength=len(names)).max() < 2:
+        raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
+    order = np.argsort(owner, kind="stable")
+    return Evidence(q[order], owner[order])
 
 
 def _units(arm: Arm, evidence: Evidence, size: float) -> Iterator[tuple[float, float]]:
@@ -192,11 +212,11 @@ def _units(arm: Arm, evidence: Evidence, size: float) -> Iterator[tuple[float, f
     yield from itertools.product(angles, lengths)
 
 
-def _groups(found: Found, size: float) -> list[list[Hypothesis]]:
+def _groups(searched: Searched, size: float) -> list[list[Hypothesis]]:
     """The first hypotheses by residual, those of equal residual together."""
     groups: list[list[Hypothesis]] = []
     before = -np.inf
-    for rms, hypothesis in zip(found.rms, found.hypotheses, strict=True):
+    for rms, hypothesis in zip(searched.rms, searched.hypotheses, strict=True):
         if rms - before > _EQUAL[0] * rms + _EQUAL[1] * size / M:
             if len(groups) == _REFITTED:
                 break
@@ -213,19 +233,19 @@ def _others(
 
     Hypotheses of equal cost are compared as they were tried, with zeros at multiples of 45 degrees.
     """
-    bound, others, equal, own = _bound(best.rms_fitted, fit), [], 0, False
-    for members, one in good:
-        of_best = not own and (best.hypothesis in members or best == one)
-        own = own or of_best
+    bound, others, equal, best_seen = _bound(best.rms_fitted, fit), [], 0, False
+    for members, explanation in good:
+        of_best = not best_seen and (best.hypothesis in members or best == explanation)
+        best_seen = best_seen or of_best
         base = members[0] if of_best and best.hypothesis not in members else best.hypothesis
-        for member in members[:_LISTED] if of_best else [one.hypothesis]:
+        for member in members[:_LISTED] if of_best else [explanation.hypothesis]:
             same, mirrored = _compared(fit, member, base)
             if same or any(_compared(fit, member, other)[0] for other, _ in others):
                 equal += same and member != base
                 continue
-            found = fit.refitted(member, one.angle, one.length) if of_best else one
-            if found.rms_fitted <= bound and (best.outside > 0 or not found.outside) and _distinct(found, best):
-                others.append((member, found._replace(mirrored=mirrored)))
+            other = fit.refitted(member, explanation.angle, explanation.length) if of_best else explanation
+            if other.rms_fitted <= bound and (best.outside > 0 or not other.outside) and _distinct(other, best):
+                others.append((member, other._replace(mirrored=mirrored)))
     # Of a joint that stands still, unless there is a single pose, nothing that an alternative says could be tested.
     still = [joint.joint - 1 for joint in standing_joints(fit.arm, best.angle * fit.evidence.q)]
     still = still if len(still) < fit.arm.joints else []
@@ -254,7 +274,8 @@ def _compared(fit: ReadingFit, one: Hypothesis, other: Hypothesis) -> tuple[bool
     that is unknown; and whether in mirror images of them."""
     limits = np.asarray(joint_limits(fit.arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_COMMON, fit.arm.joints))
-    tips = [np.asarray(tip_position(to_numpy(fit.arm.geometry), each.readings(q))) for each in (one, other)]
+    geometry = to_numpy(fit.arm.geometry)
+    tips = [np.asarray(tip_position(geometry, hypothesis.readings(q))) for hypothesis in (one, other)]
     if fit.evidence.in_base:
         return bool(np.abs(tips[0] - tips[1]).max() < _ALIKE * fit.size), False
     first, second = (tip - tip.mean(axis=0) for tip in tips)

@@ -127,9 +127,9 @@ class ReadingFit:
         offsets = np.array(hypothesis.offsets)
         waiting = [i for i in np.argsort(-np.abs(zeros)).tolist() if abs(zeros[i]) > _ZERO]
         while True:
-            found = self.explanation(hypothesis._replace(offsets=tuple(offsets.tolist())), angle, length)
-            if found.rms_fitted <= _NEARLY * rms + _EXACT * self.size or not waiting:
-                return found
+            changed = self.explanation(hypothesis._replace(offsets=tuple(offsets.tolist())), angle, length)
+            if changed.rms_fitted <= _NEARLY * rms + _EXACT * self.size or not waiting:
+                return changed
             joint = waiting.pop(0)
             offset = math.remainder(offsets[joint] + zeros[joint], 2 * math.pi)
             quarter = round(offset / (math.pi / 2)) * (math.pi / 2)
@@ -202,8 +202,8 @@ class ReadingFit:
         residual = (tips - evidence.points).ravel()
         if evidence.rotations is None:
             return residual, flat
-        found = np.stack(forward.frame, axis=1).T.swapaxes(1, 2)
-        turned = Rotation.from_matrix(found @ evidence.rotations.swapaxes(1, 2)).as_rotvec().ravel()
+        frames = np.stack(forward.frame, axis=1).T.swapaxes(1, 2)
+        turned = Rotation.from_matrix(frames @ evidence.rotations.swapaxes(1, 2)).as_rotvec().ravel()
         by_angles = np.moveaxis(np.asarray(rotation_columns(forward, self._indices)), -1, 0).swapaxes(1, 2)
         rows = self.lever * by_angles.reshape(turned.size, -1)
         return np.concatenate([residual, self.lever * turned]), np.concatenate([flat, rows])

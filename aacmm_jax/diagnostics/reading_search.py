@@ -97,7 +97,7 @@ def as_recorded(joints: int) -> Hypothesis:
     return Hypothesis(tuple(range(joints)), (1,) * joints, (0.0,) * joints)
 
 
-class Found(NamedTuple):
+class Searched(NamedTuple):
     """Hypotheses in the order of their RMS residual, mm, and how many there were."""
 
     rms: list[float]
@@ -105,17 +105,12 @@ class Found(NamedTuple):
     tried: int
 
 
-def search(arm: Arm, evidence: Evidence, lever: float) -> Found:
-    """The best hypotheses for the nominal arm; zeros are tried at multiples of 45 degrees.
+def search(arm: Arm, evidence: Evidence, lever: float) -> Searched:
+    """The best hypotheses for the nominal arm, by a few dozen poses; an error of orientation counts ``lever`` mm a rad.
 
     Tried are, each with all signs: all orders of columns, with as many zeros a quarter of a revolution off as the
     budget allows; the orders that people make (two columns exchanged, reversed, shifted by one), with one or two zeros
-    off; and the order as it is, with all zeros off.
-
-    Args:
-        arm: The nominal arm, its arrays NumPy's.
-        evidence: A few dozen poses.
-        lever: What an error of orientation counts, mm a rad.
+    off by a quarter or an eighth; and the order as it is, with all zeros off.
     """
     n = arm.joints
     joints = [i for i in range(n) if i or evidence.in_base]  # elsewhere the base takes up the zero of the first joint
@@ -138,16 +133,16 @@ def search(arm: Arm, evidence: Evidence, lever: float) -> Found:
         tried += sizes[most]
         for first, last in _halves(links, orders, step, most, evidence.rotations is not None):
             for k in range(most + 1):
-                one, other = first.at(first.zeros == k), last.at(last.zeros <= most - k)
-                rows = max(1, _BLOCK // max(len(other.signs), 1))
-                for start in range(0, len(one.signs) if len(other.signs) else 0, rows):
-                    part = one.at(slice(start, start + rows))
-                    best.take(_costs(part, other, evidence, lever), part, other)
+                front, rear = first.at(first.zeros == k), last.at(last.zeros <= most - k)
+                rows = max(1, _BLOCK // max(len(rear.signs), 1))
+                for start in range(0, len(front.signs) if len(rear.signs) else 0, rows):
+                    part = front.at(slice(start, start + rows))
+                    best.take(_costs(part, rear, evidence, lever), part, rear)
     rms = np.sqrt(np.maximum(best.costs, 0) / len(evidence.q))
     order = np.argsort(rms, kind="stable")
     # The families overlap.
-    found = {best.hypotheses[i]: float(rms[i]) for i in reversed(order)}
-    return Found(list(found.values())[::-1], list(found)[::-1], tried)
+    residuals = {best.hypotheses[i]: float(rms[i]) for i in reversed(order)}
+    return Searched(list(residuals.values())[::-1], list(residuals)[::-1], tried)
 
 
 def _variants(n: int, joints: int, most: int, zeros: int) -> int:
@@ -172,7 +167,7 @@ class _Links:
     def __init__(self, arm: Arm, q: Float[np.ndarray, "m n"], joints: list[int]):
         self.joints, self.q, self._geometry = joints, q, to_numpy(arm.geometry)
         self.count, self.probe = arm.joints, np.asarray(arm.probe)
-        self._known: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        self._kept: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     def variants(self, joint: int, step: int) -> tuple[Int[np.ndarray, " v"], Int[np.ndarray, " v"]]:
         """Signs and zeros (in eighths of a revolution) that are tried."""
@@ -187,7 +182,7 @@ class _Links:
         self, joint: int, column: int, signs: Int[np.ndarray, " v"], zeros: Int[np.ndarray, " v"]
     ) -> tuple[Float[np.ndarray, "v m 3 3"], Float[np.ndarray, "v m 3"]]:
         """Rotations and translations of one link."""
-        if (joint, column) not in self._known:
+        if (joint, column) not in self._kept:
             readings = np.array([[[s * self.q[:, column] + k * _EIGHTH] for k in range(8)] for s in (1, -1)])
             part = slice(joint, joint + 1)
             whole, slides = self._geometry, self._slides(joint)
@@ -195,8 +190,8 @@ class _Links:
             beta = None if whole.beta is None else whole.beta[part]
             link = Geometry(alpha, a, d, theta, beta, 0 * whole.probe, JointKinds((True,)) if slides else None)
             poses = np.asarray(tip_pose(link, readings.reshape(-1, 1))).reshape(2, 8, -1, 4, 4)
-            self._known[joint, column] = poses[..., :3, :3], poses[..., :3, 3]
-        turns, shifts = self._known[joint, column]
+            self._kept[joint, column] = poses[..., :3, :3], poses[..., :3, 3]
+        turns, shifts = self._kept[joint, column]
         chosen = (signs < 0).astype(int), zeros
         return turns[chosen], shifts[chosen]
 

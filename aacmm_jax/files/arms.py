@@ -343,7 +343,7 @@ def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
         for kind in ("alpha", "a", "d", "theta", "beta"):
             values = getattr(arm, kind)
             if values is not None:
-                row[kind] = float(values[i])
+                row[kind] = float(np.asarray(values)[i])
         if arm.limits is not None:
             row["limits"] = list(arm.limits[i])
         rows.append(row)

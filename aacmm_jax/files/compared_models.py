@@ -105,6 +105,7 @@ def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
     names = [row["model"] for row in models]
     numbers = [row[key] for row in models for key in _MODELS]
     numbers += [region[key] for row in models for region in row["regions"] for key in ("rms", "ratio")]
+    chosen = {summary["best"], summary["recommended"]}
     uneven = any([region["region"] for region in row["regions"]] != summary["regions"] for row in models)
     positive = [row[key] for row in models for key in _NEEDED[:4]]
     positive += [region["rms"] or 0.0 for row in models for region in row["regions"]]
@@ -113,7 +114,7 @@ def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
         {
             "it holds no models": not models,
             "a model is named twice": len(set(names)) != len(names),
-            "the recommended model is none of its models": not {summary["best"], summary["recommended"]} <= set(names),
+            "the recommended model is not one of its models": not chosen <= set(names),
             "a model lacks a region": uneven,
             "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
             "a number is larger than any can be": any(abs(value) > _LARGEST for value in numbers if value is not None),

@@ -1,4 +1,4 @@
-"""Evaluations in HDF5: a calibrated arm tried on a capture, or the points that an arm's own program reported."""
+"""Evaluations in HDF5: a calibrated arm on a capture, or the points that an arm's own program reported."""
 
 import math
 import os
@@ -111,8 +111,8 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
         calibrated = specification_of(path, stored, "calibrated_arm")
         values = _judged(stored.tables["evaluation"], EvaluationRecord, schema.EVALUATION)
         maxima = values["maxima"]
-        known = all(name in MAXIMA and 0 <= limit < math.inf for name, limit in maxima.items())
-        check_sense(path, {"a limit is unknown, negative or not finite": not known})
+        possible = all(name in MAXIMA and 0 <= limit < math.inf for name, limit in maxima.items())
+        check_sense(path, {"a limit is unknown, negative or not finite": not possible})
         uncertainty, table = None, stored.tables.get("uncertainty")
         if table is not None:
             parameters = values_in(Uncertainty, schema.UNCERTAINTY, table, table.attributes)

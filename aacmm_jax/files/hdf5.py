@@ -346,7 +346,7 @@ def _check_kind(attributes: Entries, kinds: Sequence[str], wanted: str) -> None:
             "an attribute that is text is of another type": not all(isinstance(text, str) for text in texts),
             "it is not of aacmm": attributes["format"] != FORMAT,
             f"its format version is {version!r}": not isinstance(version, int) or version < 1,
-            "the time of writing is no date": not is_moment(attributes["created"]),
+            "the time of writing is not a date": not is_moment(attributes["created"]),
         },
     )
     if version != FORMAT_VERSION:

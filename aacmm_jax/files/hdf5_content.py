@@ -109,7 +109,7 @@ class Content:
         """The identifier of an array, of which everything that is not data has been checked."""
         item = self._item(group, name)
         if not isinstance(item, h5py.h5d.DatasetID):
-            raise self._refuse(name, "no array")
+            raise self._refuse(name, "not an array")
         properties = item.get_create_plist()
         if properties.get_external_count() or properties.get_layout() == h5py.h5d.VIRTUAL:
             raise self._refuse(name, "stored in another file")

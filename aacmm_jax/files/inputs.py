@@ -73,12 +73,12 @@ def open_input(path: str | os.PathLike, times: float = 1) -> Iterator[Any]:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
     with open(descriptor, "rb") as stream:
-        found = os.fstat(descriptor)
-        if not _is_ordinary(found):
+        status = os.fstat(descriptor)
+        if not _is_ordinary(status):
             raise _not_ordinary(path)
-        if found.st_size > limit:
+        if status.st_size > limit:
             raise InputError(
-                f"{path} has {found.st_size / 2**20:,.0f} MiB, more than the {limit / 2**20:,.0f} MiB that are read; "
+                f"{path} has {status.st_size / 2**20:,.0f} MiB, more than the {limit / 2**20:,.0f} MiB that are read; "
                 f"name another file, or raise the limit with the environment variable {LARGEST_FILE}."
             )
         yield stream

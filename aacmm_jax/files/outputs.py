@@ -34,7 +34,7 @@ _asking: ContextVar[bool] = ContextVar("asking", default=False)
 
 
 def as_path(path: Any) -> Path:
-    """The path of a file, or `InputError` for what is none: a number, for one, would name an open file."""
+    """The path of a file, or `InputError` for anything else: a number would name an open file."""
     if isinstance(path, str | os.PathLike):
         return Path(path)
     raise InputError(f"a file is named by a {type(path).__name__}; give its path as text.")
@@ -171,19 +171,19 @@ class OutputFile:
         if not _asking.get() or not self.target.exists():
             return
         if not self.temporary.exists():
-            own = self.target.suffix.lower() not in _MARKED or _is_marked(self.target)
+            ours = self.target.suffix.lower() not in _MARKED or _is_marked(self.target)
         else:
-            own = _is_own(self.target, self.temporary)
-            if own and self._same_kind is not None and os.path.getsize(self.target):
+            ours = _is_own(self.target, self.temporary)
+            if ours and self._same_kind is not None and os.path.getsize(self.target):
                 token = _current.set(None)  # it may be read, though it is an output
                 try:
-                    own = self._same_kind(self.target)
+                    ours = self._same_kind(self.target)
                 finally:
                     _current.reset(token)
-        if not own:
+        if not ours:
             raise InputError(
-                f"{self.named} exists and is no earlier output of this kind; choose another name, or replace it with "
-                "--overwrite."
+                f"{self.named} exists and is not an earlier output of this kind; choose another name, or replace it "
+                "with --overwrite."
             )
 
     def replace(self, keep: bool) -> None:

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -55,10 +55,9 @@ def plan_csv(plan: Plan, angles: Angles = "deg") -> str:
     names = list(plan.sockets)
     owners = [names[owner] for owner in plan.owner]
     points = np.array([plan.sockets[name] for name in owners])
-    above = points + plan.retract * plan.cones.normals[plan.owner]
-    return _poses_csv(
-        plan.arm, ["socket"], [[owner] for owner in owners], points, plan.q, angles, plan.motion.approach, above
-    )
+    approach, above = plan.motion.approach, points + plan.retract * plan.cones.normals[plan.owner]
+    moves = None if approach is None else (approach, above)
+    return _poses_csv(plan.arm, ["socket"], [[owner] for owner in owners], (plan.q, points), angles, moves)
 
 
 def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
@@ -74,16 +73,10 @@ def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None, angles: 
         angles=angles,
     )
     for name in plan.sockets:
-        lines += ["", "[[socket]]", f"name = {_quoted(name)}", f"file = {_quoted(name + '.csv')}"]
+        lines += _table("socket", {"name": name, "file": f"{name}.csv"})
     for length in plan.lengths:
-        lines += [
-            "",
-            "[[length]]",
-            f"from = {_quoted(length.start)}",
-            f"to = {_quoted(length.end)}",
-            f"value = {round(float(length.value), 6)!r}   # mm: the calibrated length",
-            f"u = {float(length.u)!r}   # mm: its standard uncertainty",
-        ]
+        ends = {"from": length.start, "to": length.end}
+        lines += _table("length", ends | _length(round(float(length.value), 6), float(length.u)))
     return "\n".join(lines) + "\n"
 
 
@@ -91,21 +84,19 @@ def kit_csv(plan: KitPlan, angles: Angles = "deg") -> str:
     """A row for each pose of a plan with a kit: observation, point of an artefact or plane, position, readings."""
     labels, points, q, approach, above = [], [], [], [], []
     motions = plan.motions or (None,) * len(plan.kit)
-    for simulated, one, motion in zip(plan.kit, plan.observations, motions, strict=True):
-        label, readings = _label(one), np.asarray(one.q)
-        held = [""] * len(readings) if label is None else [str(text) for text in one.stored()[label.name]]
-        labels += [[one.name, point] for point in held]
+    for simulated, observation, motion in zip(plan.kit, plan.observations, motions, strict=True):
+        label, readings = _label(observation), np.asarray(observation.q)
+        touched = [""] * len(readings) if label is None else observation.stored()[label.name]
+        labels += [[observation.name, str(point)] for point in touched]
         arm = plan.arm if simulated.offset is None else plan.arm.replace(probe=simulated.offset)
         points.append(np.asarray(arm.position(readings)))
         q.append(readings)
         moved = np.full_like(readings, np.nan) if motion is None or motion.approach is None else motion.approach
         approach.append(moved)
         above.append(np.asarray(arm.position(moved)))
-    tips, readings = np.concatenate(points), np.concatenate(q)
-    if not plan.retract:
-        return _poses_csv(plan.arm, ["observation", "point"], labels, tips, readings, angles)
-    moved, over = np.concatenate(approach), np.concatenate(above)
-    return _poses_csv(plan.arm, ["observation", "point"], labels, tips, readings, angles, moved, over)
+    poses = np.concatenate(q), np.concatenate(points)
+    moves = (np.concatenate(approach), np.concatenate(above)) if plan.retract else None
+    return _poses_csv(plan.arm, ["observation", "point"], labels, poses, angles, moves)
 
 
 def _label(observation: AbstractObservation) -> Entry | None:
@@ -127,120 +118,125 @@ def kit_manifest(plan: KitPlan, arm: str, urdf: UrdfSource | None = None, angles
         "# capture.h5",
         angles=angles,
     )
-    for one in plan.observations:
-        lines += ["", *_table(one, plan.arm.joints)]
+    for observation in plan.observations:
+        lines += _table(observation.table, _observation(observation, plan.arm.joints))
     return "\n".join(lines) + "\n"
 
 
-def _table(observation: AbstractObservation, joints: int) -> list[str]:
+def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any]:
     """The table of one observation."""
     file, stored, label = observation.name.replace("/", "-"), observation.stored(), _label(observation)
-    lines = [f"[[{observation.table}]]", f"name = {_quoted(observation.name)}"]
+    table: dict[str, Any] = {"name": observation.name}
     if label is None:
-        lines.append(f"file = {_quoted(file + '.csv')}")
+        table["file"] = f"{file}.csv"
     else:
-        held = dict.fromkeys(str(text) for text in stored[label.name])
-        files = ", ".join(f"{_quoted(point)} = {_quoted(f'{file}-{point}.csv')}" for point in held)
-        lines.append(f"files = {{ {files} }}")
+        table["files"] = {str(point): f"{file}-{point}.csv" for point in stored[label.name]}
     if isinstance(observation, Socket):
-        return lines + ([f"target = {_quoted(observation.target)}"] if observation.target else [])
-    columns, next_column = [], joints + 1
+        return table | ({"target": observation.target} if observation.target else {})
+    columns, next_column = {}, joints + 1
     for entry in observation.entries:
-        value = stored.get(entry.name)
+        value, says = stored.get(entry.name), f"{entry.unit}: {entry.says}"
         if value is None or entry.name == "q" or entry is label:
             continue
-        if not entry.dimensions:
-            lines += _single(entry, value)
+        if not entry.dimensions and entry.content == "number":
+            table[entry.name] = round(float(np.asarray(value)), 9), says
+        elif not entry.dimensions:
+            table |= {entry.name: str(value) if entry.content == "text" else True} if value else {}
         elif entry.dimensions[0] == "pose" and entry.required:
             # A rotation is recorded as a quaternion.
             count = 4 if entry.unit == "1" else 3 ** (len(entry.dimensions) - 1)
-            numbers = list(range(next_column, next_column + count))
-            columns.append(f"{entry.name} = {numbers if count > 1 else numbers[0]}")
+            columns[entry.name] = list(range(next_column, next_column + count)) if count > 1 else next_column
             next_column += count
-            lines += ['rotation = "quaternion wxyz"'] if entry.unit == "1" else []
+            table |= {"rotation": "quaternion wxyz"} if entry.unit == "1" else {}
         elif entry.dimensions[-1] == "axis" and entry.dimensions[0] != "pose":
-            names = [str(name) for name in stored[entry.dimensions[0]]]
-            points = ", ".join(
-                f"{_quoted(name)} = {[round(float(x), 6) for x in point]}"
-                for name, point in zip(names, np.asarray(value), strict=True)
-            )
-            lines.append(f"{entry.name} = {{ {points} }}   # {entry.unit}: {entry.says}")
+            points = zip(stored[entry.dimensions[0]], np.asarray(value).tolist(), strict=True)
+            table[entry.name] = {str(name): [round(x, 6) for x in point] for name, point in points}, says
     if columns:
-        u = _largest_u(observation)
-        lines += [f"columns = {{ {', '.join(columns)} }}", f"u = {u!r}   # mm: standard uncertainty (k = 1)"]
-    return lines
-
-
-def _single(entry: Entry, value: object) -> list[str]:
-    if entry.content == "text":
-        return [f"{entry.name} = {_quoted(str(value))}"] if value else []
-    if entry.content == "truth":
-        return [f"{entry.name} = true"] if value else []
-    return [f"{entry.name} = {round(float(np.asarray(value)), 9)!r}   # {entry.unit}: {entry.says}"]
-
-
-def _largest_u(observation: AbstractObservation) -> float:
-    """Standard uncertainty of what an instrument measures, mm."""
-    covariance = getattr(observation, "covariance", None)
-    values = np.sqrt(np.asarray(covariance)) if covariance is not None else np.asarray(getattr(observation, "u", 0.0))
-    return round(float(np.max(values)), 9)
+        covariance = getattr(observation, "covariance", None)
+        u = np.sqrt(covariance) if covariance is not None else getattr(observation, "u", 0.0)
+        table |= {"columns": columns, "u": (round(float(np.max(u)), 9), "mm: standard uncertainty (k = 1)")}
+    return table
 
 
 def _manifest_start(
     arm: str, urdf: UrdfSource | None, *comments: str, acceptance: str | None = None, angles: Angles = "deg"
 ) -> list[str]:
     """The first lines of a manifest of readings; those of prismatic joints are in mm, which is the default."""
+    entries = {"arm": arm} | ({} if urdf is None else {"base": urdf.base, "tip": urdf.tip})
+    entries |= {} if acceptance is None else {"acceptance": acceptance}
     date = "# date = 2026-01-31   # when it was recorded"
-    links = [] if urdf is None else [f"base = {_quoted(urdf.base)}", f"tip = {_quoted(urdf.tip)}"]
-    made_for = [] if acceptance is None else [f"acceptance = {_quoted(acceptance)}"]
-    return [*comments, f"arm = {_quoted(arm)}", *links, *made_for, date, "", "[angles]", f'unit = "{angles}"']
+    return [*comments, *_entries(entries), date, "", "[angles]", f'unit = "{angles}"']
+
+
+def _table(heading: str, entries: Mapping[str, Any]) -> list[str]:
+    """A table of a manifest."""
+    return ["", f"[[{heading}]]", *_entries(entries)]
+
+
+def _entries(entries: Mapping[str, Any]) -> list[str]:
+    """Lines of TOML: of each key a value, or a value and what it is."""
+    pairs = {key: entry if isinstance(entry, tuple) else (entry, "") for key, entry in entries.items()}
+    return [f"{key} = {_toml(value)}" + (f"   # {says}" if says else "") for key, (value, says) in pairs.items()]
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{_key(key)} = {_toml(entry)}' for key, entry in value.items())} }}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)  # as TOML writes texts, numbers and truth values
+
+
+def _key(name: str) -> str:
+    return name if name.isidentifier() and name.isascii() else _toml(name)
+
+
+def _length(value: float, u: float) -> dict[str, Any]:
+    return {"value": (value, "mm: the calibrated length"), "u": (u, "mm: its standard uncertainty")}
 
 
 def procedure_csv(procedure: Procedure, angles: Angles = "deg") -> str:
     """A row for each pose of an acceptance test: test, name, file for its reading, position, readings."""
     items = (*procedure.sockets, *procedure.touches)
     labels = ([item.test, item.name, file_of(procedure, item)] for item in items for _ in item.q)
-    points, q = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("points", "q"))
-    return _poses_csv(procedure.arm, ["test", "name", "file"], labels, points, q, angles)
+    q, points = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("q", "points"))
+    return _poses_csv(procedure.arm, ["test", "name", "file"], labels, (q, points), angles)
 
 
 def _poses_csv(
     arm: Arm,
     headings: list[str],
     labels: Iterable[list[str]],
-    points: np.ndarray,
-    q: np.ndarray,
+    poses: tuple[np.ndarray, np.ndarray],
     angles: Angles = "deg",
-    approach: np.ndarray | None = None,
-    above: np.ndarray | None = None,
+    moves: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> str:
     """A row for each pose: number, labels, where the tip is (mm), joint readings, direction of the probe.
 
-    With approach configurations, a row for them before and after each pose; not where they are not finite.
+    ``poses`` are readings and tips; ``moves`` are those of the approach, which have a row before and after each pose;
+    not where they are not finite.
     """
     readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, angles, "mm"), start=1)]
     direction = [f"probe_direction_{axis}" for axis in "xyz"]
-    moves = [] if approach is None else ["move"]
-    rows: list[list[Any]] = [["pose", *moves, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction]]
+    move = [] if moves is None else ["move"]
+    rows: list[list[Any]] = [["pose", *move, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction]]
     unit, digits = (DEG, 3) if angles == "deg" else (1.0, 6)
     units = np.array(by_joint(arm, unit, 1.0))
 
-    def numbers(at: np.ndarray, tips: np.ndarray) -> list[list[str]]:
-        axes = np.asarray(arm.pose(at))[:, :3, 2]
-        rows = zip(tips, at / units, axes, strict=True)
+    def numbers(q: np.ndarray, tips: np.ndarray) -> list[list[str]]:
+        rows = zip(tips, q / units, np.asarray(arm.pose(q))[:, :3, 2], strict=True)
         return [
             [*(f"{x:.3f}" for x in tip), *(f"{x:.{digits}f}" for x in reading), *(f"{x:.2f}" for x in axis)]
             for tip, reading, axis in rows
         ]
 
-    found = numbers(q, points)
-    around = None if approach is None or above is None else numbers(approach, above)
-    for number, label in enumerate(labels):
-        pose = [number + 1, *(["pose"] if moves else []), *label, *found[number]]
-        if around is None or approach is None or not np.all(np.isfinite(approach[number])):
+    at_poses, around = numbers(*poses), None if moves is None else numbers(*moves)
+    for i, label in enumerate(labels):
+        pose = [i + 1, *(["pose"] if move else []), *label, *at_poses[i]]
+        if moves is None or around is None or not np.all(np.isfinite(moves[0][i])):
             rows.append(pose)
             continue
-        before, after = ([number + 1, move, *label, *around[number]] for move in ("approach", "retract"))
+        before, after = ([i + 1, name, *label, *around[i]] for name in ("approach", "retract"))
         rows += [before, pose, after]
     return csv_text(rows)
 
@@ -272,39 +268,23 @@ def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None =
     kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
     for kind in kinds:
         pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"
-        lines += ["", "[[socket]]", f"name = {_quoted(pattern)}", f"file = {_quoted(pattern + '.csv')}"]
+        lines += _table("socket", {"name": pattern, "file": f"{pattern}.csv"})
     for kind in kinds:
         value = next((value for start, _, value in procedure.lengths if start.startswith(f"{kind}/")), None)
         if value is not None:
-            ends = [f"{key} = {_quoted(f'{kind}/{{position}}/{side}')}" for key, side in (("from", "a"), ("to", "b"))]
-            lines += [
-                "",
-                "[[length]]",
-                *ends,
-                f"value = {value!r}   # mm: the calibrated length",
-                "u = 0.002   # mm: its standard uncertainty",
-            ]
+            ends = {"from": f"{kind}/{{position}}/a", "to": f"{kind}/{{position}}/b"}
+            lines += _table("length", ends | _length(value, 0.002))
     for sphere in procedure.spheres:
-        of = [item for item in procedure.touches if item.name == sphere.name and TOUCHED[item.test] == sphere.test]
-        files = ", ".join(_quoted(file_of(procedure, item)) for item in of)
-        lines += [
-            "",
-            "[[sphere]]",
-            f"name = {_quoted(sphere.name)}",
-            f"test = {_quoted(sphere.test)}",
-            f"files = [{files}]",
-        ]
-        lines += [
-            f"diameter = {sphere.diameter!r}   # mm: the calibrated diameter",
-            "u = 0.0005   # mm: its standard uncertainty",
-        ]
-        lines += [
-            f"stylus = {sphere.stylus!r}   # mm: diameter of the probe's ball",
-            "form = 0.0   # mm: its calibrated form error",
-            "u_form = 0.0   # mm: the standard uncertainty of that",
-        ]
+        touches = [item for item in procedure.touches if (item.name, TOUCHED[item.test]) == (sphere.name, sphere.test)]
+        entries = {
+            "name": sphere.name,
+            "test": sphere.test,
+            "files": [file_of(procedure, item) for item in touches],
+            "diameter": (sphere.diameter, "mm: the calibrated diameter"),
+            "u": (0.0005, "mm: its standard uncertainty"),
+            "stylus": (sphere.stylus, "mm: diameter of the probe's ball"),
+            "form": (0.0, "mm: its calibrated form error"),
+            "u_form": (0.0, "mm: the standard uncertainty of that"),
+        }
+        lines += _table("sphere", entries)
     return "\n".join(lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)  # a TOML basic string

@@ -206,6 +206,6 @@ def check_fields(fields: Fields, arrays: Entries, attributes: Entries) -> None:
             arrays.path,
             {
                 f"{key} ({field.says}) is below {field.least}": below,
-                f"{key} ({field.says}) is none of {', '.join(filter(None, map(str, field.among)))}": foreign,
+                f"{key} ({field.says}) is not one of {', '.join(filter(None, map(str, field.among)))}": foreign,
             },
         )

@@ -26,7 +26,7 @@ def read_checked(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
             if name in stored.tables:
                 check_fields(fields, stored.tables[name], stored.tables[name].attributes)
         measured = stored.attributes.get("measured")
-        check_sense(path, {"the day of measurement is no date": measured and not is_moment(measured[:10])})
+        check_sense(path, {"the day of measurement is not a date": measured and not is_moment(measured[:10])})
         if "capture" in stored.tables:
             joints = stored.tables["capture"]["angle"].shape[1]
             arms = [table["alpha"].shape for name, table in stored.tables.items() if name.endswith("_arm")]

@@ -1,4 +1,3 @@
-from .acceptance import acceptance_metrics as acceptance_metrics
 from .arm import arm_at_zero as arm_at_zero
 from .arm import arm_poses as arm_poses
 from .arm import arm_workspace as arm_workspace
@@ -8,11 +7,12 @@ from .drift import parameter_trend as parameter_trend
 from .drift import save_drift_trend as save_drift_trend
 from .joint_models import joint_function as joint_function
 from .joint_models import model_comparison as model_comparison
+from .lengths import acceptance_metrics as acceptance_metrics
 from .lengths import reference_length_errors as reference_length_errors
 from .parameters import length_parameter_errors as length_parameter_errors
 from .parameters import parameter_changes as parameter_changes
-from .patterns import residual_patterns as residual_patterns
 from .residuals import pose_distances as pose_distances
+from .residuals import residual_patterns as residual_patterns
 from .residuals import residuals_by_kind as residuals_by_kind
 from .residuals import save_calibration_figure as save_calibration_figure
 from .study import save_study_figures as save_study_figures

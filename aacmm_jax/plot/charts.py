@@ -170,6 +170,14 @@ def names(title: str, labels: Sequence[str]) -> Axis:
     return Axis(title, -0.6, len(labels) - 0.4, ticks, named=True)
 
 
+def runs(words: Sequence[str], first: float = 0.0) -> tuple[tuple[tuple[float, str], ...], np.ndarray]:
+    """Labels at the middle of each run of equal words at first, first + 1, ..., and the borders between the runs."""
+    last = [i for i, word in enumerate(words) if i + 1 == len(words) or words[i + 1] != word]
+    edges = first + 0.5 + np.array([-1, *last])
+    middles = ((edges[:-1] + edges[1:]) / 2).tolist()
+    return tuple((at, words[i]) for at, i in zip(middles, last, strict=True)), edges[1:-1]
+
+
 def shades(values: Any, number: int = SHADES) -> tuple[np.ndarray, tuple[float, ...]]:
     """The shade of each value, and the limits between them, which divide the range of most values evenly: few that are
     much larger would leave the other shades unused, and share the last one."""

@@ -1,4 +1,4 @@
-"""Errors of lengths, placement by placement: of reference lengths, and reading by reading against their limits."""
+"""Errors of lengths, placement by placement, and metrics of acceptance tests against their limits."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,24 +9,18 @@ from ..acceptance.results import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..summaries.tables import format_number
-from .charts import Axis, Chart, Marks, Plot, borders, level, linear
+from .charts import Axis, Chart, Marks, Plot, borders, level, linear, names, ordinates, runs
 from .figures import draw
 
 _NAMED = 16  # most lengths or placements along an axis
+_LEAST = 1e-6  # mm: drawn for a limit of zero
 _TITLE = "measured − value [mm]"
 
 
 def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, Axis, np.ndarray]:
-    """Errors of lengths side by side, those of one placement together.
-
-    Args:
-        between: The ends of the length of each error. Names that have a folder in common ("monday/a", "monday/b") are
-            of one placement.
-
-    Returns:
-        The abscissa of each error; the axis, which names the lengths, or the placements where there are too many
-        lengths; and the borders between them.
-    """
+    """Errors of lengths, given by their ends, side by side, those of one placement together: ends that have a folder in
+    common ("monday/a", "monday/b"). The abscissa of each error; the axis, which names the lengths, or the placements
+    where there are too many lengths; and the borders between them."""
     lengths = [f"{start} – {end}" for start, end in between]
     folders = [[name.rpartition("/")[0] for name in ends] for ends in between]
     placements = [
@@ -40,31 +34,16 @@ def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, Axis, 
     x[order] = np.arange(len(keys))
     alone = len(length_number) == len(place_number)  # each length in a placement of its own
     for words, plural in ((placements if alone else lengths, "length"), (placements, "placement")):
-        sorted_words = [words[i] for i in order]
-        last = [i for i, word in enumerate(sorted_words) if i + 1 == len(order) or sorted_words[i + 1] != word]
-        if len(last) <= _NAMED:
-            edges = np.array([-1, *last]) + 0.5
-            middles = (edges[:-1] + edges[1:]) / 2
-            ticks = tuple((float(at), sorted_words[i]) for at, i in zip(middles, last, strict=True))
-            return x, Axis(plural, -0.6, len(x) - 0.4, ticks, named=True), edges[1:-1]
+        ticks, edges = runs([words[i] for i in order])
+        if len(ticks) <= _NAMED:
+            return x, Axis(plural, -0.6, len(x) - 0.4, ticks, named=True), edges
     title = f"{len(length_number)} lengths in {len(place_number)} placements, one after the other"
     return x, Axis(title, -0.6, len(x) - 0.4, named=True), np.zeros(0)
 
 
-def length_chart(
-    between: Sequence[tuple[str, str]], errors: Mapping[str, np.ndarray], expanded: np.ndarray, id: str = "lengths"
-) -> Chart:
-    """Errors of reference lengths by one arm or two, the last with its expanded uncertainty.
-
-    Args:
-        between: The ends of each length.
-        errors: Name of an arm -> measured minus calibrated value, mm.
-        expanded: U of the errors by the last arm, mm; NaN where there is none.
-        id: Identifier of the chart.
-
-    Returns:
-        The chart.
-    """
+def length_chart(between: Sequence[tuple[str, str]], errors: Mapping[str, np.ndarray], expanded: np.ndarray) -> Chart:
+    """Errors of reference lengths, given by their ends, by one arm or two, mm; the last with its U, NaN where there is
+    none."""
     x, axis, edges = by_placement(between)
     *earlier, (last, error) = errors.items()
     words = [
@@ -76,10 +55,10 @@ def length_chart(
     name = f"{last}, with U (95 %)" if np.any(np.isfinite(expanded)) else last
     low, high = error - expanded, error + expanded
     marks.append(Marks(name, x, error, "square", "main", words, low, high, size=7))
-    y = linear(_TITLE, *errors.values(), low, high, [0.0])
+    y = linear(_TITLE, *ordinates(marks), [0.0])
     description = "Measured minus calibrated value" + (", before and after the scale fix." if earlier else ".")
     plot = Plot(axis, y, (*marks, borders(edges), level(0.0)))
-    return Chart(id, "Errors of the reference lengths", description, (plot,))
+    return Chart("lengths", "Errors of the reference lengths", description, (plot,))
 
 
 def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
@@ -103,7 +82,7 @@ def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
     limited, order = bool(np.any(np.isfinite(limits))), np.argsort(x)
     if limited:
         marks += [Marks("MPE", x[order], side * limits[order], "dashed", "ink") for side in (1, -1)]
-    y = linear(_TITLE, low, high, limits, -limits, [0.0])
+    y = linear(_TITLE, *ordinates(marks), [0.0])
     description = "Errors of the reference lengths, reading by reading, by the calibrated arm"
     plot = Plot(axis, y, (*marks, borders(edges), level(0.0)))
     return Chart(
@@ -138,3 +117,55 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     u, stated = np.asarray(evaluations["calibrated"].u), np.array([float(length.u) for length in lengths])
     expanded = np.where(np.isfinite(u), uncertainty_of(record).expanded_by_scatter(u, stated), np.nan)
     return draw(length_chart([(length.start, length.end) for length in lengths], errors, expanded).plots[0], axes)
+
+
+def metrics_chart(tests: Sequence[AcceptanceTest]) -> Chart:
+    """The worst value of every metric with U, divided by its limit if limits were given."""
+    metrics = [metric for test in tests for metric in test.metrics]
+    limited = [metric for metric in metrics if metric.worst.limit is not None]
+    if limited:
+        metrics, y, lines = limited, "|value| / MPE", [1.0]
+        divisors = [max(metric.worst.limit or 0.0, _LEAST) for metric in metrics]
+        title = "Metrics against their limits"
+        description = (
+            "The value of each metric, divided by its limit, with U. The decisions are in the tables: they follow the "
+            "rule stated above, whose guard band may be less than U."
+        )
+    else:
+        y, lines, divisors = "|value| [mm]", [], [1.0] * len(metrics)
+        title, description = "Metrics", "The value of each metric, with U. No limit was given."
+    values = np.array([abs(metric.value) / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
+    bars = np.array([metric.worst.expanded / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
+    words = [f"{metric.name}: {format_number(metric.value)} mm at {metric.worst.where}" for metric in metrics]
+    labels = [f"{metric.name}: {metric.decision}" if metric.decision else metric.name for metric in metrics]
+    # An absolute value is not negative, so a bar that is longer than its value ends at 0.
+    low, high = np.maximum(values - bars, 0.0), values + bars
+    marks = Marks("", np.arange(len(metrics)), values, "square", "main", words, low, high, size=8)
+    axes = names("", labels), linear(y, high, lines, [0.0], zero=True)
+    return Chart("margins", title, description, (Plot(*axes, (marks, level(*lines)), height=240),))
+
+
+def acceptance_metrics(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any:
+    """Plot the worst value of every metric that has a limit, divided by the limit, with its expanded uncertainty.
+
+    The decision beside each name follows its rule, whose guard band may be less than the bar.
+
+    Args:
+        tests: Acceptance tests of one arm (`acceptance.run`).
+        axes: Axes to plot into; new ones if None.
+
+    Returns:
+        The axes.
+
+    Raises:
+        InputError: If no metric has a limit.
+
+    Example:
+        >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
+        >>> tests = aj.acceptance.run(measured, limits={"SPAT": 0.1, "Length": 0.05})
+        >>> axes = aj.plot.acceptance_metrics(tests)
+        >>> axes.figure.savefig("acceptance.svg")
+    """
+    if not any(metric.worst.limit for test in tests for metric in test.metrics):
+        raise InputError("no metric has a limit to be drawn against; give limits to accept.")
+    return draw(metrics_chart(tests).plots[0], axes)

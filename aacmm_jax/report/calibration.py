@@ -8,20 +8,35 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import REPEATABILITY, CalibrationRecord, uncertainty_of
 from ..core.text import pluralise, shorten
-from ..core.units import DEG, people_read
 from ..diagnostics.determined import determined
 from ..diagnostics.findings import case_of
 from ..plot.lengths import length_chart
 from ..plot.residuals import arms_chart, distances_by_arm
 from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
-from ..summaries.tables import Cell, Table, decimals_for, format_number, lengths_sentence, listed, number, two_digits
-from ..summaries.uncertainty_sentences import shared_sentence
+from ..summaries.result_tables import (
+    agreement_tables,
+    metrics_table,
+    other_poses_table,
+    prior_table,
+    truth_table,
+    validation_tables,
+)
+from ..summaries.tables import (
+    Cell,
+    decimals_for,
+    format_number,
+    lengths_sentence,
+    listed,
+    number,
+    shared_sentence,
+    two_digits,
+)
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
 from .elements import Block, Report, Section
-from .observations import agreement_tables, observation_tables, other_poses_table, removed_tables
-from .tables import DRAWN, length_table, metrics_table, validation_tables
+from .observations import observation_tables, removed_tables
+from .tables import DRAWN, length_table
 
 _METHODS = {
     "two-stage": "Identification from repeatability, then a scale fix",
@@ -164,11 +179,12 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
         blocks += validation_tables(summary["cross_validation"])
     capture = record.recording.capture
     if summary.get("prior"):
-        blocks.append(_prior_table(summary["prior"]))
+        blocks.append(prior_table(summary["prior"]))
     if summary.get("shared_errors"):
         blocks.append(shared_sentence(summary["shared_errors"]))
     if not record.sockets_alone:
-        blocks += [*agreement_tables(summary), *other_poses_table(summary)]
+        blocks += agreement_tables(summary)
+        blocks += [other_poses_table(summary["other_poses"])] if "other_poses" in summary else []
     if summary["nominal"]:
         caption = "Metrics by arm [mm]"
         if capture.observations:
@@ -177,33 +193,8 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
         blocks.append(metrics_table(caption, summary, stages, fixed_scale=record.fixed_by_one_length))
     blocks.append(arms_chart(capture, distances_by_arm(record), most=DRAWN))
     if "truth" in summary:
-        errors = (
-            ("length_error_largest_mm", "largest error of a length parameter [mm]", 1.0),
-            ("angle_error_largest_rad", "largest error of an angle parameter [deg]", 1 / DEG),
-        )
-        columns = {
-            words: lambda row, stage=stage: row[2] * summary["truth"][stage][row[0]] for stage, words in stages.items()
-        }
-        caption = "Against the true arm of the simulation"
-        blocks.append(listed(caption, errors, {"": lambda row: row[1]} | columns))
+        blocks.append(truth_table(summary["truth"], stages))
     return Section("stages", "Nominal and calibrated arm", blocks)
-
-
-def _prior_table(prior: list[dict[str, Any]]) -> Table:
-    """Each group of parameters that has a prior: its standard deviation, and how many parameters the data determine."""
-
-    def deviation(row: dict[str, Any]) -> str:
-        scale, unit = people_read(row["unit"])
-        return f"{row['sd'] * scale:.3g} {unit}".strip() if row["supported"] else "0: not supported by the data"
-
-    columns = {
-        "group": "group",
-        "prior": lambda row: "learned" if row["learned"] else "given",
-        "standard deviation": deviation,
-        "parameters": "parameters",
-        "of these determined by the data": lambda row: number(row["effective_parameters"], 1),
-    }
-    return listed("Priors of the parameters, and effective parameters", prior, columns)
 
 
 def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict[str, Evaluation]) -> Section:

@@ -15,32 +15,29 @@ from ..model.metrics import pose_outliers
 from ..plot.charts import Chart, Marks, Plot, linear, names, thinned
 from ..plot.joint_models import functions_chart
 from ..plot.parameters import bounds_chart, change_chart
-from ..plot.patterns import pattern_charts
-from ..plot.residuals import Groups, distances_in, kinds_chart
+from ..plot.residuals import Groups, distances_in, kinds_chart, pattern_charts
 from ..plot.uncertainty import correlation_chart, singular_chart, tried_chart, volume_chart
-from ..summaries.harmonics import harmonics_by_joint, listed_apart
+from ..summaries.harmonics import listed_apart
+from ..summaries.result_tables import geometry_table, harmonics_table, parameter_table, weights_table, with_u_digits
 from ..summaries.tables import (
     Cell,
-    Table,
     by_columns,
-    decimals_for,
     encoders_in_words,
     factor_words,
     listed,
     number,
     numbers,
     seat_in_words,
+    tried_sentence,
     two_digits,
     volume_rows,
 )
-from ..summaries.uncertainty_sentences import tried_sentence
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from .arm_view import view_of_arm
 from .elements import Block, Section
-from .observations import geometry_table, weights_table
-from .tables import DRAWN, pose_table, residual_chart, socket_table, with_u_digits
+from .tables import DRAWN, pose_table, residual_chart, socket_table
 
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
@@ -65,66 +62,17 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     blocks: list[Block] = [
         introduction,
         *(change_chart(unit, rows) for unit, rows in by_unit.items() if rows),
-        _parameter_table("Parameters", others),
+        parameter_table("Parameters", others),
         *([] if functions is None else [functions]),
     ]
     if harmonics:
         blocks += [
             f"The {len(harmonics)} coefficients of harmonics are not printed: they are in the table below on screen, "
             "and in the calibration's file (aacmm export --format csv).",
-            _by_joint(harmonics),
-            _parameter_table("Coefficients of harmonics", harmonics)._replace(folded=True),
+            harmonics_table(harmonics),
+            parameter_table("Coefficients of harmonics", harmonics)._replace(folded=True),
         ]
     return Section("parameters", "Parameters", blocks)
-
-
-def _value(row: dict[str, Any], value: float, u: float | None, *, signed: bool = False) -> Cell:
-    """A number of a parameter in the unit that people read, to two digits of an uncertainty."""
-    scale, _ = people_read(row["unit"])
-    decimals = decimals_for(None if u is None else scale * u)
-    return number(scale * value, decimals, signed=signed, rounded=u is not None)
-
-
-def _expanded(row: dict[str, Any], u: float | None) -> Cell:
-    return with_u_digits(None if u is None else people_read(row["unit"])[0] * u)
-
-
-def _parameter_table(caption: str, rows: list[Any]) -> Table:
-    def state(row: dict[str, Any]) -> Cell:
-        words = "" if row["expanded"] else "only with others"
-        if row["bound"]:
-            words = f"on the {row['bound']} bound" + (" of stage 1; U is that of k" if row["expanded"] else "")
-        return Cell(words, None, "unsure" if words else "")
-
-    def nominal(row: dict[str, Any]) -> Cell:
-        scale, _ = people_read(row["unit"])
-        u = row["expanded"]
-        return number(scale * row["nominal"], max(decimals_for(None if u is None else scale * u), 4))
-
-    columns = {
-        "parameter": "parameter",
-        "unit": lambda row: people_read(row["unit"])[1],
-        "calibrated": lambda row: _value(row, row["calibrated"], row["expanded"]),
-        "U (95 %)": lambda row: _expanded(row, row["expanded"]),
-        "change": lambda row: _value(row, row["calibrated"] - row["nominal"], row["expanded"], signed=True),
-        "nominal": nominal,
-        "": state,
-    }
-    return listed(caption, rows, columns)
-
-
-def _by_joint(harmonics: list[Any]) -> Table:
-    columns = {
-        "joint": "joint",
-        "coefficients": "coefficients",
-        "orders": "orders",
-        "RMS over a revolution": lambda row: _value(row, row["rms"], row["largest"]["expanded"]),
-        "largest": lambda row: row["largest"]["parameter"],
-        "its value": lambda row: _value(row, row["largest"]["calibrated"], row["largest"]["expanded"], signed=True),
-        "its U": lambda row: _expanded(row, row["largest"]["expanded"]),
-        "unit": lambda row: people_read(row["unit"])[1],
-    }
-    return listed("Harmonics of the joints", harmonics_by_joint(harmonics), columns)
 
 
 def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
@@ -164,9 +112,10 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
         "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on "
         "an indexed platform in the platform's frame."
     )
+    factor = summary["uncertainty"]["coverage_factor_geometry_95"]
     return [
         Section("residuals", "Residuals by observation and pose", blocks),
-        Section("geometry", "Geometry found", [introduction, geometry_table(summary)]),
+        Section("geometry", "Geometry found", [introduction, geometry_table(summary["geometry"], factor)]),
     ]
 
 

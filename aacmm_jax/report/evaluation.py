@@ -1,31 +1,36 @@
 """The report of an evaluation: acceptance tests, and the nominal and the calibrated arm on a capture."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..acceptance.decision import COVERAGE_FACTOR
 from ..acceptance.record import EvaluationRecord, PointsRecord
-from ..acceptance.results import METRICS, AcceptanceTest
+from ..acceptance.results import AcceptanceTest
 from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
-from ..plot.acceptance import metrics_chart
-from ..plot.lengths import reading_errors_chart
+from ..plot.lengths import metrics_chart, reading_errors_chart
 from ..plot.residuals import arms_chart, distances_in
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
+from ..summaries.result_tables import (
+    MARKS,
+    acceptance_tables,
+    metrics_table,
+    observations_table,
+    stated_expanded,
+    with_u_digits,
+)
 from ..summaries.tables import Cell, Table, decimals_for, format_number, listed, number
 from ..summaries.verdicts import overall_decision
 from .arm_view import view_of_arm
 from .elements import Block, Report, Section
-from .tables import DRAWN, length_table, metrics_table, residual_chart, socket_table, with_u_digits
+from .tables import DRAWN, length_table, residual_chart, socket_table
 
-_MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}
-_SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _STAGES = ("nominal", "calibrated")
 _GROUPS = (("held_out", "Held-out data"), ("identified_from", "Data used for identification"))
 _FACTS = {
@@ -76,18 +81,9 @@ def evaluation_report(record: EvaluationRecord) -> Report:
 
 
 def observation_tables(summary: dict[str, Any]) -> list[Table]:
-    """Observations besides sockets; of held-out ones, what the calibration predicts too."""
-    columns = {
-        "observation": "observation",
-        "kind": "kind",
-        "poses": "poses",
-        "nominal": "nominal_rms_mm",
-        "calibrated": "rms_mm",
-        "predicted": "rms_predicted_mm",
-        "calibrated, in standard deviations": lambda row: number(row["reduced_chi"], 2),
-    }
+    """Observations besides sockets, held-out ones first."""
     return [
-        listed(f"{title}, RMS distance of poses from their geometry [mm]", rows, columns)
+        observations_table(f"{title}, RMS distance of poses from their geometry [mm]", rows)
         for group, title in _GROUPS
         if (rows := (summary[group] or {}).get("observations"))
     ]
@@ -163,20 +159,8 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
         blocks.append(f"Decision rules: {'; '.join(used)}. What no rule decides is undecided.")
     value = "calibrated" if nominal else "value"
-    # Decisions first: on a telephone, what stands behind them is off the screen.
-    columns = {
-        "metric": "symbol",
-        f"decision, {value}" if nominal else "decision": _decision if limited else None,
-        "decision, nominal": (lambda row: _decided(row["as_found_decision"])) if limited and nominal else None,
-        value: lambda row: number(row["value_mm"], decimals_for(row["expanded_mm"])),
-        "U": lambda row: _expanded(row["expanded_mm"]),
-        "MPE": "limit_mm" if limited else None,
-        "nominal": (lambda row: number(row["as_found_mm"], decimals_for(row["expanded_mm"]))) if nominal else None,
-        "worst at": "where",
-        "what it is": lambda row: METRICS[row["name"]],
-    }
-    for test in rows:
-        blocks.append(listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns))
+    for test, metrics_of_test in zip(rows, acceptance_tables(rows), strict=True):
+        blocks.append(metrics_of_test)
         if test["missing"]:
             blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
     parts = [
@@ -191,28 +175,15 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         parts,
         {
             "at": lambda row: row[0].where,
-            "decision": lambda row: Cell(row[0].decision or "–", None, _MARKS[row[0].decision]),
+            "decision": lambda row: Cell(row[0].decision or "–", None, MARKS[row[0].decision]),
             value: lambda row: number(row[0].value, decimals_for(row[0].expanded)),
-            "U": lambda row: _expanded(row[0].expanded),
+            "U": lambda row: stated_expanded(row[0].expanded),
             "MPE": lambda row: row[0].limit,
             "metric": lambda row: row[1].name,
             "standard": lambda row: row[2].standard,
         },
     )
     return [*blocks, metrics_chart(tests)._replace(table=every, printed=limited)]
-
-
-def _expanded(value: float) -> Cell:
-    """U, or that nothing was stated to compute it from."""
-    return with_u_digits(value) if value > 0 else Cell("not stated")
-
-
-def _decision(row: Mapping[str, Any]) -> Cell:
-    return _decided(row["decision"], row["failing"], len(row["parts"]))
-
-
-def _decided(decision: Any, failing: int = 0, of: int = 1) -> Cell:
-    return Cell(_SIGNS[decision] + (f" ({failing} of {of})" if failing and of > 1 else ""), None, _MARKS[decision])
 
 
 def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSphere]) -> list[Table]:

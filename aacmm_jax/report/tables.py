@@ -11,27 +11,10 @@ from ..diagnostics.pose_residuals import distances_of
 from ..model.metrics import pose_outliers
 from ..plot.charts import Chart
 from ..plot.residuals import Groups, Marked, distances_in, pose_chart
-from ..summaries.tables import METRICS, Cell, Table, by_columns, decimals_for, listed, number, numbers
+from ..summaries.result_tables import BY_CONSTRUCTION, with_u_digits
+from ..summaries.tables import Cell, Table, by_columns, decimals_for, listed, number, numbers
 
 DRAWN, _LISTED = 1000, 400  # most poses in a chart, and in its table
-
-
-def metrics_table(
-    caption: str, summary: Mapping[str, Any], stages: Mapping[str, str], *, fixed_scale: bool = False
-) -> Table:
-    """Repeatability and length errors, one column per arm.
-
-    ``fixed_scale``: a single length fixed the scale of the last arm, so its error is zero by construction.
-    """
-    last = list(stages)[-1]
-
-    def value(stage: str, key: str) -> Cell | str:
-        by_construction = fixed_scale and stage == last and key.startswith("length")
-        return "fixed the scale" if by_construction else number(summary[stage].get(key))
-
-    rows = [(key, title) for key, title in METRICS if key in summary[next(iter(stages))]]
-    columns = {words: lambda row, stage=stage: value(stage, row[0]) for stage, words in stages.items()}
-    return listed(caption, rows, {"": lambda row: row[1]} | columns)
 
 
 def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
@@ -101,38 +84,7 @@ def length_table(
             "between": lambda i: f"{rows[i]['from']} – {rows[i]['to']}",
             "value": lambda i: rows[i]["value_mm"],
             **{f"error, {arm}": lambda i, errors=errors: error(i, float(errors[i])) for arm, errors in before.items()},
-            "error, calibrated": lambda i: "fixed the scale" if i == fixed_scale else error(i, rows[i]["error_mm"]),
+            "error, calibrated": lambda i: BY_CONSTRUCTION if i == fixed_scale else error(i, rows[i]["error_mm"]),
             "U of error": lambda i: with_u_digits(rows[i]["expanded_mm"]),
         },
     )
-
-
-def with_u_digits(u: float | None, mark: str = "") -> Cell:
-    """An uncertainty, to two digits."""
-    return number(u, decimals_for(u), mark=mark)
-
-
-def validation_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Cross-validation, pooled and group by group, the most improbable group first."""
-    pooled = [
-        (title, summary[value], summary[predicted])
-        for title, value, predicted in (
-            ("RMS distance of poses from their socket's centroid or geometry", "rms_mm", "rms_predicted_mm"),
-            ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
-        )
-        if summary[value] is not None
-    ]
-    caption = f"Cross-validated: each of {summary['groups']} groups held out once [mm]"
-    columns = {"": lambda row: row[0], "residual": lambda row: row[1], "predicted by u": lambda row: row[2]}
-    groups = {
-        "group held out": "group",
-        "poses": "poses",
-        "RMS distance": "rms_mm",
-        "predicted": "rms_predicted_mm",
-        "RMS length error": "length_error_rms_mm",
-        "u": "length_u_mm",
-        "by chance [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
-        "": lambda row: "disagrees" if row["disagrees"] else "",
-    }
-    rows = summary.get("left_out")
-    return [listed(caption, pooled, columns), *([listed("Groups held out [mm]", rows, groups)] if rows else [])]

@@ -26,23 +26,31 @@ class _Variable(NamedTuple):
     long_name: str
 
 
+METRICS = {
+    "k": "k, measured / nominal",
+    "scale": "scale after stage 1, found / true",
+    "scale_error": "scale after the fix, found / true - 1",
+    "de_stage1": "DE before the scale fix",
+    "deltam_stage1": "Deltam before the scale fix",
+    "length_error_stage1": "largest length error before the scale fix",
+    "angle_error_stage1": "largest angle error before the scale fix",
+    "de": "DE after the scale fix",
+    "deltam": "Deltam after the scale fix",
+    "length_error": "largest length error after the scale fix",
+    "angle_error": "largest angle error after the scale fix",
+}
+
+
+def unit_of(metric: str) -> str:
+    """The unit of a metric in files."""
+    return "1" if metric in ("k", "scale", "scale_error") else "rad" if metric.startswith("angle") else "mm"
+
+
 VARIABLES = {
     "converged": _Variable("i1", False, "1", "1 where every solve ended at a minimum, 0 where not, -1 not yet run"),
     "reason": _Variable("i1", False, "1", "why the last solve ended, see attribute reasons"),
     "steps": _Variable("i4", False, "1", "evaluations of all solves"),
-    "k": _Variable("f8", False, "1", "k = measured / nominal, from the reference lengths"),
-    "scale": _Variable("f8", False, "1", "scale after stage 1: identified over true lengths, by least squares"),
-    "scale_error": _Variable("f8", False, "1", "the same factor less 1, after the scale fix"),
-    "de_stage1": _Variable("f8", False, "mm", "DE after stage 1"),
-    "deltam_stage1": _Variable("f8", False, "mm", "Deltam after stage 1"),
-    "length_error_stage1": _Variable("f8", False, "mm", "largest error of a length parameter after stage 1"),
-    "angle_error_stage1": _Variable("f8", False, "rad", "largest error of an angle parameter after stage 1"),
-    "de": _Variable("f8", False, "mm", "DE, mean distance of poses from their socket's centroid, after the scale fix"),
-    "deltam": _Variable(
-        "f8", False, "mm", "Deltam, largest half range of a coordinate in a socket, after the scale fix"
-    ),
-    "length_error": _Variable("f8", False, "mm", "largest error of a length parameter after the scale fix"),
-    "angle_error": _Variable("f8", False, "rad", "largest error of an angle parameter after the scale fix"),
+    **{name: _Variable("f8", False, unit_of(name), title) for name, title in METRICS.items()},
     "truth_inside": _Variable("i1", False, "1", "1 where the true arm lies inside the bounds"),
     "active": _Variable("i1", True, "1", "-1 on the lower bound, +1 on the upper, 0 inside, -128 not yet run"),
     "estimate": _Variable("f8", True, "mm or rad", "identified parameters, at the end"),

@@ -41,12 +41,12 @@ _HARMLESS = (
 
 def computed_with() -> str:
     """What the numbers that this process computes depend on, as JSON; settings are left out where they are as usual."""
-    known = {**{name: metadata.version(name) for name in _PACKAGES}, "platform": jax.default_backend()}
-    settings = {name.upper(): (jax_setting(name, usual), usual) for name, usual in _SETTINGS.items()}
-    known |= {name: str(value) for name, (value, usual) in settings.items() if value != usual}
+    used = {name: metadata.version(name) for name in _PACKAGES} | {"platform": jax.default_backend()}
+    for name, usual in _SETTINGS.items():
+        if (value := jax_setting(name, usual)) != usual:
+            used[name.upper()] = str(value)
     environment = {name: os.environ.get(name, "") for name in _ENVIRONMENT} | {_FLAGS: _flags()}
-    known |= {name: text for name, text in environment.items() if text}
-    return json.dumps(known, sort_keys=True)
+    return json.dumps(used | {name: text for name, text in environment.items() if text}, sort_keys=True)
 
 
 def check_same(begun: str, where: str, advice: str) -> None:
@@ -57,16 +57,16 @@ def check_same(begun: str, where: str, advice: str) -> None:
     now = computed_with()
     if now == begun:
         return
-    one, other = json.loads(begun), json.loads(now)
-    name = next(name for name in sorted({*one, *other}, key=str.lower) if one.get(name) != other.get(name))
-    was, found = one.get(name), other.get(name)
+    then, here = json.loads(begun), json.loads(now)
+    name = next(name for name in sorted({*then, *here}, key=str.lower) if then.get(name) != here.get(name))
+    was, present = then.get(name), here.get(name)
     again = (
         f"install {name} {was}" if name in _PACKAGES else f"unset {name}" if was is None else f"set {name} to {was!r}"
     )
     if name == "platform":
         again = f"continue on a {was}"
     raise InputError(
-        f"{where} was begun with {_shown(name, was)}, and here is {_shown(name, found)}, which can change the "
+        f"{where} was begun with {_shown(name, was)}, and here is {_shown(name, present)}, which can change the "
         f"numbers; {again}, or {advice}."
     )
 
@@ -78,12 +78,5 @@ def _shown(name: str, value: str | None) -> str:
 
 
 def _flags() -> str:
-    """XLA's flags that change programs, in one order; a value without a dash is a file that contains them."""
-    text = os.environ.get(_FLAGS, "").strip()
-    if text and not text.startswith("-"):
-        try:
-            with open(text, encoding="utf-8") as file:
-                text = file.read()
-        except (OSError, ValueError):  # XLA ends the process
-            return text
-    return " ".join(sorted({flag for flag in text.split() if not flag.startswith(_HARMLESS)}))
+    """XLA's flags that change programs, in one order."""
+    return " ".join(sorted({flag for flag in os.environ.get(_FLAGS, "").split() if not flag.startswith(_HARMLESS)}))

@@ -140,18 +140,14 @@ def check_reach(study: Study) -> None:
 
 
 def _out_of_reach(fixture: Fixture) -> InputError:
+    what = f"{'socket' if fixture.ends == 1 else 'reference length'} {fixture.name}"
+    if fixture.points is not None:
+        points = " and ".join("(" + ", ".join(f"{x:g}" for x in point) + ")" for point in fixture.points)
+        what += f" at {points} mm"
     return InputError(
-        f"{_described(fixture)} cannot be reached in enough poses within the joint limits; move it, or widen them "
+        f"{what} cannot be reached in enough poses within the joint limits; move it, or widen them "
         "(capture.joint_limits_deg)."
     )
-
-
-def _described(fixture: Fixture) -> str:
-    kind = "socket" if fixture.ends == 1 else "reference length"
-    if fixture.points is None:
-        return f"{kind} {fixture.name}"
-    points = " and ".join("(" + ", ".join(f"{x:g}" for x in point) + ")" for point in fixture.points)
-    return f"{kind} {fixture.name} at {points} mm"
 
 
 def _fixture_rows(
@@ -166,8 +162,8 @@ def _fixture_rows(
     missing = np.arange(len(points))
     for number in range(_ROUNDS):
         start = _uniform(jax.random.fold_in(key, number), limits, len(points))
-        found, good = _solved(arm, start[missing], points[missing], limits)
-        q[missing[good]] = found[good]
+        solved, good = _solved(arm, start[missing], points[missing], limits)
+        q[missing[good]] = solved[good]
         missing = missing[~good]
         if not len(missing):
             return _rows(arm, q, points)
@@ -186,13 +182,13 @@ def _solved(arm: Arm, start: np.ndarray, points: np.ndarray, limits: Array) -> t
     chunks = [np.resize(np.arange(i, min(i + _ROWS, len(start))), _ROWS) for i in range(0, len(start), _ROWS)]
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
-    def one(chunk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def solve(chunk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         with jax.default_device(device):
             q, good = _solve(arm.geometry, jnp.asarray(start[chunk]), jnp.asarray(points[chunk]), limits)
         return np.asarray(q), np.asarray(good)
 
     with ThreadPoolExecutor() as threads:
-        columns = zip(*threads.map(one, chunks), strict=True)
+        columns = zip(*threads.map(solve, chunks), strict=True)
     q, good = (np.concatenate(column)[: len(start)] for column in columns)
     return q, good
 
@@ -226,7 +222,7 @@ def _inverse(geometry: chain.Geometry, q: Array) -> Array:
 def _placements(arm: Arm, fixture: Fixture, limits: Array, key: Array, count: int) -> np.ndarray:
     """Placements of a fixture in its region, ``(count, ends, 3)``: the first candidates that are well within reach."""
     assert fixture.region is not None
-    found: list[np.ndarray] = []
+    placements: list[np.ndarray] = []
     for number in range(_ROUNDS):
         candidates = _candidates(fixture, fixture.region, jax.random.fold_in(key, 1000 + number), _CANDIDATES)
         candidates = candidates[: 2 * count + 64]
@@ -235,9 +231,9 @@ def _placements(arm: Arm, fixture: Fixture, limits: Array, key: Array, count: in
             start = _uniform(jax.random.fold_in(key, 2000 + number), limits, len(points))
             _, good = _solved(arm, start, points, limits)
             successes = good.reshape(len(candidates), fixture.ends, _STARTS).sum(axis=-1).min(axis=-1)
-            found += list(candidates[successes >= _STARTS // 2])
-        if len(found) >= count:
-            return np.array(found[:count])
+            placements += list(candidates[successes >= _STARTS // 2])
+        if len(placements) >= count:
+            return np.array(placements[:count])
     kind = "socket" if fixture.length is None else f"reference length of {fixture.length:g} mm"
     raise InputError(
         f"a {kind} has no placement in its region within reach and joint limits of the arm; widen or move the region."
@@ -265,11 +261,7 @@ def _in_region(region: Region, key: Array, count: int) -> np.ndarray:
 
 
 def _inside(region: Region, points: Float[np.ndarray, "... 3"]) -> np.ndarray:
-    inside = np.ones(points.shape[:-1], dtype=bool)
-    for axis, limits in enumerate((region.x_mm, region.y_mm, region.z_mm)):
-        if limits is not None:
-            inside &= (points[..., axis] >= limits[0]) & (points[..., axis] <= limits[1])
-    if region.distance_mm is not None:
-        distance = np.linalg.norm(points, axis=-1)
-        inside &= (distance >= region.distance_mm[0]) & (distance <= region.distance_mm[1])
-    return inside
+    amounts = (*np.moveaxis(points, -1, 0), np.linalg.norm(points, axis=-1))
+    limits = (region.x_mm, region.y_mm, region.z_mm, region.distance_mm)
+    pairs = [(amount, pair) for amount, pair in zip(amounts, limits, strict=True) if pair is not None]
+    return np.all([(amount >= low) & (amount <= high) for amount, (low, high) in pairs], axis=0)

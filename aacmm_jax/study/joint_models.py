@@ -58,12 +58,12 @@ def coefficients_of(nominal: ArmSpecification, model: str | None) -> tuple[str, 
 
 def all_joints(nominal: ArmSpecification, models: Iterable[str | None]) -> Arm:
     """The nominal arm with the corrections of all models, 0 where it has not got them itself."""
-    own = correction_names(nominal.arm)
+    stated = correction_names(nominal.arm)
     names = tuple(dict.fromkeys(name for model in (None, *models) for name in coefficients_of(nominal, model)))
-    if not set(names) - set(own):
+    if not set(names) - set(stated):
         return nominal.arm
     arm = _modelled(nominal, names)
-    return arm.replace(**{name: value_of(nominal.arm, name) for name in own})
+    return arm.replace(**{name: value_of(nominal.arm, name) for name in stated})
 
 
 def identified(nominal: ArmSpecification, joints: Arm, held: list[str] | None, model: str | None) -> Parameters:
@@ -71,15 +71,15 @@ def identified(nominal: ArmSpecification, joints: Arm, held: list[str] | None, m
     specification = nominal if model is None else plain(nominal)
     chosen = specification.held if held is None else tuple(held)
     if model is None:
-        own = specification.space() if held is None else Parameters.free_of(specification.arm, held=held)
-        names = own.names
+        space = specification.space() if held is None else Parameters.free_of(specification.arm, held=held)
+        names = space.names
     else:
         coefficients = coefficients_of(nominal, model)
         without = None if chosen is None else tuple(name for name in chosen if name not in correction_names(joints))
-        own = Parameters.free_of(specification.arm, held=without, free=specification.free if held is None else ())
-        names = (*own.names, *(name for name in coefficients if name not in (chosen or ())))
+        space = Parameters.free_of(specification.arm, held=without, free=specification.free if held is None else ())
+        names = (*space.names, *(name for name in coefficients if name not in (chosen or ())))
         joints = joints.replace(**{name: 0.0 for name in correction_names(joints) if not name.startswith("gravity_")})
-    return Parameters(joints if own.base.beta is None else joints.replace(beta=own.base.beta), names)
+    return Parameters(joints if space.base.beta is None else joints.replace(beta=space.base.beta), names)
 
 
 def prior_of(nominal: ArmSpecification, space: Parameters, model: str | None, text: str | None) -> Prior | None:
@@ -104,9 +104,9 @@ def deviation_of(cell: Mapping[str, Any], arm: Arm, name: str) -> tuple[Any, flo
 
 def check_deviations(given: Iterable[str], arm: Arm, names: Iterable[str]) -> None:
     """Raise `InputError` for a deviation of coefficients that no arm of the study has."""
-    known = {_coefficient(arm, name)[0] for name in names if name in correction_names(arm)}
+    present = {_coefficient(arm, name)[0] for name in names if name in correction_names(arm)}
     for kind, _, key, _ in _COEFFICIENTS:
-        if key in given and key not in known:
+        if key in given and key not in present:
             raise InputError(
                 f"deviation.{key} is of coefficients that no arm of this study has; name them in deviation.model, such "
                 f"as model = '{kind}'."
@@ -115,8 +115,7 @@ def check_deviations(given: Iterable[str], arm: Arm, names: Iterable[str]) -> No
 
 def _coefficient(arm: Arm, name: str) -> tuple[str, float]:
     unit = parameter_unit(arm, name)
-    found = (row[2:] for row in _COEFFICIENTS if is_of_group(row[0], name) and row[1] == unit)
-    return next(found, ("", 1.0))
+    return next((row[2:] for row in _COEFFICIENTS if is_of_group(row[0], name) and row[1] == unit), ("", 1.0))
 
 
 def _modelled(nominal: ArmSpecification, model: str | tuple[str, ...]) -> Arm:

@@ -54,17 +54,17 @@ def draw_observed(
     """Trials ``trials`` of cells ``cells``, and their captures as a batch. Each has random numbers of its own."""
     recorded = _recorded(study)
     seed = study.specification.seed
-    found = []
+    rows = []
     for cell, trial in zip(cells.tolist(), trials.tolist(), strict=True):
         values = CellValues(*(column[cell] for column in study.cell_values))
-        found.append(_trial(study, setting, recorded, values, np.random.default_rng([seed, cell, trial])))
-    true, start, q, shifts, certified, lengths = zip(*found, strict=True)
+        rows.append(_trial(study, setting, recorded, values, np.random.default_rng([seed, cell, trial])))
+    true, start, q, shifts, certified, lengths = zip(*rows, strict=True)
     truth = recorded.truth
     readings, value = np.stack(q), np.stack(lengths)
-    stacked = {name: np.stack([one[name] for one in certified]) for name in certified[0]}
+    stacked = {name: np.stack([values[name] for values in certified]) for name in certified[0]}
     observations = [
-        shifted(observation, readings[:, rows], np.stack([one[i] for one in shifts]), stacked)
-        for i, (observation, rows) in enumerate(zip(truth.observed.observations, truth.observed.slices, strict=True))
+        shifted(observation, readings[:, poses], np.stack([shift[i] for shift in shifts]), stacked)
+        for i, (observation, poses) in enumerate(zip(truth.observed.observations, truth.observed.slices, strict=True))
     ]
     u = np.broadcast_to(np.asarray(truth.observed.u), value.shape)
     captures = batch_of_observations(observations, truth.ends, DrawnLengths(value, u))
@@ -90,19 +90,20 @@ def _trial(
     read = _read(recorded.space.base, q, truth.reading, values, random)
     errors = truth.errors_of_rows(1, float(values.seating), random)
     shifts = [error[0] - rows for error, rows in zip(errors, left, strict=True)]
-    certified = {name: one[0] for name, one in truth.values(1, random).items()}
+    certified = {name: drawn[0] for name, drawn in truth.values(1, random).items()}
     return true, start, read, shifts, certified, truth.lengths(1, random).value[0]
 
 
 def _taken(
     recorded: _Recorded, true: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "M n"], list[Float[np.ndarray, "r m"]]]:
-    """Configurations in which the true arm owes as little as it can, and the residuals that are left."""
+    """Configurations in which the true arm has the least residuals that it can have, and these."""
     observed, z = recorded.truth.observed, np.concatenate([true, recorded.geometry])
     q, units = np.asarray(observed.q).copy(), reading_units(recorded.space.base.geometry)
     for number in range(_ROUNDS + 1):
         now = observed.moved(recorded.space.base, q)
-        left = [np.asarray(one) for one in now.by_observation([r.values for r in rows_at(recorded.space, now, z).rows])]
+        values = [rows.values for rows in rows_at(recorded.space, now, z).rows]
+        left = [np.asarray(rows) for rows in now.by_observation(values)]
         if number == _ROUNDS:
             break
         for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):

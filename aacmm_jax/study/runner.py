@@ -338,10 +338,10 @@ def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | No
 
 def _difference(one: Study, other: Study) -> str:
     """The first key in which two studies differ, in words."""
-    known, asked = (s.specification.model_dump(exclude={"name", "arm"}) for s in (one, other))
+    begun, asked = (s.specification.model_dump(exclude={"name", "arm"}) for s in (one, other))
     for table, value in asked.items():
-        if value != known[table]:
-            both = isinstance(value, dict) and isinstance(known[table], dict)
-            inner = [key for key in value if known[table].get(key) != value[key]] if both else []
+        if value != begun[table]:
+            both = isinstance(value, dict) and isinstance(begun[table], dict)
+            inner = [key for key in value if begun[table].get(key) != value[key]] if both else []
             return f"{table}{'.' + inner[0] if inner else ''} differs"
     return "its arm or its capture differs"

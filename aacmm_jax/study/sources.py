@@ -116,8 +116,8 @@ def read_study(source: str | os.PathLike) -> Study:
             return _study_of_file(path)
     path = as_path(source)
     if not os.path.exists(path) and path.suffix != ".toml":
-        known = nearest(str(source), shipped_studies())
-        raise InputError(f"'{source}' is neither a file nor a study that ships with the package{known}")
+        hint = nearest(str(source), shipped_studies())
+        raise InputError(f"'{source}' is neither a file nor a study that ships with the package{hint}")
     return _study_of_file(path)
 
 

@@ -61,7 +61,7 @@ Ends = Annotated[tuple[Point, Point], Field(strict=False)]
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     if not pair[0] < pair[1]:
-        raise ValueError(f"{pair[0]:g} to {pair[1]:g} is no range; give the lower number first.")
+        raise ValueError(f"{pair[0]:g} to {pair[1]:g} is not a range; give the lower number first.")
     return pair
 
 
@@ -238,16 +238,6 @@ class IdentificationTable(_Table):
     max_steps: Annotated[int, Field(ge=1, le=1_000_000)] = 300
 
 
-# Keys that a study made before they existed lacks: its digest must stay what it was.
-_LATER = {
-    "deviation": (
-        *("model", "harmonics_arcsec", "harmonics_mm", "gear_ppm", "coupled_ppm"),
-        *("gravity_mrad_per_m", "gravity_mrad_per_knm"),
-    ),
-    "identification": ("model", "prior"),
-}
-
-
 class Specification(_Table):
     """A study. Lists (but for ``override`` and ``held``) are factors of the grid, the last varying fastest."""
 
@@ -284,12 +274,8 @@ class Specification(_Table):
         return self
 
     def content(self) -> str:
-        """All that the numbers of a study depend on, as JSON; keys that came later, only where they are given."""
-        later = {
-            table: {name for name in names if getattr(getattr(self, table), name) is None}
-            for table, names in _LATER.items()
-        }
-        return self.model_dump_json(exclude={"name": True, "arm": True, **later})
+        """All that the numbers of a study depend on, as JSON."""
+        return self.model_dump_json(exclude={"name", "arm"})
 
     def factors(self) -> dict[str, list]:
         """Values with more than one level: dotted name -> levels, in the order of the tables."""

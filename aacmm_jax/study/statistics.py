@@ -15,22 +15,10 @@ from jaxtyping import Float, Int
 from ..core.units import ARCSEC
 from ..kinematics.arm import parameter_unit
 from ..solver.reason import Reason, numbers_of
+from .blocks import METRICS, unit_of
 from .results import Results
 from .specification import label, unit
 
-METRICS = {
-    "k": "k, measured / nominal",
-    "scale": "scale after stage 1, found / true",
-    "scale_error": "scale after the fix, found / true - 1",
-    "de_stage1": "DE before the scale fix",
-    "deltam_stage1": "Deltam before the scale fix",
-    "length_error_stage1": "largest length error before the scale fix",
-    "angle_error_stage1": "largest angle error before the scale fix",
-    "de": "DE after the scale fix",
-    "deltam": "Deltam after the scale fix",
-    "length_error": "largest length error after the scale fix",
-    "angle_error": "largest angle error after the scale fix",
-}
 PERCENTILES = (5, 50, 95)
 _FACTORS = {
     "bounds.length_mm": "half-width of lengths [mm]",
@@ -58,9 +46,7 @@ _FACTORS = {
 
 def shown_unit(metric: str) -> tuple[str, float]:
     """The unit in which people read a metric, and the factor to it from mm and rad."""
-    if metric.startswith("angle"):
-        return "arcsec", 1 / ARCSEC
-    return ("" if metric in ("k", "scale", "scale_error") else "mm"), 1.0
+    return {"1": ("", 1.0), "mm": ("mm", 1.0), "rad": ("arcsec", 1 / ARCSEC)}[unit_of(metric)]
 
 
 def metric_title(metric: str) -> str:
@@ -144,7 +130,7 @@ def cell_summary(results: Results, cell: int) -> dict[str, Any]:
     good = columns["converged"] == 1
     levels = results.study.cells[cell]
     labels = {name: _label(levels[name], values) for name, values in results.study.factors.items()}
-    found: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "cell": cell + 1,
         "factors": labels,
         "trials_run": int(ran.sum()),
@@ -155,10 +141,10 @@ def cell_summary(results: Results, cell: int) -> dict[str, Any]:
         "figures": {},
     }
     for name in METRICS:
-        known = good & np.isfinite(columns[name])
-        if known.any():
-            found["figures"][name] = distribution(columns[name][known], columns["group"][known])
-    return found | _parameters(results, cell)
+        finite = good & np.isfinite(columns[name])
+        if finite.any():
+            summary["figures"][name] = distribution(columns[name][finite], columns["group"][finite])
+    return summary | _parameters(results, cell)
 
 
 def _label(level: Any, labels: list) -> float | str:
@@ -174,13 +160,13 @@ def distribution(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"])
     """Mean, standard deviation (key "spread") and percentiles, each with its standard error."""
     order = np.argsort(values)
     values, groups = values[order], groups[order]
-    found = {"mean": statistic(np.mean, values, groups)}
+    figures = {"mean": statistic(np.mean, values, groups)}
     if len(values) > 1:
-        found["spread"] = statistic(lambda x: np.std(x, ddof=1 if len(x) > 1 else 0), values, groups)
+        figures["spread"] = statistic(lambda x: np.std(x, ddof=1 if len(x) > 1 else 0), values, groups)
     percentiles = statistic(_percentiles, values, groups)
     for i, percentile in enumerate(PERCENTILES):
-        found[f"p{percentile}"] = {key: value[i] for key, value in percentiles.items()}
-    return found
+        figures[f"p{percentile}"] = {key: value[i] for key, value in percentiles.items()}
+    return figures
 
 
 def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " t"]) -> dict[str, Any]:

@@ -148,8 +148,8 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
     # One draw for both distributions: its rank among all normal draws is uniform.
     deviation = values.width * jnp.where(values.normal, normal, jax.scipy.special.erf(normal / math.sqrt(2)))
     true = shared.nominal[None] + deviation
-    found = shared.table.at[_chosen(static, parts[:, 1], trials)].get(mode="promise_in_bounds")
-    columns = jax.lax.optimization_barrier(jnp.moveaxis(found, -1, 0))  # (columns, w, N)
+    rows = shared.table.at[_chosen(static, parts[:, 1], trials)].get(mode="promise_in_bounds")
+    columns = jax.lax.optimization_barrier(jnp.moveaxis(rows, -1, 0))  # (columns, w, N)
     q, cosine, sine = columns[:n], columns[n : 2 * n], columns[2 * n : 3 * n]
     inverse = columns[3 * n : 6 * n].reshape(n, 3, _WIDTH, poses)
     point = jnp.swapaxes(columns[6 * n :], 0, 1)  # (w, 3, N)

@@ -27,14 +27,14 @@ def run_block(study: Study, block: Block, *, device: Any = None, workers: int | 
     They depend on the study and on which trials they are, and on nothing else: not on the block, the machine's load or
     the order; on the kind of processor to rounding.
     """
-    count, each = block.shape
-    cells = np.repeat(np.arange(block.first_cell, block.last_cell), each)
+    count, trials_each = block.shape
+    cells = np.repeat(np.arange(block.first_cell, block.last_cell), trials_each)
     trials = np.tile(np.arange(block.first_trial, block.last_trial), count)
     setting = study.settings[block.first_cell]
     devices = jax.local_devices() if device is None else [device]
     drawn, captures = _drawn(study, setting, cells, trials, devices[0])
-    found = _identified(study, setting, drawn, captures, devices, workers)
-    return {name: values.reshape(*block.shape, *values.shape[1:]) for name, values in found.items()}
+    results = _identified(study, setting, drawn, captures, devices, workers)
+    return {name: values.reshape(*block.shape, *values.shape[1:]) for name, values in results.items()}
 
 
 def draw_trials(study: Study, cell: int, trials: Numbers) -> tuple[DrawnTrials, Capture]:
@@ -106,8 +106,8 @@ def _identified(
     # that each is summed in the same order however many there are.
     true = np.ascontiguousarray(np.where(lengths, drawn.true, 0.0))
     scale, scale_after = (
-        np.ascontiguousarray(found * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
-        for found in (identified1, identified)
+        np.ascontiguousarray(values * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
+        for values in (identified1, identified)
     )
     scaled = setting.method != "stage1"
     return {
@@ -134,9 +134,9 @@ def _identified(
 
 def _identified_of_all(fixed: np.ndarray, chosen: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values of all parameters of a study, of which a cell identifies some."""
-    found = np.tile(fixed, (len(values), 1))
-    found[:, chosen] = values
-    return found
+    every = np.tile(fixed, (len(values), 1))
+    every[:, chosen] = values
+    return every
 
 
 def _largest(error: np.ndarray, which: np.ndarray, present: bool = True) -> np.ndarray:
@@ -151,7 +151,7 @@ def _captures_of(study: Study, setting: Setting, drawn: DrawnTrials) -> Capture:
 @lru_cache(maxsize=64)
 def _template(study: Study, setting: Setting) -> Capture:
     """One capture of the right shape; its numbers do not matter."""
-    names = [f"{one.name}{'ab'[end] if one.ends == 2 else ''}" for one in setting.fixtures for end in range(one.ends)]
+    names = [f"{fixture.name}{end}" for fixture in setting.fixtures for end in ("a", "b")[: fixture.ends]]
     angles = np.random.default_rng(0).uniform(-1, 1, (sum(setting.sizes), study.nominal.arm.joints))
     rows = np.split(angles, np.cumsum(setting.sizes)[:-1])
     lengths = [ReferenceLength(names[a], names[b], 1.0) for a, b in ends_of(study, setting)]

@@ -19,76 +19,55 @@ from .calibration import reference_length_rows
 
 def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
     """Positions of the sockets, how many poses each gets, and the predicted uncertainties."""
-    return {
-        "kind": "plan",
-        "arm": arm,
-        "criterion": plan.criterion,
-        "poses": len(plan.q),
-        "sockets": [
-            {
-                "socket": name,
-                "position_mm": list(point),
-                "poses": int(np.sum(plan.owner == i)),
-                "normal": plan.cones.normals[i].tolist(),
-                "cone_deg": math.degrees(float(plan.cones.half_angles[i])),
-                "largest_tilt_deg": math.degrees(float(plan.motion.tilt[plan.owner == i].max())),
-            }
-            for i, (name, point) in enumerate(plan.sockets.items())
-        ],
-        "lengths": reference_length_rows(plan.lengths),
-        "check_length_mm": plan.check_length,
-        "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
-        "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
-        "seating_mm": float(plan.noise.seating),
-        "unconstrained": None if plan.unconstrained is None else _prediction(plan.unconstrained),
-        **_motion_summary([plan.motion], plan.cell, plan.retract, list(plan.sockets), plan.owner),
-        "predicted": _prediction(plan.predicted),
-        "loose": _prediction(plan.loose),
-        "random": _prediction(plan.random),
-        "more": _prediction(plan.more),
-        "more_poses": MORE,
-    }
+    rows = [
+        {
+            "socket": name,
+            "position_mm": list(point),
+            "poses": int(np.sum(plan.owner == i)),
+            "normal": plan.cones.normals[i].tolist(),
+            "cone_deg": math.degrees(float(plan.cones.half_angles[i])),
+            "largest_tilt_deg": math.degrees(float(plan.motion.tilt[plan.owner == i].max())),
+        }
+        for i, (name, point) in enumerate(plan.sockets.items())
+    ]
+    placed = {"kind": "plan", "sockets": rows, "lengths": reference_length_rows(plan.lengths)}
+    return placed | _plan_rows(plan, arm, [plan.motion], list(plan.sockets), plan.owner)
 
 
 def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
     """Where everything is put, how many poses each gets, the predicted uncertainties, and what each part adds."""
     rows = []
-    for simulated, one, part in zip(plan.kit, plan.observations, plan.parts, strict=True):
+    for simulated, observation, part in zip(plan.kit, plan.observations, plan.parts, strict=True):
         held = plan.arm if simulated.offset is None else plan.arm.replace(probe=simulated.offset)
-        tips = np.asarray(held.position(np.asarray(one.q)))
-        places = one.places
-        middles = [tips[places == i].mean(axis=0).tolist() for i in range(int(places.max()) + 1)]
-        rows.append(
-            {
-                "observation": one.name,
-                "kind": one.kind,
-                "part": part,
-                "poses": one.q.shape[0],
-                "places": [
-                    {"position_mm": middle, "poses": int(np.sum(places == i))} for i, middle in enumerate(middles)
-                ],
-            }
-        )
+        tips, places = np.asarray(held.position(np.asarray(observation.q))), observation.places
+        put = [
+            {"position_mm": tips[places == i].mean(axis=0).tolist(), "poses": int(np.sum(places == i))}
+            for i in range(int(places.max()) + 1)
+        ]
+        row = {"observation": observation.name, "kind": observation.kind, "part": part}
+        rows.append(row | {"poses": observation.q.shape[0], "places": put})
+    names = [row["observation"] for row in rows]
+    owner = np.repeat(np.arange(len(rows)), [row["poses"] for row in rows])
+    without = {name: _prediction(u) if np.isfinite(u.largest) else None for name, u in plan.without.items()}
+    placed = {"kind": "kit plan", "observations": rows, "without": without}
+    return placed | _plan_rows(plan, arm, list(plan.motions), names, owner)
+
+
+def _plan_rows(
+    plan: Plan | KitPlan, arm: str, motions: Sequence[Motion], names: Sequence[str], owner: np.ndarray
+) -> dict[str, Any]:
+    """What both kinds of plans state: the noise assumed, how the arm moves, and the predicted uncertainties."""
     return {
-        "kind": "kit plan",
         "arm": arm,
         "criterion": plan.criterion,
-        "poses": plan.poses,
-        "observations": rows,
+        "poses": len(owner),
         "check_length_mm": plan.check_length,
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
         "unconstrained": None if plan.unconstrained is None else _prediction(plan.unconstrained),
-        **_motion_summary(
-            list(plan.motions),
-            plan.cell,
-            plan.retract,
-            [one.name for one in plan.observations],
-            np.repeat(np.arange(len(plan.observations)), [one.q.shape[0] for one in plan.observations]),
-        ),
+        **_motion_summary(motions, plan.cell, plan.retract, names, owner),
         **{name: _prediction(getattr(plan, name)) for name in ("predicted", "loose", "random", "more")},
-        "without": {name: _prediction(one) if np.isfinite(one.largest) else None for name, one in plan.without.items()},
         "more_poses": MORE,
     }
 

@@ -6,7 +6,7 @@ Example:
     >>> rows = [{"socket": "A", "rms_mm": 0.01234}, {"socket": "B", "rms_mm": None}]
     >>> listed("Sockets", rows, {"socket": "socket", "RMS [mm]": "rms_mm"}).rows
     [['A', 0.01234], ['B', None]]
-    >>> shown(0.01234), shown(None)
+    >>> formatted(0.01234), formatted(None)
     ('0.0123', '-')
 """
 
@@ -16,11 +16,13 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 from ..core.text import pluralise
+from ..core.units import DEG, people_read_change
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 _MOST_DECIMALS = 6  # of a quantity that was found
 _MOST = 1e9  # from here on decimals mean nothing
 _ZERO = 1e-9  # mm: smaller numbers are rounding errors
-_STYLES = {"good": "green", "unsure": "yellow", "bad": "red", "outlier": "red"}  # of the terminal
+STYLES = {"good": "green", "unsure": "yellow", "bad": "red", "outlier": "red"}  # of marks on the terminal
 
 # Repeatability and errors of lengths, by their keys in a summary.
 METRICS = (
@@ -49,6 +51,7 @@ class Cell(NamedTuple):
 
 
 Line = str | Styled | Sequence[str | Styled]
+Columns = Mapping[str, str | Callable[[Any], Any] | None]
 
 
 class Table(NamedTuple):
@@ -57,8 +60,7 @@ class Table(NamedTuple):
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[Any]]
-    left: Sequence[int] = (0,)  # columns that are set flush left
-    keys: int = 1  # columns that are repeated where a table is too wide for its page
+    keys: int = 1  # columns that a terminal repeats where it is too narrow for all
     folded: bool = False  # a page shows it on demand only, and does not print it
 
     @property
@@ -70,18 +72,23 @@ class Table(NamedTuple):
 def listed(
     title: str,
     rows: Iterable[Any],
-    columns: Mapping[str, str | Callable[[Any], Any] | None],
+    columns: Columns | Sequence[str],
     *,
-    left: Sequence[int] = (0,),
     folded: bool = False,
+    keys: int = 1,
 ) -> Table:
-    """A table of rows: each column is a key of the row, or a function of the row; None: there is no such column."""
+    """A table of rows: each column is a key of the row, or a function of the row; None: there is no such column.
+
+    With headings alone, each row is its cells.
+    """
+    if not isinstance(columns, Mapping):
+        return Table(title, columns, list(rows), keys, folded)
     read = {
         heading: getter if callable(getter) else lambda row, key=getter: row.get(key)
         for heading, getter in columns.items()
         if getter is not None
     }
-    return Table(title, list(read), [[cell(row) for cell in read.values()] for row in rows], left, folded=folded)
+    return Table(title, list(read), [[cell(row) for cell in read.values()] for row in rows], keys, folded)
 
 
 def by_columns(title: str, columns: Mapping[str, Iterable[Any]]) -> Table:
@@ -92,6 +99,8 @@ def by_columns(title: str, columns: Mapping[str, Iterable[Any]]) -> Table:
 def _cell(cell: Any) -> Cell:
     if isinstance(cell, Cell):
         return cell
+    if isinstance(cell, bool):
+        return Cell("yes" if cell else "no")
     return Cell(cell) if isinstance(cell, str) else number(cell, 0 if isinstance(cell, Integral) else 4)
 
 
@@ -115,31 +124,15 @@ def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> s
     sign = "+" if signed else ""
     if abs(value) < _ZERO:
         value = 0.0
+    if not abs(value) < _MOST:
+        return f"{value:{sign}.6g}".replace("-", "−")
     small = value != 0 and abs(value) < 0.5 * 10**-decimals
     return (f"{value:{sign}.1e}" if small else f"{value:{sign}.{decimals}f}").replace("-", "−")
 
 
-def shown(cell: Any) -> str | Styled:
-    """A cell as it is printed."""
-    if isinstance(cell, Cell):
-        return Styled(cell.text, _STYLES[cell.mark]) if cell.mark else cell.text
-    if isinstance(cell, str | Styled):
-        return cell
-    if isinstance(cell, bool):
-        return "yes" if cell else "no"
-    return str(cell) if isinstance(cell, int) else formatted(cell)
-
-
 def formatted(value: float | None, decimals: int = 4) -> str:
-    """A number of mm with a fixed number of decimals, or in scientific notation if too small or too large for them."""
-    if value is None:
-        return "-"
-    if abs(value) < _ZERO:
-        value = 0.0
-    if not abs(value) < _MOST:
-        return f"{value:.6g}"
-    small = value != 0 and abs(value) < 0.5 * 10**-decimals
-    return f"{value:.1e}" if small else f"{value:.{decimals}f}"
+    """A number in a line of the terminal."""
+    return "-" if value is None else format_number(value, decimals).replace("−", "-")
 
 
 def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:") -> list[Line]:
@@ -150,7 +143,7 @@ def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:") -> list[Line
 def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
     """What a result is good for, in one line."""
     verdict = summary.get("verdict")
-    return [Styled(verdict["says"], _STYLES.get(verdict["mark"], "bold"))] if verdict else []
+    return [Styled(verdict["says"], STYLES.get(verdict["mark"], "bold"))] if verdict else []
 
 
 def limits_of(summary: Mapping[str, Any]) -> list[Line]:
@@ -227,7 +220,7 @@ def volume_rows(volume: Mapping[str, Any]) -> list[tuple[str, list[float | None]
     """U over the working volume: what it is of, and its median, 95th percentile and largest value, mm."""
     length = f"{volume['length_mm']:g} mm length"
     titles = {
-        "expanded_tip": "tip position, along its worst direction: from the calibration",
+        "expanded_tip": "tip position (worst direction): from the calibration",
         "expanded_length": f"{length}: from the calibration",
         "expanded_length_reading": f"{length}: with the noise of both readings",
     }
@@ -275,4 +268,28 @@ def lengths_sentence(found: Mapping[str, Any]) -> str:
     return (
         f"Lengths tested: {found['lengths']} ({size}), {held} held out; RMS error "
         f"{two_digits(found['rms_mm'])} mm{predicted}. {untested}"
+    )
+
+
+def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Errors that poses share in words."""
+    words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
+
+    def shown(row: Mapping[str, Any]) -> str:
+        scale, unit = (1.0, "mm") if row["unit"] == "mm" else people_read_change(row["unit"])
+        sd = float(f"{row['sd'] * scale:.3g}")
+        return f"{words.get(row['kind'], row['kind'])} {sd:g} {unit}"
+
+    tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
+    functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
+    parts = [*tips, *(["functions that the model lacks: " + ", ".join(functions)] if functions else [])]
+    return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
+
+
+def tried_sentence(found: Mapping[str, Any]) -> str:
+    """How much of the volume a calibration has tried, in words."""
+    return (
+        f"{100 * found['tried'] / found['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
+        f"one as these are to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
+        "poses U is an extrapolation by the model."
     )

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float
 
-from ..core.text import pluralise
+from ..core.text import listed, pluralise
 from ..kinematics.arm import Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
@@ -43,21 +43,21 @@ def why_undetermined(
         for name in chief:
             if name in terms and causes.get(name, "") != "line":  # which says more than that it is nearly constant
                 causes[name] = _cause(arm, q, terms[name], names, sockets) or causes.get(name, "")
-    found: dict[tuple[str, int], list[str]] = {}
+    names_by_cause: dict[tuple[str, int], list[str]] = {}
     for name, cause in causes.items():
-        found.setdefault((cause, terms[name].joint), []).append(name)
+        names_by_cause.setdefault((cause, terms[name].joint), []).append(name)
     sentences = tuple(
-        _SENTENCES[cause].format(names=_listed(names), joint=joint, travel=_travel(arm, q, joint), poses=_poses(q))
-        for (cause, joint), names in found.items()
+        _SENTENCES[cause].format(names=listed(names), joint=joint, travel=_travel(arm, q, joint), poses=_poses(q))
+        for (cause, joint), names in names_by_cause.items()
         if cause
     )
-    unexplained = [name for (cause, _), names in found.items() if not cause for name in names]
+    unexplained = [name for (cause, _), names in names_by_cause.items() if not cause for name in names]
     return sentences, tuple(dict.fromkeys(unexplained))
 
 
 def by_more_sockets(names: Iterable[str]) -> str:
     """What poses in more sockets would determine."""
-    return f"Poses in more sockets, over all of the workspace, would determine {_listed(list(names))}."
+    return f"Poses in more sockets, over all of the workspace, would determine {listed(names)}."
 
 
 _SENTENCES = {
@@ -124,8 +124,3 @@ def _travel(arm: Arm, q: Float[np.ndarray, "N n"], joint: int) -> str:
 
 def _poses(q: Float[np.ndarray, "N n"]) -> str:
     return pluralise(len(q), "pose")
-
-
-def _listed(names: list[str]) -> str:
-    unique = list(dict.fromkeys(names))
-    return " and ".join([", ".join(unique[:-1]), unique[-1]] if len(unique) > 1 else unique)

@@ -15,7 +15,7 @@ the variances that are possible, as the propagation of distributions has it (JCG
 Student's t with the same factor at 95 %.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -47,6 +47,10 @@ class Law(NamedTuple):
         """Of variances that were estimated from so many degrees of freedom."""
         certain = np.ones((len(degrees_of_freedom), 1))
         return cls(degrees_of_freedom, certain, certain)
+
+    def of_parts(self, index: Any) -> "Law":
+        """Of some of the parts."""
+        return Law(*(values[index] for values in self))
 
     @property
     def in_numpy(self) -> "Law":
@@ -94,7 +98,7 @@ class Components(eqx.Module):
         kept = np.array([i for i, part in enumerate(self.names) if part != name], dtype=int)
         if not len(kept):
             return None
-        return Components(tuple(self.names[i] for i in kept), self.matrices[kept], Law(*(of[kept] for of in self.law)))
+        return Components(tuple(self.names[i] for i in kept), self.matrices[kept], self.law.of_parts(kept))
 
     def wider(self, free: np.ndarray, size: int) -> "Components":
         """Of ``size`` parameters, of which these are the ``free`` ones; the others are exact."""

@@ -79,36 +79,40 @@ class Observability(NamedTuple):
 
     def sentences(self) -> list[str]:
         """What a user should know, one sentence each: directions that are not or hardly determined, and what to do."""
-        found = []
+        sentences = []
         always = [text for text, never in zip(self.undetermined, self.structural, strict=True) if never]
         now = [text for text, never in zip(self.undetermined, self.structural, strict=True) if not never]
         if always:
-            found.append(f"No measurement of this kind can separate: {'; '.join(always)}. Fix one of each (--held).")
+            sentences.append(
+                f"No measurement of this kind can separate: {'; '.join(always)}. Fix one of each (--held)."
+            )
         if now:
             remedy = f" {self.remedy}" if self.remedy else " Fix one of each (--held)."
             count = f"{len(now)} combinations of {len(self.names)} parameters"
-            found.append(f"Not determined by these data: {'; '.join(now) if len(now) <= _NAMED else count}.{remedy}")
+            sentences.append(
+                f"Not determined by these data: {'; '.join(now) if len(now) <= _NAMED else count}.{remedy}"
+            )
         if self.by_prior:
             texts = list(self.by_prior[:_NAMED])
             if len(self.by_prior) > _NAMED:
                 texts.append(f"{len(self.by_prior) - _NAMED} more combinations")
-            found.append(f"Determined by the prior and not, or hardly, by these data: {'; '.join(texts)}.")
+            sentences.append(f"Determined by the prior and not, or hardly, by these data: {'; '.join(texts)}.")
         if self.trade_offs:
             texts = [trade_off.text for trade_off in self.trade_offs[:_NAMED]]
             if len(self.trade_offs) > _NAMED:
                 texts.append(f"{len(self.trade_offs) - _NAMED} more combinations")
             first = ", ".join(trade_off.names[0] for trade_off in self.trade_offs)
-            found.append(
+            sentences.append(
                 f"Hardly determined by these data: {'; '.join(texts)}. Fix one of each, such as {first} (--held); "
                 "wider bounds do not help."
             )
-        found += self.corrections
+        sentences += self.corrections
         for i in self.parallel:
-            found.append(
+            sentences.append(
                 f"Axes {i} and {i + 1} are nearly parallel, where d_{i} and d_{i + 1} trade off and a small tilt has "
                 f"no D-H parameters: fix d_{i} and free beta_{i} (--free beta_{i})."
             )
-        return found
+        return sentences
 
 
 @checked_arguments
@@ -293,9 +297,9 @@ def _by_more_sockets(arm: Arm, capture: Capture, space: Parameters, names: tuple
     spectrum = _spectrum(arm, arm, more, space, None)
     lost = complement(spectrum.vectors[: spectrum.rank], len(space.names))
     left = {space.names[i] for i in np.flatnonzero(np.any(np.abs(lost) > _FOLLOWS, axis=1))}
-    left |= {one.names[0] for one in _trade_offs(spectrum, space, None, None)}
-    found = [name for name in names if name not in left]
-    return (by_more_sockets(found),) if found else ()
+    left |= {trade_off.names[0] for trade_off in _trade_offs(spectrum, space, None, None)}
+    determined = [name for name in names if name not in left]
+    return (by_more_sockets(determined),) if determined else ()
 
 
 def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
@@ -307,8 +311,8 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
     temperature = np.asarray(capture.readings)[: len(q), arm.joints :][:1]
     q = np.concatenate([q, np.repeat(temperature, len(q), axis=0)], axis=1)
     more_sockets = {f"\0{i}": row[None] for i, row in enumerate(q)}
-    one = [ReferenceLength("\0000", "\0001", 1.0)]
-    two = [*one, ReferenceLength("\0002", "\0003", 1.0)]
+    one_length = [ReferenceLength("\0000", "\0001", 1.0)]
+    two_lengths = [*one_length, ReferenceLength("\0002", "\0003", 1.0)]
     more_poses = {}
     for first, readings in list(capture.sockets.items())[:1]:
         more_poses = {f"\0 {first}": _other_configurations(arm, np.asarray(readings)[0], random)}
@@ -318,10 +322,10 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
     length = "a second position of the reference length" if capture.lengths else "a reference length"
     for text, sockets, lengths in (
         ("Poses in the same sockets at other temperatures would determine them.", warmer, []),
-        (f"{length[0].upper()}{length[1:]} would determine them.", more_sockets, one),
-        ("Reference lengths at two more positions would determine them.", more_sockets, two),
+        (f"{length[0].upper()}{length[1:]} would determine them.", more_sockets, one_length),
+        ("Reference lengths at two more positions would determine them.", more_sockets, two_lengths),
         ("More poses in a socket, as different as possible, would determine them.", more_poses, []),
-        (f"More poses in a socket, and {length}, would determine them.", more_poses | more_sockets, one),
+        (f"More poses in a socket, and {length}, would determine them.", more_poses | more_sockets, one_length),
     ):
         if not sockets:
             continue
@@ -342,5 +346,5 @@ def _other_configurations(arm: Arm, q: np.ndarray, random: np.random.Generator) 
     """Other configurations with the tip where ``q`` has it."""
     starts = np.tile(q, (60, 1))
     starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
-    found, reached = project_to_targets(arm, starts, np.tile(np.asarray(arm.position(q)), (60, 1)))
-    return found[reached] if reached.any() else q[None]
+    configurations, reached = project_to_targets(arm, starts, np.tile(np.asarray(arm.position(q)), (60, 1)))
+    return configurations[reached] if reached.any() else q[None]

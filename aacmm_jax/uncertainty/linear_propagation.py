@@ -99,7 +99,9 @@ class Influence(NamedTuple):
     def covariance(self) -> UnknownsCovariance:
         """Of the unknowns, where every row has the variance 1 that its weight says."""
         pairs = zip(self.own, self.follow, strict=True)
-        return UnknownsCovariance(self.inverse, [own + _conjugated(self.inverse, follow) for own, follow in pairs])
+        return UnknownsCovariance(
+            self.inverse, [d_inverse + _conjugated(self.inverse, follow) for d_inverse, follow in pairs]
+        )
 
     def weighted(self, number: int, rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k r m"]:
         """Rows of a block as a robust loss counts them: the influence of its poses."""
@@ -145,7 +147,7 @@ class Influence(NamedTuple):
         """
         sums, of_components = self.sums(rows)
         head, triples = -self.inverse @ sums, zip(self.own, self.follow, of_components, strict=True)
-        return head, [-(own @ part) - follow @ head for own, follow, part in triples]
+        return head, [-(d_inverse @ part) - follow @ head for d_inverse, follow, part in triples]
 
     def eliminated(
         self, head: Float[AnyArray, "q h"], components: Sequence[Float[AnyArray, "q _ _"]]
@@ -311,9 +313,11 @@ def propagated(
             middle[block.of] = middle[block.of] + sums_by_component(times, private, block.sizes)
     # Of dy = -D^-1 (B W w + C dx): both parts, and twice what they have in common.
     components = []
-    for own, follow, square, both in zip(influence.own, influence.follow, middle, crossed, strict=True):
-        mixed = own @ both @ inverse @ xp.swapaxes(follow, -1, -2)
-        components.append(_conjugated(head, follow) + own @ square @ own - mixed - xp.swapaxes(mixed, -1, -2))
+    for d_inverse, follow, square, both in zip(influence.own, influence.follow, middle, crossed, strict=True):
+        mixed = d_inverse @ both @ inverse @ xp.swapaxes(follow, -1, -2)
+        components.append(
+            _conjugated(head, follow) + d_inverse @ square @ d_inverse - mixed - xp.swapaxes(mixed, -1, -2)
+        )
     return UnknownsCovariance(head, components)
 
 

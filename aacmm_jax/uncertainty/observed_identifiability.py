@@ -111,12 +111,12 @@ class Agreeing(NamedTuple):
         rows = np.concatenate(rows)
         # What remains is to eliminate the shared geometry.
         basis, singular, vectors = np.linalg.svd(rows[:, p:], full_matrices=False)
-        known = singular > _NULL * max(singular.max(initial=0.0), 1e-300)
-        basis, inverse = basis[:, known], vectors[known].T / singular[known]
+        determined = singular > _NULL * max(singular.max(initial=0.0), 1e-300)
+        basis, inverse = basis[:, determined], vectors[determined].T / singular[determined]
         along = basis.T @ rows[:, :p]
         rest, shared = rows[:, :p] - basis @ along, -inverse @ along
         whole = np.concatenate([np.eye(p), shared])
-        followers = (-np.moveaxis(np.asarray(one) @ whole, -1, 0) for one in influence.follow)
+        followers = (-np.moveaxis(np.asarray(by_head) @ whole, -1, 0) for by_head in influence.follow)
         geometry = np.asarray(joined(shared.T, *followers)).T
         lengths = self._lengths(influence, inverse, geometry, measured)
         return Eliminated(rest[:count], np.concatenate([rest[count:], lengths]), geometry)
@@ -141,9 +141,9 @@ class Agreeing(NamedTuple):
             return pull @ geometry
         head, components = split(pull, observed.layout.shared, observed.layout.classes)
         covariance = np.diag(np.maximum(self.u, _LEAST_U) ** 2)
-        for part, own, follow in zip(components, influence.own, influence.follow, strict=True):
+        for part, inverse_of_part, follow in zip(components, influence.own, influence.follow, strict=True):
             head = head - np.einsum("lKk,Kkh->lh", part, follow[..., p:])
-            turned = np.einsum("lKk,Kkm->lKm", part, own)
+            turned = np.einsum("lKk,Kkm->lKm", part, inverse_of_part)
             covariance += turned.reshape(len(pull), -1) @ part.reshape(len(pull), -1).T
         by_shared = head @ inverse
         covariance += by_shared @ by_shared.T
@@ -155,14 +155,16 @@ class Agreeing(NamedTuple):
         if not texts:
             return ()
         follow = self.eliminated().geometry @ null
-        sockets = {position_of(one.name) for one in self.observed.observations if one.kind == "socket"}
-        positions, found = self.observed.positions, []
+        sockets = {
+            position_of(observation.name) for observation in self.observed.observations if observation.kind == "socket"
+        }
+        positions, names = self.observed.positions, []
         for text, change, direction in zip(texts, follow.T, null.T, strict=True):
             least = _MOVED * np.abs(direction).max()
             parts = [name for name in self.observed.names if np.abs(change[positions[name]]).max() > least]
             parts = [name for name in parts if name not in sockets]
-            found.append(text if not parts or "the scale" in text else _with_parts(text, parts))
-        return tuple(found)
+            names.append(text if not parts or "the scale" in text else _with_parts(text, parts))
+        return tuple(names)
 
 
 def _with_parts(text: str, parts: list[str]) -> str:
@@ -186,7 +188,7 @@ def _whitening(
         return whitening_of(point.rows, observed, of_arm, np.asarray(_LEAST_U))
     rows = [part._replace(measured=np.zeros_like(part.measured)) for part in point.rows]
     whitening = whitening_of(rows, observed, of_arm, np.asarray(_LEAST_U))
-    return whitening._replace(certified={name: np.ones_like(each) for name, each in whitening.certified.items()})
+    return whitening._replace(certified={name: np.ones_like(weight) for name, weight in whitening.certified.items()})
 
 
 def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]]:
@@ -194,17 +196,19 @@ def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]
 
     Eliminated a second time: what rounding leaves of a poorly determined component would look like information.
     """
-    left = [np.zeros((*own.shape[:2], influence.inverse.shape[0])) for own in influence.own]
+    left = [np.zeros((*private.shape[:2], influence.inverse.shape[0])) for private in influence.own]
     for number, (block, rows) in enumerate(zip(influence.blocks, influence.rows, strict=True)):
-        own = influence.own_rows(number)
-        if own is not None and block.of >= 0:
-            left[block.of] += sums_by_component(own, rows, block.sizes)
-    found = [np.asarray(rows) for rows in influence.rows]
+        private = influence.own_rows(number)
+        if private is not None and block.of >= 0:
+            left[block.of] += sums_by_component(private, rows, block.sizes)
+    eliminated = [np.asarray(rows) for rows in influence.rows]
     for number, block in enumerate(influence.blocks):
-        own = influence.own_rows(number)
-        if own is not None and block.of >= 0:
-            found[number] = found[number] - followed(own, influence.own[block.of] @ left[block.of], block.sizes)
-    return found
+        private = influence.own_rows(number)
+        if private is not None and block.of >= 0:
+            eliminated[number] = eliminated[number] - followed(
+                private, influence.own[block.of] @ left[block.of], block.sizes
+            )
+    return eliminated
 
 
 def _moved(observed: Observed, arm: Arm, point: PointRows, errors: list[ArmErrors]) -> Observed:

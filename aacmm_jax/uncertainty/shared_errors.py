@@ -41,14 +41,14 @@ class SharedErrors(eqx.Module):
             correlation_length=self.correlation_length,
             added=self.added,
             by_group=np.zeros((0, 0, 0)),
-            law=Law(*(of[:count] for of in self.law)),
+            law=self.law.of_parts(slice(count)),
         )
 
     @property
     def of_tips(self) -> Components | None:
         """What errors of the tip add to the covariance of the parameters."""
         count = len(self.added)
-        return Components(self.kinds[:count], self.added, Law(*(of[:count] for of in self.law))) if count else None
+        return Components(self.kinds[:count], self.added, self.law.of_parts(slice(count))) if count else None
 
     @property
     def of_functions(self) -> Components:
@@ -56,7 +56,7 @@ class SharedErrors(eqx.Module):
         xp, count = namespace(self), len(self.added)
         by_coefficients = xp.concatenate([self.follow, xp.asarray(np.eye(len(self.names)))])
         grown = by_coefficients @ self.by_group @ by_coefficients.T
-        return Components(self.kinds[count:], grown, Law(*(of[count:] for of in self.law)))
+        return Components(self.kinds[count:], grown, self.law.of_parts(slice(count, None)))
 
     def sd_of(self, *kinds: str) -> Float[AnyArray, ""] | float:
         """Standard deviation of a tip coordinate by effects of some kinds, mm; 0 without."""

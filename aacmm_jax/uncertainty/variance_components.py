@@ -178,9 +178,9 @@ def _expectation(influence: Influence, form: _Sums, column: _Sums) -> Any:
             both = sums_by_component(form.by_private[number], column.by_private[number], block.sizes)
             total = total - 2 * xp.sum(influence.own[block.of] * both)
     classes = zip(influence.own, form.private, form.crossed, column.private, column.crossed, strict=True)
-    for own, form_private, form_crossed, private, crossed in classes:
-        total = total + xp.sum((own @ form_private) * xp.swapaxes(own @ private, -1, -2))
-        total = total + 2 * xp.sum((own @ crossed @ inverse) * form_crossed)
+    for inverse_private, form_private, form_crossed, private, crossed in classes:
+        total = total + xp.sum((inverse_private @ form_private) * xp.swapaxes(inverse_private @ private, -1, -2))
+        total = total + 2 * xp.sum((inverse_private @ crossed @ inverse) * form_crossed)
     return total
 
 

@@ -145,7 +145,7 @@ def test_what_a_command_replaces(tmp_path, new, own, foreign):
 
 def test_a_capture_of_somebody_else_is_not_replaced(aacmm, inputs):
     (inputs / "x.h5").write_bytes(FOREIGN)
-    assert "x.h5 exists and is no earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
+    assert "x.h5 exists and is not an earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
     assert (inputs / "x.h5").read_bytes() == FOREIGN
     aacmm(*SIMULATE, "-o", "x.h5", "--overwrite")
     aacmm(*SIMULATE, "-o", "x.h5")
@@ -153,7 +153,7 @@ def test_a_capture_of_somebody_else_is_not_replaced(aacmm, inputs):
         file.attrs["kind"] = "calibration"
     with open(inputs / "x.h5", "rb+") as stream:
         seal(stream)
-    assert "x.h5 exists and is no earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
+    assert "x.h5 exists and is not an earlier output" in aacmm(*SIMULATE, "-o", "x.h5", expect=2).stderr
 
 
 @pytest.mark.slow
@@ -176,7 +176,7 @@ def test_a_file_of_somebody_else_is_not_replaced(aacmm, calibrated, command, out
     path = calibrated / output
     path.write_bytes(foreign)
     done = aacmm(*command, output, expect=2)
-    assert f"{output} exists and is no earlier output of this kind" in done.stderr
+    assert f"{output} exists and is not an earlier output of this kind" in done.stderr
     assert path.read_bytes() == foreign
     aacmm(*command, output, "--overwrite")
     written = path.read_bytes()

@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 
 import aacmm_jax as aj
 from aacmm_jax.cli import _FAMILIES, calibration_views, evaluation_views
-from aacmm_jax.cli.app import app, examples, length_option
+from aacmm_jax.cli.app import app, examples
 from aacmm_jax.cli.display import display, new_console, print_table
+from aacmm_jax.cli.options import length_option
 from aacmm_jax.summaries.calibration import calibration_summary
-from aacmm_jax.summaries.tables import Table, formatted, observed_words
+from aacmm_jax.summaries.tables import formatted, listed, observed_words
 from tests.example_counts import example_count
 from tests.refusals import assert_refused
 
@@ -71,8 +72,7 @@ def test_nothing_in_a_table_is_cut(columns, keys, data):
     count = data.draw(st.integers(keys + 1, 8))
     rows = data.draw(st.lists(st.lists(texts, min_size=count, max_size=count), min_size=1, max_size=4))
     stream = io.StringIO()
-    table = Table("", rows[0], rows[1:], keys=keys)
-    print_table(Console(file=stream, width=columns, highlight=False), table)
+    print_table(Console(file=stream, width=columns, highlight=False), listed("", rows[1:], rows[0], keys=keys))
     lines = stream.getvalue().splitlines()
     printed = [word for line in lines for word in line.split()]
     assert all(word in printed for row in rows for cell in row for word in cell.split())
@@ -88,6 +88,14 @@ def test_what_is_piped_is_as_wide_as_asked(monkeypatch, given_columns, width):
     assert new_console().width == width
 
 
+POINTS = {"points": 9, "sockets": 2, "lengths": 1, "spheres": 0, "warnings": [], "u_test_mm": 0.0, "influences": {}}
+TEST = {
+    "called": "ISO 10360-12:2016",
+    "title": "articulated arms",
+    "missing": [],
+    "rule": "ISO 14253-1",
+    "decision": None,
+}
 NAMES = ("Volumetric performance, 2 RMS", "Volumetric performance, largest", "E_Uni", "L_Dia.5x5:Art:Tact.AArm")
 
 
@@ -96,12 +104,9 @@ def test_acceptance_at_80_columns(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     numbers = {"value_mm": 0.0312, "as_found_mm": 12.3456, "expanded_mm": 0.0021, "limit_mm": 0.0415}
     parts = {"failing": 2, "parts": [None] * 7, "decision": "undecided", "where": "500 mm bar at position 3, repeat 2"}
-    tests = [
-        {"standard": "ISO 10360-12:2016", "title": "articulated arms", "missing": ["5 lengths"]}
-        | {"figures": [{"name": name} | numbers | parts for name in NAMES]}
-    ]
-    summary = {"points": 9, "sockets": 2, "lengths": 1, "spheres": 0, "warnings": [], "u_test_mm": 0.0}
-    display(evaluation_views.points(summary | {"acceptance": tests}))
+    parts |= {"as_found_decision": "fails", "what": "error"}
+    test = TEST | {"missing": ["5 lengths"], "figures": [{"symbol": name} | numbers | parts for name in NAMES]}
+    display(evaluation_views.points(POINTS | {"acceptance": [test]}))
     shown = capsys.readouterr().out
     assert max(map(len, shown.splitlines())) <= 80
     words = shown.split()
@@ -114,11 +119,17 @@ def test_acceptance_at_80_columns(monkeypatch, capsys):
 @pytest.mark.parametrize(("limit", "decision", "said"), [(0.0415, "conforms", True), (None, None, False)])
 def test_a_decision_rule_is_named_only_where_there_is_a_limit(monkeypatch, capsys, limit, decision, said):
     monkeypatch.setenv("COLUMNS", "200")
-    metric = {"name": "E_Uni", "value_mm": 0.03, "as_found_mm": None, "expanded_mm": 0.002, "limit_mm": limit}
+    metric = {
+        "symbol": "E_Uni",
+        "what": "error",
+        "value_mm": 0.03,
+        "as_found_mm": None,
+        "expanded_mm": 0.002,
+        "limit_mm": limit,
+    }
     metric |= {"decision": decision, "failing": 0, "parts": [], "where": ""}
-    test = {"standard": "ISO 10360-12:2016", "title": "articulated arms", "missing": [], "figures": [metric]}
-    summary = {"points": 9, "sockets": 2, "lengths": 1, "spheres": 0, "warnings": [], "u_test_mm": 0.0}
-    display(evaluation_views.points(summary | {"acceptance": [test]}))
+    test = TEST | {"decision": decision, "figures": [metric]}
+    display(evaluation_views.points(POINTS | {"acceptance": [test]}))
     assert ("ISO 14253-1" in capsys.readouterr().out) == said
 
 

@@ -213,7 +213,7 @@ def test_readings_of_another_arm_are_not_explained(paper_arm, few):
         (np.zeros((3, 6)), {"sockets": [0, 0, 0], "positions": np.zeros((3, 3))}, "either the sockets"),
         (np.zeros((3, 6)), {"sockets": [0, 1]}, "each of 3 poses"),
         (np.zeros((3, 6)), {"sockets": [0, 1, 2]}, "no socket has two poses"),
-        (np.full((3, 6), np.nan), {"sockets": [0, 0, 0]}, "not finite"),
+        (np.full((3, 6), np.nan), {"sockets": [0, 0, 0]}, "finite"),
         (np.zeros((3, 6)), {"positions": np.zeros((2, 3))}, "positions has shape"),
         (np.zeros((3, 6)), {"positions": np.zeros((3, 3)), "own_frame": True}, "four positions"),
     ],

@@ -20,7 +20,7 @@ from aacmm_jax.diagnostics.shared_errors import _USUAL, missing_functions
 from aacmm_jax.kinematics.corrected_arm import with_further_corrections
 from aacmm_jax.kinematics.priors import default_prior
 from aacmm_jax.summaries.calibration import shared_rows
-from aacmm_jax.summaries.uncertainty_sentences import shared_sentence
+from aacmm_jax.summaries.tables import shared_sentence
 from aacmm_jax.uncertainty.degrees_of_freedom import Law, coverage_factor
 
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)

@@ -47,10 +47,10 @@ def test_one_pose_has_no_distance(paper_arm):
 
 
 def test_a_calibration_tried_its_own_poses_and_says_how_much_else(paper_arm):
-    from aacmm_jax.summaries.uncertainty_sentences import tried_sentence
+    from aacmm_jax.summaries.tables import tried_sentence
 
     q = np.random.default_rng(0).uniform(-1, 1, (200, 6))
     assert tried_poses(paper_arm, q, q).tried.all()
     said = tried_sentence({"poses": 400, "tried": 30, "spacing_rad": 0.2})
-    assert "7.5 % lie as near" in said
+    assert "7.5 % of the joint space is covered" in said
     assert "(11 deg RMS over the joints)" in said

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.diagnostics.fixed_parameters import fixed_parameters
+from aacmm_jax.diagnostics.joint_travel import fixed_parameters
 from aacmm_jax.diagnostics.reading_fit import Explanation
 from aacmm_jax.files.manifest import read_manifest
 from aacmm_jax.files.reading_checks import angles_toml

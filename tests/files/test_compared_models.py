@@ -43,7 +43,7 @@ def test_what_was_saved_is_read(file):
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"recommended": "functions"}, "recommended model is none"),
+        ({"recommended": "functions"}, "recommended model is not one"),
         ({"models": [row("dh", 0.3, 0.33, 1.1)] * 2}, "named twice"),
         ({"models": [SUMMARY["models"][0], row("gravity", 0.2, 1e300, 1.2)]}, "larger than any can be"),
         ({"models": [SUMMARY["models"][0], row("gravity", -0.2, 0.3, 1.2)]}, "negative"),

@@ -122,8 +122,8 @@ HOSTILE = {
     "reference": (replaced((3,), h5py.ref_dtype), "of a type that no file of aacmm has"),
     "lists": (replaced((3,), h5py.vlen_dtype("f8")), "of a type that no file of aacmm has"),
     "texts": (replaced(data=[["a", "b"]], dtype=h5py.string_dtype()), "a table of texts in several dimensions"),
-    "group": (lambda file: (file.pop("t/x"), file.create_group("t/x")), "is no array"),
-    "itself": (lambda file: file.__setitem__("t/t", file["t"]), "is no array"),
+    "group": (lambda file: (file.pop("t/x"), file.create_group("t/x")), "is not an array"),
+    "itself": (lambda file: file.__setitem__("t/t", file["t"]), "is not an array"),
 }
 
 

@@ -114,7 +114,7 @@ BAD = {
     "text for numbers": (replace("reference/value", "long"), ["damaged", "make it again"]),
     "group for numbers": (
         edit(lambda file: (file.pop("capture/angle"), file.create_group("capture/angle"))),
-        ["'angle' is no array"],
+        ["'angle' is not an array"],
     ),
     "no partner": (remove("nominal_arm/highest"), ["damaged", "make it again"]),
     "not finite": (replace("nominal_arm/alpha", [0.0, np.nan, 0.0]), ["alpha[1] is nan; give finite numbers"]),

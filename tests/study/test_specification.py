@@ -99,7 +99,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"capture": {}}, "give one of positions_mm, sockets .* file and kit"),
         ({"capture": {"sockets": 2}}, "sockets at random need a region"),
         ({"capture": {"sockets": 2, "region": {"x_mm": [0, 1]}}}, "a region needs distance_mm, or x_mm, y_mm and z_mm"),
-        ({"capture": {"sockets": 2, "region": {"distance_mm": [2, 1]}}}, "2 to 1 is no range"),
+        ({"capture": {"sockets": 2, "region": {"distance_mm": [2, 1]}}}, "2 to 1 is not a range"),
         (
             {"capture": CAPTURE | {"poses": 7}},
             "7 poses in 1 socket give 18 equations, but 20 unknowns need at least 8 poses",

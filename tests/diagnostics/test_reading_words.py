@@ -8,9 +8,10 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.diagnostics import reading_check, reading_search
+from aacmm_jax.diagnostics.reading_check import check_capture
 from aacmm_jax.diagnostics.reading_fit import Explanation
+from aacmm_jax.diagnostics.reading_words import explanation_words, reading_check_summary
 from aacmm_jax.files.reading_checks import units_toml
-from aacmm_jax.summaries.reading_check import check_capture, explanation_words, reading_check_summary
 
 DEG = math.pi / 180
 SIX = tuple(range(6))
@@ -66,7 +67,7 @@ def test_a_capture_of_a_tracker_and_what_cannot_be_checked(paper_arm, monkeypatc
     found = check_capture(paper_arm, aj.Capture({}, observations=parts))
     assert found.poses == 20
     summary = reading_check_summary(found, "paper's")
-    assert summary["sentence"].startswith("Column 4 runs the other way. So corrected")
+    assert summary["sentence"].startswith("Column 4 runs the other way. Correcting it")
     assert summary["found"]["signs"] == [1, 1, 1, -1, 1, 1]
     assert summary["tip"] == ""
     with pytest.raises(aj.InputError, match="at least two"):
