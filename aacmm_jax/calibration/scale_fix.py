@@ -57,6 +57,7 @@ def measured_scale(solution: Solution, capture: Capture) -> MeasuredScale:
     scale, relative = scale_and_weights(ends)
     _, pull = linear.observed.distances(geometry, ends_of(capture))
     rows = rows_of_functions(influence, *linear.observed.by_unknowns((relative @ pull)[None], p))
+    # k = sum of weights m_i / n_i, with m_i measured and n_i certified: dk/dn_i = - (weight / n_i) m_i / n_i.
     by_lengths = -relative * scale.measured / scale.nominal
     of_lengths = xp.sum((by_lengths * ends.u) ** 2)
     u = xp.sqrt(solution.covariance_of(rows)[0, 0] + of_lengths + scale.surplus)

@@ -178,6 +178,7 @@ def _at_divided(task: Task, solution: Solution, parameters: Float[AnyArray, " p"
     space = Parameters(task.bounds.space.arm(parameters), names)
     z = namespace(parameters).concatenate([vector, task.observed.start(space, vector)])
     weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "least": _LEAST_U}
+    # Rows are linear in the positions, so that one step takes these to where they fit the divided arm.
     z = Linearisation.at(task.observed, space, z, **weighing).with_fitted_geometry()
     return Linearisation.at(task.observed, space, z, **weighing)
 
@@ -217,6 +218,7 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
 
 def _of_lengths(solution: Solution, capture: Capture) -> Float[np.ndarray, "l 3 M"]:
     """Derivatives of the measured lengths by the tips, where the arm is given and positions are means."""
+    # With the inverse of the head's information 0, the parameters follow nothing: only the positions do.
     linear, influence = solution.linear, solution.influence._replace(inverse=np.zeros_like(solution.influence.inverse))
     observed, p = linear.observed, len(linear.space.names)
     _, pull = observed.distances(np.asarray(linear.z)[p:], ends_of(capture))
@@ -225,6 +227,7 @@ def _of_lengths(solution: Solution, capture: Capture) -> Float[np.ndarray, "l 3 
 
 def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str) -> Stages:
     """Everything that the capture holds in one least squares; ``stage1`` is where lengths alone fix the scale."""
+    # The divided arm is near the solution, and saves most of the steps.
     near = None
     if stage1 is not None and stage1.measured is not None:
         first, k = stage1.identification, stage1.measured.scale.value

@@ -246,6 +246,7 @@ def check_data(
 
 def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
     """Raise `InputError` where poses are too few: m poses in a socket give 3 (m - 1) equations."""
+    # 3 m coordinates, of which 3 find the position of the socket.
     equations = 3 * sum(size - 1 for size in sizes)
     if equations < unknowns:
         sockets, poses = len(sizes), sum(sizes)
@@ -278,6 +279,8 @@ def _check_targets(observed: Observed, forward: ForwardPass) -> None:
     for observation, part in zip(observed.observations, observed.slices, strict=True):
         if observation.target:
             poses.setdefault(observation.target, []).append(np.arange(part.start, part.stop))
+    # A target at t in the last frame (x, y, z) is seen at F (p + R t): where R is one matrix, t and the translation of
+    # the station's frame F cannot be told apart.
     for target, parts in poses.items():
         axes = [np.asarray(forward.frame[i])[:, np.concatenate(parts)] for i in (0, 2)]
         if max(np.ptp(axis, axis=1).max() for axis in axes) < _LEAST_TURN:

@@ -138,6 +138,7 @@ def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
     def changed(by: Float[AnyArray, "k r m"] | None) -> Float[AnyArray, "k r m"] | None:
         if by is None:
             return None
+        # (1 - (1 - along) u u^T) A, with the direction u of the residual.
         less = (1 - along)[None] * xp.sum(direction[None] * by, axis=1)
         return by - less[:, None] * direction[None]
 
@@ -170,12 +171,13 @@ def arrow_of(
     xp = namespace([block.white for block in blocks])
     heads = [_flat(block.by_head) for block in blocks if block.by_head is not None]
     whole = heads[0] if len(heads) == 1 else xp.concatenate(heads, axis=1)
-    head = whole @ whole.T
+    head = whole @ whole.T  # A A^T, over the rows of all blocks
     if prior is not None:
         own = np.arange(prior.weight.shape[0])
         head = added_to(head, (own, own), prior.weight**2)
     crossed, own, slopes = [], [], []
     for number, (count, size) in enumerate(classes):
+        # C = B A^T, D = B B^T and the gradient B w, summed over the blocks with components of this class.
         c, d, g = xp.zeros((count, size, height)), xp.zeros((count, size, size)), xp.zeros((count, size))
         for block in blocks:
             if block.of != number:
@@ -198,6 +200,7 @@ def _of_points(block: RowBlock) -> tuple[AnyArray, AnyArray, AnyArray]:
     """C, D and B w of rows that are coordinates less those of their point."""
     assert block.by_head is not None
     xp = namespace(block.white)
+    # B is minus the identity at every pose, so that these are sums over the poses of a socket.
     crossed = -xp.moveaxis(sums_over_sockets(block.by_head, block.sizes), (0, 1, 2), (2, 1, 0))
     own = xp.asarray(np.asarray(block.sizes, dtype=float)[:, None, None] * np.eye(block.white.shape[0]))
     return crossed, own, -sums_over_sockets(block.white, block.sizes).T
@@ -208,10 +211,12 @@ def _shifts(block: RowBlock) -> Float[AnyArray, "h _"]:
     assert block.by_head is not None
     height, xp = block.by_head.shape[0], namespace(block.by_head)
     if block.by_own is None:
+        # D = m: the outer product of the sum of the rows' derivatives, over m.
         shifts = sums_over_sockets(block.by_head, block.sizes) / np.sqrt(counts(block.sizes, 3))
         return shifts.reshape(height, -1)
     sums = sums_by_component(block.by_own, xp.concatenate([block.by_own, block.by_head]), block.sizes)
     size = block.by_own.shape[0]
+    # With D = L L^T: C^T D^-1 C = (L^-1 C)^T (L^-1 C).
     return xp.moveaxis(inverse_cholesky(sums[..., :size]) @ sums[..., size:], -1, 0).reshape(height, -1)
 
 
@@ -225,6 +230,7 @@ def _fitted(block: RowBlock) -> RowBlock:
             white = white - to_poses(means_over_sockets(white, block.sizes), block.sizes)
         else:
             sums = sums_by_component(block.by_own, xp.concatenate([block.by_own, white[None]]), block.sizes)
+            # w - B^T D^-1 B w: the projection onto what the component cannot follow.
             step = inverse_positive_definite(sums[..., :-1]) @ sums[..., -1:]
             white = white - followed(block.by_own, step, block.sizes)[0]
     return RowBlock(white, block.by_head, block.by_own, block.of, block.sizes)
@@ -326,6 +332,7 @@ def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) 
 def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, "h h"], Float[AnyArray, " h"]]:
     """Information and gradient of the head, with the components eliminated."""
     xp = namespace(arrow, gradient)
+    # A A^T - C^T D^-1 C, and the slope of the cost where the components follow the head.
     slope, parts = arrow.split(gradient)
     head = arrow.head
     for crossed, own, part in zip(arrow.crossed, arrow.own, parts, strict=True):
