@@ -152,8 +152,8 @@ def study_distributions(
     x, axis = np.arange(len(cells)), names(factor_title(factor), _levels(results, factor))
     plots = []
     for name in filter(None, (_available(results, metric) for metric in metrics)):
-        low, q25, median, q75, high = np.array([_quantiles(_values(results, name, of), (5, 25, 50, 75, 95))
-                                                for of in cells]).T  # fmt: skip
+        low, q25, median, q75, high = np.array([_quantiles(_values(results, name, level_cells), (5, 25, 50, 75, 95))
+                                                for level_cells in cells]).T  # fmt: skip
         marks = (
             Marks("", x, median, "bars", low=q25, high=q75, size=16),
             Marks("", x, median, "square", low=low, high=high, size=5),
