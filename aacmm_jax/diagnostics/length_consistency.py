@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.drawn_errors import covariance_of_lengths
 from ..calibration.record import CalibrationRecord
+from ..calibration.redrawn import covariance_of_lengths
 from ..calibration.scale_fix import ends_between, positions_at_ends
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.drawn_errors import functions_of, places_of
 from ..calibration.record import CalibrationRecord
+from ..calibration.redrawn import functions_of, places_of
 from ..calibration.results import Calibration
 from ..calibration.stages import Sensitivities
 from ..core.distributions import chi_square_tail, f_tail

@@ -1,15 +1,18 @@
 """Observations in HDF5: one table each, of the entries that its kind declares; nothing here depends on a kind."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..core.errors import InputError
+from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
 from .hdf5 import Stored, StoredTable, Table, Variable
-from .temperatures import reading_variables, readings_of
+from .records import Field, attribute_name, table_of
 
 _PREFIX = "observation_"
 
@@ -24,25 +27,18 @@ def observation_tables(observations: Iterable[AbstractObservation], joints: int,
 
 
 def _table(observation: AbstractObservation, joints: int, unit: str) -> Table:
-    variables: dict[str, Variable] = {}
-    attributes: dict[str, Any] = {"kind": observation.kind, "name": observation.name}
     stored = observation.stored()
-    for entry in observation.entries:
-        if entry.name not in stored:
-            continue
-        value = np.asarray(stored[entry.name])
-        if not entry.dimensions:
-            attributes[_attribute(entry.name, entry.unit)] = value.item()
-            continue
-        if entry.name == "q":
-            variables |= reading_variables(entry.name, value, joints, unit)
-            continue
-        variables[entry.name] = Variable(entry.dimensions, value, entry.unit, entry.says)
-    return Table(variables, attributes)
+    q = stored.pop("q", None)
+    fields = {entry.name: _field(entry) for entry in observation.entries if entry.name in stored}
+    table = table_of(SimpleNamespace(**stored), fields)
+    readings = {} if q is None else reading_variables("q", np.asarray(q), joints, unit)
+    attributes = {"kind": observation.kind, "name": observation.name} | dict(table.attributes)
+    return Table(readings | table.variables, attributes)
 
 
-def _attribute(name: str, unit: str) -> str:
-    return f"{name}_{unit}" if unit else name
+def _field(entry: Entry) -> Field:
+    content = "number" if entry.content == "points" else entry.content
+    return Field(entry.says, entry.unit, entry.dimensions, content)
 
 
 def observations_of(path: str | os.PathLike, stored: Stored) -> list[AbstractObservation]:
@@ -62,10 +58,27 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
         )
     values: dict[str, Any] = {}
     for entry in kind.entries:
-        source, name = (table, entry.name) if entry.dimensions else (attributes, _attribute(entry.name, entry.unit))
-        if entry.name == "q" and entry.name in table:
-            values[entry.name] = readings_of(table, entry.name)
+        name = entry.name if entry.dimensions else attribute_name(entry.name, _field(entry))
+        source = table if entry.dimensions else attributes
+        if entry.name == "q" and name in table:
+            values[name] = readings_of(table, name)
         elif entry.required or name in source:
             value = source[name]
             values[entry.name] = value.astype(str) if entry.dimensions and entry.content == "text" else value
     return kind.rebuilt(attributes["name"], values)
+
+
+def reading_variables(
+    name: str, readings: Float[np.ndarray, "N n"], joints: int, unit: str, rows: str = "pose"
+) -> dict[str, Variable]:
+    """Readings as variables: those of the joints, and the temperature that may follow them."""
+    variables = {name: Variable((rows, "joint"), readings[:, :joints], unit, "joint reading")}
+    if readings.shape[1] > joints:
+        variables["temperature"] = Variable((rows,), readings[:, joints], "degC", "temperature of the arm")
+    return variables
+
+
+def readings_of(table: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, "N n"]:
+    """The readings that `reading_variables` wrote, with the temperature last where there is one."""
+    temperature = table.get("temperature")
+    return table[name] if temperature is None else np.concatenate([table[name], temperature[:, None]], axis=1)

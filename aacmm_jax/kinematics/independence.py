@@ -51,16 +51,6 @@ def rigid_motions(tips: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3 6"]:
     return np.concatenate([np.broadcast_to(np.eye(3), (len(tips), 3, 3)), rotations * 1e-3], axis=2)
 
 
-def _determining(
-    arm: Arm, capture: SocketPoses, names: Sequence[str], targets_of: Arm
-) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
-    """`equations` of the sockets, and the like of other observations."""
-    poses, lengths = np.zeros((0, 3, len(names))), np.zeros((0, len(names)))
-    if capture.sizes:
-        poses, lengths = equations(arm, capture, names, project_to_centroids(arm, capture, targets_of))
-    return np.concatenate([poses, *(_of_positions(arm, observed, names) for observed in capture.observations)]), lengths
-
-
 def determined_at(
     arm: Arm,
     capture: SocketPoses,
@@ -139,7 +129,11 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
             # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may
             # make others redundant, so the choice is repeated.
             neighbour = neighbouring_arm(arm, taken or tuple(order))
-            poses, lengths = _determining(neighbour, capture, order, targets_of=arm)
+            blocks, lengths = [np.zeros((0, 3, len(order)))], np.zeros((0, len(order)))
+            if capture.sizes:
+                *blocks, lengths = equations(neighbour, capture, order, project_to_centroids(neighbour, capture, arm))
+            blocks += [_of_positions(neighbour, observed, order) for observed in capture.observations]
+            poses = np.concatenate(blocks)
             rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
             before, taken = taken, _independent(neighbour, order, rows)
             if taken == before or not taken:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.joint_functions import function_of_joint
+from ..calibration.joint_model import function_of_joint
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.units import DEG
