@@ -137,7 +137,7 @@ def _frames(centred: Float[AnyArray, "3 m"]) -> Float[AnyArray, "k 3 3"]:
     height = (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     angle = np.pi * (3 - math.sqrt(5)) * np.arange(_DIRECTIONS)
     turns = np.arccos(height) * np.stack([np.cos(angle), np.sin(angle), np.zeros(_DIRECTIONS)])
-    return xp.concatenate([xp.stack(ordered), xp.asarray(np.moveaxis(rotation_matrix(turns), -1, 0))])
+    return xp.concatenate([xp.stack(ordered), xp.asarray(np.moveaxis(np.asarray(rotation_matrix(turns)), -1, 0))])
 
 
 def _refined(
