@@ -305,8 +305,7 @@ def _of_items(check: Check | None) -> Check:
     def call(value: Any, what: str, sizes: Sizes) -> Any:
         if isinstance(value, str):  # whose items are characters
             raise InputError(f"{what} is {shown(value)}; give a list.")
-        items = items_of(value, what)
-        return tuple(items if check is None else (check(x, _item(what, i), sizes) for i, x in enumerate(items)))
+        return tuple(_each(dict(enumerate(items_of(value, what))), check, what, sizes).values())
 
     return call
 
@@ -315,9 +314,19 @@ def _of_values(check: Check | None) -> Check:
     def call(value: Any, what: str, sizes: Sizes) -> Any:
         if not isinstance(value, Mapping):
             raise InputError(f"{what} is {_with_article(type(value).__name__)}; give a dictionary.")
-        return value if check is None else {k: check(x, _item(what, k), sizes) for k, x in value.items()}
+        return value if check is None else _each(value, check, what, sizes)
 
     return call
+
+
+def _each(values: Mapping[Any, Any], check: Check | None, what: str, sizes: Sizes) -> Mapping[Any, Any]:
+    """Each of several values as a check returns it."""
+    if check is None:
+        return values
+    try:
+        return {key: check(value, what, sizes) for key, value in values.items()}
+    except InputError:  # once more, to say which: names take longer to make than most checks
+        return {key: check(value, _item(what, key), sizes) for key, value in values.items()}
 
 
 class _ArrayCheck(NamedTuple):

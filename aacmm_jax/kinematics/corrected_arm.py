@@ -54,7 +54,16 @@ def with_corrections(
     if not is_single(arm):
         raise InputError("corrections are for one arm, but this is a batch; take one of it first.")
     plain: Arm = to_numpy(without_corrections(arm))
-    loads, down = _loads(plain, mass, centre), _direction(gravity)
+    down = checked(gravity, Float[np.ndarray, "3"], "gravity")
+    if not np.any(down):
+        raise InputError("gravity has the length 0; give its direction in the base frame.")
+    down, loads, sizes = down / np.linalg.norm(down), None, {"links": plain.joints}
+    if (mass is None) != (centre is None):
+        raise InputError("masses and centres of mass go together; give both mass and centre.")
+    if mass is not None:
+        masses = checked(mass, Float[np.ndarray, " links"], "mass", sizes)
+        centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)
+        loads = Loads(tuple(masses.tolist()), tuple(map(tuple, centres.tolist())))
     if isinstance(model, str):
         terms = _determined(plain, terms_of(model, plain.joints, loads), down)
     else:
@@ -72,24 +81,6 @@ def corrected_like(corrected: Arm, arm: Arm) -> Arm:
     """An arm of other parameters with the corrections of a corrected one, and their functions on its nominal arm."""
     changes = {kind: getattr(corrected, kind) for kind in ("corrections", "coefficients", "gravity")}
     return arm.replace(**changes)
-
-
-def _loads(arm: Arm, mass: Numbers | None, centre: Numbers | None) -> Loads | None:
-    if mass is None and centre is None:
-        return None
-    if mass is None or centre is None:
-        raise InputError("masses and centres of mass go together; give both mass and centre.")
-    sizes = {"links": arm.joints}
-    masses = checked(mass, Float[np.ndarray, " links"], "mass", sizes)
-    centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)
-    return Loads(tuple(masses.tolist()), tuple((x, y, z) for x, y, z in centres.tolist()))
-
-
-def _direction(gravity: Numbers) -> Float[np.ndarray, " 3"]:
-    direction = checked(gravity, Float[np.ndarray, "3"], "gravity")
-    if not np.any(direction):
-        raise InputError("gravity has the length 0; give its direction in the base frame.")
-    return direction / np.linalg.norm(direction)
 
 
 def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"]) -> tuple[Term, ...]:

@@ -150,7 +150,7 @@ class Parameters(eqx.Module):
 
     def indices(self) -> tuple[tuple[str, int], ...]:
         """Kind and 0-based index of each free parameter."""
-        return _indices(self.base, self.names)
+        return _located(self.base.joints, correction_names(self.base), self.names)
 
     def index(self, name: str) -> int:
         """Position of a free parameter in the vector; raises `InputError` if it is not free."""
@@ -193,11 +193,8 @@ class Parameters(eqx.Module):
         Raises:
             InputError: The vector does not have p values.
         """
-        vector = self.checked_vector(vector, "vector")
-        base, indices = self.base, _indices(self.base, self.names)
-        if base.beta is None and any(kind == "beta" for kind, _ in indices):
-            base = with_arrays(base, beta=0.0 * base.alpha)
-        return with_arrays(base, **with_values(base.geometry, vector, indices))
+        geometry = self.geometry(self.checked_vector(vector, "vector"))
+        return with_arrays(self.base, **{kind: getattr(geometry, kind) for kind, _ in self.indices()})
 
     def checked_vector(self, vector: Numbers, what: str) -> Float[AnyArray, "... p"]:
         """Values of the free parameters as an array, or `InputError`; NaN passes, as of an iteration that diverged."""
@@ -210,7 +207,7 @@ class Parameters(eqx.Module):
 
     def geometry(self, vector: Float[AnyArray, "... p"]) -> Geometry:
         """The geometry of ``arm(vector)``, unchecked: what an iteration evaluates."""
-        base, indices = self.base.geometry, _indices(self.base, self.names)
+        base, indices = self.base.geometry, self.indices()
         if base.beta is None and any(kind == "beta" for kind, _ in indices):
             base = base._replace(beta=0.0 * base.alpha)
         return base._replace(**with_values(base, vector, indices))
@@ -221,13 +218,9 @@ def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...]) 
     return tuple(located(joints, corrections, name) for name in names)
 
 
-def _indices(arm: Arm, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
-    return _located(arm.joints, correction_names(arm), names)
-
-
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     names = (names,) if isinstance(names, str) else tuple(names)
-    _indices(arm, names)
+    _located(arm.joints, correction_names(arm), names)
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"parameter '{twice}' is named twice in {what}; name it once.")
