@@ -114,7 +114,7 @@ def load_cell(
         >>> print(cell.body.names, [obstacle.name for obstacle in cell.obstacles], cell.clearance)
         ('shoulder', 'upper_arm', 'forearm') ['table'] 20.0
     """
-    content = _CellFile() if file is None else read_toml(file, _CellFile)
+    content: Any = _CellFile() if file is None else read_toml(file, _CellFile)
     obstacles: tuple[Any, ...] = (
         *(HalfSpace(row.name, tuple(row.normal), tuple(row.point)) for row in content.half_space),
         *(Box(row.name, tuple(row.centre), tuple(row.size), tuple(row.rotation)) for row in content.box),
