@@ -85,9 +85,12 @@ def test_angles(given, sockets, parts):
     [
         (lambda q: aj.ReferenceLength("A", "B", 0.0), ["'A' to 'B' is 0 mm", "positive"]),
         (lambda q: aj.ReferenceLength("A", "B", -200.0), ["'A' to 'B' is -200 mm", "positive"]),
-        (lambda q: aj.ReferenceLength("A", "B", np.nan), ["'A' to 'B' is nan mm", "finite"]),
-        (lambda q: aj.ReferenceLength("A", "B", [1.0, 2.0]), ["'A' to 'B'", "one value"]),
-        (lambda q: aj.ReferenceLength("A", "B", 200.0, u=-0.002), ["'A' to 'B' has u = -0.002 mm", "zero or positive"]),
+        (lambda q: aj.ReferenceLength("A", "B", np.nan), ["'A' to 'B' is nan", "finite"]),
+        (lambda q: aj.ReferenceLength("A", "B", [1.0, 2.0]), ["'A' to 'B' has shape (2,)", "one number"]),
+        (
+            lambda q: aj.ReferenceLength("A", "B", 200.0, u=-0.002),
+            ["u of reference length 'A' to 'B' is -0.002 mm", "zero or positive"],
+        ),
         (lambda q: aj.ReferenceLength("A", "A", 200.0), ["'A' to 'A'", "itself", "two different sockets"]),
         (
             lambda q: aj.Capture({"plate": q, "B": -q}, [aj.ReferenceLength("plaet", "B", 200.0)]),

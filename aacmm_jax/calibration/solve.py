@@ -123,8 +123,7 @@ def concluded(
     whitening = whitening_at(task, state, prior_rows)
     active = Bounds(space, *(side[:p] for side in begun.sides)).active(z[:p])
     linear = Linearisation.of(task.observed, space, z, state.point, state.errors, whitening, task.loss)
-    # A parameter on a bound follows no row: where the bound is known, it is known (`active_bounds` adds the chance that
-    # it is not on its bound).
+    # A parameter on a bound follows no row; `stages` adds the chance that it is not on its bound.
     influence = linear.influence(xp.concatenate([active != 0, xp.zeros(count, dtype=bool)]))
     noise = _noise_of(task, linear, influence, state)
     # Cov z = G (sum over poses of A W Cov(w) W A^T) G (JCGM 100, section 5), plus what poses with one reading share.

@@ -198,9 +198,9 @@ def _chosen(
             return np.ones(len(q), dtype=bool)
         return approaches(region, q, region.cones.normals[owner], retract).possible
 
-    each, pools = max((options.candidates or _CANDIDATES) // len(names), 50), []
+    starts, pools = max((options.candidates or _CANDIDATES) // len(names), 50), []
     for _ in range(_ROUNDS):
-        drawn = pool_at(problem, placement.points, each)
+        drawn = pool_at(problem, placement.points, starts)
         pools.append(drawn.at(approachable(drawn.q, drawn.owner)))
         pool = Pool(*(np.concatenate(parts) for parts in zip(*pools, strict=True)))
         few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
@@ -208,7 +208,7 @@ def _chosen(
             break
     else:
         cones = None if region.cones is None else region.cones.at(few[:1])
-        share = _LEAST_CANDIDATES / (_ROUNDS * each)
+        share = _LEAST_CANDIDATES / (_ROUNDS * starts)
         name, point = f"socket '{names[few[0]]}'", placement.points[few[0]]
         raise InputError(explained_place(region._replace(cones=cones), name, point, share, retract))
     rows = exchange(

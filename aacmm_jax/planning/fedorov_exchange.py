@@ -222,11 +222,11 @@ def _improvement_of_many_rows(
 
 def _products(one: Float[np.ndarray, "3 c k"], other: Float[np.ndarray, "3 c k"]) -> Float[np.ndarray, "3 3 c"]:
     """Scalar products of each candidate's rows, which make a symmetric matrix."""
-    found = np.empty((3, 3, one.shape[1]))
+    products = np.empty((3, 3, one.shape[1]))
     for i in range(3):
         for j in range(i, 3):
-            found[i, j] = found[j, i] = np.einsum("ck,ck->c", one[i], other[j])
-    return found
+            products[i, j] = products[j, i] = np.einsum("ck,ck->c", one[i], other[j])
+    return products
 
 
 class _Factors(NamedTuple):

@@ -98,9 +98,9 @@ def pool_of(problem: DesignProblem, q: Float[np.ndarray, "c n"], owner: Int[np.n
     return Pool(q, owner, roots @ jacobian, roots)
 
 
-def pool_at(problem: DesignProblem, points: Float[np.ndarray, "s 3"], each: int) -> Pool:
+def pool_at(problem: DesignProblem, points: Float[np.ndarray, "s 3"], starts: int) -> Pool:
     """Configurations that reach the points from ``each`` random starts a point."""
-    return pool_of(problem, *configurations_at(problem.region, points, each))
+    return pool_of(problem, *configurations_at(problem.region, points, starts))
 
 
 def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Pool) -> Candidates:

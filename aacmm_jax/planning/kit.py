@@ -146,9 +146,9 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
 
 def _pool(problem: DesignProblem, placed: PlacedKit, count: int) -> list[AbstractObservation]:
     """Poses to choose from in everything."""
-    each = count // len(placed.kit)
+    starts = count // len(placed.kit)
     things = zip(placed.kit, placed.items, strict=True)
-    return [set_up(problem.region, thing, each, item=item, retract=problem.retract) for thing, item in things]
+    return [set_up(problem.region, thing, starts, item=item, retract=problem.retract) for thing, item in things]
 
 
 def _in_order(
@@ -217,12 +217,12 @@ def _chosen(
 
 def _taken(pool: Sequence[AbstractObservation], rows: Int[np.ndarray, " N"]) -> list[AbstractObservation]:
     """The observations with some of the poses of the pool, numbered through."""
-    found, first = [], 0
+    chosen, first = [], 0
     for one in pool:
         last = first + one.q.shape[0]
-        found.append(one.select(np.sort(rows[(rows >= first) & (rows < last)]) - first))
+        chosen.append(one.select(np.sort(rows[(rows >= first) & (rows < last)]) - first))
         first = last
-    return found
+    return chosen
 
 
 def _near(

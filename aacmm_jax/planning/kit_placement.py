@@ -114,14 +114,14 @@ def set_up(
     `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever; it says which
     constraint leaves too few, unless ``explain`` is False.
     """
-    own = region_of(region, simulated, item)
-    each = len(simulated.changed(poses=1).tips(np.random.default_rng(0)))
-    many = simulated.changed(poses=max(starts // each, 2 * _LEAST_CANDIDATES))
+    seat = region_of(region, simulated, item)
+    places = len(simulated.changed(poses=1).tips(np.random.default_rng(0)))
+    many = simulated.changed(poses=max(starts // places, 2 * _LEAST_CANDIDATES))
     tips = many.tips(region.random)
-    q, good = reached(own, own.draw(len(tips)), tips, scattered=True)
+    q, good = reached(seat, seat.draw(len(tips)), tips, scattered=True)
     if item is not None:
-        good[good] = approachable(own, q[good], item, retract)
-    transforms = np.asarray(own.arm.pose(q)).copy()
+        good[good] = approachable(seat, q[good], item, retract)
+    transforms = np.asarray(seat.arm.pose(q)).copy()
     transforms[:, :3, 3] = tips
     # In NumPy: every number of poses would be another program of JAX.
     whole = to_numpy(many.recorded(q, transforms, _WithoutErrors(np.random.PCG64(0))))
@@ -133,7 +133,7 @@ def set_up(
         point = tips[whole.places == int(np.argmin(counts / tried))][0]
         enough = max(share, _LEAST_CANDIDATES / float(tried.min()))
         approach = retract if item is not None and item.has_cone else 0.0
-        raise InputError(explained_place(own, f"'{simulated.name}'", point, enough, approach))
+        raise InputError(explained_place(seat, f"'{simulated.name}'", point, enough, approach))
     return whole.select(np.flatnonzero(good))
 
 

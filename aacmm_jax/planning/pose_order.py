@@ -79,8 +79,8 @@ def _nearest(cost_from, groups: Int[np.ndarray, " N"], start: int) -> Int[np.nda
     order = [start]
     left[start] = False
     while left.any():
-        own = left & (groups == groups[order[-1]])
-        rows = np.flatnonzero(own if own.any() else left)
+        of_group = left & (groups == groups[order[-1]])
+        rows = np.flatnonzero(of_group if of_group.any() else left)
         order.append(int(rows[np.argmin(cost_from(order[-1], rows))]))
         left[order[-1]] = False
     return np.array(order)

@@ -133,12 +133,12 @@ def _slopes_of_errors(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray
 
 def _by_readings(arm: Arm, q: Float[np.ndarray, "N n"], function: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Derivative of a smooth function of the readings, ``(n, ...)``, by central differences."""
-    found = []
+    slopes = []
     for joint, unit in enumerate(reading_units(arm.geometry)):
         step = np.zeros(arm.joints)
         step[joint] = 1e-5 * unit
-        found.append((function(q + step) - function(q - step)) / (2 * step[joint]))
-    return np.stack(found)
+        slopes.append((function(q + step) - function(q - step)) / (2 * step[joint]))
+    return np.stack(slopes)
 
 
 def _value(problem: DesignProblem, placement: FixturePlacement, q: np.ndarray, owner: np.ndarray) -> float:
@@ -197,15 +197,15 @@ def _by_functions(
     assert forward.errors is not None
     functions, columns = forward.errors.functions, np.asarray(reading_columns(forward))
     of_joints = np.einsum("ncN,cN->nN", columns, cotangent)
-    found = np.zeros((len(functions.term_of_row), cotangent.shape[1]))
+    derivatives = np.zeros((len(functions.term_of_row), cotangent.shape[1]))
     coefficients, gravity = np.asarray(problem.arm.coefficients), [*np.asarray(problem.arm.gravity), 1.0]
     for row, (term, component) in enumerate(zip(functions.term_of_row, functions.component_of_row, strict=True)):
         joint = functions.terms[term].joint - 1
         if kind == "coefficients" and term == i:
-            found[row] = gravity[component] * of_joints[joint]
+            derivatives[row] = gravity[component] * of_joints[joint]
         if kind == "gravity" and component == i:
-            found[row] = coefficients[term] * of_joints[joint]
-    return found
+            derivatives[row] = coefficients[term] * of_joints[joint]
+    return derivatives
 
 
 def _gradient_of_functions(

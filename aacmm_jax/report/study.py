@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.units import error_unit
 from ..plot.charts import Chart
-from ..plot.study import metric_plots, metric_unit, runs_of_metric
+from ..plot.study import metric_plots, metric_unit
 from ..study.results import Results
 from ..study.statistics import METRICS, factor_title, level_text, level_title, study_summary
 from ..summaries.tables import Cell, Table, format_number, listed, number
@@ -17,7 +17,7 @@ _SHOWN = (
     *("length_error", "angle_error", "de", "deltam", "scale_error"),
     *("length_error_stage1", "angle_error_stage1", "de_stage1", "deltam_stage1", "k"),
 )
-_MOST_CELLS, _MOST_ROWS, _NAMED, _MOST_PLOTS = 400, 2000, 6, 12
+_MOST_CELLS, _MOST_ROWS, _NAMED = 400, 2000, 6
 _STATISTICS = {"mean": "mean", "standard deviation": "spread", "5 %": "p5", "50 %": "p50", "95 %": "p95"}
 
 
@@ -118,9 +118,7 @@ def _metric_section(results: Results, summary: dict[str, Any], name: str) -> Sec
         for words, key in _STATISTICS.items()
     }
     cells = listed(f"{heading}; ± one Monte Carlo standard error", summary["results"][:_MOST_CELLS], columns)
-    along, runs = runs_of_metric(results, _MOST_PLOTS)
-    groups = [{words: chosen} for words, chosen in runs.items()]
-    plots = metric_plots(results, name, along, groups, lambda chosen: factor * _ends(summary, name, chosen))
+    plots = metric_plots(results, name, lambda chosen: factor * _ends(summary, name, chosen))
     description = "Marks are medians, bars reach from the 5th to the 95th percentile of the converged trials."
     return Section(f"figure-{name}", title, [Chart(f"chart-{name}", heading, description, plots, cells)])
 
