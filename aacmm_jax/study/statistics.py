@@ -186,7 +186,7 @@ def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " 
 
 def _jackknife(rest: np.ndarray) -> np.ndarray:
     """The standard error of a statistic from its values with one group left out each (Efron and Stein 1981)."""
-    return np.sqrt((len(rest) - 1) / len(rest) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
+    return np.asarray(np.sqrt((len(rest) - 1) / len(rest) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0)))
 
 
 def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
