@@ -1,7 +1,5 @@
-"""How an arm gets from pose to pose: approach points, the order, whether a move hits anything; or why it cannot."""
+"""How an arm gets from pose to pose: approach points, the order, whether a move hits anything."""
 
-import math
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,12 +10,11 @@ from ..kinematics.collisions import clearances, is_clear, nearest_contact
 from ..kinematics.cones import Cone, cones_of, tilts
 from ..kinematics.correction import readings_at_poses
 from ..kinematics.inverse_kinematics import project_to_targets
-from ..kinematics.workspace import SearchRegion, configurations_at, lowest_point
+from ..kinematics.workspace import SearchRegion, lowest_point
 from .pose_order import joint_weights, short_order, travel
 
 _STEP = np.radians(2.0)  # largest step of a joint between samples of a move
 _ROUNDS = 25  # of ordering and checking
-_STARTS = 500  # of what shows why a place cannot be reached
 
 
 class Motion(NamedTuple):
@@ -136,56 +133,10 @@ def _whole_travel(
     return travel(visits.reshape(-1, q.shape[1]), weights)
 
 
-def explained(
-    region: SearchRegion,
-    names: Sequence[str],
-    points: Float[np.ndarray, "s 3"],
-    socket: int,
-    share: float,
-    retract: float,
-) -> str:
-    """Which constraint leaves too few of the poses in a socket.
-
-    ``share`` is the part of the random starts that would be enough.
-    """
-    cones = None if region.cones is None else region.cones.at(np.array([socket]))
-    return explained_place(region._replace(cones=cones), f"socket '{names[socket]}'", points[socket], share, retract)
-
-
-def explained_place(
-    region: SearchRegion, name: str, point: Float[np.ndarray, " 3"], share: float, retract: float
-) -> str:
-    """Which constraint leaves too few poses of the tip in a point: obstacles, cone, approach point, or the reach.
-
-    ``region`` has one cone, that of the point.
-    """
-    enough = math.ceil(share * _STARTS)
+def hardly_reached(name: str, point: Float[np.ndarray, " 3"]) -> str:
+    """Why nothing can be planned with a place."""
     where = ", ".join(f"{round(float(x)):.6g}" for x in point)
-    what = f"{name} at ({where}) mm cannot be reached in enough poses"
-    cones = region.cones
-
-    def reached(other: SearchRegion) -> Float[np.ndarray, "c n"]:
-        return configurations_at(other, point[None], _STARTS)[0]
-
-    arrived = reached(region)
-    if len(arrived) >= enough and retract and cones is not None:
-        normals = np.tile(cones.normals, (len(arrived), 1))
-        if np.sum(approaches(region, arrived, normals, retract).possible) < enough:
-            return (
-                f"{what} by way of its approach point {retract:g} mm along its normal; give a shorter distance "
-                "(retract), or move it."
-            )
-    if region.cell is not None and len(arrived) < enough:
-        touching = reached(region._replace(cell=None))
-        if len(touching) >= enough:
-            part, other = nearest_contact(region.cell, region.arm, touching[0])
-            return (
-                f"{what} without touching an obstacle or the arm itself (such as {part} and {other}); move it or what "
-                "is in the way, or give smaller radii."
-            )
-    if cones is not None and cones.any and len(reached(region._replace(cell=None, cones=None))) >= enough:
-        angle, normal = math.degrees(float(cones.half_angles[0])), ", ".join(f"{x:.3g}" for x in cones.normals[0])
-        return (
-            f"{what} within its cone of {angle:.3g} deg about ({normal}); widen the cone, turn its normal, or move it."
-        )
-    return f"{what} within the joint limits and their margin; move it, or give more candidates."
+    return (
+        f"{name} at ({where}) mm cannot be reached in enough poses within joint limits, cone and obstacles; move it, "
+        "widen its cone, shorten retract, or give more candidates."
+    )
