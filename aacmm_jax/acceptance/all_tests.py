@@ -102,10 +102,10 @@ def run(
         >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
         >>> for test in aj.acceptance.run(measured, limits={"SPAT": 0.1}):
         ...     print(test.called, [(metric.name, metric.decision) for metric in test.metrics])
-        after JJF 1408-2013 [('Deltam', None), ('Length', None), ('Length_Range', None), ('Length_2RMS', None)]
-        after ASME B89.4.22-2004 [('SPAT', 'conforms'), ('SPAT_2s', None)]
-        after ASME B89.4.22-2004 [('Volumetric', None), ('Volumetric_Range', None), ('Volumetric_2RMS', None)]
-        after ISO 10360-12:2016 [('E_Uni', None)]
+        based on JJF 1408-2013 [('Deltam', None), ('Length', None), ('Length_Range', None), ('Length_2RMS', None)]
+        based on ASME B89.4.22-2004 [('SPAT', 'conforms'), ('SPAT_2s', None)]
+        based on ASME B89.4.22-2004 [('Volumetric', None), ('Volumetric_Range', None), ('Volumetric_2RMS', None)]
+        based on ISO 10360-12:2016 [('E_Uni', None)]
     """
     measured, influences, given = _checked(measured), checked_influences(influences), checked_limits(limits or {})
     influences = influences._replace(u=math.hypot(influences.u, u_test))

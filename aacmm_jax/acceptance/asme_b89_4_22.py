@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..core.arrays import Numbers
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
 from .geometry import LEAST_SPREAD, LEFT_OR_RIGHT, elbow_sides, least_turn
@@ -45,7 +45,7 @@ from .requirements import (
     touches,
 )
 from .results import Measured, Metric, metric_value, percent
-from .spheres import errors_named, points_of, size_error
+from .spheres import points_of, size_error
 from .standards import ASME_B89_4_22
 
 ZONES = {"near": (0.0, 0.2), "middle": (0.2, 0.8), "far": (0.8, 1.0)}  # fractions of the reach
@@ -88,7 +88,7 @@ def _diameter_metrics(measured: Measured, influences: Influences) -> list[Metric
     values = []
     for sphere in spheres_for(measured, "effective-diameter"):
         for number, group in enumerate(sphere.groups, start=1):
-            with errors_named(sphere, number):
+            with naming(f"sphere '{sphere.name}', group {number}"):
                 error = size_error(group, sphere.diameter, sphere.stylus) + influences.correction(sphere.diameter)
             u = influences.u_of(sphere.diameter)
             values.append(metric_value(f"{sphere.name}, repeat {number}", error, sphere.u, u))
@@ -126,11 +126,11 @@ def _zones_lacking(measured: Measured) -> str:
     if measured.reach is None:
         return "The reach of the arm and its shoulder are unknown, so that its zones cannot be told apart."
     radius = _radius(measured, measured.reach)
-    found = {_zone(measured, points) for points in _articulated(measured).values()}
+    zones = {_zone(measured, points) for points in _articulated(measured).values()}
     absent = [
         f"at {percent(zone)} of the reach ({zone[0] * radius:.0f} to {zone[1] * radius:.0f} mm from the shoulder)"
         for zone in ZONES.values()
-        if zone not in found
+        if zone not in zones
     ]
     return f"A socket with {_SPAT_POSES} poses is required {' and '.join(absent)}." if absent else ""
 
@@ -287,7 +287,7 @@ def _both_sides(sides: np.ndarray, q: np.ndarray) -> np.ndarray:
     far = np.abs(sides) >= LEFT_OR_RIGHT
     halves = [np.flatnonzero(far & (sides > 0)), np.flatnonzero(far & (sides < 0))]
     chosen = [half[far_apart(q[half], _SPAT_POSES // 2)] for half in halves if len(half)]
-    found = np.concatenate([*chosen, np.zeros(0, dtype=int)]).astype(int)
-    others = np.setdiff1d(np.arange(len(q)), found)
-    missing = _SPAT_POSES - len(found)
-    return found if missing <= 0 else np.concatenate([found, others[far_apart(q[others], missing)]])
+    first = np.concatenate([*chosen, np.zeros(0, dtype=int)]).astype(int)
+    others = np.setdiff1d(np.arange(len(q)), first)
+    missing = _SPAT_POSES - len(first)
+    return first if missing <= 0 else np.concatenate([first, others[far_apart(q[others], missing)]])

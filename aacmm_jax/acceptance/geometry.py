@@ -140,15 +140,15 @@ class BarPositions(NamedTuple):
 
 def bar_positions(measured: Measured, groups: Sequence[Sequence[float]]) -> list[BarPositions]:
     """The positions of each bar, of which ``groups`` has the calibrated values."""
-    found = []
+    positions = []
     pairs = {frozenset((length.start, length.end)): length for length in measured.lengths}
     for values in groups:
         lengths = [length for length in pairs.values() if min(values) <= float(length.value) <= max(values)]
         ends = [[measured.sockets[name] for name in (length.start, length.end)] for length in lengths]
         start, end = (np.array([pair[i].mean(axis=0) for pair in ends]) for i in (0, 1))
         readings = tuple(min(map(len, pair)) for pair in ends)
-        found.append(BarPositions(float(np.mean(values)), (start + end) / 2, unit_rows(end - start), readings))
-    return found
+        positions.append(BarPositions(float(np.mean(values)), (start + end) / 2, unit_rows(end - start), readings))
+    return positions
 
 
 def all_bars(bars: Sequence[BarPositions]) -> BarPositions:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..core.arrays import Numbers
+from ..core.errors import naming
 from .geometry import LEAST_SPREAD, unit_rows
 from .influences import Influences
 from .lengths import length_readings
@@ -33,7 +34,7 @@ from .requirements import (
     touches,
 )
 from .results import Measured, Metric, metric_value
-from .spheres import EXACT_POINTS, enclosing_sphere, errors_named, fit_sphere, size_error
+from .spheres import EXACT_POINTS, enclosing_sphere, fit_sphere, size_error
 from .standards import ISO_10360_12
 
 _PROBING_POINTS, _ORIENTATIONS, _ORIENTATION_POINTS = 25, 5, 5
@@ -104,7 +105,7 @@ def _probing_metrics(measured: Measured, influences: Influences) -> list[Metric]
     for sphere in spheres_for(measured, "probing"):
         for number, group in enumerate(sphere.groups, start=1):
             where = sphere.name + (f", repeat {number}" if len(sphere.groups) > 1 else "")
-            with errors_named(sphere, number):
+            with naming(f"sphere '{sphere.name}', group {number}"):
                 error = size_error(group, sphere.diameter, sphere.stylus) + influences.correction(sphere.diameter)
             size.append(metric_value(where, error, sphere.u, influences.u_of(sphere.diameter)))
             if len(group) > EXACT_POINTS:
@@ -117,7 +118,7 @@ def _location_metrics(measured: Measured, influences: Influences) -> list[Metric
     values = []
     for sphere in spheres_for(measured, "articulation"):
         if len(sphere.groups) > 1:  # the sphere around one centre always has the diameter zero
-            with errors_named(sphere):
+            with naming(f"sphere '{sphere.name}'"):
                 error = articulated_location(sphere.groups)
             values.append(metric_value(sphere.name, error, sphere.form / 2, sphere.u_form, influences.u))
     return [Metric("L_Dia", tuple(values))]
@@ -135,8 +136,8 @@ def _orientations_lacking(measured: Measured) -> str:
         means = (
             unit_rows(np.array([directions.mean(axis=0) for directions in groups])) if test == "articulation" else []
         )
-        for one, other in itertools.combinations(means, 2):
-            if one @ other > math.cos(_LEAST_TURN):
+        for mean, other in itertools.combinations(means, 2):
+            if mean @ other > math.cos(_LEAST_TURN):
                 return f"The orientations of the probe must differ; on sphere '{name}' two are nearly the same."
     return ""
 

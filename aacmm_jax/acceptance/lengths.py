@@ -34,7 +34,7 @@ class LengthReading(NamedTuple):
 def length_readings(measured: Measured, influences: Influences) -> list[LengthReading]:
     """Every length as single readings: the i-th point at one end with the i-th at the other; thermal expansion of
     artefact and arm, where it is stated, is corrected."""
-    found = []
+    readings = []
     for length in measured.lengths:
         start, end = (measured.sockets[name] for name in (length.start, length.end))
         pairs = min(len(start), len(end))
@@ -42,8 +42,8 @@ def length_readings(measured: Measured, influences: Influences) -> list[LengthRe
         deviations = np.linalg.norm(end[:pairs] - start[:pairs], axis=1) - value + influences.correction(value)
         for number, deviation in enumerate(deviations, start=1):
             where = f"{length.start} - {length.end}" + (f", reading {number}" if pairs > 1 else "")
-            found.append(LengthReading(where, float(deviation), float(length.u), value))
-    return found
+            readings.append(LengthReading(where, float(deviation), float(length.u), value))
+    return readings
 
 
 def deviation_metrics(

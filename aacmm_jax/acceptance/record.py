@@ -75,11 +75,11 @@ class EvaluationRecord(NamedTuple):
     def length_that_fixed_scale(self) -> int | None:
         """Index of the only length identified from, if its error is zero by construction because it fixed the scale."""
         lengths, held_out = self.recording.capture.lengths, self.held_out_lengths()
-        known = [i for i in range(len(lengths)) if i not in held_out]
-        if len(known) != 1:
+        used = [i for i in range(len(lengths)) if i not in held_out]
+        if len(used) != 1:
             return None
-        error = float(np.asarray(evaluate(self.calibrated.arm, self.recording.capture).error)[known[0]])
-        return known[0] if abs(error) <= _ROUNDING * float(lengths[known[0]].value) else None
+        error = float(np.asarray(evaluate(self.calibrated.arm, self.recording.capture).error)[used[0]])
+        return used[0] if abs(error) <= _ROUNDING * float(lengths[used[0]].value) else None
 
     def measured(self, arm: Arm) -> Measured:
         """What acceptance tests are run on: held-out data, or everything if there are none."""
@@ -181,12 +181,12 @@ def evaluation_of(
         ...     print(test.title, test.decision)
         single point and length, as in Cheng et al. 2018 conforms
     """
-    known = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
-    recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, known))
+    used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
+    recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, used))
     check_geometry(record.calibrated.arm, recording.capture)
     readings = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
     readings |= {observation.name: np.asarray(observation.q) for observation in recording.capture.observations}
-    shared = {name: sum(row.tobytes() in known for row in q) for name, q in readings.items()}
+    shared = {name: sum(row.tobytes() in used for row in q) for name, q in readings.items()}
     warnings = []
     if not record.converged or not record.plausible_scale:
         reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
@@ -224,11 +224,11 @@ def evaluation_of(
     return evaluation._replace(warnings=tuple(warnings))
 
 
-def _divided(arm: Arm, capture: Capture, known: Collection[bytes]) -> Capture:
-    """With the unseen poses of observations of which others are known as observations of their own."""
+def _divided(arm: Arm, capture: Capture, used: Collection[bytes]) -> Capture:
+    """With the poses of an observation that were not used as an observation of their own, where others were."""
     observations = []
     for observation in capture.observations:
-        seen = np.array([row.tobytes() in known for row in np.asarray(observation.q)])
+        seen = np.array([row.tobytes() in used for row in np.asarray(observation.q)])
         parts = [observation]
         if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
             unseen = observation.select(np.flatnonzero(~seen)).changed(name=f"{observation.name}, unseen")

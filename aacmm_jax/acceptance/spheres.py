@@ -1,7 +1,5 @@
 """Spheres: fitted by least squares, and the smallest around points; and what the tests of touched spheres share."""
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +7,6 @@ from jaxtyping import Float
 
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
-from ..data.sphere import ProbedSphere
 
 EXACT_POINTS = 4  # a sphere goes through so many points exactly, so they have no form error
 _COINCIDENT = 1e-7  # distance of two points, relative to the extent of all, below which they count as one
@@ -75,8 +72,8 @@ def fit_sphere(points: Numbers) -> FittedSphere:
 
     guess = np.append(start[:3], radius)
     solve: Any = optimize.least_squares
-    found = solve(residuals, guess, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    return FittedSphere(middle + size * found.x[:3], float(size * found.x[3]), size * found.fun)
+    solution = solve(residuals, guess, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return FittedSphere(middle + size * solution.x[:3], float(size * solution.x[3]), size * solution.fun)
 
 
 def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
@@ -108,8 +105,8 @@ def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
     for point in (given - middle) / size:
         if all(np.linalg.norm(point - other) > _COINCIDENT for other in apart):
             apart.append(point)
-    found: Any = miniball.get_bounding_ball(np.array(apart), rng=np.random.default_rng(0))
-    centre = middle + size * found[0]
+    ball: Any = miniball.get_bounding_ball(np.array(apart), rng=np.random.default_rng(0))
+    centre = middle + size * ball[0]
     return centre, float(np.linalg.norm(given - centre, axis=1).max())
 
 
@@ -144,13 +141,3 @@ def points_of(points: Numbers, what: str) -> Float[np.ndarray, "m 3"]:
     if array.ndim != 2 or array.shape[1] != 3 or not len(array):
         raise InputError(f"{what} have shape {array.shape}; give (x, y, z) in mm, one row per point, at least one row.")
     return array
-
-
-@contextlib.contextmanager
-def errors_named(sphere: ProbedSphere, group: int | None = None) -> Iterator[None]:
-    """Add the sphere, and which of its groups, to the text of an `InputError`."""
-    try:
-        yield
-    except InputError as error:
-        where = f"sphere '{sphere.name}'" + ("" if group is None else f", group {group}")
-        raise InputError(f"{where}: {error}") from error

@@ -14,7 +14,6 @@ import jax.core
 import numpy as np
 from jax.custom_derivatives import SymbolicZero as SymbolicZero
 from jax.experimental.compilation_cache.compilation_cache import reset_cache as reset_compilation_cache  # noqa: F401
-from jax.extend.random import define_prng_impl, threefry2x32_p
 from jaxtyping import Array, Int
 
 Static = eqxi.Static  # a leaf that jit takes as a constant
@@ -34,16 +33,6 @@ def jax_setting(name: str, usual: Any) -> Any:
     """A setting of JAX as it is now, or ``usual`` where this version of JAX has none of this name."""
     config: Any = jax.config
     return getattr(config, name, config.values.get(name, usual))  # some have no attribute
-
-
-def threefry2x32(key1: Array, key2: Array, high: Array, low: Array) -> tuple[Array, Array]:
-    """The Threefry hash of counts of two words each, all uint32."""
-    return tuple(threefry2x32_p.bind(key1, key2, high, low))
-
-
-def random_generator_of(**functions: Callable) -> Any:
-    """A generator of random numbers, with keys of two words, made of the functions that JAX asks for."""
-    return define_prng_impl(key_shape=(2,), name="aacmm_jax", tag="aacmm", **functions)
 
 
 def while_loop(cond_fun: Callable, body_fun: Callable, init_val: Any, *, max_steps: int | None) -> Any:

@@ -193,7 +193,10 @@ def checked(value: Any, annotation: Any, what: str, sizes: Sizes | None = None) 
 
     ``sizes`` holds the sizes of dimensions by name; those that this value determines are added.
     """
-    check = _check_of(annotation)
+    try:
+        check = _known_check(annotation)
+    except TypeError:  # names in a dictionary, say, cannot be looked up
+        check = _check_of(annotation)
     return value if check is None else check(value, what, {} if sizes is None else sizes)
 
 
@@ -239,6 +242,9 @@ def _check_of(annotation: Any) -> Check | None:
     if _is_array(annotation) or _is_class(annotation):
         return _of_alternatives((annotation,))
     return _SCALARS.get(annotation) if isinstance(annotation, type) else None
+
+
+_known_check = cache(_check_of)  # of a value that is checked again and again: 0.1 ms each
 
 
 def _is_array(annotation: Any) -> bool:
@@ -299,8 +305,7 @@ def _of_items(check: Check | None) -> Check:
     def call(value: Any, what: str, sizes: Sizes) -> Any:
         if isinstance(value, str):  # whose items are characters
             raise InputError(f"{what} is {shown(value)}; give a list.")
-        items = items_of(value, what)
-        return tuple(items if check is None else (check(x, _item(what, i), sizes) for i, x in enumerate(items)))
+        return tuple(_each(dict(enumerate(items_of(value, what))), check, what, sizes).values())
 
     return call
 
@@ -309,9 +314,19 @@ def _of_values(check: Check | None) -> Check:
     def call(value: Any, what: str, sizes: Sizes) -> Any:
         if not isinstance(value, Mapping):
             raise InputError(f"{what} is {_with_article(type(value).__name__)}; give a dictionary.")
-        return value if check is None else {k: check(x, _item(what, k), sizes) for k, x in value.items()}
+        return value if check is None else _each(value, check, what, sizes)
 
     return call
+
+
+def _each(values: Mapping[Any, Any], check: Check | None, what: str, sizes: Sizes) -> Mapping[Any, Any]:
+    """Each of several values as a check returns it."""
+    if check is None:
+        return values
+    try:
+        return {key: check(value, what, sizes) for key, value in values.items()}
+    except InputError:  # once more, to say which: names take longer to make than most checks
+        return {key: check(value, _item(what, key), sizes) for key, value in values.items()}
 
 
 class _ArrayCheck(NamedTuple):

@@ -238,6 +238,21 @@ def semidefinite_eigen(
     return values, vectors
 
 
+def independent_columns(
+    columns: Float[np.ndarray, "r p"], least: Float[np.ndarray, " p"], basis: Float[np.ndarray, "r b"] | None = None
+) -> list[int]:
+    """The columns of which more than ``least`` is left once those before them, and a basis, have imitated them."""
+    basis, chosen = np.zeros((len(columns), 0)) if basis is None else basis, []
+    for i, rest in enumerate(columns.T):
+        for _ in range(2):  # Gram-Schmidt; twice is enough for orthogonality to rounding (Giraud et al. 2005)
+            rest = rest - basis @ (basis.T @ rest)
+        size = np.linalg.norm(rest)
+        if size > least[i] and basis.shape[1] < len(columns):
+            chosen.append(i)
+            basis = np.hstack([basis, rest[:, None] / size])
+    return chosen
+
+
 def _round_robin(p: int) -> np.ndarray:
     """The partner of each column in each round of a tournament in which every pair meets once; a column alone meets
     itself."""

@@ -69,15 +69,14 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     in that cell. `TextTable` reads such a cell without the apostrophe.
     """
     stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows([_not_calculated(cell) for cell in row] for row in rows)
+
+    def written(cell: object) -> object:
+        text = printable(cell) if isinstance(cell, str) else ""  # a carriage return would end the row
+        formula = text.startswith(_BEGINS_FORMULA) and not is_number(text)
+        return f"'{text}" if formula else text or cell
+
+    csv.writer(stream, lineterminator="\n").writerows(map(written, row) for row in rows)
     return stream.getvalue()
-
-
-def _not_calculated(cell: object) -> object:
-    if not isinstance(cell, str):
-        return cell
-    cell = printable(cell)  # a carriage return would end the row
-    return f"'{cell}" if cell.startswith(_BEGINS_FORMULA) and not is_number(cell) else cell
 
 
 def shorten(items: Sequence[str], most: int = 5) -> str:

@@ -211,7 +211,7 @@ class _Equations(NamedTuple):
         freedom = float(sum(np.sum(np.einsum("maa->m", block)) for block in blocks))
         tips = [rows.by_tip @ rows.by_tip.swapaxes(1, 2) for rows in self.rows]
         trace_t, trace_tt = _traces(blocks, tips, tips)
-        none, tests = [None] * (len(left.slices) - len(self.rows)), []
+        tests = []
         for joint in joints:
             columns = [self.readings(rows)[..., joint, None] for rows in self.rows]
             kernels = [column @ column.swapaxes(1, 2) for column in columns]
@@ -224,7 +224,7 @@ class _Equations(NamedTuple):
             c = (freedom * trace_both - trace * trace_t) / below if seated else 0.0
             kernels = [kernel - c * tip for kernel, tip in zip(kernels, tips, strict=True)]
             x = _value(kernels, poses) / max(cost, 1e-300)
-            chance = chance_above_zero(left, [*(kernel - x * np.eye(kernel.shape[1]) for kernel in kernels), *none])
+            chance = chance_above_zero(left, [kernel - x * np.eye(kernel.shape[1]) for kernel in kernels])
             tests.append(NoisyJoint(joint + 1, ratio, chance))
         if not tests:
             return None

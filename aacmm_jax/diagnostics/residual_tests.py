@@ -55,10 +55,10 @@ class Residuals(NamedTuple):
 
     def unexplained(self, columns: Float[np.ndarray, "R c"]) -> Float[np.ndarray, "R c"]:
         """M times some columns."""
-        found = np.array(columns)
+        rest = np.array(columns)
         for rows, own in zip(self.slices, self.own, strict=True):
-            found[rows] -= own @ (own.T @ found[rows])
-        return found - self.basis @ (self.basis.T @ found)
+            rest[rows] -= own @ (own.T @ rest[rows])
+        return rest - self.basis @ (self.basis.T @ rest)
 
     def extended(self, columns: Float[np.ndarray, "R c"]) -> "Residuals":
         """The least squares with further unknowns, whose columns are given."""
@@ -106,23 +106,20 @@ def consistency(
 ) -> Consistency:
     """Relations predicted by a least squares of the other equations, with the uncertainty of that prediction.
 
-    Args:
-        parts: The other equations.
-        relations: Residuals of the relations, and their derivatives by the shared unknowns.
-        covariance: Of the relations' own errors.
-        open_direction: Derivatives of the equations and of the relations by an unknown that only the relations
-            determine, such as the scale. Whatever else the equations leave open, the relations determine too.
+    ``covariance`` is that of the relations' own errors, and ``open_direction`` the derivatives of the equations and of
+    the relations by an unknown that only the relations determine, such as the scale. Whatever else the equations leave
+    open, the relations determine too.
     """
     plain = Residuals.of([part._replace(shared=part.shared[:, :0]) for part in parts])
     slopes = plain.unexplained(np.concatenate([part.shared for part in parts]))
     lengths = np.linalg.norm(slopes, axis=0)
     scale = np.where(lengths > 0, lengths, 1.0)
     vectors, values, turned = np.linalg.svd(slopes / scale, full_matrices=False)
-    known = values > _NULL * values.max(initial=0.0)
-    by_rows = relations.shared @ ((turned[known].T / values[known]) / scale[:, None])
-    vectors = vectors[:, known]
+    seen = values > _NULL * values.max(initial=0.0)
+    by_rows = relations.shared @ ((turned[seen].T / values[seen]) / scale[:, None])
+    vectors = vectors[:, seen]
     residual = relations.residual - by_rows @ (vectors.T @ plain.values)
-    free = [relations.shared @ (turned[~known].T / scale[:, None])]
+    free = [relations.shared @ (turned[~seen].T / scale[:, None])]
     if open_direction is not None:
         rows, of_relations = open_direction
         free.append((of_relations - by_rows @ (vectors.T @ plain.unexplained(rows[:, None])[:, 0]))[:, None])
@@ -151,46 +148,39 @@ class ScoreTest(NamedTuple):
 
 
 def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]], least: float = 0.0) -> list[ScoreTest]:
-    """Each candidate against the model, whatever the level of the noise is.
+    """Each candidate, given by its columns, against the model, whatever the level of the noise is.
 
-    Args:
-        left: The residuals.
-        candidates: The columns of each candidate.
-        least: Size of what the model leaves of a column, below which it counts as the model's own.
-
-    Returns:
-        One for each candidate; probability 1 for those that the model explains itself.
+    A column of which the model leaves less than ``least`` counts as the model's own; a candidate that the model
+    explains itself has the probability 1.
     """
     if not candidates:
         return []
     columns = np.concatenate(candidates, axis=1)
     lengths = np.linalg.norm(columns, axis=0)
-    columns = columns / np.where(lengths > 0, lengths, 1.0)
-    projected = left.unexplained(columns)
+    lengths = np.where(lengths > 0, lengths, 1.0)
+    projected = left.unexplained(columns / lengths)
     projected = np.where(lengths * np.linalg.norm(projected, axis=0) > least, projected, 0.0)
     gram, score = projected.T @ projected, projected.T @ left.values
-    ends, found = np.cumsum([each.shape[1] for each in candidates]), []
-    for end, each in zip(ends, candidates, strict=True):
-        of = slice(end - each.shape[1], end)
-        values, vectors = np.linalg.eigh(gram[of, of])
-        known = values > _EXPLAINED
-        along = vectors[:, known].T @ score[of]
-        gain, added = float(np.sum(along**2 / values[known])), int(known.sum())
-        spare = left.degrees_of_freedom - added
-        step = vectors[:, known] @ (along / values[known]) / np.where(lengths[of] > 0, lengths[of], 1.0)
-        if not added or spare < 1:
-            found.append(ScoreTest(0.0, 0.0, (added, spare), 1.0, step))
-            continue
-        ratio = gain / added / max((left.cost - gain) / spare, 1e-300)
-        found.append(ScoreTest(gain, ratio, (added, spare), f_tail(ratio, added, spare), step))
-    return found
+    ends = np.cumsum([candidate.shape[1] for candidate in candidates])
+    return [
+        _score_test(left, gram[start:end, start:end], score[start:end], lengths[start:end])
+        for start, end in zip([0, *ends[:-1]], ends, strict=True)
+    ]
 
 
-class Form(NamedTuple):
-    """A quadratic form r'A r with A = Z K Z', part by part: symmetric K (c, c), and Z (r, c) of the part's rows."""
-
-    columns: tuple[Float[np.ndarray, "r c"] | None, ...]  # None: the part has none
-    kernel: tuple[Float[np.ndarray, "c c"] | None, ...]  # None: the identity
+def _score_test(
+    left: Residuals, gram: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], lengths: Float[np.ndarray, " c"]
+) -> ScoreTest:
+    """Of one candidate, by the Gram matrix of its scaled columns and their products with the residuals."""
+    values, vectors = np.linalg.eigh(gram)
+    present = values > _EXPLAINED
+    along, added = vectors[:, present].T @ score, int(present.sum())
+    gain, freedom = float(np.sum(along**2 / values[present])), left.degrees_of_freedom - added
+    step = vectors[:, present] @ (along / values[present]) / lengths
+    if not added or freedom < 1:
+        return ScoreTest(0.0, 0.0, (added, freedom), 1.0, step)
+    ratio = gain / added / max((left.cost - gain) / freedom, 1e-300)
+    return ScoreTest(gain, ratio, (added, freedom), f_tail(ratio, added, freedom), step)
 
 
 class FormTest(NamedTuple):
@@ -201,47 +191,39 @@ class FormTest(NamedTuple):
     degrees_of_freedom: float  # of a chi-square variable with the same relative variance
 
 
-def form_test(left: Residuals, form: Form, relative: bool) -> FormTest:
-    """Whether a quadratic form of the residuals is larger than independent errors make it.
+Kernels = Sequence[Float[np.ndarray, "_ _ _"] | None]
 
-    Args:
-        left: The residuals.
-        form: The form.
-        relative: Compare with the variance of all residuals instead of 1.
+
+def form_test(
+    left: Residuals, columns: Sequence[np.ndarray | None], kernels: Sequence[np.ndarray | None], relative: bool
+) -> FormTest:
+    """Whether a quadratic form r'A r of the residuals is larger than independent errors make it.
+
+    A = Z K Z' part by part, with columns Z (r, c) of the part's rows and symmetric K (c, c), the identity where it is
+    None. Parts without columns, and those that follow, have no part in it. Where it is ``relative``, the form is
+    compared with the variance of all residuals instead of 1.
     """
-    return _tested(left, *_value_and_traces(left, form), relative)
+    return _tested(left, *_value_and_traces(left, columns, kernels), relative)
 
 
-def form_of_poses(left: Residuals, columns: Sequence[np.ndarray | None], kernel: Sequence[np.ndarray | None]) -> Form:
-    """A form of the rows of poses; relations, which come last, have no part in it."""
-    none = (None,) * (len(left.slices) - len(columns))
-    return Form((*columns, *none), (*kernel, *none))
+def pose_form_test(left: Residuals, kernels: Kernels, relative: bool) -> FormTest:
+    """The same of a form in which rows of different poses do not meet: r'A r is the sum of r_i' K_i r_i, with the
+    symmetric K of each pose of a part, whose rows follow each other."""
+    return _tested(left, *_value_and_traces_by_pose(left, kernels), relative)
+
+
+def chance_above_zero(left: Residuals, kernels: Kernels) -> float:
+    """Probability that independent errors make a form by pose (as of `pose_form_test`) positive: with A - x B for A,
+    where x is the ratio of r'A r to r'B r that was found, that of a larger ratio."""
+    return _tail(0.0, _value_and_traces_by_pose(left, kernels)[1])
 
 
 def block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R C"]:
     """Columns of single poses, 0 in the rows of all others."""
     poses, size, width = columns.shape
-    found = np.zeros((poses, size, poses, width))
-    found[np.arange(poses), :, np.arange(poses)] = columns
-    return found.reshape(poses * size, poses * width)
-
-
-def pose_form_test(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None], relative: bool) -> FormTest:
-    """The same of a form in which rows of different poses do not meet: r'A r is the sum of r_i' K_i r_i.
-
-    Args:
-        left: The residuals.
-        kernels: Part by part, the symmetric K of each of its poses, whose rows follow each other; None for a part that
-            has none.
-        relative: Compare with the variance of all residuals instead of 1.
-    """
-    return _tested(left, *_value_and_traces_by_pose(left, kernels), relative)
-
-
-def chance_above_zero(left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None]) -> float:
-    """Probability that independent errors make a form by pose (as of `pose_form_test`) positive: with A - x B for A,
-    where x is the ratio of r'A r to r'B r that was found, that of a larger ratio."""
-    return _tail(0.0, _value_and_traces_by_pose(left, kernels)[1])
+    whole = np.zeros((poses, size, poses, width))
+    whole[np.arange(poses), :, np.arange(poses)] = columns
+    return whole.reshape(poses * size, poses * width)
 
 
 def _tested(left: Residuals, value: float, traces: tuple[float, float, float], relative: bool) -> FormTest:
@@ -259,7 +241,9 @@ def _tested(left: Residuals, value: float, traces: tuple[float, float, float], r
     return FormTest(ratio, probability, traces[0] ** 2 / max(traces[1], 1e-300))
 
 
-def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, float, float]]:
+def _value_and_traces(
+    left: Residuals, columns: Sequence[np.ndarray | None], kernels: Sequence[np.ndarray | None]
+) -> tuple[float, tuple[float, float, float]]:
     """r'A r, and the traces of the first powers of MA.
 
     With W = Z' M Z = V - B B', V of the parts less their own unknowns and B = Z' times the basis, tr (MA)^k is
@@ -268,11 +252,11 @@ def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, 
     size = left.basis.shape[1]
     g, h, h2 = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
     value = one = two = three = 0.0
-    for rows, own, columns, kernel in zip(left.slices, left.own, form.columns, form.kernel, strict=True):
-        if columns is None:
+    for rows, basis, part, kernel in zip(left.slices, left.own, columns, kernels, strict=False):
+        if part is None:
             continue
-        seen, z = own.T @ columns, columns.T @ left.values[rows]
-        v, b = columns.T @ columns - seen.T @ seen, columns.T @ left.basis[rows]
+        seen, z = basis.T @ part, part.T @ left.values[rows]
+        v, b = part.T @ part - seen.T @ seen, part.T @ left.basis[rows]
         kv, kb, kz = (v, b, z) if kernel is None else (kernel @ v, kernel @ b, kernel @ z)
         kv2 = kv @ kv
         value += float(z @ kz)
@@ -285,28 +269,26 @@ def _value_and_traces(left: Residuals, form: Form) -> tuple[float, tuple[float, 
     )
 
 
-def _value_and_traces_by_pose(
-    left: Residuals, kernels: Sequence[Float[np.ndarray, "_ _ _"] | None]
-) -> tuple[float, tuple[float, float, float]]:
+def _value_and_traces_by_pose(left: Residuals, kernels: Kernels) -> tuple[float, tuple[float, float, float]]:
     """r'A r, and the traces of the first powers of MA, with M = I - Q Q' and the columns Q of all unknowns.
 
     With G_k = Q' A^k Q, tr (MA)^2 = tr A^2 - 2 tr G_2 + tr G_1^2, and tr (MA)^3 = tr A^3 - 3 tr G_3 + 3 tr G_1 G_2 -
     tr G_1^3. Q is [O B] with the parts' own columns O, of which those of different parts do not meet in G.
     """
-    size = left.basis.shape[1]
-    shared = np.zeros((3, size, size))  # B' A^k B
-    mixed = np.zeros((size, size))  # B' A O O' A B
+    width = left.basis.shape[1]
+    shared = np.zeros((3, width, width))  # B' A^k B
+    mixed = np.zeros((width, width))  # B' A O O' A B
     value = one = two = three = 0.0
-    for rows, own, kernel in zip(left.slices, left.own, kernels, strict=True):
+    for rows, own, kernel in zip(left.slices, left.own, kernels, strict=False):
         if kernel is None:
             continue
-        poses, each = kernel.shape[:2]
+        poses, size = kernel.shape[:2]
         k2 = kernel @ kernel
-        r, basis = left.values[rows].reshape(poses, each), left.basis[rows]
-        o = own.reshape(poses, each, -1)
+        r, basis = left.values[rows].reshape(poses, size), left.basis[rows]
+        o = own.reshape(poses, size, -1)
         value += float(np.einsum("ma,mab,mb->", r, kernel, r))
         ko, k2o = (kernel @ o).reshape(own.shape), (k2 @ o).reshape(own.shape)
-        kb, k2b = ((k @ basis.reshape(poses, each, -1)).reshape(basis.shape) for k in (kernel, k2))
+        kb, k2b = ((k @ basis.reshape(poses, size, -1)).reshape(basis.shape) for k in (kernel, k2))
         shared += np.stack([basis.T @ kb, basis.T @ k2b, kb.T @ k2b])
         d1, d2, d3, e1, e2 = own.T @ ko, own.T @ k2o, ko.T @ k2o, own.T @ kb, own.T @ k2b
         mixed += e1.T @ e1

@@ -33,7 +33,7 @@ from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import EXACT, PRIOR, Rows, lengths_in_solve, residual_rms
 from .findings import Case
 from .random_effects import NULL, Effects, Moments, OneVariance, group_deviations, one_variance, second_moments
-from .residual_tests import block_diagonal, form_of_poses, form_test, score_tests
+from .residual_tests import block_diagonal, form_test, score_tests
 from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
@@ -220,7 +220,7 @@ def _visits(problem: SharedProblem) -> _Tips:
     nothing = _Tips(VISITS if capture.visits is not None else SUCCESSIVE, 1.0, [])
     if not any(np.any(matrix) for matrix in kernel):
         return nothing
-    probability = form_test(problem.left, form_of_poses(problem.left, columns, kernel), relative).probability
+    probability = form_test(problem.left, columns, kernel, relative).probability
     if not probability < _GATE:
         return nothing
     if capture.visits is not None:
@@ -363,4 +363,4 @@ def _neighbours(problem: SharedProblem) -> float:
         columns.append(block_diagonal(each.by_tip))
         kernel.append(np.kron(np.exp(-distance / _NEIGHBOURS) - np.eye(len(own)), np.eye(3)))
     relative = problem.record.given_noise is None
-    return form_test(problem.left, form_of_poses(problem.left, columns, kernel), relative).probability
+    return form_test(problem.left, columns, kernel, relative).probability

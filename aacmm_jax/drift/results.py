@@ -162,8 +162,7 @@ def _of_each(drift: Drift) -> str:
     if not len(moved):
         return f"{start}."
     worst = sorted(moved, key=lambda i: -abs(drift.change[i]) / drift.expanded[i])
-    each = [_moved(drift, int(i)) for i in worst]
-    return f"{start}: {shorten(each)}."
+    return f"{start}: {shorten([_moved(drift, int(i)) for i in worst])}."
 
 
 def _moved(drift: Drift, i: int) -> str:

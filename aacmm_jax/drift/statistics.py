@@ -1,7 +1,7 @@
 """Statistics of the change between two calibrations: its uncertainty, a test of all parameters together, lengths."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -105,37 +105,35 @@ def joint_test(
     tested = tuple(names[i] for i in chosen)
     if not tested:
         return JointTest(math.nan, 0, math.inf, math.nan, (), ())
-    records = (old, new)
-    steps = np.where([is_length(name) for name in tested], 1.0, 1e-3)  # the units of the projectors: `Parameters.scale`
-    rows = [[record.names.index(name) for name in tested] for record in records]
-    open_directions = np.concatenate([record.open[own] for record, own in zip(records, rows, strict=True)], axis=1)
-    left, size, _ = np.linalg.svd(open_directions)
+    steps = _steps(tested)  # the units of the projectors: `Parameters.scale`
+    rows = [(record, [record.names.index(name) for name in tested]) for record in (old, new)]
+    left, size, _ = np.linalg.svd(np.concatenate([record.open[index] for record, index in rows], axis=1))
     determined = left[:, int(np.sum(size > _OPEN)) :]
     moved = determined.T @ (change[chosen] / steps)
-    covariances = [
-        determined.T @ (record.covariance[np.ix_(own, own)] / np.outer(steps, steps)) @ determined
-        for record, own in zip(records, rows, strict=True)
-    ]
+    covariance = sum(record.covariance[np.ix_(index, index)] for record, index in rows) / np.outer(steps, steps)
+    covariance = determined.T @ covariance @ determined
     # Scaled by each combination's own uncertainty, so that eigenvalues are comparable.
-    u = np.sqrt(np.diag(covariances[0] + covariances[1]))
+    u = np.sqrt(np.diag(covariance))
     u = np.where(u > 0, u, 1.0)
-    values, vectors = np.linalg.eigh((covariances[0] + covariances[1]) / np.outer(u, u))
+    values, vectors = np.linalg.eigh(covariance / np.outer(u, u))
     regular = values > _SINGULAR * values[-1] if len(values) else np.zeros(0, dtype=bool)
-    root = vectors[:, regular] / np.sqrt(values[regular]) / u[:, None]
+    root = vectors[:, regular] / np.sqrt(values[regular]) / u[:, None]  # root root^T = C^+ on what is determined
     rank = int(regular.sum())
     whitened = root.T @ moved
     statistic = float(np.sum(whitened**2))
+    # Welch and Satterthwaite of the trace: with whitened parts P_k of the covariance, sum over P_k of the identity,
+    # rank / nu = sum_k |P_k|^2 / nu_k, where |.| is the Frobenius norm.
     combined = determined @ root / steps[:, None]
     denominator = sum(
-        float(np.sum((combined.T @ matrix[np.ix_(own, own)] @ combined) ** 2)) / freedom
-        for record, own in zip(records, rows, strict=True)
+        float(np.sum((combined.T @ matrix[np.ix_(index, index)] @ combined) ** 2)) / freedom
+        for record, index in rows
         for matrix, freedom in _parts_of(record)
     )
-    spare = rank / denominator if denominator > 0 else math.inf
+    freedom = rank / denominator if denominator > 0 else math.inf
     robust = "robust" in (old.noise_model, new.noise_model)
 
     def probability(remaining: float, fitted: int) -> float:
-        return _probability(remaining, rank - fitted, spare, robust)
+        return _probability(remaining, rank - fitted, freedom, robust)
 
     columns = root.T @ determined.T  # whitened change for a change of each parameter by one step
     causes = _causes(whitened, columns, lambda remaining, fitted: probability(remaining, fitted) >= 1 - level)
@@ -145,15 +143,21 @@ def joint_test(
     if p < 1 - level:
         of_probe = columns @ (_changes_of_probe(new, tested) / steps[:, None])
         probe = _probe_test(whitened, of_probe, columns, probability)
-    return JointTest(statistic, rank, spare, p, tested, named, probe)
+    return JointTest(statistic, rank, freedom, p, tested, named, probe)
+
+
+def _steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
+    """Changes of parameters that are comparable: 1 mm and 1 mrad."""
+    return np.where([is_length(name) for name in names], 1.0, 1e-3)
 
 
 def _parts_of(record: CalibrationRecord) -> list[tuple[Float[np.ndarray, "p p"], float]]:
     """Parts of the covariance of a calibration's parameters, each with its degrees of freedom."""
     uncertainty = uncertainty_of(record)
     others = [] if uncertainty.components is None else list(np.asarray(uncertainty.components.matrices))
-    each = degrees_of_freedom(np.eye(1 + len(others)), uncertainty.law)
-    return list(zip([record.covariance - sum(others, np.zeros_like(record.covariance)), *others], each, strict=True))
+    freedom = degrees_of_freedom(np.eye(1 + len(others)), uncertainty.law)
+    scatter = record.covariance - sum(others, np.zeros_like(record.covariance))
+    return list(zip([scatter, *others], freedom, strict=True))
 
 
 def _changes_of_probe(record: CalibrationRecord, names: tuple[str, ...]) -> Float[np.ndarray, "p 3"]:
@@ -165,15 +169,14 @@ def _changes_of_probe(record: CalibrationRecord, names: tuple[str, ...]) -> Floa
     q = q[np.unique(np.linspace(0, len(q) - 1, _PROBE_POSES).astype(int))]
     every = (*names, *(name for name in PROBE if name not in names))
     by = np.moveaxis(np.asarray(arm.jacobian(q, every)), -1, 0).reshape(len(every), -1).T
-    steps = np.where([is_length(name) for name in names], 1.0, 1e-3)
-    found = np.zeros((len(names), 3))
+    steps, changes = _steps(names), np.zeros((len(names), 3))
     for i, name in enumerate(PROBE):
         if name in names:
-            found[names.index(name), i] = 1.0
+            changes[names.index(name), i] = 1.0
         else:
             alike = np.linalg.lstsq(by[:, : len(names)] * steps, by[:, every.index(name)], rcond=1e-6)[0]
-            found[:, i] = alike * steps
-    return found
+            changes[:, i] = alike * steps
+    return changes
 
 
 def _probe_test(
@@ -189,20 +192,20 @@ def _probe_test(
     """
 
     def left_by(which: Float[np.ndarray, "r k"]) -> tuple[float, int, np.ndarray]:
-        factors, _, known, _ = np.linalg.lstsq(which, whitened, rcond=1e-9)
-        return float(np.sum((whitened - which @ factors) ** 2)), int(known), factors
+        factors, _, rank, _ = np.linalg.lstsq(which, whitened, rcond=1e-9)
+        return float(np.sum((whitened - which @ factors) ** 2)), int(rank), factors
 
     total = float(np.sum(whitened**2))
-    left, known, factors = left_by(of_probe)
-    spare = len(whitened) - known
-    if known == 0 or spare < 1:
+    left, fitted, factors = left_by(of_probe)
+    redundancy = len(whitened) - fitted
+    if fitted == 0 or redundancy < 1:
         return None
     others = min(left_by(columns[:, [i]])[0] for i in range(columns.shape[1]))
-    ratio = (total - left) / known / max(left / spare, 1e-300)
-    significant = f_tail(ratio, known, spare) < _REMOUNTED_LEVEL
+    ratio = (total - left) / fitted / max(left / redundancy, 1e-300)
+    significant = f_tail(ratio, fitted, redundancy) < _REMOUNTED_LEVEL
     remounted = significant and total - left > _REMOUNTED_SHARE * total and left < others
     change = tuple(zip(PROBE, map(float, factors), strict=True))
-    return ProbeTest(left, spare, probability(left, known), ratio, change, remounted)
+    return ProbeTest(left, redundancy, probability(left, fitted), ratio, change, remounted)
 
 
 def _causes(
@@ -219,10 +222,10 @@ def _causes(
             return []
         # By how much each column, orthogonal to those already chosen, would reduce the remainder.
         basis = np.linalg.qr(columns[:, chosen])[0]
-        spare = columns - basis @ (basis.T @ columns)
-        size = np.linalg.norm(spare, axis=0)
+        across = columns - basis @ (basis.T @ columns)
+        size = np.linalg.norm(across, axis=0)
         usable = size > 1e-6 * np.linalg.norm(columns, axis=0)
-        reduction = np.where(usable, np.abs(spare.T @ left) / np.where(usable, size, 1.0), -1.0)
+        reduction = np.where(usable, np.abs(across.T @ left) / np.where(usable, size, 1.0), -1.0)
         chosen.append(int(np.argmax(reduction)))
         factors = np.linalg.lstsq(columns[:, chosen], whitened, rcond=None)[0]
         left = whitened - columns[:, chosen] @ factors
@@ -240,10 +243,11 @@ def _probability(statistic: float, rank: int, degrees_of_freedom: float, robust:
         return math.nan
     if math.isinf(degrees_of_freedom):
         return chi_square_tail(statistic, rank)
-    spare = degrees_of_freedom - rank + 1 if robust else degrees_of_freedom
-    if spare < 1:
+    # Hotelling: T^2 (nu - r + 1) / (nu r) follows F with r and nu - r + 1 degrees of freedom.
+    second = degrees_of_freedom - rank + 1 if robust else degrees_of_freedom
+    if second < 1:
         return math.nan
-    return f_tail(statistic / rank * spare / degrees_of_freedom, rank, spare)
+    return f_tail(statistic / rank * second / degrees_of_freedom, rank, second)
 
 
 def length_change(
@@ -251,21 +255,22 @@ def length_change(
 ) -> LengthChange:
     """Change of ``lengths``: their length, mm, and the configurations at both ends (``(v, n)`` each)."""
     length, start, end = lengths
-    both = [uncertainty_of(record) for record in (old, new)]
-    (before, *of_old), (after, *of_new) = ([np.asarray(part) for part in _measured(one, start, end)] for one in both)
-    law = both[0].law.joined(both[1].law)
-    each, mean = (np.concatenate(pair, axis=-1) for pair in zip(of_old, of_new, strict=True))
-    u, u_scale_change = np.sqrt(each.sum(axis=-1)), float(np.sqrt(mean.sum()) / np.mean(before))
+    uncertainties = [uncertainty_of(record) for record in (old, new)]
+    measured = [tuple(np.asarray(part) for part in _measured(item, start, end)) for item in uncertainties]
+    (before, *parts_before), (after, *parts_after) = measured
+    law = uncertainties[0].law.joined(uncertainties[1].law)
+    parts, of_mean = (np.concatenate(pair, axis=-1) for pair in zip(parts_before, parts_after, strict=True))
+    u, u_scale_change = np.sqrt(parts.sum(axis=-1)), float(np.sqrt(of_mean.sum()) / np.mean(before))
     return LengthChange(
         length=length,
         q=start,
         q_end=end,
         change=after - before,
         u=u,
-        expanded=coverage_factor(level, each, law) * u,
+        expanded=coverage_factor(level, parts, law) * u,
         scale_change=float(np.mean(after - before) / np.mean(before)),
         u_scale_change=u_scale_change,
-        expanded_scale_change=float(coverage_factor(level, mean, law)) * u_scale_change,
+        expanded_scale_change=float(coverage_factor(level, of_mean, law)) * u_scale_change,
     )
 
 

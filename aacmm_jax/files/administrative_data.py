@@ -20,10 +20,10 @@ _NOT_IN_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010fff
 
 def held_by_xml(text: str, what: str) -> str:
     """The same text, or `InputError` where it has a character that XML 1.0 cannot hold; ``what`` names the text."""
-    found = _NOT_IN_XML.search(text)
-    if found:
+    character = _NOT_IN_XML.search(text)
+    if character:
         raise InputError(
-            f"{what} holds the character U+{ord(found.group()):04X}, which no XML file can hold; take it out."
+            f"{what} holds the character U+{ord(character.group()):04X}, which no XML file can hold; take it out."
         )
     return text
 
@@ -41,7 +41,7 @@ Text = Annotated[str, AfterValidator(_text)]
 
 def _country(code: str) -> str:
     if not re.fullmatch("[A-Z]{2}", code):
-        raise ValueError(f"{code!r} is no country code of ISO 3166-1; give two capital letters, for example DE.")
+        raise ValueError(f"{code!r} is not a country code of ISO 3166-1; give two capital letters, for example DE.")
     return code
 
 

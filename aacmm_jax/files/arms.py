@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.arrays import Numbers
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError, naming, nearest
 from ..core.text import printable
 from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture
@@ -136,10 +136,8 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
     arm, model = load_arm(source, base=base, tip=tip), _arm_file(_path_of(source))
     default = "measuring arm" if model is not None and model.urdf is None else "robot"
     table = NoiseTable() if model is None or model.noise is None else model.noise
-    try:
+    with naming(f"{source}: [noise]"):
         return table.noise(arm, default)
-    except InputError as error:
-        raise InputError(f"{source}: [noise] {error}") from error
 
 
 def usual_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise | None:
@@ -206,10 +204,8 @@ def read_arm(
     model = read_toml(path, ArmFile)
     if probe is not None and any(model.probe):
         raise InputError(f"{path} states the probe itself; change it there, or with arm.replace(probe=...).")
-    try:
+    with naming(path):
         return _specification(path, model, probe), model.identification is not None
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpecification:

@@ -19,17 +19,17 @@ from ..uncertainty.shared_errors import SharedErrors
 from . import schema
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
-from .records import record_in, rows_in, rows_table, table_of, values_in
+from .records import Within, records_within, rows_in, rows_table, table_of, tables_within, values_in
 from .sense import read_checked
 
-# Records within the record that are a table each: their fields, and of many in rows, the dimension.
-_RECORDS: dict[str, tuple[str, type, schema.Fields, str]] = {
-    "others": ("other_poses", OtherPoses, schema.OTHER_POSES, ""),
-    "prior": ("prior", PriorMetrics, schema.PRIOR, ""),
-    "shared": ("shared_errors", SharedErrors, schema.SHARED_ERRORS, ""),
-    "components": ("components", Components, schema.COMPONENTS, ""),
-    "removed": ("removed", Removed, schema.REMOVED, "removed_group"),
-    "noisy_encoders": ("noisy_encoders", NoisyEncoder, schema.NOISY_ENCODERS, "noisy_encoder"),
+# Records within the record that are a table each.
+_RECORDS = {
+    "others": Within("other_poses", OtherPoses, schema.OTHER_POSES),
+    "prior": Within("prior", PriorMetrics, schema.PRIOR),
+    "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
+    "components": Within("components", Components, schema.COMPONENTS),
+    "removed": Within("removed", Removed, schema.REMOVED, "removed_group"),
+    "noisy_encoders": Within("noisy_encoders", NoisyEncoder, schema.NOISY_ENCODERS, "noisy_encoder"),
 }
 
 
@@ -97,7 +97,7 @@ def save_calibration(
     if record.sampled is not None:
         tables["monte_carlo"] = table_of(_Sampled(**record.sampled), schema.SAMPLED)
     tables |= _observed_tables(record.observed, Observed.of(record.recording.capture, None).blocks)
-    tables |= tables_of_records(record, _RECORDS)
+    tables |= tables_within(record, _RECORDS)
     write_tables(path, "calibration", tables, recording_attributes(record.recording), summary=summary)
 
 
@@ -131,32 +131,11 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
             observed=_observed_of(path, stored, recording.capture),
             sampled=None if sampled is None else {name: sampled[name] for name in schema.SAMPLED},
             validation=None if groups is None else CrossValidation(rows_in(LeftOut, schema.LEFT_OUT, "group", groups)),
-            **records_of_tables(stored, _RECORDS),
+            **records_within(stored.tables, _RECORDS),
             **values_in(CalibrationRecord, schema.CALIBRATION, table, table.attributes),
         )
         check_sense(path, {"the noise model is unknown": record.noise_model not in NOISE_MODELS})
         return record
-
-
-def tables_of_records(record: Any, kinds: Mapping[str, tuple[str, type, schema.Fields, str]]) -> dict[str, Table]:
-    """Tables of the records within a record, those that there are."""
-    present = {field: getattr(record, field) for field in kinds if getattr(record, field)}
-    return {
-        kinds[field][0]: rows_table(kinds[field][3], value, kinds[field][2])
-        if kinds[field][3]
-        else table_of(value, kinds[field][2])
-        for field, value in present.items()
-    }
-
-
-def records_of_tables(stored: Stored, kinds: Mapping[str, tuple[str, type, schema.Fields, str]]) -> dict[str, Any]:
-    """What `tables_of_records` stored, by field."""
-    return {
-        field: rows_in(cls, fields, dimension, stored.tables.get(name))
-        if dimension
-        else record_in(cls, fields, stored.tables.get(name))
-        for field, (name, cls, fields, dimension) in kinds.items()
-    }
 
 
 def _parameter_table(record: CalibrationRecord) -> Table:

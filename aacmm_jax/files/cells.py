@@ -3,6 +3,7 @@
 The collision shapes of a URDF are each within one capsule; of meshes, the vertices alone are read.
 """
 
+import contextlib
 import math
 import os
 import re
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat
 
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
 from ..kinematics.body import Body, body_along_links, segment_distance
 from ..kinematics.collisions import Box, Cell, HalfSpace, Obstacle, Post, check_obstacle
@@ -114,14 +115,10 @@ def load_cell(
         ('shoulder', 'upper_arm', 'forearm') ['table'] 20.0
     """
     content = _CellFile() if file is None else read_toml(file, _CellFile)
-    try:
+    with contextlib.nullcontext() if file is None else naming(file):
         obstacles = _obstacles(content)
         stated = content.body.radius if radius is None else radius
         body, notes = _body(arm, base, tip, stated, content.body.tool_radius)
-    except InputError as error:
-        if file is None:
-            raise
-        raise InputError(f"{file}: {error}") from error
     return LoadedCell(Cell(body, obstacles, content.clearance), notes)
 
 

@@ -91,7 +91,7 @@ def dh_table(
         f"{i},{_row((*joint, *link))}" for i, (joint, link) in enumerate(zip(joints, links, strict=True), start=1)
     ]
     if arm.corrections is not None:
-        lines.append("# coefficients of joint corrections, which are no Denavit-Hartenberg parameters:")
+        lines.append("# coefficients of joint corrections, which are not Denavit-Hartenberg parameters:")
         coefficients = ((name, float(value_of(arm, name))) for name in correction_names(arm))
         lines += [f"# {name} = {value!r} {parameter_unit(arm, name)}" for name, value in coefficients if value != 0]
     return "\n".join(lines) + "\n"
@@ -113,8 +113,8 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
         InputError: The arms or the readings have other numbers of joints.
 
     Example:
-        >>> found = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))
-        >>> print(f"{found.rms_nominal:.2f} mm without offsets, {found.rms:.2f} mm with them")
+        >>> zeros = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))
+        >>> print(f"{zeros.rms_nominal:.2f} mm without offsets, {zeros.rms:.2f} mm with them")
         1.92 mm without offsets, 1.48 mm with them
     """
     nominal, calibrated = single(nominal), single(calibrated)
@@ -147,29 +147,29 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
     )
 
 
-def zero_offsets_csv(found: ZeroOffsets) -> str:
+def zero_offsets_csv(zeros: ZeroOffsets) -> str:
     """Zero offsets as CSV, with the error that remains in comments.
 
     Args:
-        found: The offsets, from `zero_offsets`; rad, or mm of prismatic joints.
+        zeros: The offsets, from `zero_offsets`; rad, or mm of prismatic joints.
 
     Example:
-        >>> found = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))
-        >>> print(aj.files.zero_offsets_csv(found).splitlines()[0])
+        >>> zeros = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))
+        >>> print(aj.files.zero_offsets_csv(zeros).splitlines()[0])
         # To be added to the joint readings of the nominal arm.
     """
     lines = [
         "# To be added to the joint readings of the nominal arm.",
-        f"# Distance of the tip from the calibrated arm's: RMS {found.rms:.4f} mm, largest {found.largest:.4f} mm; RMS",
-        f"# {found.rms_nominal:.4f} mm without the offsets. Tip in the last frame: {_row(found.probe, ' ')} mm.",
+        f"# Distance of the tip from the calibrated arm's: RMS {zeros.rms:.4f} mm, largest {zeros.largest:.4f} mm; RMS",
+        f"# {zeros.rms_nominal:.4f} mm without the offsets. Tip in the last frame: {_row(zeros.probe, ' ')} mm.",
     ]
-    if "mm" in found.units:
+    if "mm" in zeros.units:
         lines.append("joint,offset_deg,offset_rad,offset_mm")
     else:
         lines.append("joint,offset_deg,offset_rad")
-    for i, (offset, unit) in enumerate(zip(found.offsets, found.units, strict=True), start=1):
+    for i, (offset, unit) in enumerate(zip(zeros.offsets, zeros.units, strict=True), start=1):
         slide = f",,{_row((offset,))}" if unit == "mm" else None
-        angle = _row((offset / DEG, offset)) + ("," if "mm" in found.units else "")
+        angle = _row((offset / DEG, offset)) + ("," if "mm" in zeros.units else "")
         lines.append(f"{i},{angle if slide is None else slide}")
     return "\n".join(lines) + "\n"
 

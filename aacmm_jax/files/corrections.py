@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tomlkit.items import Table as TomlTable
 
 _Vector = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-_KINDS = ("alpha", "a", "d", "theta", "beta")
+_KINDS = ("alpha", "a", "d", "theta", "beta", "probe")
 _LENGTHS = ("a", "d", "probe")
 
 
@@ -37,7 +37,7 @@ class CorrectionsTable(Strict):
             raise ValueError("give either model, such as 'gravity,harmonics=1', or coefficients by name.")
         if self.nominal and not self.coefficients:
             raise ValueError("nominal is of coefficients; leave it out of a model.")
-        unknown = set(self.nominal) - {*_KINDS, "probe"}
+        unknown = set(self.nominal) - {*_KINDS}
         if unknown:
             raise ValueError(f"nominal has no '{min(unknown)}'; it has lists of alpha, a, d, theta, beta, and probe.")
         return self
@@ -48,11 +48,9 @@ class CorrectionsTable(Strict):
         options: dict[str, Any] = {"mass": self.mass, "centre": centre, "gravity": self.gravity}
         if self.model is not None:
             return with_corrections(arm, self.model, **options)
-        units = {kind: length if kind in _LENGTHS else angle for kind in (*_KINDS, "probe")}
-        nominal = arm.replace(**{kind: units[kind] * np.array(row) for kind, row in self.nominal.items()})
-        corrected = with_corrections(nominal, self.coefficients, **options)
-        values = {"coefficients": list(self.coefficients.values()), "gravity": self.gravity}
-        return corrected_like(corrected, arm).replace(**values)
+        units = {kind: length if kind in _LENGTHS else angle for kind in _KINDS}
+        nominal = {kind: units[kind] * np.array(row) for kind, row in self.nominal.items()}
+        return _rebuilt(arm, self.coefficients, nominal, options)
 
 
 def corrections_toml(arm: Arm) -> "TomlTable":
@@ -100,16 +98,21 @@ def corrected_of(arm: Arm, arrays: Mapping[str, np.ndarray]) -> Arm:
     """The arm with the corrections of its table in an HDF5 file, if it has any."""
     if "coefficients" not in arrays:
         return arm
-    nominal = arm.replace(
-        **{kind: arrays[f"nominal_{kind}"] for kind in (*_KINDS, "probe") if f"nominal_{kind}" in arrays}
-    )
-    names = [str(name) for name in arrays["coefficient"]]
-    corrected = corrected_like(
-        with_corrections(nominal, names, mass=arrays.get("mass"), centre=arrays.get("centre")), arm
-    )
-    return corrected.replace(coefficients=arrays["coefficients"], gravity=arrays["gravity"])
+    nominal = {kind: arrays[f"nominal_{kind}"] for kind in _KINDS if f"nominal_{kind}" in arrays}
+    coefficients = dict(zip(map(str, arrays["coefficient"]), arrays["coefficients"], strict=True))
+    options = {key: arrays.get(key) for key in ("mass", "centre", "gravity")}
+    return _rebuilt(arm, coefficients, nominal, options)
+
+
+def _rebuilt(
+    arm: Arm, coefficients: Mapping[str, float], nominal: Mapping[str, np.ndarray], options: Mapping[str, Any]
+) -> Arm:
+    """The arm with coefficients of functions that are of another, nominal, arm."""
+    corrected = with_corrections(arm.replace(**nominal), list(coefficients), **options)
+    values = np.array(list(coefficients.values()), dtype=float)
+    return corrected_like(corrected, arm).replace(coefficients=values, gravity=options["gravity"])
 
 
 def _arrays(geometry: Geometry) -> dict[str, Float[np.ndarray, "..."]]:
-    arrays = {kind: getattr(geometry, kind) for kind in (*_KINDS, "probe")}
+    arrays = {kind: getattr(geometry, kind) for kind in _KINDS}
     return {kind: np.asarray(values) for kind, values in arrays.items() if values is not None}

@@ -29,8 +29,13 @@ from .captures import (
     spheres_of,
 )
 from .hdf5 import StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
-from .records import record_in, rows_table, table_of, values_in
+from .records import Within, records_within, rows_table, table_of, tables_within, values_in
 from .sense import read_checked
+
+_RECORDS = {
+    "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
+    "components": Within("components", Components, schema.COMPONENTS),
+}
 
 
 def save_evaluation(
@@ -58,10 +63,7 @@ def save_evaluation(
     uncertainty = record.uncertainty
     if uncertainty is not None:
         tables["uncertainty"] = table_of(uncertainty, schema.UNCERTAINTY)
-        if uncertainty.shared is not None:
-            tables["shared_errors"] = table_of(uncertainty.shared, schema.SHARED_ERRORS)
-        if uncertainty.components is not None:
-            tables["components"] = table_of(uncertainty.components, schema.COMPONENTS)
+        tables |= tables_within(uncertainty, _RECORDS)
     write_tables(path, "evaluation", tables, recording_attributes(record.recording), summary=summary)
 
 
@@ -122,8 +124,7 @@ def load_evaluation(path: str | os.PathLike) -> EvaluationRecord:
             uncertainty = Uncertainty(
                 arm=calibrated.arm,
                 u_k=None,
-                shared=record_in(SharedErrors, schema.SHARED_ERRORS, stored.tables.get("shared_errors")),
-                components=record_in(Components, schema.COMPONENTS, stored.tables.get("components")),
+                **records_within(stored.tables, _RECORDS),
                 **parameters,
             )
         return EvaluationRecord(recording_of(path, stored), calibrated, uncertainty=uncertainty, **values)

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from ..acceptance.standards import Standard
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings
 from ..data.joined_captures import join_sessions
@@ -208,7 +208,7 @@ def readings_of_manifest(path: str | os.PathLike) -> Readings:
 def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
     model = read_toml(manifest := InputFile(path), _Manifest)
     path = as_path(path)
-    try:
+    with naming(path):
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
         files = InputFiles(manifest, TABLE_SHARE)
@@ -248,8 +248,6 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
             usual=usual_noise(arm, base=model.base, tip=model.tip),
         )
         return recording, readings
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 class Seated(NamedTuple):

@@ -72,7 +72,7 @@ PRESETS = {
 def _rotation(text: str) -> str:
     if text not in NUMBERS_OF_ROTATION and not _EULER.fullmatch(text):
         raise ValueError(
-            f"'{text}' is no convention of rotations; give {', '.join(NUMBERS_OF_ROTATION)}, or three axes such as "
+            f"'{text}' is not a convention of rotations; give {', '.join(NUMBERS_OF_ROTATION)}, or three axes such as "
             "XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx)."
         )
     return text

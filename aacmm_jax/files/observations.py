@@ -2,13 +2,16 @@
 
 import os
 from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from ..core.errors import InputError
+from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
-from .hdf5 import Stored, StoredTable, Table, Variable
+from .hdf5 import Stored, StoredTable, Table
+from .records import Field, attribute_name, table_of
 from .temperatures import reading_variables, readings_of
 
 _PREFIX = "observation_"
@@ -24,25 +27,18 @@ def observation_tables(observations: Iterable[AbstractObservation], joints: int,
 
 
 def _table(observation: AbstractObservation, joints: int, unit: str) -> Table:
-    variables: dict[str, Variable] = {}
-    attributes: dict[str, Any] = {"kind": observation.kind, "name": observation.name}
     stored = observation.stored()
-    for entry in observation.entries:
-        if entry.name not in stored:
-            continue
-        value = np.asarray(stored[entry.name])
-        if not entry.dimensions:
-            attributes[_attribute(entry.name, entry.unit)] = value.item()
-            continue
-        if entry.name == "q":
-            variables |= reading_variables(entry.name, value, joints, unit)
-            continue
-        variables[entry.name] = Variable(entry.dimensions, value, entry.unit, entry.says)
-    return Table(variables, attributes)
+    q = stored.pop("q", None)
+    fields = {entry.name: _field(entry) for entry in observation.entries if entry.name in stored}
+    table = table_of(SimpleNamespace(**stored), fields)
+    readings = {} if q is None else reading_variables("q", np.asarray(q), joints, unit)
+    attributes = {"kind": observation.kind, "name": observation.name} | dict(table.attributes)
+    return Table(readings | table.variables, attributes)
 
 
-def _attribute(name: str, unit: str) -> str:
-    return f"{name}_{unit}" if unit else name
+def _field(entry: Entry) -> Field:
+    content = "number" if entry.content == "points" else entry.content
+    return Field(entry.says, entry.unit, entry.dimensions, content)
 
 
 def observations_of(path: str | os.PathLike, stored: Stored) -> list[AbstractObservation]:
@@ -62,9 +58,10 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
         )
     values: dict[str, Any] = {}
     for entry in kind.entries:
-        source, name = (table, entry.name) if entry.dimensions else (attributes, _attribute(entry.name, entry.unit))
-        if entry.name == "q" and entry.name in table:
-            values[entry.name] = readings_of(table, entry.name)
+        name = entry.name if entry.dimensions else attribute_name(entry.name, _field(entry))
+        source = table if entry.dimensions else attributes
+        if entry.name == "q" and name in table:
+            values[name] = readings_of(table, name)
         elif entry.required or name in source:
             value = source[name]
             values[entry.name] = value.astype(str) if entry.dimensions and entry.content == "text" else value

@@ -138,10 +138,10 @@ def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any
         value, says = stored.get(entry.name), f"{entry.unit}: {entry.says}"
         if value is None or entry.name == "q" or entry is label:
             continue
-        if not entry.dimensions and entry.content == "number":
-            table[entry.name] = round(float(np.asarray(value)), 9), says
-        elif not entry.dimensions:
+        if not entry.dimensions and entry.content in ("text", "truth"):
             table |= {entry.name: str(value) if entry.content == "text" else True} if value else {}
+        elif not entry.dimensions:
+            table[entry.name] = round(float(np.asarray(value)), 9), says
         elif entry.dimensions[0] == "pose" and entry.required:
             # A rotation is recorded as a quaternion.
             count = 4 if entry.unit == "1" else 3 ** (len(entry.dimensions) - 1)

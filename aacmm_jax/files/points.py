@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from ..acceptance.results import Measured
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError, naming, nearest
 from ..core.text import quoted
 from ..core.units import LENGTH_UNITS
 from ..kinematics.workspace import Reach
@@ -51,7 +51,7 @@ def read_points(path: str | os.PathLike) -> Measured:
     """
     path = as_path(path)
     model = read_toml(manifest := InputFile(path), PointsManifest)
-    try:
+    with naming(path):
         files = InputFiles(manifest, TABLE_SHARE)
 
         def points(text: TextTable, wanted: Wanted) -> np.ndarray:
@@ -78,8 +78,6 @@ def read_points(path: str | os.PathLike) -> Measured:
             measured=str(model.date or ""),
             measuring_range=model.points.measuring_range,
         )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _points(text: TextTable, wanted: Wanted, model: PointsManifest) -> np.ndarray:

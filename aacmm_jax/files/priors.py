@@ -40,9 +40,9 @@ class PriorTable(Strict):
             names = possible_names(arm)
             return {group: value * factors.get(unit_of_group(group, names), 1.0) for group, value in values.items()}
 
-        found = Prior(converted(self.sd), mean=converted(self.mean), learn=self.learn)
-        found.check(arm)
-        return found
+        prior = Prior(converted(self.sd), mean=converted(self.mean), learn=self.learn)
+        prior.check(arm)
+        return prior
 
 
 def prior_toml(prior: Prior) -> dict[str, Any]:
@@ -76,21 +76,21 @@ def prior_of_text(text: str, arm: Arm) -> Prior | None:
         if value == _LEARN:
             learn.append(group)
             continue
-        found = _VALUE.fullmatch(value)
+        match = _VALUE.fullmatch(value)
         unit = unit_of_group(group, possible_names(arm))
         factors = {} if unit == MIXED else _UNITS.get(unit, {unit.removeprefix("1"): 1.0})
         try:
-            if found is None or found["unit"] not in factors:
+            if match is None or match["unit"] not in factors:
                 raise ValueError(value)
-            sd[group] = number(found["sd"]) * factors[found["unit"]]
-            if found["mean"] is not None:
-                mean[group] = number(found["mean"]) * factors[found["unit"]]
+            sd[group] = number(match["sd"]) * factors[match["unit"]]
+            if match["mean"] is not None:
+                mean[group] = number(match["mean"]) * factors[match["unit"]]
         except ValueError as error:
             units = ", ".join(factors) or "one unit for lengths and one for angles, in groups of their own"
             raise InputError(
                 f"--prior '{part}' is not of the form GROUP=NUMBER and unit ({units}), GROUP=MEAN+-NUMBER and unit, or "
                 "GROUP=learn."
             ) from error
-    found = Prior(sd, mean=mean, learn=learn)
-    found.check(arm)
-    return found
+    prior = Prior(sd, mean=mean, learn=learn)
+    prior.check(arm)
+    return prior

@@ -64,7 +64,7 @@ def part(fields: Fields) -> Field:
     return Field("", fields=fields)
 
 
-def _attribute(name: str, field: Field) -> str:
+def attribute_name(name: str, field: Field) -> str:
     """What an attribute is called in a file: it has no unit of its own, but bears it in the name."""
     return field.name or (name if field.unit in ("", "1") else f"{name}_{field.unit}")
 
@@ -96,11 +96,11 @@ def table_of(record: Any, fields: Fields) -> Table:
             values = _array(value, field)
             variables[field.name or name] = Variable(field.dimensions, values, field.unit, field.says)
         elif field.content == "json":
-            attributes[_attribute(name, field)] = json.dumps(
+            attributes[attribute_name(name, field)] = json.dumps(
                 dict(value) if isinstance(value, Mapping) else value, default=float
             )
         else:
-            attributes[_attribute(name, field)] = sorted(value) if isinstance(value, frozenset) else value
+            attributes[attribute_name(name, field)] = sorted(value) if isinstance(value, frozenset) else value
     return Table(variables, attributes)
 
 
@@ -131,7 +131,7 @@ def values_in(cls: type, fields: Fields, arrays: Entries, attributes: Entries) -
         if field.fields is not None:
             values[name] = hint(**values_in(hint, field.fields, arrays, attributes))
             continue
-        source, key = (arrays, field.name or name) if field.dimensions else (attributes, _attribute(name, field))
+        source, key = (arrays, field.name or name) if field.dimensions else (attributes, attribute_name(name, field))
         value = source.get(key) if NoneType in get_args(hint) or not hints.get(name) else source[key]
         values[name] = json.loads(str(value)) if field.content == "json" else restored(hint, value)
     return values
@@ -148,6 +148,34 @@ def rows_in(cls: type, fields: Fields, dimension: str, table: StoredTable | None
         return ()
     size = len(next(table[field.name or name] for name, field in fields.items() if not field.dimensions))
     return tuple(cls(**row_values(cls, fields, dimension, table, i)) for i in range(size))
+
+
+class Within(NamedTuple):
+    """A record within a record, or many of them, as a table of its own; of many, each is a row of ``dimension``."""
+
+    table: str
+    cls: type
+    fields: Fields
+    dimension: str = ""
+
+
+def tables_within(record: Any, parts: Mapping[str, Within]) -> dict[str, Table]:
+    """Tables of the records that there are in fields of a record."""
+    tables = {}
+    for name, (table, _, fields, dimension) in parts.items():
+        value = getattr(record, name)
+        if value is not None and value != ():
+            tables[table] = rows_table(dimension, value, fields) if dimension else table_of(value, fields)
+    return tables
+
+
+def records_within(tables: Entries, parts: Mapping[str, Within]) -> dict[str, Any]:
+    """What `tables_within` stored, by field."""
+    records = {}
+    for name, (key, cls, fields, dimension) in parts.items():
+        table = tables.get(key)
+        records[name] = rows_in(cls, fields, dimension, table) if dimension else record_in(cls, fields, table)
+    return records
 
 
 def row_values(cls: type, fields: Fields, dimension: str, table: StoredTable, i: int) -> dict[str, Any]:
@@ -185,7 +213,7 @@ def check_fields(fields: Fields, arrays: Entries, attributes: Entries) -> None:
         key = field.name or name
         dimensions = (field.dimensions or ("row",)) if key in arrays else ()
         if not dimensions:
-            key = _attribute(name, field)
+            key = attribute_name(name, field)
         value = (arrays if dimensions else attributes).get(key)
         if value is None or field.content == "json" or (field.content == "text" and not (field.among or dimensions)):
             continue

@@ -16,8 +16,8 @@ _OF_JOINTS = re.compile("q|j|a|ax|axis|axes|achse|joints?|jnt|jpos|gelenk|theta|
 # Words in the names of other quantities that joints have.
 _OF_OTHERS = re.compile(
     "qd+|d+q|dtheta|vel|velocity|velocities|speed|acc|acceleration|tau|torques?|effort|moments?|force|currents?|"
-    "voltage|power|temp|temperatures?|error|err|mode|limit|min|max|std|sigma|u|control|output|contact|collision|brake|tcp|pose|"
-    "probe|direction"
+    "voltage|power|temp|temperatures?|error|err|mode|limit|min|max|std|sigma|u|control|output|contact|collision|brake|"
+    "tcp|pose|probe|direction"
 )
 # First words in the names of columns that hold no reading.
 _NO_JOINT = re.compile("[xyzt]|time|timestamp|date|stamp|index|row|point|socket|group|name|nr|no")

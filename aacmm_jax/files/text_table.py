@@ -322,7 +322,7 @@ class TextTable:
         if self._ended or self.length < _FEW or self.width - 1 not in picked:
             return
         cells = [row[-1].strip(" \t").replace(self._decimal, ".") for row in self._rows]
-        digits = [tuple(map(len, found.groups(""))) if (found := _DECIMALS.fullmatch(x)) else None for x in cells]
+        digits = [tuple(map(len, match.groups(""))) if (match := _DECIMALS.fullmatch(x)) else None for x in cells]
         if digits[-1] is not None and any(
             all(other is not None and last < other[part] for other in digits[:-1])
             for part, last in enumerate(digits[-1])

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arrays import Numbers
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..core.rotations import roll_pitch_yaw, roll_pitch_yaw_matrix
 from ..core.text import number, quoted
 from ..kinematics.arm import Arm, arm_of
@@ -47,7 +47,7 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
     joints, two revolutions.
     """
     file = InputFile(path)
-    try:
+    with naming(path):
         try:
             text = file.text
         except UnicodeDecodeError as error:
@@ -58,8 +58,6 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
         if probe is not None:
             arm = with_tool(arm, probe)
         return ArmSpecification(arm, os.path.splitext(os.path.basename(os.fspath(file)))[0])
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def ur_kinematics_yaml(arm: Arm) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.arrays import Numbers
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..core.rotations import roll_pitch_yaw
 from ..core.text import quoted, shorten
 from ..kinematics.arm import Arm, arm_of
@@ -104,7 +104,7 @@ def read_urdf(
     The arm is in the first D-H frame, which is the base link's frame where the first axis is its z axis.
     """
     file = InputFile(path)
-    try:
+    with naming(path):
         try:
             text = file.content.decode("utf-8")
         except UnicodeDecodeError as error:
@@ -114,8 +114,6 @@ def read_urdf(
         source = UrdfSource(text, base, _tip(robot, base, tip))
         arm = urdf_chain(source).arm
         return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def urdf_chain(source: UrdfSource) -> UrdfChain:

@@ -23,6 +23,7 @@ from .jacobian import tip_jacobian, tip_position
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
 _AXES = ("x", "y", "z")
+_BY_JOINT, _BY_TERM, _VECTOR = (Float[Array, shape] for shape in ("... joints", "... coefficients", "... 3"))
 DOWN = (0.0, 0.0, -1.0)
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
@@ -94,20 +95,20 @@ class Arm(eqx.Module):
     ):
         sizes: dict[str, int] = {}
 
-        def array(value: Numbers, what: str, shape: str = "... joints") -> Any:
-            return checked(value, Float[Array, shape], what, sizes)
+        def array(value: Numbers, what: str, kind: Any = _BY_JOINT) -> Any:
+            return checked(value, kind, what, sizes)
 
-        self.alpha = checked(alpha, Annotated[Float[Array, "... joints"], NOT_EMPTY], "alpha", sizes)
+        self.alpha = array(alpha, "alpha", Annotated[_BY_JOINT, NOT_EMPTY])
         self.a, self.d = array(a, "a"), array(d, "d")
         self.theta = array(np.zeros(self.alpha.shape) if theta is None else theta, "theta")
         self.beta = None if beta is None else array(beta, "beta")
-        self.probe = array(probe, "probe", "... 3")
+        self.probe = array(probe, "probe", _VECTOR)
         self.corrections, self.coefficients, self.gravity = corrections, None, None
         if corrections is not None:
             sizes["coefficients"] = len(corrections.functions.terms)
             given = np.zeros(sizes["coefficients"]) if coefficients is None else coefficients
-            self.coefficients = array(given, "coefficients", "... coefficients")
-            self.gravity = array(DOWN if gravity is None else gravity, "gravity", "... 3")
+            self.coefficients = array(given, "coefficients", _BY_TERM)
+            self.gravity = array(DOWN if gravity is None else gravity, "gravity", _VECTOR)
         elif coefficients is not None or gravity is not None:
             raise InputError("coefficients and gravity need an arm made by with_corrections().")
         kinds = ("alpha", "a", "d", "theta", "beta", "probe", "coefficients", "gravity")

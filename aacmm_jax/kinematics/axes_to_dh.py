@@ -206,6 +206,7 @@ def _to_axis(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"],
     if sine < NEARLY_PARALLEL:
         if not keep_point:
             point = point - point[2] / direction[2] * direction
+        # Hayati's form: no common normal, but the next frame at the point itself, d along z and a in the plane.
         d, a = float(point[2]), math.hypot(point[0], point[1])
         theta = math.atan2(point[1], point[0]) if a > _NO_LENGTH else 0.0
         if abs(theta) > math.pi / 2 + _NO_ANGLE:  # zero offsets of less than a quarter revolution, as tables have them
@@ -215,6 +216,7 @@ def _to_axis(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"],
         if abs(beta) < _NO_ANGLE:
             beta = 0.0
     else:
+        # The common normal ends on the next axis at the point that is nearest to z.
         foot = point - (point[:2] @ direction[:2]) / sine**2 * direction
         normal = np.array([-direction[1], direction[0]]) / sine
         d, a = float(foot[2]), float(foot[:2] @ normal)

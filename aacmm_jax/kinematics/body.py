@@ -15,7 +15,7 @@ from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from .arm import Arm
-from .chain import forward_pass, joint_motion
+from .chain import forward_pass, frame_axes, joint_motion
 
 _SHORTEST = 1e-6  # mm: shorter links have no capsule
 _NEAR = 2.0  # times the sum of the radii: capsules that less of the arm joins than this are neighbours
@@ -54,14 +54,7 @@ class Frames(NamedTuple):
 def frames_at(arm: Arm, q: Float[AnyArray, "N n"]) -> Frames:
     """The frames of an arm at N configurations."""
     forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
-    xp = namespace(forward)
-    z = xp.concatenate([forward.z_before[1:], forward.frame[2][None]])
-    if forward.y is None:
-        x = forward.x
-        y = xp.cross(z, x, axis=-2)
-    else:  # Hayati's rotation about y turns x
-        y = forward.y
-        x = xp.cross(y, z, axis=-2)
+    xp, (x, y, z) = namespace(forward), frame_axes(forward)
     base = xp.broadcast_to(xp.asarray(np.eye(3))[None, :, :, None], (1, 3, 3, z.shape[-1]))
     axes = xp.concatenate([base, xp.stack([x, y, z], axis=2)])
     return Frames(axes, xp.concatenate([xp.zeros_like(forward.origin[:1]), forward.origin]))

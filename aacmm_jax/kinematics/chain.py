@@ -268,6 +268,18 @@ def length_scale(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArra
     return joint_errors(geometry, joint_motion(geometry, q))[1][0]
 
 
+def frame_axes(forward: ForwardPass) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """The axes x, y, z of the frames after each joint, joints first.
+
+    Hayati's angle turns x and z about y, so that y = z x x where it is unused, and x = y x z after it.
+    """
+    xp = namespace(forward)
+    z = xp.concatenate([forward.z_before[1:], forward.frame[2][None]])
+    if forward.y is None:
+        return forward.x, xp.cross(z, forward.x, axis=-2), z
+    return xp.cross(forward.y, z, axis=-2), forward.y, z
+
+
 def components_last(
     rows: Float[AnyArray, "... 3 N"], geometry: Geometry, q: Float[AnyArray, "... n"]
 ) -> Float[AnyArray, "... 3"]:

@@ -103,6 +103,8 @@ def into_cones(
     low, high = limits[:, :1], limits[:, 1:]
     units = reading_units(geometry)[:, None]  # steps are in what counts alike: 1 rad, or 1 m
 
+    # The first three equations move the tip: J dq = gap, solved by dq0 = J+ gap. The fourth turns the tool by r . dq =
+    # turn. Along f = r - J+ J r, the part of r that moves no tip, dq = dq0 + f (turn - r . dq0) / (f . r) solves all.
     def step(
         q: np.ndarray, targets: np.ndarray, normals: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from ..core.arguments import checked
 from ..core.arrays import Numbers
 from ..core.errors import InputError
+from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
 from .chain import Corrections, Geometry, forward_pass, joint_motion, joints_first
@@ -53,7 +54,16 @@ def with_corrections(
     if not is_single(arm):
         raise InputError("corrections are for one arm, but this is a batch; take one of it first.")
     plain: Arm = to_numpy(without_corrections(arm))
-    loads, down = _loads(plain, mass, centre), _direction(gravity)
+    down = checked(gravity, Float[np.ndarray, "3"], "gravity")
+    if not np.any(down):
+        raise InputError("gravity has the length 0; give its direction in the base frame.")
+    down, loads, sizes = down / np.linalg.norm(down), None, {"links": plain.joints}
+    if (mass is None) != (centre is None):
+        raise InputError("masses and centres of mass go together; give both mass and centre.")
+    if mass is not None:
+        masses = checked(mass, Float[np.ndarray, " links"], "mass", sizes)
+        centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)
+        loads = Loads(tuple(masses.tolist()), tuple(map(tuple, centres.tolist())))
     if isinstance(model, str):
         terms = _determined(plain, terms_of(model, plain.joints, loads), down)
     else:
@@ -73,24 +83,6 @@ def corrected_like(corrected: Arm, arm: Arm) -> Arm:
     return arm.replace(**changes)
 
 
-def _loads(arm: Arm, mass: Numbers | None, centre: Numbers | None) -> Loads | None:
-    if mass is None and centre is None:
-        return None
-    if mass is None or centre is None:
-        raise InputError("masses and centres of mass go together; give both mass and centre.")
-    sizes = {"links": arm.joints}
-    masses = checked(mass, Float[np.ndarray, " links"], "mass", sizes)
-    centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)
-    return Loads(tuple(masses.tolist()), tuple((x, y, z) for x, y, z in centres.tolist()))
-
-
-def _direction(gravity: Numbers) -> Float[np.ndarray, " 3"]:
-    direction = checked(gravity, Float[np.ndarray, "3"], "gravity")
-    if not np.any(direction):
-        raise InputError("gravity has the length 0; give its direction in the base frame.")
-    return direction / np.linalg.norm(direction)
-
-
 def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"]) -> tuple[Term, ...]:
     """The terms whose functions are no combination of a constant and of those before them, joint by joint."""
     if not terms:
@@ -98,20 +90,13 @@ def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"
     limits = joint_limits(arm, None)
     limits = np.concatenate([limits, [_TEMPERATURES]])
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints + 1))
-    values, taken = function_values(arm.geometry, terms, q, gravity), set()
+    values, chosen = function_values(arm.geometry, terms, q, gravity), []
+    constant = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
     for joint in range(arm.joints + 1):  # 0: functions that scale all lengths
-        basis = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
-        for number, column in enumerate(values):
-            if terms[number].joint != joint:
-                continue
-            rest = column
-            for _ in range(2):  # twice is enough for orthogonality to rounding
-                rest = rest - basis @ (basis.T @ rest)
-            size = np.linalg.norm(rest)
-            if size > _INDEPENDENT * max(np.linalg.norm(column), 1e-6):
-                taken.add(number)
-                basis = np.hstack([basis, rest[:, None] / size])
-    return tuple(terms[number] for number in sorted(taken))
+        numbers = np.array([number for number, term in enumerate(terms) if term.joint == joint], dtype=int)
+        least = _INDEPENDENT * np.maximum(np.linalg.norm(values[numbers], axis=1), 1e-6)
+        chosen += numbers[independent_columns(values[numbers].T, least, constant)].tolist()
+    return tuple(terms[number] for number in sorted(chosen))
 
 
 def function_values(
@@ -131,10 +116,10 @@ def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
     if arm.corrections is None:
         return arm.replace(corrections=Corrections(KnownFunctions(added), arm.geometry), gravity=np.array(DOWN))
     assert arm.coefficients is not None
-    each = (*arm.corrections.functions.terms, *added)
+    terms = (*arm.corrections.functions.terms, *added)
     coefficients = namespace(arm.coefficients).concatenate([arm.coefficients, np.zeros(len(added))])
     return arm.replace(
-        corrections=Corrections(KnownFunctions(each), arm.corrections.nominal),
+        corrections=Corrections(KnownFunctions(terms), arm.corrections.nominal),
         coefficients=coefficients,
         gravity=arm.gravity,
     )

@@ -206,6 +206,7 @@ def _remaining(
 def _least_norm(columns: Float[AnyArray, "n m N"], gap: Float[AnyArray, "m N"]) -> Float[AnyArray, "n N"]:
     """J^T (J J^T + damping)^-1 gap. The damping vanishes with the gap, so that the last steps are Newton's; what stays
     of it keeps the matrix positive definite where the arm is singular."""
+    # Six equations at most: their matrix J J^T, not the joints' J^T J, which has no inverse with seven joints.
     xp = namespace(columns, gap)
     rows = xp.transpose(columns, (2, 1, 0))
     matrix = rows @ xp.swapaxes(rows, -1, -2)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import in_chunks
 from .arm import (
     LENGTHS,
@@ -39,7 +40,7 @@ def equations(
     centroids = _socket_means(in_chunks(lambda rows: np.asarray(arm.position(rows)), q), capture)
     ends = capture.ends()
     between = centroids[ends[:, 1]] - centroids[ends[:, 0]]
-    directions = between / np.linalg.norm(between, axis=1, keepdims=True)
+    directions = between / np.linalg.norm(between, axis=1, keepdims=True)  # d|b - a| = e . (db - da), e from a to b
     lengths = np.einsum("lc,lcp->lp", directions, means[ends[:, 1]] - means[ends[:, 0]])
     return columns - means[capture.owner], lengths
 
@@ -48,16 +49,6 @@ def rigid_motions(tips: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3 6"]:
     """How tips move with the whole arm: by 1 mm along each axis, and by 1 mrad about each axis of the base; mm."""
     rotations = np.cross(np.eye(3)[None, :, :], tips[:, None, :]).transpose(0, 2, 1)
     return np.concatenate([np.broadcast_to(np.eye(3), (len(tips), 3, 3)), rotations * 1e-3], axis=2)
-
-
-def _determining(
-    arm: Arm, capture: SocketPoses, names: Sequence[str], targets_of: Arm
-) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
-    """`equations` of the sockets, and the like of other observations."""
-    poses, lengths = np.zeros((0, 3, len(names))), np.zeros((0, len(names)))
-    if capture.sizes:
-        poses, lengths = equations(arm, capture, names, project_to_centroids(arm, capture, targets_of))
-    return np.concatenate([poses, *(_of_positions(arm, one, names) for one in capture.observations)]), lengths
 
 
 def determined_at(
@@ -72,7 +63,10 @@ def determined_at(
     def changed(q: Any) -> Float[np.ndarray, "m n"]:
         return change(np.array(q)[:, : arm.joints])
 
-    rows = [_of_positions(arm, one, order, changed(one.q)).reshape(-1, len(order)) for one in capture.observations]
+    rows = [
+        _of_positions(arm, observed, order, changed(observed.q)).reshape(-1, len(order))
+        for observed in capture.observations
+    ]
     if capture.sizes:
         poses, lengths = equations(arm, capture, order, changed(capture.q))
         rows += [poses.reshape(-1, len(order)), lengths]
@@ -86,6 +80,8 @@ def _of_positions(
     and, where nothing fixes it, the scale imitate; at other readings, where they are given."""
     q = np.asarray(observed.q) if q is None else q
     tips = np.asarray(arm.position(q))
+    # A frame that is not known imitates motions of the whole arm, a scale all tips, a target its probe. What these
+    # explain is projected out of the columns: what is left is what the positions say of the parameters.
     unknown = [rigid_motions(tips)]
     if not observed.fixes_scale:
         unknown.append(tips[:, :, None] * 1e-3)
@@ -133,7 +129,11 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
             # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may
             # make others redundant, so the choice is repeated.
             neighbour = neighbouring_arm(arm, taken or tuple(order))
-            poses, lengths = _determining(neighbour, capture, order, targets_of=arm)
+            blocks, lengths = [np.zeros((0, 3, len(order)))], np.zeros((0, len(order)))
+            if capture.sizes:
+                *blocks, lengths = equations(neighbour, capture, order, project_to_centroids(neighbour, capture, arm))
+            blocks += [_of_positions(neighbour, observed, order) for observed in capture.observations]
+            poses = np.concatenate(blocks)
             rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
             before, taken = taken, _independent(neighbour, order, rows)
             if taken == before or not taken:
@@ -195,21 +195,11 @@ def generic_poses(arm: Arm, limits: Float[np.ndarray, "n 2"] | None = None) -> S
 
 
 def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str, ...]:
-    """The parameters whose columns those before them do not imitate (Gram-Schmidt)."""
-    basis = np.zeros((rows.shape[0], 0))
-    taken = []
-    for name, whole in zip(order, rows.T, strict=True):
-        column = whole
-        for _ in range(2):  # twice is enough for orthogonality to rounding
-            column = column - basis @ (basis.T @ column)
-        least = 1e-7 * (
-            1.0 if locate(arm, name)[0] in LENGTHS else 1e3
-        )  # small at the tip for steps of 1 mm and 1 mrad
-        size = float(np.linalg.norm(column))
-        if size > max(_INDEPENDENT * float(np.linalg.norm(whole)), least) and basis.shape[1] < rows.shape[0]:
-            taken.append(name)
-            basis = np.hstack([basis, column[:, None] / size])
-    return tuple(taken)
+    """The parameters whose columns those before them do not imitate."""
+    steps = np.array([1.0 if locate(arm, name)[0] in LENGTHS else 1e3 for name in order])
+    # 1e-7 mm at the tip for a step of 1 mm, and of 1 mrad: less is rounding of a column that is 0.
+    least = np.maximum(_INDEPENDENT * np.linalg.norm(rows, axis=0), 1e-7 * steps)
+    return tuple(order[i] for i in independent_columns(rows, least))
 
 
 def _order(arm: Arm, parallel: list[int]) -> list[str]:

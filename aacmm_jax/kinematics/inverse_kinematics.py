@@ -138,6 +138,7 @@ def damped_inverse(
         (yz * xz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
         (xy * yz - yy * xz, xy * xz - xx * yz, xx * yy - xy * xy),
     )
+    # The matrix is [xx xy xz; xy yy yz; xz yz zz]; its determinant by the first row.
     determinant = xx * adjugate[0][0] + xy * adjugate[0][1] + xz * adjugate[0][2]
     rows = [[entry / determinant for entry in row] for row in adjugate]
     return xp.stack([x * row[0][None] + y * row[1][None] + z * row[2][None] for row in rows], axis=-2)

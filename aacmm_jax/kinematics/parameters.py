@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arguments import NotNegative, Range, checked_arguments
+from ..core.arguments import NOT_EMPTY, NotNegative, Range, checked_arguments, checked_fields
 from ..core.arrays import Numbers, as_array, is_concrete, joined
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
@@ -59,14 +59,11 @@ class Parameters(eqx.Module):
     """
 
     base: Arm
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Annotated[tuple[str, ...], NOT_EMPTY] = eqx.field(static=True)
 
     def __check_init__(self):
-        if not isinstance(self.base, Arm) or not isinstance(self.names, tuple) or not self.names:
-            raise InputError("Parameters takes an arm and a tuple of the names of its free parameters, at least one.")
-        _indices(self.base, self.names)
-        if len(set(self.names)) != len(self.names):
-            _unique_names(self.base, self.names, "names")
+        checked_fields(self)
+        _unique_names(self.base, self.names, "names")
 
     @classmethod
     @checked_arguments
@@ -153,7 +150,7 @@ class Parameters(eqx.Module):
 
     def indices(self) -> tuple[tuple[str, int], ...]:
         """Kind and 0-based index of each free parameter."""
-        return _indices(self.base, self.names)
+        return _located(self.base.joints, correction_names(self.base), self.names)
 
     def index(self, name: str) -> int:
         """Position of a free parameter in the vector; raises `InputError` if it is not free."""
@@ -197,7 +194,7 @@ class Parameters(eqx.Module):
             InputError: The vector does not have p values.
         """
         vector = self.checked_vector(vector, "vector")
-        base, indices = self.base, _indices(self.base, self.names)
+        base, indices = self.base, self.indices()
         if base.beta is None and any(kind == "beta" for kind, _ in indices):
             base = with_arrays(base, beta=0.0 * base.alpha)
         return with_arrays(base, **with_values(base.geometry, vector, indices))
@@ -213,7 +210,7 @@ class Parameters(eqx.Module):
 
     def geometry(self, vector: Float[AnyArray, "... p"]) -> Geometry:
         """The geometry of ``arm(vector)``, unchecked: what an iteration evaluates."""
-        base, indices = self.base.geometry, _indices(self.base, self.names)
+        base, indices = self.base.geometry, self.indices()
         if base.beta is None and any(kind == "beta" for kind, _ in indices):
             base = base._replace(beta=0.0 * base.alpha)
         return base._replace(**with_values(base, vector, indices))
@@ -224,16 +221,12 @@ def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...]) 
     return tuple(located(joints, corrections, name) for name in names)
 
 
-def _indices(arm: Arm, names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
-    return _located(arm.joints, correction_names(arm), names)
-
-
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     names = (names,) if isinstance(names, str) else tuple(names)
-    for name in names:
-        locate(arm, name)
-        if names.count(name) > 1:
-            raise InputError(f"parameter '{name}' is named twice in {what}; name it once.")
+    _located(arm.joints, correction_names(arm), names)
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"parameter '{twice}' is named twice in {what}; name it once.")
     return names
 
 

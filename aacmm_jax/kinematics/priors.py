@@ -93,6 +93,7 @@ class Prior(eqx.Module):
         """The prior of the named parameters, mm and rad; None where it says nothing of any of them."""
         given, nominal = to_numpy((self, nominal))
         xp, steps = namespace(given, nominal), natural_steps(names)
+        # Each parameter belongs to the closest of the groups that hold it, and has its standard deviation.
         owners = [_owner(self.groups, name) for name in names]
         mean, sd = xp.asarray(nominal), xp.asarray(_BROAD * steps)
         members, used = [], []

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import in_chunks, to_numpy
 from .arm import Arm, joint_limits
@@ -92,11 +93,13 @@ def _extreme_distance(arm: Arm, shoulder: Float[np.ndarray, " 3"], *, farthest: 
                 q[:, joint] = reading
                 continue
             axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
+            # tip(t) = origin + (tip - origin) cos t + ..., so that s . tip varies as cosine cos t + sine sin t.
             offset, across = origin - shoulder, np.cross(axis, tip - origin)
             along = np.cross(across, axis)
             cosine, sine = sign * np.sum(offset * along, axis=1), sign * np.sum(offset * across, axis=1)
             highest = q[:, joint] + np.arctan2(sine, cosine)
             low, high = limits[joint]
+            # The angle of the maximum, by whole revolutions within the limits if one is; else the better limit.
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
             at_low, at_high = (
                 cosine * np.cos(end) + sine * np.sin(end) for end in (low - q[:, joint], high - q[:, joint])
@@ -177,8 +180,7 @@ def search_region(
 ) -> SearchRegion:
     """The region ``margin`` (rad, or m of prismatic joints) inside the joint limits (default: the arm's own), ``above``
     (mm) the table, within the cones of approach and clear of the cell's obstacles."""
-    if seed < 0:
-        raise InputError(f"seed is {seed}; give zero or a positive number.")
+    checked(seed, Annotated[int, Range(least=0)], "seed")
     allowed = np.asarray(joint_limits(arm, limits))
     margins = margin * reading_units(arm.geometry)
     if not (math.isfinite(margin) and margin >= 0 and np.all(margins < (allowed[:, 1] - allowed[:, 0]) / 2)):

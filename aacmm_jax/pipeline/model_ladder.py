@@ -6,18 +6,23 @@ region: what two models have in common (a region that is hard for both) cancels 
 section 3.4.3, with paired differences). A model that is richer than the best has nothing to show for it. Of those left,
 which predict equally well as far as the regions can tell, the simplest is chosen that makes the measurement nearly as
 probable as the most probable one (`log_evidence`).
+
+The evidence of a model is the probability of what was measured, after every parameter and scale has been integrated
+out. The equations are linear at the solution, and what is known of a learned scale is that its log variance is expected
+with the variance 9 (`uncertainty.evidence`), so that all integrals are Gaussian (Laplace's method; MacKay 1992; Kass
+and Raftery 1995, Journal of the American Statistical Association 90, section 4.1).
 """
 
 import time
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..calibration.joint_model import default_bounds, with_coefficients
 from ..calibration.record import record_of
-from ..calibration.results import Calibration
+from ..calibration.results import Calibration, PriorMetrics
 from ..core.arguments import checked_arguments, items_of
 from ..core.arrays import Numbers
 from ..core.distributions import student_quantile
@@ -26,16 +31,17 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..diagnostics.equations import equations_of
+from ..diagnostics.equations import PRIOR, Equations, Rows, equations_of
 from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds
 from ..kinematics.priors import default_prior
-from .model_evidence import log_evidence
 from .single import calibrate
-from .unseen_regions import Region, UnseenRegion, regions_of, unseen_regions
+from .unseen_regions import UnseenRegion, regions_of, unseen_regions
 
 _LEVEL = 0.05  # of the test by regions
+_EXPECTED_VARIANCE = 9.0  # of a log variance that is expected
+_SMALL = 1e-9  # singular value, relative to the largest
 _EVIDENCE = 3.0  # of a log evidence: 20 times as probable, from which evidence is "strong" (Kass and Raftery)
 DEFAULT_MODELS = ("dh", "gravity", "harmonics=1", "gravity,harmonics=1", "functions", "gravity,functions")
 
@@ -185,45 +191,77 @@ def compare_models(
     plain = without_corrections(arm)
     bounds = default_bounds(plain, capture) if bounds is None else bounds
     left_out = regions_of(to_numpy(capture), regions, arm.joints)
+    loads: dict[str, Any] = {"mass": mass, "centre": centre, "gravity": gravity}
 
     def compared(model: str) -> ComparedModel:
         begun = time.process_time()
-        corrected = with_corrections(plain, model, mass=mass, centre=centre, gravity=gravity)
-        return _compared(corrected, model, capture, bounds, left_out, noise, begun)
+        widened = with_coefficients(bounds, with_corrections(plain, model, **loads))
+        corrected, prior = widened.space.base, default_prior(widened.space.base)
+        result = calibrate(
+            *(corrected, capture, widened),
+            method="joint",
+            noise=noise,
+            prior=prior,
+            replace_noise=False,  # so that all models are compared with the same
+            undetermined="ignore",
+        )
+        record = record_of(result, Recording(capture, ArmSpecification(corrected)))
+        assert record.prior is not None
+        equations = equations_of(record)
+        return ComparedModel(
+            model=model,
+            parameters=len(record.names),
+            effective_parameters=float(np.sum(record.prior.effective)),
+            rms_inside=record.observed.rms,
+            regions=unseen_regions(record, left_out, equations),
+            cpu_seconds=time.process_time() - begun,
+            result=result,
+            log_evidence=log_evidence(equations, record.prior, {group: float(sd) for group, sd in prior.sd.items()}),
+        )
 
     return ComparedModels(tuple(compared(model) for model in named))
 
 
-def _compared(
-    arm: Arm,
-    model: str,
-    capture: Capture,
-    bounds: Bounds,
-    regions: tuple[Region, ...],
-    noise: Noise | None,
-    begun: float,
-) -> ComparedModel:
-    widened = with_coefficients(bounds, arm)
-    arm = widened.space.base
-    prior = default_prior(arm)
-    result = calibrate(
-        *(arm, capture, widened),
-        method="joint",
-        noise=noise,
-        prior=prior,
-        replace_noise=False,  # so that all models are compared with the same
-        undetermined="ignore",
-    )
-    record = record_of(result, Recording(capture, ArmSpecification(arm)))
-    assert record.prior is not None
-    equations = equations_of(record)
-    return ComparedModel(
-        model=model,
-        parameters=len(record.names),
-        effective_parameters=float(np.sum(record.prior.effective)),
-        rms_inside=record.observed.rms,
-        regions=unseen_regions(record, regions, equations),
-        cpu_seconds=time.process_time() - begun,
-        result=result,
-        log_evidence=log_evidence(equations, record.prior, {group: float(sd) for group, sd in prior.sd.items()}),
-    )
+def log_evidence(equations: Equations, prior: PriorMetrics, expected: Mapping[str, float]) -> float:
+    """Logarithm of the evidence of one of several models of the same capture, to be compared with that of others.
+
+    ``expected`` is the standard deviation that is expected of each learned group, in its unit. Constants that all
+    models of a capture have in common are left out: of the geometry, which has no prior, and of reference lengths and
+    certified values.
+    """
+    logarithm = -_cost_of_scales(prior, expected)
+    information, squares, eliminated = 0.0, 0.0, 0.0
+    for rows in equations.rows:
+        shared, determinant = _without_geometry(rows)
+        information, eliminated = information + shared.T @ shared, eliminated + determinant
+        squares += float(np.sum(rows.residual**2))
+        # The product of the standard deviations of the rows, by what one of them is in mm.
+        sizes = np.linalg.svd(rows.in_mm, compute_uv=False)
+        logarithm -= float(np.sum(np.log(sizes[sizes > _SMALL * sizes.max(initial=1e-300)])))
+    for block in equations.relations:
+        information = information + block.shared.T @ block.shared
+        squares += float(np.sum(block.residual**2))
+        if block.fixture == PRIOR:
+            logarithm += float(np.sum(np.log(np.linalg.norm(block.shared, axis=1))))
+    return logarithm - 0.5 * (squares + eliminated + float(np.linalg.slogdet(information)[1]))
+
+
+def _without_geometry(rows: Rows) -> tuple[Float[np.ndarray, "R s"], float]:
+    """Derivatives by what observations share, with the geometry of this one eliminated; log determinant of what is
+    eliminated."""
+    shared, own = (part.reshape(rows.residual.size, part.shape[2]) for part in (rows.shared, rows.own))
+    basis, sizes, _ = np.linalg.svd(own, full_matrices=False)
+    determined = sizes > _SMALL * sizes.max(initial=1e-300)
+    basis = basis[:, determined]
+    return shared - basis @ (basis.T @ shared), float(2 * np.sum(np.log(sizes[determined])))
+
+
+def _cost_of_scales(prior: PriorMetrics, expected: Mapping[str, float]) -> float:
+    """What learned scales cost: being away from what is expected, and having been chosen by the data."""
+    cost, groups = 0.0, zip(prior.groups, np.asarray(prior.sd), np.asarray(prior.effective), prior.learned, strict=True)
+    for group, sd, effective, learned in groups:
+        if learned:
+            away = 2 * np.log(sd / expected[group])
+            # Each parameter that the data determine adds 1/2 to the curvature by the log variance.
+            cost += 0.5 * (away**2 / _EXPECTED_VARIANCE + np.log1p(0.5 * effective * _EXPECTED_VARIANCE))
+    return float(cost)

@@ -54,36 +54,32 @@ def regions_of(
     """
     names = names_in(capture)
     sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
-    owner = np.repeat(np.arange(len(names)), sizes)
+    owner = np.repeat(np.array(names), sizes)
     if patterns is not None:
-        chosen = {pattern: names_in(capture.select(pattern)) for pattern in items_of(patterns, "regions")}
-        found = [Region(pattern, np.isin(owner, [names.index(name) for name in of])) for pattern, of in chosen.items()]
+        members = {pattern: names_in(capture.select(pattern)) for pattern in items_of(patterns, "regions")}
+        regions = [Region(pattern, np.isin(owner, group)) for pattern, group in members.items()]
     elif len(groups := groups_of(capture)) >= _GROUPS:
-        members = [np.isin(owner, [names.index(name) for name in group]) for group in groups]
-        found = [Region(label, poses) for label, poses in zip(common_labels(groups), members, strict=True)]
+        labelled = zip(common_labels(groups), groups, strict=True)
+        regions = [Region(label, np.isin(owner, group)) for label, group in labelled]
     else:
-        sockets = [capture.q] if capture.sizes else []
-        q = np.concatenate([*sockets, *(observation.q for observation in capture.observations)])
-        found = _halves(q[:, :joints])
-    whole = [region.label for region in found if region.poses.all()]
+        regions = _halves(np.asarray(capture.readings)[:, :joints])
+    whole = [region.label for region in regions if region.poses.all()]
     if whole:
         raise InputError(f"nothing is left without '{whole[0]}', so nothing can be calibrated; leave out less.")
-    found = [region for region in found if region.poses.sum() >= _POSES and (~region.poses).sum() >= _POSES]
-    if len(found) < 2:
+    regions = [region for region in regions if _POSES <= region.poses.sum() <= len(owner) - _POSES]
+    if len(regions) < 2:
         raise InputError(
             "models are compared by regions that they have not seen, and these poses make fewer than two; record more."
         )
-    return tuple(found)
+    return tuple(regions)
 
 
 def _halves(q: Float[np.ndarray, "M n"]) -> list[Region]:
-    found = []
+    halves = []
     for joint in np.flatnonzero(np.ptp(q, axis=0) > _MOVES):
         upper = q[:, joint] >= np.median(q[:, joint])
-        found += [
-            Region(f"joint {joint + 1}, {side} half", half) for side, half in (("lower", ~upper), ("upper", upper))
-        ]
-    return found
+        halves += [Region(f"joint {joint + 1}, lower half", ~upper), Region(f"joint {joint + 1}, upper half", upper)]
+    return halves
 
 
 class _Dense(NamedTuple):
@@ -130,12 +126,8 @@ def unseen_regions(
 ) -> tuple[UnseenRegion, ...]:
     """Errors of each region, of a calibration without it; geometry that only the region shows is fitted to its poses.
 
-    Reference lengths with an end that only the region shows are left out with it.
-
-    Args:
-        record: The calibration of everything, solved with observations or a prior.
-        regions: What to leave out, one after the other.
-        equations: Those of the calibration, where they are known already.
+    Of a calibration of everything, with observations or a prior. Reference lengths with an end that only the region
+    shows are left out with it.
     """
     dense = _dense(
         equations_of(record) if equations is None else equations, len(record.names) - (record.hold is not None)

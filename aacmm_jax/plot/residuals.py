@@ -22,13 +22,14 @@ from ..diagnostics.pose_residuals import (
     signed_residuals,
 )
 from ..kinematics.arm import by_joint
-from ..summaries.tables import format_number
+from ..summaries.tables import Cell, Table, by_columns, format_number, numbers
 from .charts import SERIES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, round_ticks, runs, thinned
 from .figures import draw, draw_all, save_figure
 from .parameters import error_plot
 
 _NAMED = 16  # most sockets or observations that are named along an axis
 _SEPARATED = 60  # most of them with lines between them
+_LISTED = 400  # most poses in the table of a chart
 _LEAST = 1e-5  # a residual of zero on a logarithmic axis, mm
 _MOST_IN_A_ROW = 3  # panels of a figure
 _QUANTITIES = {"standard deviations": "residual", "deg": "angle between orientations"}
@@ -136,7 +137,24 @@ def pose_chart(
     description += f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
     description += " The only pose of a socket has no distance." if len(known) < len(last) else ""
     description += f" {len(drawn)} of {len(known)} poses are drawn." if len(drawn) < len(known) else ""
-    return Chart(id, title, description, (plot,))
+    return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
+
+
+def _pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked) -> Table:
+    """The residual of every pose, or of those of very many that have the largest; and which are marked, and why."""
+    chosen, caption = np.arange(len(residuals)), "Every pose"
+    if len(chosen) > _LISTED:
+        chosen = np.argsort(-np.nan_to_num(residuals))[:_LISTED]
+        caption = f"The {_LISTED} farthest of {len(residuals)} poses"
+    columns: dict[str, Any] = {
+        groups.word: [groups.names[i] for i in groups.owner[chosen]],
+        "pose": groups.numbers[chosen].tolist(),
+        f"calibrated [{unit}]": numbers(residuals[chosen], 5),
+    }
+    if far[0]:
+        says, marked = Cell(far[0], None, "outlier"), np.isin(chosen, far[1])
+        columns["marked"] = [says if mark else "" for mark in marked]
+    return by_columns(caption, columns)
 
 
 def distances_in(capture: Capture, evaluation: Evaluation) -> np.ndarray:
@@ -205,7 +223,7 @@ def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = N
     """
     if unit not in ("mm", *_QUANTITIES):
         raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
-    chart = kinds_chart(record, unit)[0]
+    chart = kinds_chart(record, unit)
     if chart is None:
         raise InputError("the calibration has no orientations; draw its residuals in mm or in standard deviations.")
     return draw(chart.plots[0], axes)
@@ -213,14 +231,13 @@ def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = N
 
 def kinds_chart(
     record: CalibrationRecord, unit: str, far: Marked | None = None, most: int | None = None
-) -> tuple[Chart | None, Marked, Groups]:
+) -> Chart | None:
     """Residuals of a calibration in a unit, by kind of observation; ``far`` marks poses, by default those that lost
-    weight. With the poses that are marked, and what the poses belong to; without a chart where there are no
-    orientations."""
+    weight. None where there are no orientations."""
     parts = [part for part in enumerate(observation_residuals(record)) if unit != "deg" or part[1].angle is not None]
-    groups = Groups.of(record.recording.capture).only([i for i, _ in parts])
     if not parts:
-        return None, ("", ()), groups
+        return None
+    groups = Groups.of(record.recording.capture).only([i for i, _ in parts])
     values = np.concatenate([_in_unit(part, unit) for _, part in parts])
     if far is None or unit == "deg":
         far = _LITTLE_WEIGHT, np.flatnonzero(np.concatenate([part.weight for _, part in parts]) <= 0.5)
@@ -229,7 +246,7 @@ def kinds_chart(
         "deg": ("angles", "Residuals of orientations"),
         "standard deviations": ("normalised", "Residuals in standard deviations"),
     }[unit]
-    return pose_chart(id, title, groups, {"calibrated": values}, unit=unit, far=far, most=most), far, groups
+    return pose_chart(id, title, groups, {"calibrated": values}, unit=unit, far=far, most=most)
 
 
 def _in_unit(part: ObservationResiduals, unit: str) -> np.ndarray:
@@ -254,8 +271,8 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
         >>> aj.plot.save_calibration_figure(record, Path("calibration.svg"))
     """
     charts = [arms_chart(record.recording.capture, distances_by_arm(record))]
-    charts += [] if record.sockets_alone else [kinds_chart(record, "standard deviations")[0]]
-    charts.append(kinds_chart(record, "deg")[0])
+    charts += [] if record.sockets_alone else [kinds_chart(record, "standard deviations")]
+    charts.append(kinds_chart(record, "deg"))
     plots = [chart.plots[0] for chart in charts if chart is not None]
     plots += [] if record.recording.true is None else [error_plot(record)]
     columns = len(plots) if len(plots) <= _MOST_IN_A_ROW else 2

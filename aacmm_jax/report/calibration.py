@@ -12,16 +12,9 @@ from ..diagnostics.determined import determined
 from ..diagnostics.findings import case_of
 from ..plot.lengths import length_chart
 from ..plot.residuals import arms_chart, distances_by_arm
+from ..summaries import result_tables
 from ..summaries.calibration import calibration_summary
 from ..summaries.observations import capture_words
-from ..summaries.result_tables import (
-    agreement_tables,
-    metrics_table,
-    other_poses_table,
-    prior_table,
-    truth_table,
-    validation_tables,
-)
 from ..summaries.tables import (
     Cell,
     decimals_for,
@@ -35,8 +28,7 @@ from ..summaries.tables import (
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
 from .elements import Block, Report, Section
-from .observations import observation_tables, removed_tables
-from .tables import DRAWN, length_table
+from .tables import DRAWN, length_table, observation_tables, removed_tables
 
 _METHODS = {
     "two-stage": "Identification from repeatability, then a scale fix",
@@ -176,24 +168,24 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
         introduction += " Root mean squares count every pose in full, those too that lost weight."
     blocks: list[Block] = [introduction]
     if summary["cross_validation"] is not None:
-        blocks += validation_tables(summary["cross_validation"])
+        blocks += result_tables.validation_tables(summary["cross_validation"])
     capture = record.recording.capture
     if summary.get("prior"):
-        blocks.append(prior_table(summary["prior"]))
+        blocks.append(result_tables.prior_table(summary["prior"]))
     if summary.get("shared_errors"):
         blocks.append(shared_sentence(summary["shared_errors"]))
     if not record.sockets_alone:
-        blocks += agreement_tables(summary)
-        blocks += [other_poses_table(summary["other_poses"])] if "other_poses" in summary else []
+        blocks += result_tables.agreement_tables(summary)
+        blocks += [result_tables.other_poses_table(summary["other_poses"])] if "other_poses" in summary else []
     if summary["nominal"]:
         caption = "Metrics by arm [mm]"
         if capture.observations:
             counts = pluralise(len(capture.names), "socket"), pluralise(len(capture.lengths), "reference length")
             caption = f"{counts[0]} of the arm's own probe, {counts[1]} [mm]"
-        blocks.append(metrics_table(caption, summary, stages, fixed_scale=record.fixed_by_one_length))
+        blocks.append(result_tables.metrics_table(caption, summary, stages, fixed_scale=record.fixed_by_one_length))
     blocks.append(arms_chart(capture, distances_by_arm(record), most=DRAWN))
     if "truth" in summary:
-        blocks.append(truth_table(summary["truth"], stages))
+        blocks.append(result_tables.truth_table(summary["truth"], stages))
     return Section("stages", "Nominal and calibrated arm", blocks)
 
 

@@ -37,7 +37,7 @@ from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from .arm_view import view_of_arm
 from .elements import Block, Section
-from .tables import DRAWN, pose_table, residual_chart, socket_table
+from .tables import DRAWN, residual_chart, socket_table
 
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
@@ -97,16 +97,8 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
     if not summary["robust"]:
         introduction += "Poses more than eight times as far, in standard deviations, as the median are marked."
         far = "far from its geometry", pose_outliers(normalised, groups.sizes)[0]
-    values = {
-        "mm": np.concatenate([part.distance for part in parts]),
-        "standard deviations": normalised,
-        "deg": np.concatenate([np.asarray(part.angle) / DEG for part in parts if part.angle is not None] or [[]]),
-    }
-    blocks = [introduction, *([weights_table(summary)] if summary["robust"] else [])]
-    for unit, shown in values.items():
-        chart, marked, of = kinds_chart(record, unit, far, DRAWN)
-        if chart is not None:
-            blocks.append(chart._replace(table=pose_table(of, shown, unit, None if unit == "deg" else marked)))
+    charts = (kinds_chart(record, unit, far, DRAWN) for unit in ("mm", "standard deviations", "deg"))
+    blocks = [introduction, *([weights_table(summary)] if summary["robust"] else []), *filter(None, charts)]
     introduction = (
         "The geometry that was unknown, as determined with the parameters: positions and frames in the base frame, "
         "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on "

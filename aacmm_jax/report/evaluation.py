@@ -15,16 +15,9 @@ from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..plot.lengths import metrics_chart, reading_errors_chart
 from ..plot.residuals import arms_chart, distances_in
+from ..summaries import result_tables
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
-from ..summaries.result_tables import (
-    MARKS,
-    acceptance_tables,
-    metrics_table,
-    observations_table,
-    stated_expanded,
-    with_u_digits,
-)
 from ..summaries.tables import Cell, Table, decimals_for, format_number, listed, number
 from ..summaries.verdicts import overall_decision
 from .arm_view import view_of_arm
@@ -83,7 +76,7 @@ def evaluation_report(record: EvaluationRecord) -> Report:
 def observation_tables(summary: dict[str, Any]) -> list[Table]:
     """Observations besides sockets, held-out ones first."""
     return [
-        observations_table(f"{title}, RMS distance of poses from their geometry [mm]", rows)
+        result_tables.observations_table(f"{title}, RMS distance of poses from their geometry [mm]", rows)
         for group, title in _GROUPS
         if (rows := (summary[group] or {}).get("observations"))
     ]
@@ -159,7 +152,7 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
         blocks.append(f"Decision rules: {'; '.join(used)}. What no rule decides is undecided.")
     value = "calibrated" if nominal else "value"
-    for test, metrics_of_test in zip(rows, acceptance_tables(rows), strict=True):
+    for test, metrics_of_test in zip(rows, result_tables.acceptance_tables(rows), strict=True):
         blocks.append(metrics_of_test)
         if test["missing"]:
             blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
@@ -175,9 +168,9 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
         parts,
         {
             "at": lambda row: row[0].where,
-            "decision": lambda row: Cell(row[0].decision or "–", None, MARKS[row[0].decision]),
+            "decision": lambda row: Cell(row[0].decision or "–", None, result_tables.MARKS[row[0].decision]),
             value: lambda row: number(row[0].value, decimals_for(row[0].expanded)),
-            "U": lambda row: stated_expanded(row[0].expanded),
+            "U": lambda row: result_tables.stated_expanded(row[0].expanded),
             "MPE": lambda row: row[0].limit,
             "metric": lambda row: row[1].name,
             "standard": lambda row: row[2].standard,
@@ -198,7 +191,7 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
     columns = {
         "artefact": lambda row: row[0],
         "calibrated value [mm]": lambda row: number(row[1], decimals_for(row[2])),
-        "u [mm]": lambda row: with_u_digits(row[2]),
+        "u [mm]": lambda row: result_tables.with_u_digits(row[2]),
         "used": lambda row: row[3],
     }
     return [listed("Artefacts", rows, columns)] if rows else []
@@ -209,7 +202,7 @@ def _nominal_and_calibrated(
 ) -> list[Block]:
     stages = {stage: stage for stage in _STAGES}
     blocks: list[Block] = [
-        metrics_table(f"{title} [mm]", rows, stages, fixed_scale=rows["fixed_by_one_length"])
+        result_tables.metrics_table(f"{title} [mm]", rows, stages, fixed_scale=rows["fixed_by_one_length"])
         for group, title in _GROUPS
         if (rows := summary[group]) is not None
     ]

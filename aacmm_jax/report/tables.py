@@ -1,4 +1,4 @@
-"""Tables and charts that reports of calibrations and of evaluations have in common."""
+"""Tables and charts of reports that are made of captures and evaluations, not of summaries."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,15 +6,27 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord
 from ..data.capture import Capture
-from ..diagnostics.pose_residuals import distances_of
+from ..diagnostics.pose_residuals import distances_of, observation_residuals
 from ..model.metrics import pose_outliers
 from ..plot.charts import Chart
-from ..plot.residuals import Groups, Marked, distances_in, pose_chart
+from ..plot.residuals import Groups, distances_in, pose_chart
+from ..summaries.observations import capture_observations
 from ..summaries.result_tables import BY_CONSTRUCTION, with_u_digits
-from ..summaries.tables import Cell, Table, by_columns, decimals_for, listed, number, numbers
+from ..summaries.tables import (
+    Cell,
+    Table,
+    by_columns,
+    decimals_for,
+    format_number,
+    listed,
+    number,
+    numbers,
+    quantity_words,
+)
 
-DRAWN, _LISTED = 1000, 400  # most poses in a chart, and in its table
+DRAWN = 1000  # most poses in a chart
 
 
 def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
@@ -39,28 +51,7 @@ def residual_chart(capture: Capture, evaluation: Evaluation) -> Chart:
     far = pose_outliers(np.concatenate(distances_of(capture, evaluation)), groups.sizes)[0]
     says = "far from its socket" if groups.word == "socket" else "far from its geometry"
     title = "Residuals of the calibrated arm"
-    chart = pose_chart("residuals", title, groups, {"calibrated": distances}, far=(says, far), most=DRAWN)
-    return chart._replace(table=pose_table(groups, distances, "mm", (says, far)))
-
-
-def pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked | None = None) -> Table:
-    """The residual of every pose, or of those of very many that have the largest; and which are marked, and why."""
-    chosen, caption = np.arange(len(residuals)), "Every pose"
-    if len(chosen) > _LISTED:
-        chosen = np.argsort(-np.nan_to_num(residuals))[:_LISTED]
-        caption = f"The {_LISTED} farthest of {len(residuals)} poses"
-    owner, numbers = groups.owner, groups.numbers
-    says, marked = ("", set()) if far is None else (far[0], set(np.asarray(far[1]).tolist()))
-    return listed(
-        caption,
-        chosen.tolist(),
-        {
-            groups.word: lambda i: groups.names[owner[i]],
-            "pose": lambda i: int(numbers[i]),
-            f"calibrated [{unit}]": lambda i: number(float(residuals[i]), 5),
-            "marked": None if far is None else lambda i: Cell(says, None, "outlier") if i in marked else "",
-        },
-    )
+    return pose_chart("residuals", title, groups, {"calibrated": distances}, far=(says, far), most=DRAWN)
 
 
 def length_table(
@@ -88,3 +79,55 @@ def length_table(
             "U of error": lambda i: with_u_digits(rows[i]["expanded_mm"]),
         },
     )
+
+
+def observation_tables(record: CalibrationRecord) -> list[Table]:
+    """What was observed besides sockets and lengths, what is certified of it, and what else was stated."""
+    capture = record.recording.capture
+    if not capture.observations:
+        return []
+    u = {part.observation.name: part.u for part in observation_residuals(record)}
+    rows = capture_observations(capture)
+    certified = [{"observation": row["observation"]} | quantity for row in rows for quantity in row["certified"]]
+    columns = {
+        "observation": "observation",
+        "kind": "kind",
+        "tip": lambda row: row["target"] or "own probe",
+        "poses": "poses",
+        "unknown geometry": lambda row: ", ".join(row["unknowns"]),
+        "u of what was measured [mm]": lambda row: number(u[row["observation"]] or None),
+        "stated": lambda row: "; ".join(f"{quantity['quantity']} {_words(quantity)}" for quantity in row["stated"]),
+    }
+    if not any(row["stated"] for row in rows):
+        del columns["stated"]
+    if not any(u[row["observation"]] for row in rows):
+        del columns["u of what was measured [mm]"]
+    of_certified = {
+        "observation": "observation",
+        "quantity": "quantity",
+        "certified value": _words,
+        "u [mm]": lambda quantity: "taken as exact" if quantity["u"] == 0 else number(quantity["u"]),
+    }
+    tables = [listed("Observations", rows, columns)]
+    return [*tables, *([listed("Certified values", certified, of_certified)] if certified else [])]
+
+
+def removed_tables(record: CalibrationRecord) -> list[Table]:
+    """What was left out because it contradicts the rest, why, and what that changed."""
+    columns = {
+        "group": lambda left_out: left_out.group,
+        "kind": lambda left_out: left_out.kind,
+        "its sockets and observations": lambda left_out: ", ".join(left_out.members),
+        "F": lambda left_out: number(left_out.ratio, 1),
+        "degrees of freedom": lambda left_out: "{} and {}".format(*left_out.degrees_of_freedom),
+        "p": lambda left_out: left_out.probability if left_out.probability >= 1e-4 else "< 0.0001",
+        "RMS of the rest, with it [mm]": lambda left_out: left_out.rms_with,
+        "without it [mm]": lambda left_out: left_out.rms_without,
+        "changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
+    }
+    caption = "Left out, because it contradicts the rest"
+    return [listed(caption, record.removed, columns)] if record.removed else []
+
+
+def _words(quantity: dict[str, Any]) -> str:
+    return quantity_words(quantity, u=False).replace("-", "−")

@@ -25,7 +25,6 @@ from .computed_with import check_same, computed_with
 from .configuration_pool import check_reach
 from .definition import Study
 from .executors import THREADS, available_cores
-from .parts_folder import check_ours
 from .settings import Setting
 from .trials import run_block
 
@@ -109,7 +108,7 @@ def run_study(
     if executor is not None:
         _check_executor(executor)
     with _locked(output):
-        check_ours(path)
+        store.check_ours(path)
         store.tidy(path)
         layout, finished = _opened(study, path, chunk, executor)
         total = layout.cells * layout.trials

@@ -182,10 +182,14 @@ def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " 
     none = [None] * len(value) if value.ndim else None
     if count < 2:
         return {"value": value.tolist(), "se": none}
-    rest = np.array([function(values[groups != group]) for group in members])
-    se = np.sqrt((count - 1) / count * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
+    se = _jackknife(np.array([function(values[groups != group]) for group in members]))
     # No scatter at all (every trial converged) does not mean that the value has no error.
     return {"value": value.tolist(), "se": none if not np.any(se) else se.tolist()}
+
+
+def _jackknife(rest: np.ndarray) -> np.ndarray:
+    """The standard error of a statistic from its values with one group left out each (Efron and Stein 1981)."""
+    return np.sqrt((len(rest) - 1) / len(rest) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
 
 
 def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
@@ -219,8 +223,7 @@ def _parameters(results: Results, cell: int) -> dict[str, Any]:
 
     value, se = statistics(np.full(len(count), True)), np.full((4, len(names)), np.nan)
     if len(count) > 1:
-        rest = np.array([statistics(np.arange(len(count)) != g) for g in range(len(count))])
-        se = np.sqrt((len(count) - 1) / len(count) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
+        se = _jackknife(np.array([statistics(np.arange(len(count)) != g) for g in range(len(count))]))
 
     def entry(row: int, i: int) -> dict[str, Any]:
         return {"value": float(value[row, i]), "se": None if np.isnan(se[row, i]) else float(se[row, i])}

@@ -11,6 +11,7 @@ from .tables import (
     Columns,
     Table,
     decimals_for,
+    difference_from_best,
     expanded_words,
     listed,
     number,
@@ -278,3 +279,39 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         "what it is": None if brief else "what",
     }
     return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
+
+
+MODELS_MEANING = (
+    "Determined: parameters that the data determine. Inside, outside: RMS distance from the geometry of all poses, and "
+    "of regions left out one by one. To the best: difference of the error outside to the best one, compared region by "
+    "region. u: standard errors by the scatter of the regions. Ratio: mean of (error / predicted standard deviation)² "
+    "outside. Evidence: its logarithm, less that of the most probable model."
+)
+
+
+def model_tables(summary: Row) -> tuple[Table, Table]:
+    """Compared models, and their errors region by region."""
+    models, regions = summary["models"], summary["regions"]
+    most_probable = max(row["log_evidence"] for row in models)
+    least = min(row["rms_outside"] for row in models)
+
+    def name(row: Row) -> str | Cell:
+        return row["model"] if row["converged"] else Cell(f"{row['model']}: did not converge", None, "unsure")
+
+    columns = {
+        "model": name,
+        "parameters": "parameters",
+        "determined": lambda row: number(row["effective_parameters"], 1),
+        "inside [mm]": "rms_inside",
+        "outside [mm]": "rms_outside",
+        "u of outside": "u_outside",
+        "to the best": lambda row: difference_from_best(row, least)[0],
+        "u of it": lambda row: difference_from_best(row, least)[1],
+        "ratio": lambda row: number(row["ratio"], 2),
+        "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
+        "CPU [s]": lambda row: number(row["cpu_seconds"], 1),
+    }
+    of_region: Columns = {"region": lambda i: regions[i], "poses": lambda i: models[0]["regions"][i]["poses"]}
+    of_region |= {row["model"]: lambda i, row=row: row["regions"][i]["rms"] for row in models}
+    by_region = listed("RMS error of each region [mm]", range(len(regions)), of_region)
+    return listed("Models", models, columns), by_region

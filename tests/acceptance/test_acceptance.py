@@ -527,7 +527,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
     printed = aacmm("evaluate", "points.toml", "--mpe", "E_Uni=0.03", expect=1).stdout
     assert "undecided" in printed
     assert "25 points per group are required ('S' has a group of 6)" in " ".join(printed.split())
-    assert "after ISO 10360-12:2016" in printed
+    assert "based on ISO 10360-12:2016" in printed
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def complete(cheng) -> dict[str, Measured]:
 
 def missing(measured: Measured, title: str) -> tuple[str, ...]:
     (test,) = [test for test in run(measured) if test.title == title]
-    assert test.called.startswith("after") == bool(test.missing)
+    assert test.called.startswith("based on") == bool(test.missing)
     return test.missing
 
 
@@ -363,5 +363,5 @@ def test_symbols_are_of_complete_tests(complete):
     assert tests["length error"].symbol(length) == "E_Uni:0:Tact.AArm"
     after = {test.title: test for test in run(no_range(complete["iso"]))}
     assert after["length error"].symbol(length) == "E_Uni"
-    assert after["length error"].called == "after ISO 10360-12:2016"
+    assert after["length error"].called == "based on ISO 10360-12:2016"
     assert {test.rule for test in tests.values()} == {"iso-2017", "simple"}

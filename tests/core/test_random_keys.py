@@ -12,7 +12,6 @@ from aacmm_jax.core.random_keys import random_key
 
 SEED = -(2**40) - 7
 SETTINGS = {
-    "jax_threefry_partitionable": False,
     "jax_default_prng_impl": "rbg",
     "jax_random_seed_offset": 7,
     "jax_enable_custom_prng": True,
@@ -61,5 +60,13 @@ def test_numbers_are_those_of_the_defaults(settings, expected):
 
 
 def test_a_negative_seed_of_a_simulation_is_refused(paper_arm):
-    with pytest.raises(aj.InputError, match=r"the seed is -1; give a whole number, zero or positive"):
+    with pytest.raises(aj.InputError, match=r"the seed is -1; it must be zero or positive"):
         aj.simulate(paper_arm, {"A": (400, 200, 300)}, poses=2, seed=-1)
+
+
+def test_a_setting_that_changes_all_numbers_is_refused():
+    with (
+        changed({"jax_threefry_partitionable": False}),
+        pytest.raises(aj.InputError, match="JAX_THREEFRY_PARTITIONABLE"),
+    ):
+        random_key(0)

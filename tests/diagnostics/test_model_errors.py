@@ -14,14 +14,12 @@ from aacmm_jax.diagnostics import (
     missing_terms,
     model_errors,
     model_tests,
-    noise_level,
     noisy_encoders,
-    successive_poses,
 )
 from aacmm_jax.diagnostics.findings import case_of, sentences
 from aacmm_jax.diagnostics.model_errors import rows_of_tests, values_of_tests
 
-MODULES = (missing_terms, noise_level, noisy_encoders, successive_poses, length_consistency)
+MODULES = (missing_terms, model_errors, noisy_encoders, length_consistency)
 ARCSEC = aj.units.ARCSEC
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (300, -300, 300), "D": (500, 300, 100)}
 NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)

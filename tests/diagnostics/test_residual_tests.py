@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from aacmm_jax.diagnostics.group_test import Block
-from aacmm_jax.diagnostics.residual_tests import Form, Residuals, consistency, form_test, pose_form_test, score_tests
+from aacmm_jax.diagnostics.residual_tests import Residuals, consistency, form_test, pose_form_test, score_tests
 
 SIZES, PARAMETERS = (12, 9, 15), 4
 
@@ -84,7 +84,7 @@ def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, rela
     parts = [rng.normal(size=(rows, size)) for rows in SIZES]
     parts[1] = None
     inner = None if kernel is None else np.eye(size, k=1) / 2 + np.eye(size, k=-1) / 2
-    form = Form(tuple(parts), tuple(None if part is None else inner for part in parts))
+    form = parts, [None if part is None else inner for part in parts]
     matrix = np.zeros((sum(SIZES), sum(SIZES)))
     for part, end, rows in zip(parts, np.cumsum(SIZES), SIZES, strict=True):
         if part is not None:
@@ -97,7 +97,7 @@ def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, rela
     value = residual @ matrix @ residual
     if relative:
         draws, value = draws / np.sum(errors**2, axis=0), value / (residual @ residual)
-    found = form_test(Residuals.of(blocks), form, relative)
+    found = form_test(Residuals.of(blocks), *form, relative)
     assert found.probability == pytest.approx(np.mean(draws > value), abs=0.02)
     if kernel is None:
         assert found.ratio == pytest.approx(value / draws.mean(), rel=0.03)
@@ -113,8 +113,8 @@ def test_forms_by_pose_are_those_with_one_large_kernel(problem, rng, relative):
     for whole, each in zip(large, kernels, strict=True):
         for number, k in enumerate(each):
             whole[3 * number : 3 * number + 3, 3 * number : 3 * number + 3] = k
-    form = Form((np.eye(SIZES[0]), np.eye(SIZES[1]), None), (*large, None))
-    found, expected = pose_form_test(left, [*kernels, None], relative), form_test(left, form, relative)
+    form = [np.eye(SIZES[0]), np.eye(SIZES[1])], large
+    found, expected = pose_form_test(left, kernels, relative), form_test(left, *form, relative)
     assert found == pytest.approx(expected, rel=1e-9)
 
 

@@ -282,7 +282,7 @@ def test_bad_columns(tmp_path, text, parts):
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ('rotation = "euler"', ["'euler' is no convention of rotations", "XYZ (moving axes"]),
+        ('rotation = "euler"', ["'euler' is not a convention of rotations", "XYZ (moving axes"]),
         ("", ["does not say how its rotations are written"]),
         ('rotation = "XYZ"', ["angles without a unit", "rotations = 'deg'"]),
         ('rotation = "quaternion wxyz"', ["rotations is in 4 columns, but 3 are picked"]),

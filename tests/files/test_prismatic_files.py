@@ -108,7 +108,7 @@ def test_a_manifest_states_the_unit_of_slides(tmp_path):
 
 
 def test_plans_are_tables_with_the_unit_of_each_joint():
-    text = plans._poses_csv(SCARA, ["socket"], [["A"]] * 5, np.asarray(SCARA.position(Q)), Q)
+    text = plans._poses_csv(SCARA, ["socket"], [["A"]] * 5, (Q, np.asarray(SCARA.position(Q))))
     header, first = (line.split(",") for line in text.splitlines()[:2])
     assert header[5:9] == ["q_1_deg", "q_2_deg", "q_3_mm", "q_4_deg"]
     expected = Q[0] * [180 / np.pi, 180 / np.pi, 1, 180 / np.pi]

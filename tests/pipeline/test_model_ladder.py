@@ -14,13 +14,13 @@ from aacmm_jax.data.recording import Recording
 from aacmm_jax.diagnostics.equations import equations_of
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.parameters import ArmSpecification
-from aacmm_jax.pipeline.model_evidence import log_evidence
 from aacmm_jax.pipeline.model_ladder import (
     DEFAULT_MODELS,
     ComparedModel,
     ComparedModels,
     compare_models,
     default_models,
+    log_evidence,
 )
 from aacmm_jax.pipeline.unseen_regions import Region, UnseenRegion, _dense, regions_of, unseen_regions
 

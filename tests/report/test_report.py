@@ -289,7 +289,7 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
 def test_a_report_says_what_was_left_out(observed_record):
     from aacmm_jax.calibration.record import Removed
     from aacmm_jax.diagnostics.contradictions import removal
-    from aacmm_jax.report.observations import removed_tables
+    from aacmm_jax.report.tables import removed_tables
 
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     record = observed_record._replace(removed=(removed,))
@@ -432,7 +432,7 @@ def test_an_evaluation_report_decides(written):
     assert "✓ conforms" in text  # Deltam of 5 mm
     assert "Fails: E_Uni is over its limit." in text
     assert "This was not the full procedure" in text
-    assert "after ISO 10360-12:2016" in text
+    assert "based on ISO 10360-12:2016" in text
 
 
 def test_observations_of_an_evaluation_stand_beside_their_prediction():

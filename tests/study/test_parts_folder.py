@@ -9,7 +9,7 @@ import aacmm_jax as aj
 from aacmm_jax.core.file_owners import keeps_owners
 from aacmm_jax.study import store
 from aacmm_jax.study.blocks import Layout, parts_of
-from aacmm_jax.study.parts_folder import check_ours, check_readable
+from aacmm_jax.study.store import check_ours, check_readable
 
 from .test_store import written_in_blocks
 
@@ -103,7 +103,7 @@ def test_a_file_system_without_owners_is_a_warning(home, study, tmp_path, monkey
     path = tmp_path / "s.h5"
     written_in_blocks(home, study, path, 16)
     parts_of(path).chmod(0o777)
-    monkeypatch.setattr("aacmm_jax.study.parts_folder.keeps_owners", lambda folder: False)
+    monkeypatch.setattr("aacmm_jax.study.store.keeps_owners", lambda folder: False)
     with pytest.warns(UserWarning, match="does not keep who owns a file"):
         check_ours(path)
     with pytest.warns(UserWarning, match="does not keep who owns a file"):

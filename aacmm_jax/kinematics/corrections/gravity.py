@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import cross
-from ..chain import ForwardPass
+from ..chain import ForwardPass, frame_axes
 from .kind import AbstractCorrection, Loads, Sought, Term
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
@@ -75,19 +75,9 @@ def _pull(term: Term, forward: ForwardPass) -> tuple[float, Float[AnyArray, "...
     if term.number:
         return 1.0, forward.tip if term.number == len(forward.origin) else forward.origin[term.number - 1]
     assert term.loads is not None
-    weights = _KILONEWTON * _STANDARD_GRAVITY * np.array(term.loads.mass)[term.joint - 1 :]
-    centres = _centres(forward, term.loads)[term.joint - 1 :]
-    pulls = [weight * centre for weight, centre in zip(weights, centres, strict=True)]
-    return float(weights.sum()), functools.reduce(operator.add, pulls)
-
-
-def _centres(forward: ForwardPass, loads: Loads) -> list[Float[AnyArray, "... 3 N"]]:
-    """Centres of mass of the links in the base frame, mm."""
-    links, centres = len(forward.origin), []
-    for j in range(links):
-        z = forward.z_before[j + 1] if j + 1 < links else forward.frame[2]
-        # Hayati's angle turns x and z about y, so that y = z x x holds before it, and x = y x z after it.
-        y = cross(z, forward.x[j]) if forward.y is None else forward.y[j]
-        axes = (cross(y, z), y, z)
-        centres.append(forward.origin[j] + sum(loads.centre[j][k] * axes[k] for k in range(3)))
-    return centres
+    # A link's centre of mass is at its origin, and along its axes by the coordinates that are stated.
+    links = range(term.joint - 1, len(forward.origin))
+    weights = {j: _KILONEWTON * _STANDARD_GRAVITY * term.loads.mass[j] for j in links}
+    axes, centre = frame_axes(forward), term.loads.centre
+    pulls = [weights[j] * (forward.origin[j] + sum(centre[j][k] * axes[k][j] for k in range(3))) for j in links]
+    return sum(weights.values()), functools.reduce(operator.add, pulls)
