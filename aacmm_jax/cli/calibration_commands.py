@@ -12,7 +12,8 @@ from ..core.text import number as number_of
 from ..core.units import DEG
 from ..files.outputs import reading, together
 from ..model.loss_names import LossName
-from ..summaries.tables import Styled, difference_from_best, listed, number, warnings_of, written_of
+from ..summaries.result_tables import MODELS_IN_WORDS, models_table, regions_table
+from ..summaries.tables import Styled, warnings_of, written_of
 from . import options
 from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View, calibration
@@ -316,30 +317,7 @@ def compared_models(summary: dict[str, Any]) -> View:
     ]
     yield from warnings_of(summary)
     yield from summary["findings"]
-    most_probable = max(row["log_evidence"] for row in models)
-    least = min(row["rms_outside"] for row in models)
-    headings = ("model", "parameters", "determined", "inside", "outside", "u", "to best", "u", "ratio", "evidence")
-    rows = [
-        (
-            *(row["model"], row["parameters"], number(row["effective_parameters"], 1)),
-            *(row[key] for key in ("rms_inside", "rms_outside", "u_outside")),
-            *difference_from_best(row, least),
-            number(row["ratio"], 2),
-            number(row["log_evidence"] - most_probable, 1),
-            number(row["cpu_seconds"], 1),
-        )
-        for row in models
-    ]
-    yield listed(
-        "RMS distance from the geometry [mm]; to best: outside, less that of the best outside, compared region by "
-        "region; u: standard errors by the scatter of the regions; ratio: mean of (error / predicted standard "
-        "deviation)^2 outside; evidence: its logarithm, less the largest",
-        rows,
-        (*headings, "CPU [s]"),
-    )
-    by_region = [
-        (label, models[0]["regions"][i]["poses"], *(row["regions"][i]["rms"] for row in models))
-        for i, label in enumerate(summary["regions"])
-    ]
-    yield listed("RMS error of each region [mm]", by_region, ("region", "poses", *(row["model"] for row in models)))
+    yield models_table(models)
+    yield MODELS_IN_WORDS
+    yield regions_table(summary)
     yield from written_of(summary)

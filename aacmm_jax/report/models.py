@@ -7,7 +7,8 @@ import numpy as np
 from ..core.text import pluralise
 from ..plot.charts import Chart, Marks, Plot, linear, names
 from ..plot.joint_models import models_chart
-from ..summaries.tables import Cell, Table, difference_from_best, format_number, listed, number
+from ..summaries.result_tables import MODELS_IN_WORDS, models_table, regions_table
+from ..summaries.tables import format_number, number
 from .elements import Report, Section
 
 _INTRODUCTION = (
@@ -15,11 +16,6 @@ _INTRODUCTION = (
     "(outside). Neighbouring poses have similar errors, so that only regions that were left out whole show how a model "
     "extrapolates. Of the model that is best outside, and simpler ones that regions cannot tell from it, the "
     "simplest that makes the measurement about as probable (evidence) is recommended."
-)
-_MEANING = (
-    "Determined: parameters that the data determine. u of it: standard error of the number before it. To the best: "
-    "difference of the error outside to the best one, compared region by region. Ratio: mean of (error / predicted "
-    "standard deviation)² outside. Evidence: its logarithm, less that of the most probable model."
 )
 
 
@@ -49,31 +45,12 @@ def models_report(summary: dict[str, Any]) -> Report:
             ("(error / predicted standard deviation)², mean outside", number(chosen["ratio"], 2).text),
         ],
         sections=[
-            Section("models", "Errors inside and outside", [_INTRODUCTION, by_model, _model_table(models), _MEANING]),
+            Section(
+                "models", "Errors inside and outside", [_INTRODUCTION, by_model, models_table(models), MODELS_IN_WORDS]
+            ),
             Section("regions", "Errors by region", [_by_region(summary)]),
         ],
     )
-
-
-def _model_table(models: list[dict[str, Any]]) -> Table:
-    most_probable = max(row["log_evidence"] for row in models)
-    least = min(row["rms_outside"] for row in models)
-    columns = {
-        "model": lambda row: (
-            row["model"] if row["converged"] else Cell(f"{row['model']}: did not converge", None, "unsure")
-        ),
-        "parameters": "parameters",
-        "determined": lambda row: number(row["effective_parameters"], 1),
-        "inside [mm]": "rms_inside",
-        "outside [mm]": "rms_outside",
-        "u of it [mm]": "u_outside",
-        "to the best outside [mm]": lambda row: difference_from_best(row, least)[0],
-        "u of the difference [mm]": lambda row: difference_from_best(row, least)[1],
-        "ratio": lambda row: number(row["ratio"], 2),
-        "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
-        "CPU [s]": lambda row: number(row["cpu_seconds"], 1),
-    }
-    return listed("Models", models, columns)
 
 
 def _by_region(summary: dict[str, Any]) -> Chart:
@@ -88,10 +65,7 @@ def _by_region(summary: dict[str, Any]) -> Chart:
         tone = "accent" if row["model"] == summary["recommended"] else "main"
         marks = Marks("", np.arange(len(errors)), errors, "dot", tone, words, size=7)
         plots.append(Plot(*axes, (marks,), title=row["model"], height=170))
-    columns = {"region": lambda i: regions[i], "poses": lambda i: models[0]["regions"][i]["poses"]}
-    columns |= {row["model"]: lambda i, row=row: row["regions"][i]["rms"] for row in models}
-    by_region = listed("RMS error by region [mm]", range(len(regions)), columns)
     description = (
         "The RMS error of each region, predicted from all the others; the recommended model in the other colour."
     )
-    return Chart("regions", "Errors by region", description, tuple(plots), by_region)
+    return Chart("regions", "Errors by region", description, tuple(plots), regions_table(summary))

@@ -11,6 +11,7 @@ from .tables import (
     Columns,
     Table,
     decimals_for,
+    difference_from_best,
     expanded_words,
     listed,
     number,
@@ -24,6 +25,11 @@ STAGES = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
 BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
+MODELS_IN_WORDS = (
+    "Determined: parameters that the data determine. u of it: standard error of the number before it. To the best: "
+    "difference of the error outside to the best one, compared region by region. Ratio: mean of (error / predicted "
+    "standard deviation)² outside. Evidence: its logarithm, less that of the most probable model."
+)
 _TRUTH = {
     "length_error_largest_mm": ("largest error of a length parameter [mm]", 1.0),
     "angle_error_largest_rad": ("largest error of an angle parameter [deg]", 1 / DEG),
@@ -278,3 +284,33 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         "what it is": None if brief else "what",
     }
     return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
+
+
+def models_table(models: Rows) -> Table:
+    """Compared models of the joints: errors inside and outside what each was fitted to."""
+    most_probable = max(row["log_evidence"] for row in models)
+    least = min(row["rms_outside"] for row in models)
+    columns = {
+        "model": lambda row: (
+            row["model"] if row["converged"] else Cell(f"{row['model']}: did not converge", None, "unsure")
+        ),
+        "parameters": "parameters",
+        "determined": lambda row: number(row["effective_parameters"], 1),
+        "inside [mm]": "rms_inside",
+        "outside [mm]": "rms_outside",
+        "u of it [mm]": "u_outside",
+        "to the best outside [mm]": lambda row: difference_from_best(row, least)[0],
+        "u of the difference [mm]": lambda row: difference_from_best(row, least)[1],
+        "ratio": lambda row: number(row["ratio"], 2),
+        "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
+        "CPU [s]": lambda row: number(row["cpu_seconds"], 1),
+    }
+    return listed("Models", models, columns)
+
+
+def regions_table(summary: Row) -> Table:
+    """The error of each compared model in each region that was left out."""
+    models, regions = summary["models"], summary["regions"]
+    columns: dict[str, Any] = {"region": lambda i: regions[i], "poses": lambda i: models[0]["regions"][i]["poses"]}
+    columns |= {row["model"]: lambda i, row=row: row["regions"][i]["rms"] for row in models}
+    return listed("RMS error by region [mm]", range(len(regions)), columns)
