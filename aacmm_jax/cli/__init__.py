@@ -46,7 +46,7 @@ def main() -> None:
     try:
         from ..core.errors import InputError
         from ..files.outputs import asking
-        from .app import Stopped, app, check_numbers, prepare_jax
+        from .app import Stopped, app, prepare_jax
 
         for family in _FAMILIES:
             import_module(f".{family}", __name__)
@@ -57,7 +57,6 @@ def main() -> None:
     except KeyboardInterrupt:
         _interrupted()
     try:
-        check_numbers(sys.argv[1:])
         if sys.argv[1:2] != ["show"] and not {"--help", "--version"} & set(sys.argv):  # which rarely compute
             prepare_jax()
         with contextlib.nullcontext() if overwrite else asking():

@@ -16,8 +16,6 @@ from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View
 from .options import argument, option
 
-_COLUMNS = 9  # calibrations side by side
-
 
 @app.command(
     epilog=examples(
@@ -126,14 +124,17 @@ def comparison(summary: dict[str, Any]) -> View:
     )
     if len(summary["trend"]) > 2:
         yield _trend(summary["trend"])
-        yield from _changes(summary["trend"])
+        yield "The change of every parameter from the first calibration: --csv, --json, --figure."
     yield from limits_of(summary)
     yield from written_of(summary)
 
 
 def _parameters(summary: dict[str, Any]) -> View:
     """Values to the digits that the uncertainty of their change allows, changes in small units: um, arcsec."""
-    names, rows = _listed([summary["parameters"]]), []
+    # Of hundreds of harmonics, those that moved.
+    names = {row["parameter"] for row in summary["parameters"] if row["moved"]}
+    names |= {row["parameter"] for row in listed_apart(summary["parameters"])[0]}
+    rows = []
     for row in (row for row in summary["parameters"] if row["parameter"] in names):
         (factor, unit), (fine, small_unit) = people_read(row["unit"]), people_read_change(row["unit"])
         expanded = row["expanded"]
@@ -151,12 +152,6 @@ def _parameters(summary: dict[str, Any]) -> View:
         yield f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv."
 
 
-def _listed(tables: list[list[dict[str, Any]]]) -> set[str]:
-    """Names of the parameters to print: of hundreds of harmonics, those that moved."""
-    moved = {row["parameter"] for rows in tables for row in rows if row["moved"]}
-    return moved | {row["parameter"] for row in listed_apart(tables[0])[0]}
-
-
 def _trend(calibrations: list[dict[str, Any]]) -> Table:
     rows = []
     for i, row in enumerate(calibrations, start=1):
@@ -170,26 +165,6 @@ def _trend(calibrations: list[dict[str, Any]]) -> Table:
     headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
     title = "Each calibration against the first (whose own error is in all of them)"
     return listed(title, rows, (*headings, "mean [um/m]"))
-
-
-def _changes(calibrations: list[dict[str, Any]]) -> View:
-    """Change of every parameter from the first calibration; of many calibrations, the last ones."""
-    shown = list(enumerate(calibrations, start=1))[1:][-_COLUMNS:]
-    title = "Change from the first calibration (*: beyond its uncertainty)"
-    if len(calibrations) - 1 > len(shown):
-        title += f", the last {_COLUMNS}; --csv and --json have all"
-    names, rows = _listed([row["parameters"] for _, row in shown]), []
-    marks = {True: "*", False: " ", None: "?"}
-    for of_parameter in zip(*(row["parameters"] for _, row in shown), strict=True):
-        name = of_parameter[0]["parameter"]
-        if name in names:
-            fine, unit = people_read_change(of_parameter[0]["unit"])
-            changes = (fine * row["change"] for row in of_parameter)
-            texts = (Cell(f"{x:+.1f}{marks[row['moved']]}", x) for x, row in zip(changes, of_parameter, strict=True))
-            rows.append((name, unit, *texts))
-    yield listed(title, rows, ("parameter", "unit", *(str(i) for i, _ in shown)))
-    if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
-        yield "?: without an uncertainty, since it is fixed, on a bound or not determined in one of the two."
 
 
 def _day(moment: str) -> str:

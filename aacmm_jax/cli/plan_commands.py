@@ -153,7 +153,6 @@ def plan(
     from ..files.plans import kit_csv, kit_manifest, plan_csv, plan_manifest, procedure_csv, procedure_manifest
     from ..planning.design import plan as run
     from ..planning.kit import plan_kit
-    from ..planning.options import PlanOptions
     from ..summaries.planning import kit_plan_summary, plan_summary, procedure_summary
     from . import evaluation_views, plan_views
 
@@ -181,7 +180,7 @@ def plan(
             arm, links, (encoder_arcsec, seating_mm, linear_encoder_mm), (cone_deg, normal), tool_axis, retract_mm,
             (cell, collisions, link_radius_mm), names,
         )  # fmt: skip
-    chosen = PlanOptions(
+    chosen = assumed.options._replace(
         space=specification.space(),
         criterion=criterion,
         region=_region(region),
@@ -192,7 +191,7 @@ def plan(
         candidates=candidates,
         check_length=check_length_mm,
         seed=seed,
-    )._replace(**assumed.options)
+    )
     planned: Any
     with plan_views.progress() as progress:
         settings = {"poses": poses, **chosen._replace(progress=progress)._asdict()}
@@ -203,7 +202,7 @@ def plan(
             placed |= {"lengths": [length_option(text) for text in length or ()], "cone": assumed.cone}
             planned, made = run(specification.arm, **placed, **settings), (plan_summary, plan_csv, plan_manifest)
     summarise, table, manifest_of = made
-    stated = {"noise_source": assumed.noise_source, "notes": list(assumed.notes), "angles": angles, "model": model}
+    stated = assumed.stated | {"angles": angles, "model": model}
     summary = summarise(planned, specification.name) | stated | {"written": files.write(planned, table, manifest_of)}
     show_summary(summary, as_json, plan_views.plan if kit is None else plan_views.kit_plan)
 
