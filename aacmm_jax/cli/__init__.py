@@ -1,7 +1,6 @@
 """The command line, ``aacmm``."""
 
 import contextlib
-import errno
 import gc
 import io
 import os
@@ -81,13 +80,9 @@ def main() -> None:
         if debug:
             raise
         _fail_without_jax()
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        if isinstance(error, OSError):  # standard output cannot be written
             _discard_output()
-            _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
-        _fail(
-            f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.",
-            1,
-        )
+        _fail(f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.", 1)
     finally:
         gc.freeze()
 

@@ -101,7 +101,8 @@ def simulate(
                 )
             recording = with_spinner("Simulating", lambda: _tested(nominal, true, acceptance, noise, seed))
         else:
-            points = sockets_option(socket)
+            points, form = sockets_option(socket), "one number or two, LOWEST,HIGHEST in C"
+            warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)
             if not points:
                 raise InputError("there is no socket; give --socket NAME=X,Y,Z, or --acceptance.")
             capture = with_spinner("Simulating", lambda: run(
@@ -112,7 +113,7 @@ def simulate(
                 noise=noise,
                 resolution_arcsec=resolution_arcsec,
                 linear_resolution=linear_resolution_mm,
-                temperature=None if temperature_c is None else _temperature_option(temperature_c),
+                temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
                 seed=seed,
             ))  # fmt: skip
             if temperature_c is not None:
@@ -194,11 +195,6 @@ def import_(
     show_summary(summary, as_json, lambda s: (*calibration_views.capture(s), "", *checked(s["check"])))
     if not summary["check"]["explained"]:
         raise typer.Exit(1)
-
-
-def _temperature_option(text: str) -> float | list[float]:
-    limits = numbers_option("--temperature-c", text, "one number or two, LOWEST,HIGHEST in C")
-    return limits[0] if len(limits) == 1 else list(limits)
 
 
 def _poses_option(texts: Sequence[str], sockets: Iterable[str]) -> dict[str, int]:

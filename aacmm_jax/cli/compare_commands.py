@@ -57,7 +57,10 @@ def compare(
         check_format(figure)
     with together(figure, csv):
         records = [load_calibration(file) for file in files]
-        created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
+        created = [
+            record.recording.measured or read_tables(file, ("calibration",)).attributes["created"]
+            for record, file in zip(records, files, strict=True)
+        ]
         labels = [str(file) for file in files]
         settings = {"level": level, "length": length_mm, "labels": labels}
         trend = with_spinner("Comparing", lambda: _compared(records, created, settings))
@@ -103,14 +106,9 @@ def _compared(records: list, created: list[str], settings: dict[str, Any]) -> An
     return Trend((old, new), (0, 1), (drift,))
 
 
-def _created(file: Path) -> str:
-    """When a calibration's file was made."""
-    return read_tables(file, ("calibration",)).attributes["created"]
-
-
 def comparison(summary: dict[str, Any]) -> View:
     """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
-    new, old = (f"{summary[which]} ({_day(summary[f'{which}_created'])})" for which in ("new", "old"))
+    new, old = (f"{summary[which]} ({summary[f'{which}_created'][:10]})" for which in ("new", "old"))
     yield [Styled(summary["arm"]), f": {new} against {old}"]
     yield from warnings_of(summary)
     yield from summary["findings"]
@@ -161,11 +159,7 @@ def _trend(calibrations: list[dict[str, Any]]) -> Table:
             probability = "-" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
             numbers = (lengths[key] for key in ("rms_mm", "rms_by_chance_mm", "largest_mm"))
             cells = [row["moved"], probability, *numbers, number(lengths["mean_um_per_m"], 1, signed=True)]
-        rows.append((str(i), row["calibration"], _day(row["created"]), *cells))
+        rows.append((str(i), row["calibration"], row["created"][:10], *cells))
     headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
     title = "Each calibration against the first (whose own error is in all of them)"
     return listed(title, rows, (*headings, "mean [um/m]"))
-
-
-def _day(moment: str) -> str:
-    return moment[:10]
