@@ -49,8 +49,10 @@ RIGHT = {
 }
 KINDS = ("expansion", "gear", "gravity", "harmonics=1")
 MODELS = ("dh", *KINDS, *(",".join(kind for kind in KINDS if kind != out) for out in KINDS[::-1]), ",".join(KINDS))
-# Beginnings of warnings that only state how a capture is made.
-STATEMENTS = ("One reference length", "Only ", "Determined", "Hardly determined", "No measurement", "These data")
+# Codes of findings that only state how a capture is made.
+STATEMENTS = (
+    "one-reference-length", "little-redundancy", "determined-together", "hardly-determined", "undetermined",
+)  # fmt: skip
 NEW, LENGTH = 20, 300.0  # lengths whose coverage is asked, mm
 
 
@@ -142,7 +144,8 @@ def trial(fault: str, seed: int) -> dict[str, Any]:
         if name.rpartition("_")[2] not in elsewhere
     ]
     alone = aj.calibrate(plain, capture, bounds, undetermined="ignore")
-    said = [text for text in aj.warnings_of(alone, capture) if not text.startswith(STATEMENTS)]
+    findings = [one for one in aj.diagnostics.findings_of(alone, capture) if one.code not in STATEMENTS]
+    said = [finding.sentence for finding in findings]
     return {
         "recommended": compared.recommended.model,
         "largest_evidence": max(compared.models, key=lambda model: model.log_evidence).model,

@@ -20,31 +20,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.diagnostics.findings import findings_of, sentences
+from aacmm_jax.diagnostics.findings import findings_of
 from aacmm_jax.diagnostics.missing_terms import missing_terms
 
-# Beginnings of the warnings that chance or an error can raise.
-WARNINGS = {
-    "missing term": "Residuals follow",
-    "misfit": "Residuals are ",
-    "noisy joint": ("Residuals are larger the more", "Readings of joint"),
-    "successive poses": "Residuals of successive",
-    "lengths": "Reference lengths that disagree",
-    "contradictions": ("Socket", "Some sockets", "Placement"),
-    "pose far away": "Poses far",
-    "on a bound": ("On a bound", "Stage 1 ran"),
-    "scale": "k = ",
+# Codes of the findings that chance or an error can raise.
+FINDINGS = {
+    "missing term": ("missing-terms",),
+    "misfit": ("residuals-not-as-given", "residuals-unusual", "noisy-observations"),
+    "noisy joint": ("noisy-encoder", "noisy-encoders-replaced"),
+    "successive poses": ("successive-poses",),
+    "lengths": ("lengths-disagree",),
+    "contradictions": ("contradiction",),
+    "pose far away": ("outlying-poses",),
+    "on a bound": ("on-bounds", "weak-on-bounds", "many-on-bounds", "scale-stopped-by-bounds"),
+    "scale": ("implausible-scale", "scale-far-from-1"),
 }
 # Those that only state how a capture is made.
 STATEMENTS = (
-    "One reference length",
-    "Only ",
-    "Determined",
-    "Hardly determined",
-    "No measurement",
-    "These data",
-    "Joint ",
-)
+    "one-reference-length", "little-redundancy", "determined-together", "hardly-determined", "undetermined",
+    "outside-limits",
+)  # fmt: skip
 POSE_SETS = 8
 
 
@@ -80,7 +75,7 @@ class Trials:
         self.setup, self.specification = setup, aj.files.load_specification(setup.arm)
         self.bounds = self.specification.bounds()
         self.lengths = LENGTHS[:lengths]
-        self.true, self.exact, self.seen = [], [], {}
+        self.true, self.exact = [], []
         for i in range(POSE_SETS):
             self.true.append(aj.perturbed_arm(self.bounds.space, length=0.5, angle=np.deg2rad(0.05), seed=i))
             capture = aj.simulate(self.true[i], setup.sockets, poses=setup.poses, seed=i)
@@ -123,8 +118,8 @@ class Trials:
         parts = np.split(q, np.cumsum([len(readings) for readings in exact.values()])[:-1])
         return aj.Capture(dict(zip(exact, parts, strict=True)), lengths)
 
-    def sentences(self, seed: int, capture: aj.Capture, method: str, given: bool) -> list[str]:
-        """Warnings of a calibration."""
+    def codes(self, seed: int, capture: aj.Capture, method: str, given: bool) -> list[str]:
+        """Codes of the findings of a calibration."""
         result = aj.calibrate(
             self.specification.arm,
             capture,
@@ -134,13 +129,12 @@ class Trials:
             undetermined="ignore",
         )
         record = aj.calibration.record_of(result, aj.Recording(capture, self.specification))
-        return [sentence for sentence in sentences(findings_of(record)) if not sentence.startswith(STATEMENTS)]
+        return [finding.code for finding in findings_of(record) if finding.code not in STATEMENTS]
 
 
-def kind_of(sentence: str) -> str:
-    """Which warning a sentence is."""
-    kinds = [kind for kind, begin in WARNINGS.items() if sentence.startswith(begin)]
-    return kinds[-1] if kinds else sentence[:30]
+def kind_of(code: str) -> str:
+    """Which warning a finding is."""
+    return next((kind for kind, codes in FINDINGS.items() if code in codes), code)
 
 
 def eccentric(arcsec: float) -> Any:
@@ -214,11 +208,11 @@ def rates(trials: Trials, number: int, **made: Any) -> dict[str, Any]:
     start, counts, of = time.process_time(), collections.Counter(), collections.Counter()
     for seed in range(number):
         method, given = ("two-stage", "joint")[seed % 2], (seed // POSE_SETS) % 2 == 0
-        said = {kind_of(text) for text in trials.sentences(seed, trials.capture(seed, **made), method, given)}
+        said = {kind_of(text) for text in trials.codes(seed, trials.capture(seed, **made), method, given)}
         subsets = ["any", f"any, {method}", f"any, noise {'given' if given else 'estimated'}"]
         of.update(subsets)
         counts.update([*said, *(subsets if said else [])])
-    every = {kind: number for kind in WARNINGS} | {kind: number for kind in counts} | dict(of)
+    every = {kind: number for kind in FINDINGS} | {kind: number for kind in counts} | dict(of)
     return {
         "trials": number,
         **{kind: round(counts[kind] / total, 4) for kind, total in every.items() if counts[kind] or kind in of},

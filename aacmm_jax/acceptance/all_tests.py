@@ -7,7 +7,7 @@ Uncertainties are the tester's (artefacts, seat, fixture, temperature): the arm'
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
@@ -135,12 +135,6 @@ def requirements_table() -> str:
         ## JJF 1408-2013
     """
     return table_of(TESTS)
-
-
-def without_stated_uncertainty(tests: Sequence[AcceptanceTest]) -> list[str]:
-    """Names of metrics that were decided although no uncertainty was stated for them."""
-    metrics = (metric for test in tests for metric in test.metrics)
-    return [metric.name for metric in metrics if metric.decision is not None and metric.worst.expanded == 0]
 
 
 def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Collection, Mapping
+from statistics import NormalDist
 from typing import Annotated, Literal, NamedTuple, get_args
 
 from ..core.arguments import Range, checked, checked_arguments
@@ -89,13 +90,8 @@ def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule
     if rule == "iso-2013" or expanded <= slack:
         return "conforms"
     # Where u is large, the opposite limit counts as well.
-    return "conforms" if _within(error, limit, expanded / COVERAGE_FACTOR) >= _PROBABILITY else "undecided"
-
-
-def _within(error: float, limit: float, u: float) -> float:
-    """Probability that a normally distributed error lies between the limits."""
-    high, low = ((end - error) / (u * math.sqrt(2)) for end in (limit, -limit))
-    return 0.5 * (math.erf(high) - math.erf(low))
+    normal = NormalDist(error, expanded / COVERAGE_FACTOR)
+    return "conforms" if normal.cdf(limit) - normal.cdf(-limit) >= _PROBABILITY else "undecided"
 
 
 def checked_rule(rule: str) -> Rule:

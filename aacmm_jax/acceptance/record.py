@@ -26,7 +26,6 @@ from .all_tests import (
     checked_limits,
     measured_by,
     run,
-    without_stated_uncertainty,
 )
 from .decision import Limit, Rule
 from .influences import Influences
@@ -254,7 +253,8 @@ def made_for(recording: Recording) -> tuple[Standard, ...]:
 
 def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     """A sentence on metrics that were decided although no uncertainty was stated for them, if there are any."""
-    names = without_stated_uncertainty(tests)
+    metrics = (metric for test in tests for metric in test.metrics)
+    names = [metric.name for metric in metrics if metric.decision is not None and metric.worst.expanded == 0]
     if not names:
         return []
     return [

@@ -1,7 +1,10 @@
-"""Identification and calibration: one (`single`), many (`batch`), repeated, cross-validated; and their results.
+"""Calibrations: one and many of them, repeated on drawn data, evaluated on others; and their results.
 
-Elsewhere: the rows that are minimised (`model.rows`), the active set (`solver.active_set`), covariance
-(`uncertainty`), the file of a calibration (`files.calibrations`), the wording of its warnings (`diagnostics.findings`).
+A calibration in the order of the data: `task` (one problem, checked), `weighted_least_squares` (its unknowns, box and
+weights), `solve` (parameters, geometry and covariance), `scale_fix` and `stages` (k, and the division by it). Beside
+that path: `prior_fit`, `scale_anchor`, `batch` with `batch_kernel`, `redrawn` with `sampling`, `evaluation` with
+`prediction`, `results` and `record`. Public calls are `pipeline.single`, `batch`, `sampling` and `evaluation`; the file
+of a calibration is in `files.calibrations`.
 """
 
 import lazy_loader as _lazy_loader

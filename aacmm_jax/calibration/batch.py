@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments, items_of, with_options
+from ..core.arguments import Count, check_finite, checked_arguments, items_of, with_options
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_jax, to_numpy
@@ -27,7 +27,7 @@ from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
 from ..model.observed import Observed
-from ..model.robust import Loss, check_loss
+from ..model.robust import Loss
 from ..solver.reason import numbers_of, reasons
 from .batch_kernel import Form, Problems, selected, solve_chunk
 from .results import ManyCalibrations, ManyIdentifications
@@ -56,11 +56,11 @@ class BatchOptions(NamedTuple):
     space: Parameters | None = None
     hold: str | None = "longest"
     noise: Noise | None = None
-    max_steps: int = 300
-    chunk: int | None = None
-    slots: int | None = None
+    max_steps: Count = 300
+    chunk: Count | None = None
+    slots: Count | None = None
     devices: Sequence[Any] | None = None
-    workers: int | None = None
+    workers: Count | None = None
     robust: LossName | None = None
     prior: Prior | None = None
     covariance: bool = False
@@ -239,18 +239,6 @@ def _checked_box(
     return (lower.lower, lower.upper), lower.space
 
 
-def _check_options(arm: Arm, options: BatchOptions) -> None:
-    """Refuse options that mean nothing."""
-    check_loss(options.robust)
-    if options.noise is not None:
-        check_finite(noise=options.noise)
-        options.noise.check(arm.joints)
-    for what in ("max_steps", "chunk", "slots", "workers"):
-        number = getattr(options, what)
-        if number is not None and number < 1:
-            raise InputError(f"{what} is {number}; give at least 1, or leave it out.")
-
-
 class _Batch(NamedTuple):
     """A batch of identifications, checked: the problems on the host, and how a chunk of them is run on a device."""
 
@@ -276,7 +264,7 @@ class _Batch(NamedTuple):
         """Everything checked and laid out; ``single`` is the function that solves one problem. Reference lengths take
         part in the least squares ``with_lengths``."""
         bounds, space = _checked_box(single, arm, capture, lower, upper, start, options)
-        _check_options(arm, options)
+        check_finite(noise=options.noise)
         check_columns(arm, capture.columns)
         box, size = _lay_out(arm, capture, bounds, start, space)
         space = based_on(space, arm)

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from ..core.arguments import check_finite, checked_arguments
 from ..core.arrays import Numbers, as_array
 from ..core.errors import InputError, nearest
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, set_at, to_jax, to_numpy
-from ..data.capture import Capture
+from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..data.observations.socket import position_of
 from ..kinematics.arm import Arm, check_columns
@@ -27,7 +27,6 @@ from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
 from ..model.socket_sums import to_poses
-from ..solver.arrow import split
 from ..uncertainty.linear_propagation import variances_of_functions
 from ..uncertainty.linearisation import Linearisation
 from .scale_anchor import ScaleAnchor
@@ -108,10 +107,10 @@ def evaluate(
     if capture.q.ndim > 2:
         raise InputError("the capture is a batch; evaluate its captures one by one, or map over them with jax.vmap.")
     check_finite(noise=noise)
-    observed, lengths = Observed.of(capture, arm, lengths=False), _Lengths.of(capture)
+    observed = Observed.of(capture, arm, lengths=False)
     kept = _checked_geometry(observed, geometry)
     whole = bool(capture.observations) or bool(kept) or noise is not None
-    subject = observed, lengths, *to_numpy((kept, noise))
+    subject = observed, *to_numpy((capture.lengths, kept, noise))
     shape = np.broadcast_shapes(*(leaf.shape[:-1] for leaf in jax.tree.leaves(arm)))
     if not shape:
         return to_jax(_evaluated(*to_numpy((arm, *subject)), capture.sizes, whole))
@@ -122,28 +121,11 @@ def evaluate(
     return work(arm, *subject)
 
 
-class _Lengths(eqx.Module):
-    """The reference lengths of a capture, which are measured and not fitted."""
-
-    nominal: Float[AnyArray, " l"]  # mm
-    u: Float[AnyArray, " l"]
-    ends: tuple[tuple[str, str], ...] = eqx.field(static=True)  # names of the positions
-
-    @classmethod
-    def of(cls, capture: Capture) -> "_Lengths":
-        lengths = to_numpy(capture.lengths)
-        ends = tuple((position_of(length.start), position_of(length.end)) for length in lengths)
-        if not lengths:
-            return cls(np.zeros(0), np.zeros(0), ends)
-        xp = namespace(lengths)
-        return cls(xp.stack([length.value for length in lengths]), xp.stack([length.u for length in lengths]), ends)
-
-
 @compiled(jit=eqx.filter_jit)
 def _evaluated(
     arm: Arm,
     observed: Observed,
-    lengths: _Lengths,
+    lengths: tuple[ReferenceLength, ...],
     kept: Mapping[str, AnyArray],
     noise: Noise | None,
     sizes: tuple[int, ...],
@@ -152,24 +134,22 @@ def _evaluated(
     """`evaluate` with the observations of a capture, of which the first are its sockets of so many poses; and with the
     residuals of all of them, where these are wanted (``whole``)."""
     fitted = fit_geometry(arm, observed, kept, noise)
-    xp, positions, geometry = namespace(fitted.linear.z), observed.positions, fitted.geometry
+    xp, geometry = namespace(fitted.linear.z), fitted.geometry
     metrics, distances, measured, u = no_repeatability(fitted.sigma), xp.zeros(0), xp.zeros(0), xp.zeros(0)
+    nominal = xp.stack([length.value for length in lengths]) if lengths else xp.zeros(0)
     if sizes:
         tips = fitted.linear.point.forward.tip[:, : sum(sizes)]
         metrics = repeatability(tips.T, sizes)
         sockets = observed.observations[: len(sizes)]
-        index = np.array([positions[position_of(socket.name)] for socket in sockets])
+        index = np.array([observed.positions[position_of(socket.name)] for socket in sockets])
         distances = xp.sqrt(xp.sum((tips - to_poses(geometry[index.T], sizes)) ** 2, axis=0))
-    if lengths.ends:
-        start, end = (np.array([positions[pair[side]] for pair in lengths.ends]) for side in (0, 1))
-        between = geometry[end] - geometry[start]
-        measured = xp.sqrt(xp.sum(between**2, axis=1))
-        scatter = fitted.variances_between(lengths.ends, between / measured[:, None])
-        known = fitted.redundant or noise is not None
-        u = xp.sqrt((scatter if known else np.nan) + lengths.u**2)
-    return Evaluation(
-        metrics, measured, measured - lengths.nominal, u, distances, _described(fitted) if whole else None
-    )
+    if lengths:
+        ends = [(position_of(length.start), position_of(length.end)) for length in lengths]
+        measured, pull = observed.distances(geometry, ends)
+        scatter = fitted.variances_of(pull) if fitted.redundant or noise is not None else np.nan
+        u = xp.sqrt(scatter + xp.stack([length.u for length in lengths]) ** 2)
+    of_observations = _described(fitted) if whole else None
+    return Evaluation(metrics, measured, measured - nominal, u, distances, of_observations)
 
 
 class GeometryFit(NamedTuple):
@@ -185,19 +165,10 @@ class GeometryFit(NamedTuple):
         """The numbers of the geometry."""
         return self.linear.z[1:]
 
-    def variances_between(
-        self, ends: tuple[tuple[str, str], ...], directions: Float[AnyArray, "l 3"]
-    ) -> Float[AnyArray, " l"]:
-        """Variances of the distances between positions, along unit vectors, by an arm without errors but the noise of
-        its readings."""
-        xp, observed = namespace(self.linear.z, directions), self.linear.observed
+    def variances_of(self, derivatives: Float[AnyArray, "q g"]) -> Float[AnyArray, " q"]:
+        """Variances of functions of the geometry, by an arm without errors but the noise of its readings."""
         influence = self.linear.influence(np.concatenate([[True], ~self.free]))
-        positions, pull = observed.positions, xp.zeros((len(ends), len(self.free)))
-        for side, along in enumerate((-directions, directions)):
-            index = np.array([positions[pair[side]] for pair in ends])
-            pull = set_at(pull, (np.arange(len(ends))[:, None], index), along)
-        head, components = split(pull * observed.steps[None, :], observed.layout.shared, observed.layout.classes)
-        return variances_of_functions(influence, xp.concatenate([xp.zeros((len(ends), 1)), head], axis=1), components)
+        return variances_of_functions(influence, *self.linear.observed.by_unknowns(derivatives, 1))
 
 
 def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noise: Noise | None) -> GeometryFit:

@@ -42,9 +42,9 @@ class LeftOut(NamedTuple):
     @property
     def length_ratio(self) -> float:
         """Root mean square error of the lengths in their own standard uncertainties; NaN where there is none."""
-        known = _predicted(self)
-        normalised = self.length_error[known] / self.length_u[known]
-        return float(np.sqrt(np.mean(normalised**2))) if known.any() else math.nan
+        predicted = _predicted(self)
+        normalised = self.length_error[predicted] / self.length_u[predicted]
+        return float(np.sqrt(np.mean(normalised**2))) if predicted.any() else math.nan
 
     @property
     def probabilities(self) -> tuple[float, float]:
@@ -85,31 +85,24 @@ class CrossValidation(NamedTuple):
         return self._pooled([group.rms_predicted for group in self.groups])
 
     def _pooled(self, values: list[float]) -> float:
-        counted = [
-            (group.poses, value)
-            for group, value in zip(self.groups, values, strict=True)
-            if group.poses and np.isfinite(group.rms_predicted)
-        ]
+        pairs = zip(self.groups, values, strict=True)
+        counted = [(group.poses, value) for group, value in pairs if group.poses and np.isfinite(group.rms_predicted)]
         total = sum(poses for poses, _ in counted)
-        return float(np.sqrt(sum(poses * value**2 for poses, value in counted) / total)) if total else float("nan")
-
-    def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
-        errors, u = (
-            np.concatenate([getattr(group, what) for group in self.groups]) for what in ("length_error", "length_u")
-        )
-        return errors[np.isfinite(u)], u[np.isfinite(u)]
+        return math.sqrt(sum(poses * value**2 for poses, value in counted) / total) if total else math.nan
 
     @property
     def length_rms(self) -> float:
         """Root mean square error of the reference lengths, mm."""
-        errors, _ = self._lengths()
-        return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
+        return self._of_lengths("length_error")
 
     @property
     def length_u(self) -> float:
         """Root mean square of the predicted standard uncertainties of these errors, mm."""
-        _, u = self._lengths()
-        return float(np.sqrt(np.mean(u**2))) if len(u) else float("nan")
+        return self._of_lengths("length_u")
+
+    def _of_lengths(self, name: str) -> float:
+        values, u = (np.concatenate([getattr(group, n) for group in self.groups]) for n in (name, "length_u"))
+        return float(np.sqrt(np.mean(values[np.isfinite(u)] ** 2))) if np.isfinite(u).any() else math.nan
 
     @property
     def open(self) -> int:
@@ -119,7 +112,7 @@ class CrossValidation(NamedTuple):
     def ratios(self) -> list[float]:
         """Found over predicted, of poses and of lengths, where they are known."""
         pairs = [(self.rms, self.rms_predicted), (self.length_rms, self.length_u)]
-        return [found / predicted for found, predicted in pairs if predicted > 0 and np.isfinite(found)]
+        return [rms / predicted for rms, predicted in pairs if predicted > 0 and np.isfinite(rms)]
 
     @property
     def excess(self) -> float:
@@ -130,9 +123,9 @@ class CrossValidation(NamedTuple):
     def disagreeing(self) -> tuple[int, ...]:
         """Numbers, from 0, of the groups whose errors exceed their prediction by more than chance does in one case of
         two hundred, over all groups together; the most improbable first."""
-        known = [[p for p in group.probabilities if math.isfinite(p)] for group in self.groups]
-        least = {i: min(each) for i, each in enumerate(known) if each}
-        count = sum(map(len, known))
+        probabilities = [[p for p in group.probabilities if math.isfinite(p)] for group in self.groups]
+        least = {i: min(of_group) for i, of_group in enumerate(probabilities) if of_group}
+        count = sum(map(len, probabilities))
         return tuple(i for i in sorted(least, key=least.__getitem__) if least[i] < _HALF / count)
 
     @property
@@ -150,16 +143,16 @@ class CrossValidation(NamedTuple):
             (int(_predicted(group).sum()), group.length_ratio, 1.0, group.degrees_of_freedom[1])
             for group in self.groups
         ]
-        found = []
+        probabilities, of_noise = [], min(group.noise_degrees_of_freedom for group in self.groups)
         for parts in (poses, lengths):
-            known = [part for part in parts if part[0] and part[3] > 0 and 0 < part[2] < math.inf]
-            if known:
-                count, rms, predicted, own = np.array(known).T
+            usable = [part for part in parts if part[0] and part[3] > 0 and 0 < part[2] < math.inf]
+            if usable:
+                count, rms, predicted, freedom = np.array(usable).T
                 means = count * predicted**2
                 ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
-                pooled = float(means.sum() ** 2 / np.sum(means**2 / own))
-                found.append(chance(ratio, 1.0, pooled, min(group.noise_degrees_of_freedom for group in self.groups)))
-        return [probability for probability in found if math.isfinite(probability)]
+                pooled = float(means.sum() ** 2 / np.sum(means**2 / freedom))
+                probabilities.append(chance(ratio, 1.0, pooled, of_noise))
+        return [probability for probability in probabilities if math.isfinite(probability)]
 
 
 def _predicted(group: LeftOut) -> np.ndarray:

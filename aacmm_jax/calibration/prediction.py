@@ -21,7 +21,7 @@ from ..data.capture import Capture
 from ..data.copies import visits_of
 from ..data.observations.socket import position_of
 from ..model.elimination import followed
-from ..model.observed import Observed
+from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import LEVEL, Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
@@ -117,18 +117,18 @@ class UnseenErrors(NamedTuple):
         """Some of the reference lengths, or all, as far as their errors can be predicted; both root mean squares weigh
         each error by its own standard uncertainty, so that their ratio is that of the normalised errors."""
         u = self.length_u
-        known = [i for i in (range(len(u)) if which is None else which) if np.isfinite(u[i])]
-        if not known:
+        chosen = [i for i in (range(len(u)) if which is None else which) if np.isfinite(u[i])]
+        if not chosen:
             return NOTHING
-        u = np.maximum(u[known], _LEAST_LENGTH_U)
-        correlation = self.length_covariance[np.ix_(known, known)] / np.outer(u, u)
+        u = np.maximum(u[chosen], _LEAST_LENGTH_U)
+        correlation = self.length_covariance[np.ix_(chosen, chosen)] / np.outer(u, u)
         predicted = math.sqrt(np.mean(u**2))
-        parts = np.mean(self.length_parts[known] / u[:, None] ** 2, axis=0)
+        parts = np.mean(self.length_parts[chosen] / u[:, None] ** 2, axis=0)
         return Agreement(
-            count=len(known),
-            rms=predicted * math.sqrt(np.mean((self.length_error[known] / u) ** 2)),
+            count=len(chosen),
+            rms=predicted * math.sqrt(np.mean((self.length_error[chosen] / u) ** 2)),
             predicted=predicted,
-            degrees_of_freedom=len(known) ** 2 / float(np.sum(correlation**2)),
+            degrees_of_freedom=len(chosen) ** 2 / float(np.sum(correlation**2)),
             noise_degrees_of_freedom=float(degrees_of_freedom(parts, self.law)),
         )
 
@@ -197,8 +197,8 @@ class _Unseen(NamedTuple):
             [np.asarray(r)[part] for r in influence.rows] for part in (slice(p, None), slice(p))
         )
         values, vectors = np.linalg.eigh(sum(_flat(rows) @ _flat(rows).T for rows in of_shared))
-        known = values > _NULL * values.max(initial=0.0)
-        basis = vectors[:, known] / np.sqrt(values[known])
+        large = values > _NULL * values.max(initial=0.0)
+        basis = vectors[:, large] / np.sqrt(values[large])
         of_shared = [np.einsum("sb,srm->brm", basis, rows) for rows in of_shared]
         of_parameters = [rows / scale for rows in of_parameters]
         along = np.sum([_flat(b) @ _flat(a).T for b, a in zip(of_shared, of_parameters, strict=True)], axis=0)
@@ -268,27 +268,20 @@ def _of_lengths(
     if not count:
         none = np.zeros((0, 0))
         return np.zeros(0), none, *_parts_of_lengths(uncertainty, np.zeros((0, p)), none, u, u)
-    _, of_mean = _variances_in_places(uncertainty.shared, capture)
-    in_place = dict(zip(capture.names, of_mean, strict=True))
-    components = [np.zeros((count, *own.shape[:2])) for own in influence.own]
-    error, places = np.zeros(count), np.zeros((count, count))
-    pulls: dict[str, np.ndarray] = {}
-    for number, length in enumerate(capture.lengths):
-        rows = [observed.positions[position_of(name)] for name in (length.start, length.end)]
-        between = np.asarray(linear.z)[p + rows[1]] - np.asarray(linear.z)[p + rows[0]]
-        size = float(np.linalg.norm(between))
-        error[number] = size - float(length.value)
-        for name, index, sign in zip((length.start, length.end), rows, (-1.0, 1.0), strict=True):
-            of, component, first = observed.layout.component_of(int(index[0]))
-            components[of][number, component, first : first + 3] += sign * between / size
-            pulls.setdefault(name, np.zeros((count, 3)))[number] += sign * between / size
-    for name, pull in pulls.items():
-        places += in_place.get(name, 0.0) * pull @ pull.T
-    by_head = -np.sum([np.einsum("lKk,Kkh->lh", *of) for of in zip(components, influence.follow, strict=True)], axis=0)
+    measured, by_geometry = observed.distances(np.asarray(linear.z)[p:], ends_of(capture))
+    places = np.zeros((count, count))
+    for name, variance in zip(capture.names, _variances_in_places(uncertainty.shared, capture), strict=True):
+        if variance:
+            by_place = by_geometry[:, observed.positions[position_of(name)]]
+            places += variance * by_place @ by_place.T
+    head, components = observed.by_unknowns(by_geometry, p)
+    by_head = np.asarray(influence.eliminated(head, components))
     pull = by_head[:, p:] @ problem.basis
     along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
-    scatter = sum(np.einsum("lKk,Kkj,gKj->lg", c, d, c) for c, d in zip(components, influence.own, strict=True))
+    pairs = zip(components, influence.own, strict=True)
+    scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, own, part) for part, own in pairs], axis=0)
     covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
+    error = np.asarray(measured) - np.array([float(length.value) for length in capture.lengths])
     return error, covariance, *_parts_of_lengths(uncertainty, along, covariance, u**2, np.diagonal(places))
 
 
@@ -309,12 +302,11 @@ def _parts_of_lengths(
     return np.column_stack([whole - others.sum(axis=1), others]), law
 
 
-def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple[float, Float[np.ndarray, " s"]]:
-    """What errors that poses share add to the variance of a tip coordinate within each socket, and to that of each
-    socket's mean beside the mean of so many independent errors, mm^2."""
-    sizes = np.asarray(capture.sizes, dtype=float)
+def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> Float[np.ndarray, " s"]:
+    """What errors that poses share add to the variance of a coordinate of each socket's mean, beside the mean of so
+    many independent errors, mm^2."""
     if shared is None:
-        return 0.0, np.zeros(len(sizes))
+        return np.zeros(len(capture.sizes))
     within, between = float(shared.sd_of(VISITS, SUCCESSIVE)) ** 2, float(shared.sd_of(PLACES)) ** 2
     visits, length = visits_of(capture), float(shared.correlation_length)
 
@@ -325,4 +317,4 @@ def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> tuple
         return float(np.mean(np.exp(-np.abs(order[:, None] - order) / length))) if np.isfinite(length) else 1.0
 
     parts = np.array([part_of_mean(name, size) for name, size in zip(capture.names, capture.sizes, strict=True)])
-    return within, between + within * (parts - 1 / sizes)
+    return between + within * (parts - 1 / np.asarray(capture.sizes, dtype=float))

@@ -272,9 +272,9 @@ class _History(NamedTuple):
         """With one more round; rounds far from the fixed point say nothing of it, and are forgotten."""
         xp, residual = namespace(scales, new), new - scales
         near = xp.max(xp.abs(residual)) < _NEAR
-        known = near & (self.count > 0)
+        follows = near & (self.count > 0)
         rows = [
-            xp.where(known, xp.concatenate([(now - before)[None], older[:-1]]), 0.0)
+            xp.where(follows, xp.concatenate([(now - before)[None], older[:-1]]), 0.0)
             for now, before, older in ((new, self.new, self.of_new), (residual, self.residual, self.of_residual))
         ]
         return _History(xp.where(near, self.count + 1, 0), new, residual, rows[0], rows[1])

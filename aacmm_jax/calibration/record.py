@@ -47,8 +47,9 @@ class OtherPoses(NamedTuple):
     @property
     def rms_of_all(self) -> float:
         """Over all of these poses, mm."""
-        known = np.isfinite(self.rms)
-        return float(np.sqrt(np.sum(self.poses[known] * self.rms[known] ** 2) / max(self.poses[known].sum(), 1)))
+        measured = np.isfinite(self.rms)
+        total = np.sum(self.poses[measured] * self.rms[measured] ** 2)
+        return float(np.sqrt(total / max(self.poses[measured].sum(), 1)))
 
 
 class Removed(NamedTuple):
@@ -166,30 +167,24 @@ class CalibrationRecord(NamedTuple):
     def vectors(self) -> dict[str, np.ndarray]:
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
         space = Parameters(self.recording.nominal.arm, self.names)
-        arms = {"nominal": self.recording.nominal.arm, "stage1": self.stage1.arm, "calibrated": self.calibrated.arm}
-        found = {stage: np.asarray(space.vector(arm)) for stage, arm in arms.items()}
+        arms = {"nominal": self.recording.nominal, "stage1": self.stage1, "calibrated": self.calibrated}
+        vectors = {stage: np.asarray(space.vector(specification.arm)) for stage, specification in arms.items()}
         if self.recording.true is not None:
-            true, nominal = self.recording.true.arm, found["nominal"]
-            found["true"] = np.array(
-                [_true_value(true, name, value) for name, value in zip(self.names, nominal, strict=True)]
-            )
-        return found
+            true, nominal = self.recording.true.arm, dict(zip(self.names, vectors["nominal"], strict=True))
+            # The corrections of the true arm need not be those that are identified: what it lacks is 0, but for the
+            # direction of gravity, which no arm is without.
+            lacking = {name: nominal[name] if name.startswith("gravity_") else 0.0 for name in self.names}
+            values = lacking | {name: float(value_of(true, name)) for name in parameter_names(true)}
+            vectors["true"] = np.array([values[name] for name in self.names])
+        return vectors
 
     def evaluations(self) -> dict[str, Evaluation]:
         """The three arms on the capture that was identified from."""
         capture, calibrated = self.recording.capture, evaluate(self.calibrated.arm, self.recording.capture)
-        one, other = (jax.tree.leaves(arm.arm) for arm in (self.stage1, self.calibrated))
-        alike = len(one) == len(other) and all(map(np.array_equal, one, other))
+        leaves = [jax.tree.leaves(arm.arm) for arm in (self.stage1, self.calibrated)]
+        alike = len(leaves[0]) == len(leaves[1]) and all(map(np.array_equal, *leaves))
         stage1 = calibrated if alike else evaluate(self.stage1.arm, capture)
         return {"nominal": evaluate(self.recording.nominal.arm, capture), "stage1": stage1, "calibrated": calibrated}
-
-
-def _true_value(true: Arm, name: str, nominal: float) -> float:
-    """A parameter of the true arm, whose corrections need not be those that are identified: what it lacks is 0, but for
-    the direction of gravity, which no arm is without."""
-    if name in parameter_names(true):
-        return float(value_of(true, name))
-    return nominal if name.startswith("gravity_") else 0.0
 
 
 @checked_arguments
@@ -216,11 +211,14 @@ def record_of(
         >>> print(made.converged, made.reason)
         True Converged: the projected gradient is zero to the tolerance.
     """
-    nominal = recording.nominal
+    nominal, stage1, scale = recording.nominal, calibration.stage1, calibration.scale
     single = isinstance(calibration, Identification)
+    # What files hold is NumPy's.
     shared = None if single else calibration.shared
-    stage1 = calibration if single else calibration.stage1
-    components = calibration.parameter_covariance.components
+    covariance, observed, prior, shared = jax.tree.map(
+        np.asarray,
+        (calibration.parameter_covariance, calibration.observed, calibration.prior, shared),
+    )
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -233,28 +231,28 @@ def record_of(
         upper=np.asarray(calibration.bounds.upper),
         active_stage1=np.asarray(stage1.active),
         active=np.asarray(calibration.active),
-        covariance=np.asarray(calibration.covariance),
-        determined=np.asarray(calibration.determined),
-        open=np.asarray(calibration.parameter_covariance.open),
+        covariance=covariance.matrix,
+        determined=covariance.determined,
+        open=covariance.open,
         noise=calibration.noise,
         noise_model=calibration.noise_model,
         degrees_of_freedom=float(calibration.degrees_of_freedom),
         reduced_chi=None if stage1.reduced_chi is None else float(stage1.reduced_chi),
-        k=np.nan if calibration.scale is None else float(calibration.scale.value),
-        u_k=np.nan if calibration.scale is None else float(calibration.scale.u),
+        k=np.nan if scale is None else float(scale.value),
+        u_k=np.nan if scale is None else float(scale.u),
         method=REPEATABILITY if single else calibration.method,
         steps=int(calibration.steps),
         converged=bool(calibration.converged),
-        reason=_reason(calibration, stage1),
+        reason=_reason(calibration),
         divided=not single and bool(calibration.divided) and stage1.anchor.can_scale,
         against_division=() if single else against_division(calibration),
-        observed=jax.tree.map(np.asarray, calibration.observed),
+        observed=observed,
         robust=robust,
-        prior=None if calibration.prior is None else jax.tree.map(np.asarray, calibration.prior),
+        prior=prior,
         noisy_encoders=calibration.noisy_encoders,
-        shared=None if shared is None else jax.tree.map(np.asarray, shared),
-        components=None if components is None else jax.tree.map(np.asarray, components),
-        surplus_k=0.0 if calibration.scale is None else float(calibration.scale.surplus),
+        shared=shared,
+        components=covariance.components,
+        surplus_k=0.0 if scale is None else float(scale.surplus),
         others=None if others is None else _other_poses(calibration.arm, others, calibration.observed),
     )
 
@@ -262,17 +260,18 @@ def record_of(
 def _other_poses(arm: Arm, capture: Capture, observed: ObservedMetrics) -> OtherPoses:
     """Of an arm, with the geometry found; what another observation alone determined is fitted."""
     if not capture.observations:
-        found = evaluate(arm, capture).repeatability
-        none = np.full(len(capture.names), np.nan)
-        return OtherPoses(capture.names, np.array(capture.sizes), np.asarray(found.socket_rms), none)
-    found = evaluate(arm, capture, geometry=observed.geometry).observed
-    assert found is not None
+        rms = np.asarray(evaluate(arm, capture).repeatability.socket_rms)
+        return OtherPoses(capture.names, np.array(capture.sizes), rms, np.full(len(rms), np.nan))
+    evaluation = evaluate(arm, capture, geometry=observed.geometry).observed
+    assert evaluation is not None
     poses = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
-    return OtherPoses(found.names, np.array(poses), np.asarray(found.rms), np.asarray(found.rms_angle))
+    rms, rms_angle = np.asarray(evaluation.rms), np.asarray(evaluation.rms_angle)
+    return OtherPoses(evaluation.names, np.array(poses), rms, rms_angle)
 
 
-def _reason(calibration: Calibration | Identification, stage1: Identification) -> str:
+def _reason(calibration: Calibration | Identification) -> str:
     """Why the calibration ended, in words; where parameters trade off, with their names."""
+    stage1 = calibration.stage1
     result = calibration.result if bool(stage1.converged) else stage1.result
     sentence, number = Reason[result], int(member_numbers(result))
     together = _trading_off(calibration) if number in (MAX_STEPS, STALLED) else []
@@ -314,36 +313,27 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         arm, noise, components, shared = to_numpy(
             (result.calibrated.arm, result.noise, result.components, result.shared)
         )
-        return Uncertainty(
-            arm=arm,
-            covariance=np.asarray(result.covariance),
-            open=np.asarray(result.open),
-            noise=noise,
-            u_k=None if np.isnan(result.u_k) else np.asarray(result.u_k),
-            shared=shared,
-            components=_parts(components, shared),
-            surplus_k=np.asarray(result.surplus_k),
-            names=result.names,
-            scatter_degrees_of_freedom=result.degrees_of_freedom,
-            lengths=len(result.recording.capture.lengths),
-        )
-    scale, shared = result.scale, None if isinstance(result, Identification) else result.shared
-    return Uncertainty(
-        arm=result.arm,
-        covariance=result.covariance,
-        open=result.parameter_covariance.open,
-        noise=result.noise,
-        u_k=None if scale is None else scale.u,
-        shared=shared,
-        components=_parts(result.parameter_covariance.components, shared),
-        surplus_k=None if scale is None else scale.surplus,
-        names=result.space.names,
-        scatter_degrees_of_freedom=float(result.degrees_of_freedom),
-        lengths=0 if scale is None else len(scale.nominal),
-    )
-
-
-def _parts(components: Components | None, shared: SharedErrors | None) -> Components | None:
-    """Parts of the covariance of the parameters, with errors of the tip that poses share."""
+        covariance, is_open, names = np.asarray(result.covariance), np.asarray(result.open), result.names
+        u_k, surplus_k = None if np.isnan(result.u_k) else np.asarray(result.u_k), np.asarray(result.surplus_k)
+        lengths = len(result.recording.capture.lengths)
+    else:
+        arm, noise, scale, names = result.arm, result.noise, result.scale, result.space.names
+        covariance, _, is_open, _, components = result.parameter_covariance
+        shared = None if isinstance(result, Identification) else result.shared
+        u_k, surplus_k = (None, None) if scale is None else (scale.u, scale.surplus)
+        lengths = 0 if scale is None else len(scale.nominal)
+    # Parts of the covariance of the parameters, with errors of the tip that poses share.
     of_tips = None if shared is None else shared.of_tips
-    return of_tips if components is None else components.joined(of_tips)
+    return Uncertainty(
+        arm=arm,
+        covariance=covariance,
+        open=is_open,
+        noise=noise,
+        u_k=u_k,
+        shared=shared,
+        components=of_tips if components is None else components.joined(of_tips),
+        surplus_k=surplus_k,
+        names=names,
+        scatter_degrees_of_freedom=float(result.degrees_of_freedom),
+        lengths=lengths,
+    )

@@ -2,7 +2,7 @@
 
 An error of what was measured, or of the seat, changes a residual and hardly its derivatives. So the data of a trial are
 those of the capture with readings drawn anew, and with a constant added to every residual that replaces the errors of
-the capture by others. No kind has to say how it is drawn.
+the capture by others. No kind has to say how it is drawn. Errors that poses share are drawn along.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,67 +19,185 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, by_joint
 from ..kinematics.chain import JointKinds, reading_units
+from ..kinematics.corrected_arm import function_values, with_further_corrections
+from ..kinematics.corrections.kinds import term_of
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
+from ..model.socket_sums import membership
 from ..uncertainty.linearisation import Linearisation, ObservationRows
-from .drawn_errors import DrawnErrors, draw_shared
+from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .results import Calibration
 from .task import configurations
+
+
+class DrawnErrors(NamedTuple):
+    """Errors that poses share, in some trials: of all M poses, those of sockets first."""
+
+    tips: Float[np.ndarray, "t M 3"]  # mm
+    joints: Float[np.ndarray, "t M n"]  # what the readings are too large by, rad or mm
+    coefficients: Float[np.ndarray, "t k"]  # of the functions that the model lacks
+
+
+def draw_shared(
+    shared: SharedErrors | None, arm: Arm, capture: Capture, count: int, random: np.random.Generator
+) -> DrawnErrors | None:
+    """Errors of some trials; None where a calibration has none."""
+    if shared is None:
+        return None
+    q, law = np.asarray(capture.readings), shared.law.in_numpy
+    tips = np.zeros((count, len(q), 3))
+    for i, root in enumerate(_roots(shared, capture)):
+        # A variance that few places show is itself uncertain, so it is drawn too (JCGM 101, 6.4.9).
+        sd = np.sqrt(random.choice(law.ratios[i], size=(count, 1, 1), p=law.weights[i] / law.weights[i].sum()))
+        tips += np.einsum("Mc,tcd->tMd", root, sd * random.normal(size=(count, root.shape[1], 3)))
+    values, joints = functions_of(shared.names, arm, q)
+    factor = _square_roots(np.asarray(shared.moments))
+    coefficients = random.normal(size=(count, len(shared.names))) @ factor.T
+    turned = np.zeros((count, *q.shape))
+    for k, joint in enumerate(joints):
+        turned[:, :, joint] += coefficients[:, k, None] * values[:, k]
+    return DrawnErrors(tips, turned, coefficients)
+
+
+def functions_of(
+    names: tuple[str, ...], arm: Arm, q: Float[np.ndarray, "M n"]
+) -> tuple[Float[np.ndarray, "M k"], np.ndarray]:
+    """Values of functions by the names of their coefficients, and the joint (from 0) of each."""
+    if not names:
+        return np.zeros((len(q), 0)), np.zeros(0, dtype=int)
+    wider: Arm = to_numpy(with_further_corrections(arm, names))
+    assert wider.corrections is not None
+    terms = [term for name in names if (term := term_of(name, arm.joints)) is not None]
+    values = function_values(wider.corrections.nominal, terms, q, np.asarray(wider.gravity)).T
+    return values, np.array([term.joint - 1 for term in terms])
+
+
+def places_of(capture: Capture) -> Float[np.ndarray, "M p"]:
+    """1 for the poses of each socket or observation that a reference length starts or ends at, a column each."""
+    names, belongs = _by_name(capture)
+    ends = {end for length in capture.lengths for end in (length.start, length.end)}
+    return belongs[[name in ends for name in names]].T
+
+
+def covariance_of_lengths(
+    shared: SharedErrors, arm: Arm, names: tuple[str, ...], capture: Capture
+) -> Float[np.ndarray, "l l"]:
+    """Covariance of the distances between ends of the reference lengths, as an arm measures them, by errors that poses
+    share, mm^2. Errors of the tip move the mean of an end; how parameters follow these is left out, as it is small.
+
+    Args:
+        shared: The errors.
+        arm: The calibrated arm.
+        names: Its parameters that were free.
+        capture: What it was calibrated from.
+    """
+    q, (of_names, belongs) = np.asarray(capture.readings), _by_name(capture)
+    means = dict(zip(of_names, belongs / belongs.sum(axis=1, keepdims=True), strict=True))
+    between = np.array([means[length.end] - means[length.start] for length in capture.lengths])
+    directions = between @ np.asarray(arm.position(q))
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    covariance = np.zeros((len(between), len(between)))
+    for root in _roots(shared, capture):
+        moved = between @ root
+        covariance = covariance + (directions @ directions.T) * (moved @ moved.T)
+    if shared.names:
+        values, joints = functions_of(shared.names, arm, q)
+        angles = tuple(f"{kind}_{i}" for i, kind in enumerate(by_joint(arm, "theta", "d"), start=1))
+        tips = np.asarray(arm.jacobian(q, angles))[:, :, joints] * values[:, None]
+        tips = tips + np.asarray(arm.jacobian(q, names)) @ np.asarray(shared.follow)
+        columns = np.einsum("lc,lN,Nck->lk", directions, between, tips)
+        covariance = covariance + columns @ np.asarray(shared.moments) @ columns.T
+    return covariance
+
+
+def _by_name(capture: Capture) -> tuple[list[str], Float[np.ndarray, "k M"]]:
+    """Names of sockets and observations, and 1 where a pose belongs to each."""
+    others = capture.observations
+    names = [*capture.names, *(observation.name for observation in others)]
+    return names, membership((*capture.sizes, *(observation.q.shape[0] for observation in others)))
+
+
+def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M c"]]:
+    """Square roots of the covariances of a tip coordinate over the poses, one for each kind that moves tips."""
+    roots, belongs = [], _by_name(capture)[1]
+    total = belongs.shape[1]
+    for kind, sd in zip(shared.kinds, np.asarray(shared.sd), strict=True):
+        if kind == PLACES:
+            roots.append(sd * places_of(capture))
+        elif kind == VISITS and capture.visits is not None:
+            visits = np.full(total, -1)
+            visits[: len(capture.visits)] = capture.visits
+            roots.append(sd * (visits[:, None] == [number for number in np.unique(visits) if number >= 0]))
+        elif kind == SUCCESSIVE:
+            root = np.zeros((total, total))
+            for own in map(np.flatnonzero, belongs):
+                order = np.arange(len(own))
+                kernel = np.exp(-np.abs(order[:, None] - order) / float(shared.correlation_length))
+                root[np.ix_(own, own)] = sd * np.linalg.cholesky(kernel)
+            roots.append(root)
+    return roots
+
+
+def _square_roots(covariances: Float[np.ndarray, "*m r r"]) -> Float[np.ndarray, "*m r r"]:
+    """Of positive semidefinite matrices, which may be 0."""
+    values, vectors = np.linalg.eigh(covariances)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
 
 
 class Trials(NamedTuple):
     """Captures of a calibrated arm with new errors."""
 
     size: int  # numbers in one of them
-    # And the coefficients of functions that the model lacks, of each trial.
+    # So many of them, by random numbers, with a level (t, 1, 1) that multiplies the noise of readings and seat; and the
+    # coefficients of functions that the model lacks.
     drawn: Callable[[int, np.random.Generator, Any], tuple[Capture, Float[np.ndarray, "t k"]]]
 
 
 def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.ndarray, " l"]) -> Trials:
     """Of a calibration; ``u`` are those of its reference lengths, mm."""
-    shared = to_numpy(result.shared)
+    shared, arm = to_numpy(result.shared), result.arm
 
-    def coefficients(found: DrawnErrors | None, count: int) -> Float[np.ndarray, "t k"]:
-        return np.zeros((count, 0)) if found is None else found.coefficients
+    def alike(count: int, random: np.random.Generator) -> tuple[DrawnErrors | None, Float[np.ndarray, "t k"]]:
+        errors = draw_shared(shared, arm, capture, count, random)
+        return errors, np.zeros((count, 0)) if errors is None else errors.coefficients
 
     if result.method == "joint":
         truth = truth_of(result, capture)
 
         def drawn_observations(count: int, random: np.random.Generator, level: Any) -> Any:
-            alike = draw_shared(shared, result.arm, capture, count, random)
-            return truth.drawn(count, noise, random, level, alike), coefficients(alike, count)
+            errors, coefficients = alike(count, random)
+            return truth.drawn(count, noise, random, level, errors), coefficients
 
         return Trials(truth.size, drawn_observations)
     # Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move.
-    exact = project_to_centroids(result.arm, capture)
-    by_joints = np.asarray(result.arm.jacobian(exact, [f"q_{i}" for i in range(1, result.arm.joints + 1)]))
-    units = reading_units(result.arm.geometry)
+    exact = project_to_centroids(arm, capture)
+    by_joints = np.asarray(arm.jacobian(exact, [f"q_{i}" for i in range(1, arm.joints + 1)]))
+    units = reading_units(arm.geometry)
     moves = units[:, None] * np.linalg.pinv(by_joints * units, rcond=1e-8)
-    true_lengths = np.asarray(_lengths_by(result.arm, capture))
+    first, ends, tips = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]]), capture.ends(), arm.position(exact)
+    true_lengths = np.linalg.norm(np.asarray(tips)[first[ends[:, 0]]] - np.asarray(tips)[first[ends[:, 1]]], axis=1)
 
     def drawn(count: int, random: np.random.Generator, level: Any) -> Any:
-        seats = float(noise.seating) * level * random.normal(size=(count, *exact.shape[:1], 3))
-        alike = draw_shared(shared, result.arm, capture, count, random)
-        if alike is not None:
-            seats = seats + alike.tips
-        read = noise.of_columns(result.arm.geometry.kinds, result.arm.joints, exact.shape[1])
+        seats = float(noise.seating) * level * random.normal(size=(count, len(exact), 3))
+        errors, coefficients = alike(count, random)
+        seats = seats if errors is None else seats + errors.tips
+        read = noise.of_columns(arm.geometry.kinds, arm.joints, exact.shape[1])
         readings = exact + read * level * random.normal(size=(count, *exact.shape))
-        readings[..., : result.arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
-        readings += 0.0 if alike is None else alike.joints
-        lengths = true_lengths + u * random.normal(size=(count, len(u)))
-        return batch_of_captures(capture, readings, lengths), coefficients(alike, count)
+        readings[..., : arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
+        readings += 0.0 if errors is None else errors.joints
+        return batch_of_captures(capture, readings, _around(true_lengths, u, count, random)), coefficients
 
     return Trials(exact.size, drawn)
 
 
-def _lengths_by(arm: Arm, capture: Capture) -> np.ndarray:
-    tips = np.asarray(arm.position(project_to_centroids(arm, capture)))
-    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-    ends = capture.ends()
-    return np.linalg.norm(tips[first[ends[:, 0]]] - tips[first[ends[:, 1]]], axis=1)
+def _around(
+    centre: Float[np.ndarray, " k"], u: Float[np.ndarray, " k"], count: int, random: np.random.Generator
+) -> Float[np.ndarray, "t k"]:
+    return centre + u * random.normal(size=(count, len(u)))
 
 
 class DrawnLengths(NamedTuple):
@@ -104,15 +222,14 @@ class ObservedTruth(NamedTuple):
         """By the arm with these parameters, and the geometry by the names of its parts."""
         observed, space = to_numpy((Observed.of(capture, space.base), space))
         numbers = [np.asarray(geometry[name]) for name in observed.blocks]
-        z = np.concatenate([np.asarray(vector), *numbers])
-        linear = Linearisation.at(observed, space, z, least=1.0)
+        linear = Linearisation.at(observed, space, np.concatenate([np.asarray(vector), *numbers]), least=1.0)
         parts = linear.parts()
         return cls(
             observed,
             parts,
             linear.errors[0].kinds,
             [_square_roots(np.asarray(part.measured)) for part in parts],
-            {name: np.asarray(values) for name, values in observed.split(z[len(space.names) :]).items()},
+            dict(zip(observed.blocks, numbers, strict=True)),
             np.array(configurations(observed.q)),
         )
 
@@ -120,6 +237,11 @@ class ObservedTruth(NamedTuple):
     def size(self) -> int:
         """Numbers in the data of one trial."""
         return sum(part.observation.q.size + part.values.size for part in self.parts)
+
+    @property
+    def ends(self) -> list[tuple[str, str]]:
+        """Names of the positions at the ends of the reference lengths."""
+        return list(self.observed.ends)
 
     def drawn(
         self,
@@ -136,44 +258,44 @@ class ObservedTruth(NamedTuple):
         read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
         values = self.values(count, random)
         errors = self.errors_of_rows(count, level * float(noise.seating), random)
-        found = []
+        observations = []
         for part, error in zip(self.parts, errors, strict=True):
-            rows = part.poses
-            shift, readings = error - np.asarray(part.values), q[rows] + read[:, self.reading[rows]]
+            shift, readings = error - np.asarray(part.values), q[part.poses] + read[:, self.reading[part.poses]]
             if alike is not None:
-                shift = shift + np.einsum("rcm,tmc->trm", np.asarray(part.by_tip), alike.tips[:, rows])
-                readings = readings + alike.joints[:, rows]
-            found.append(shifted(part.observation, readings, shift, values))
-        return batch_of_observations(found, self.ends, self.lengths(count, random))
+                shift = shift + np.einsum("rcm,tmc->trm", np.asarray(part.by_tip), alike.tips[:, part.poses])
+                readings = readings + alike.joints[:, part.poses]
+            observations.append(shifted(part.observation, readings, shift, values))
+        return batch_of_observations(observations, self.ends, self.lengths(count, random))
 
     def errors_of_rows(self, count: int, seating: Any, random: np.random.Generator) -> list[Float[np.ndarray, "t r m"]]:
         """Errors of the seat (of this standard deviation, mm) and of what was measured, in each observation's rows."""
-        found = []
+        errors = []
         for part, root in zip(self.parts, self.roots, strict=True):
             r, m = part.values.shape
             seat = seating * random.normal(size=(count, part.by_seat.shape[1], m))
             measured = np.einsum("mab,tbm->tam", root, random.normal(size=(count, r, m)))
-            found.append(measured + np.einsum("rcm,tcm->trm", part.by_seat, seat))
-        return found
+            errors.append(measured + np.einsum("rcm,tcm->trm", part.by_seat, seat))
+        return errors
 
     def values(self, count: int, random: np.random.Generator) -> dict[str, Float[np.ndarray, "t k"]]:
         """Certified values of the parts that have them."""
-        return {
-            name: self.geometry[name] + np.asarray(u) * random.normal(size=(count, len(u)))
-            for name, (_, u) in self.observed.certified().items()
-        }
+        certified = self.observed.certified().items()
+        return {name: _around(self.geometry[name], np.asarray(u), count, random) for name, (_, u) in certified}
 
     def lengths(self, count: int, random: np.random.Generator) -> DrawnLengths:
         """Certified values of the reference lengths."""
-        ends = self.observed.ends
-        true = np.array([np.linalg.norm(self.geometry[end] - self.geometry[start]) for start, end in ends])
+        true = [np.linalg.norm(self.geometry[end] - self.geometry[start]) for start, end in self.ends]
+        return self._lengths(np.array(true), count, random)
+
+    def _lengths(self, centre: Float[np.ndarray, " l"], count: int, random: np.random.Generator) -> DrawnLengths:
         u = np.asarray(self.observed.u)
-        return DrawnLengths(true + u * random.normal(size=(count, len(u))), np.broadcast_to(u, (count, len(u))))
+        return DrawnLengths(_around(centre, u, count, random), np.broadcast_to(u, (count, len(u))))
 
     def resampled(self, count: int, random: np.random.Generator) -> Capture:
         """A batch of captures with poses drawn with replacement, and certified values with their uncertainty.
 
-        Poses are drawn among those that owe the same: of one socket, one point of an artefact, one of two planes.
+        Poses are drawn among those under the same constraint: of one socket, one point of an artefact, one of two
+        planes.
 
         Raises `InputError` where poses belong to two observations, or an observation has but one pose of each.
         """
@@ -182,25 +304,23 @@ class ObservedTruth(NamedTuple):
                 "some poses have exactly the readings of others, such as two targets seen at once, so they cannot be "
                 "drawn one by one; use monte_carlo."
             )
-        values = {
-            name: np.asarray(value) + np.asarray(u) * random.normal(size=(count, len(u)))
-            for name, (value, u) in self.observed.certified().items()
-        }
-        found = []
+        certified = self.observed.certified().items()
+        values = {name: _around(np.asarray(value), np.asarray(u), count, random) for name, (value, u) in certified}
+        observations = []
         for part in self.parts:
-            observation = part.observation
+            observation, none = part.observation, np.zeros((count, *part.values.shape))
             rows = _rows_with_replacement(observation, count, random)
-            batch = _selected(observation, rows)
+            fields = [field for field in observation.by_pose if not isinstance(getattr(observation, field), tuple)]
+            chosen = [np.asarray(getattr(observation, field))[rows] for field in fields]
+            batch = eqx.tree_at(
+                lambda tree, fields=fields: [getattr(tree, field) for field in fields],
+                _repeated(observation, count),
+                chosen,
+            )
             own = {name: values[name] for name in observation.certified}
-            found.append(batch.with_errors(batch.q, np.zeros((count, *part.values.shape)), own))
-        nominal, u = np.asarray(self.observed.nominal), np.asarray(self.observed.u)
-        drawn = nominal + u * random.normal(size=(count, len(u)))
-        return batch_of_observations(found, self.ends, DrawnLengths(drawn, np.broadcast_to(u, drawn.shape)))
-
-    @property
-    def ends(self) -> list[tuple[str, str]]:
-        """Names of the positions at the ends of the reference lengths."""
-        return list(self.observed.ends)
+            observations.append(batch.with_errors(batch.q, none, own))
+        lengths = self._lengths(np.asarray(self.observed.nominal), count, random)
+        return batch_of_observations(observations, self.ends, lengths)
 
 
 def truth_of(result: Calibration, capture: Capture) -> ObservedTruth:
@@ -209,7 +329,7 @@ def truth_of(result: Calibration, capture: Capture) -> ObservedTruth:
     missing = [name for name in Observed.of(capture, None).blocks if name not in geometry]
     if missing:
         raise InputError(
-            f"the calibration knows nothing of the {missing[0]}; give the capture that it was identified from."
+            f"the calibration does not have the {missing[0]}; give the capture that it was identified from."
         )
     return ObservedTruth.at(capture, Parameters(result.arm, result.space.names), result.parameters, geometry)
 
@@ -229,34 +349,6 @@ def _repeated(observation: AbstractObservation, count: int) -> AbstractObservati
     return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *np.shape(leaf))), observation)
 
 
-def batch_of_observations(
-    observations: list[AbstractObservation], ends: list[tuple[str, str]], lengths: DrawnLengths
-) -> Capture:
-    """A batch of captures, as `identify_many` takes it; ``ends`` are names of the positions at the lengths' ends."""
-    count, _, joints = observations[0].q.shape
-    names = [(start.removeprefix("position of "), end.removeprefix("position of ")) for start, end in ends]
-    template = Capture({}, (), [jax.tree.map(lambda leaf: leaf[0], one) for one in observations])
-    references = tuple(
-        eqx.tree_at(
-            lambda one: (one.value, one.u),
-            ReferenceLength(pair[0], pair[1], 1.0),
-            (lengths.value[:, i], lengths.u[:, i]),
-        )
-        for i, pair in enumerate(names)
-    )
-    return eqx.tree_at(
-        lambda capture: (capture.q, capture.lengths, capture.observations),
-        template,
-        (np.zeros((count, 0, joints)), references, tuple(observations)),
-    )
-
-
-def _square_roots(covariances: Float[np.ndarray, "m r r"]) -> Float[np.ndarray, "m r r"]:
-    """Of positive semidefinite matrices, which may be 0."""
-    values, vectors = np.linalg.eigh(covariances)
-    return vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-
-
 def _rows_with_replacement(
     observation: AbstractObservation, count: int, random: np.random.Generator
 ) -> Int[np.ndarray, "t m"]:
@@ -273,12 +365,25 @@ def _rows_with_replacement(
     return rows
 
 
-def _selected(observation: AbstractObservation, rows: Int[np.ndarray, "t m"]) -> AbstractObservation:
-    """A batch of the observation with these poses."""
-    fields = [field for field in observation.by_pose if not isinstance(getattr(observation, field), tuple)]
-    batch = _repeated(observation, len(rows))
-    chosen = [np.asarray(getattr(observation, field))[rows] for field in fields]
-    return eqx.tree_at(lambda one: [getattr(one, field) for field in fields], batch, chosen)
+def batch_of_observations(
+    observations: list[AbstractObservation], ends: list[tuple[str, str]], lengths: DrawnLengths
+) -> Capture:
+    """A batch of captures, as `identify_many` takes it; ``ends`` are names of the positions at the lengths' ends."""
+    count, _, joints = observations[0].q.shape
+    template = Capture({}, (), [jax.tree.map(lambda leaf: leaf[0], batch) for batch in observations])
+    references = tuple(
+        eqx.tree_at(lambda length: (length.value, length.u), ReferenceLength(_socket(a), _socket(b), 1.0), (value, u))
+        for (a, b), value, u in zip(ends, lengths.value.T, lengths.u.T, strict=True)
+    )
+    return eqx.tree_at(
+        lambda capture: (capture.q, capture.lengths, capture.observations),
+        template,
+        (np.zeros((count, 0, joints)), references, tuple(observations)),
+    )
+
+
+def _socket(position: str) -> str:
+    return position.removeprefix("position of ")
 
 
 def batch_of_captures(capture: Capture, q: Numbers, values: Numbers, u: Numbers | None = None) -> Capture:

@@ -1,7 +1,7 @@
 """Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..core.arguments import checked_arguments
+from ..core.arguments import OneOf, Range, checked_arguments
+from ..core.arrays import Numbers
 from ..core.errors import InputError
+from ..core.numpy_or_jax import AnyArray
 from ..core.random_keys import random_generator
 from ..data.capture import Capture
 from ..data.noise import Noise
+from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
@@ -24,7 +27,10 @@ from .record import uncertainty_of
 from .redrawn import batch_of_captures, trials_of, truth_of
 from .results import Calibration, ManyCalibrations
 
+Level = Annotated[float, Range(above=0, most=0.9999)]  # coverage probability
+
 _LENGTHS = 24  # lengths over the working volume whose distribution is found with those of the parameters and k
+_LEAST = 10  # trials that converge, of which a distribution is made
 _REFINED = 5  # the standard's own tolerance is divided by this where a linear result is validated (JCGM 101, 8.2)
 
 
@@ -57,12 +63,8 @@ class Sampled(NamedTuple):
     @property
     def agrees(self) -> Bool[np.ndarray, " q"]:
         """Where both ends of the linear interval agree with the sampled ones to the tolerance (JCGM 101, 8.2)."""
-        off = np.stack(
-            [
-                self.estimate - self.factor * self.linear_u - self.low,
-                self.estimate + self.factor * self.linear_u - self.high,
-            ]
-        )
+        half = self.factor * self.linear_u
+        off = np.stack([self.estimate - half - self.low, self.estimate + half - self.high])
         return np.all(np.abs(off) <= self.tolerance, axis=0)
 
     def table(self) -> dict[str, np.ndarray]:
@@ -72,24 +74,25 @@ class Sampled(NamedTuple):
 
     def sentences(self) -> list[str]:
         """Whether the linear result may be used, and where not."""
-        found = [] if self.stable else [f"After {self.trials} trials the intervals are not yet stable; allow more."]
+        sentences = []
+        if not self.stable:
+            sentences.append(f"After {self.trials} trials the intervals are not yet stable; allow more.")
         if self.failed:
-            found.append(f"{self.failed} of {self.trials} trials did not converge and are left out.")
+            sentences.append(f"{self.failed} of {self.trials} trials did not converge and are left out.")
         apart = [name for name, good in zip(self.quantities, self.agrees, strict=True) if not good]
         percent = f"{100 * self.level:g} %"
         if apart:
-            found.append(
+            return [
+                *sentences,
                 f"The linear {percent} intervals differ from the Monte Carlo ones by more than the tolerance of JCGM "
                 f"101 for {len(apart)} of {len(self.quantities)} quantities: {', '.join(apart[:8])}"
-                f"{' ...' if len(apart) > 8 else ''}; use the Monte Carlo ones."
-            )
-        else:
-            found.append(
-                f"The linear {percent} intervals agree with those of {self.trials} Monte Carlo trials within the "
-                f"tolerance of JCGM 101, for every parameter{', k,' if 'k' in self.quantities else ''} and lengths "
-                "over the volume."
-            )
-        return found
+                f"{' ...' if len(apart) > 8 else ''}; use the Monte Carlo ones.",
+            ]
+        return [
+            *sentences,
+            f"The linear {percent} intervals agree with those of {self.trials} Monte Carlo trials within the tolerance "
+            f"of JCGM 101, for every parameter{', k,' if 'k' in self.quantities else ''} and lengths over the volume.",
+        ]
 
 
 @checked_arguments
@@ -97,8 +100,8 @@ def monte_carlo(
     result: Calibration,
     capture: Capture,
     *,
-    level: float = 0.95,
-    digits: int = 1,
+    level: Level = 0.95,
+    digits: Annotated[int, OneOf((1, 2))] = 1,
     most: int = 1_000_000,
     lengths: tuple[np.ndarray, np.ndarray] | None = None,
     noise: Noise | None = None,
@@ -129,8 +132,8 @@ def monte_carlo(
         Distribution of every parameter, k and the lengths, with the linear result to compare it with.
 
     Raises:
-        InputError: a number is out of range, the calibration had a robust loss (a bootstrap keeps bad poses), or hardly
-            any trial converges.
+        InputError: a number is out of range, the calibration had a robust loss (a bootstrap keeps bad poses), or fewer
+            than ten trials converge.
 
     Example:
         >>> sampled = aj.monte_carlo(result, capture, most=10000)
@@ -138,9 +141,6 @@ def monte_carlo(
         >>> print(f"d_3: u = {sampled.u[at]:.3f} mm; by the linear propagation {sampled.linear_u[at]:.3f} mm")
         d_3: u = 0.010 mm; by the linear propagation 0.010 mm
     """
-    if digits not in (1, 2):
-        raise InputError(f"digits is {digits}; give 1 or 2 significant digits of the uncertainty.")
-    _check_level(level)
     random_generator(seed)
     if noise is not None:
         noise.check(result.arm.joints)
@@ -149,39 +149,30 @@ def monte_carlo(
     if most < block:
         raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
     task = _RepeatedTask.of(result, capture, lengths)
-    trials = trials_of(result, capture, noise, task.u)
-    drawn, failed, blocks = [], 0, []
+    trials, freedom = trials_of(result, capture, noise, task.u), result.degrees_of_freedom
+    values, failed, blocks = [], 0, []
     stable = False
-    while sum(map(len, drawn)) + failed < most and not stable:
-        random = np.random.default_rng([seed, len(drawn)])
+    while sum(map(len, values)) + failed < most and not stable:
+        random = np.random.default_rng([seed, len(values)])
         parts = []
         for count in _slices(block, trials.size):
             # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives
             # Student's t (JCGM 101, 6.4.9).
-            known = math.isinf(result.degrees_of_freedom)
-            level_of = (
-                1.0
-                if known
-                else np.sqrt(
-                    result.degrees_of_freedom / random.chisquare(result.degrees_of_freedom, size=(count, 1, 1))
-                )
-            )
-            captures, coefficients = trials.drawn(count, random, level_of)
+            scale = 1.0 if math.isinf(freedom) else np.sqrt(freedom / random.chisquare(freedom, size=(count, 1, 1)))
+            captures, coefficients = trials.drawn(count, random, scale)
             means = task.prior_means(count, random, np.asarray(result.parameters))
             solved, lost = task.solved(captures, means, coefficients)
             parts.append(solved)
             failed += lost
-        found = np.concatenate(parts)
-        drawn.append(found)
-        if len(found) < 10:
-            raise InputError(
-                "hardly any Monte Carlo trial converges; widen the bounds, or look at the calibration first."
-            )
-        low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2], axis=0)
-        blocks.append(np.stack([found.mean(axis=0), found.std(axis=0, ddof=1), low, high]))
-        u = np.concatenate(drawn).std(axis=0, ddof=1)
-        stable = len(blocks) > 1 and bool(np.all(_instability(blocks) <= numerical_tolerance(u, digits) / _REFINED))
-    return task.sampled(result, np.concatenate(drawn), stable, failed, level, digits)
+        values.append(np.concatenate(parts))
+        _check_some(values[-1], block, "Monte Carlo", "check the calibration or widen the bounds")
+        low, high = np.quantile(values[-1], [(1 - level) / 2, (1 + level) / 2], axis=0)
+        blocks.append(np.stack([values[-1].mean(axis=0), values[-1].std(axis=0, ddof=1), low, high]))
+        # Twice the standard deviation of the averages over blocks, of the worst of mean, u and both ends (7.9.4).
+        spread = 2 * np.std(blocks, axis=0, ddof=1).max(axis=0) / math.sqrt(len(blocks)) if blocks[1:] else np.inf
+        u = np.concatenate(values).std(axis=0, ddof=1)
+        stable = bool(np.all(spread <= numerical_tolerance(u, digits) / _REFINED))
+    return task.sampled(np.concatenate(values), failed, level, digits, stable=stable)
 
 
 @checked_arguments
@@ -189,17 +180,16 @@ def bootstrap(
     result: Calibration,
     capture: Capture,
     *,
-    trials: int = 2000,
-    level: float = 0.95,
+    trials: Annotated[int, Range(least=100)] = 2000,
+    level: Level = 0.95,
     robust: LossName | None = None,
     seed: int = 0,
 ) -> Sampled:
     """The calibration repeated on poses drawn with replacement, and certified values drawn with their u.
 
-    Poses are drawn from those of each socket; of other observations from those that owe the same, such as one point of
-    an artefact. It only assumes that the errors of poses are independent. (The variance of a socket of m poses is
-    (m - 1) / m too small.) Means of a prior are
-    drawn with its standard deviations.
+    Poses are drawn from those of each socket; of other observations from those under the same constraint, such as one
+    point of an artefact. It only assumes that the errors of poses are independent. (The variance of a socket of m poses
+    is (m - 1) / m too small.) Means of a prior are drawn with its standard deviations.
 
     Args:
         result: what `calibrate` returned.
@@ -214,7 +204,7 @@ def bootstrap(
 
     Raises:
         InputError: too few trials, poses that cannot be drawn one in the place of another, another loss than the
-            calibration's, or hardly any of them converges.
+            calibration's, or fewer than ten of them converge.
 
     Example:
         >>> sampled = aj.bootstrap(result, capture, trials=100)
@@ -222,30 +212,26 @@ def bootstrap(
         >>> print(sampled.trials, f"trials: probe_z from {sampled.low[at]:.3f} to {sampled.high[at]:.3f} mm")
         100 trials: probe_z from 102.497 to 102.503 mm
     """
-    if trials < 100:
-        raise InputError(f"{trials} trials show no distribution; ask for at least 100.")
-    _check_level(level)
     random = random_generator(seed)
     task = _RepeatedTask.of(result, capture, None, robust)
     if result.method == "joint":
         captures = truth_of(result, capture).resampled(trials, random)
-        means = None if result.prior is None else _of_prior(result, np.asarray(result.prior.mean))
-        found, failed = task.solved(captures, task.prior_means(trials, random, means))
+        means = None if result.prior is None else task.in_order(np.asarray(result.prior.mean), result.parameters)
+        values, failed = task.solved(captures, task.prior_means(trials, random, means))
     else:
         starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
         sizes = zip(starts, capture.sizes, strict=True)
         rows = np.concatenate([start + random.integers(size, size=(trials, size)) for start, size in sizes], axis=1)
         nominal = np.array([float(length.value) for length in capture.lengths])
-        values = nominal + task.u * random.normal(size=(trials, len(nominal)))
-        found, failed = task.solved(batch_of_captures(capture, np.asarray(capture.q)[rows], values))
-    if len(found) < 10:
-        raise InputError("hardly any bootstrap trial converges: too few poses a socket for this; record more.")
-    return task.sampled(result, found, True, failed, level, 1)
+        lengths = nominal + task.u * random.normal(size=(trials, len(nominal)))
+        values, failed = task.solved(batch_of_captures(capture, np.asarray(capture.q)[rows], lengths))
+    _check_some(values, trials, "bootstrap", "there are too few poses a socket for this, so record more")
+    return task.sampled(values, failed, level, 1)
 
 
-def _check_level(level: float) -> None:
-    if not 0 < level <= 0.9999:
-        raise InputError(f"level is {level:g}; give a probability between 0 and 0.9999, for example 0.95.")
+def _check_some(values: np.ndarray, trials: int, what: str, remedy: str) -> None:
+    if len(values) < _LEAST:
+        raise InputError(f"{len(values)} of {trials} {what} trials converged; {remedy}.")
 
 
 def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:
@@ -264,16 +250,6 @@ def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) 
         )
 
 
-def _of_prior(
-    result: Calibration, values: Float[np.ndarray, " q"], missing: float | None = None
-) -> Float[np.ndarray, " p"]:
-    """Numbers of the parameters of a prior in the order of all; those that it leaves out keep what was calibrated."""
-    assert result.prior is not None
-    found = np.array(result.parameters) if missing is None else np.full(len(result.space.names), missing)
-    found[[result.space.names.index(name) for name in result.prior.names]] = values
-    return found
-
-
 def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
     """delta = 10^l / 2, where u = c 10^l with an integer c of so many digits (JCGM 101, 7.9.2)."""
     safe = np.where(u > 0, u, 1.0)
@@ -281,12 +257,6 @@ def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.nda
     # 9.96 rounds to 10, which has one digit more.
     exponent += np.round(safe / 10**exponent) >= 10**digits
     return np.where(u > 0, 0.5 * 10**exponent, 0.0)
-
-
-def _instability(blocks: list[np.ndarray]) -> Float[np.ndarray, " q"]:
-    """Twice the standard deviation of the averages over blocks, of the worst of mean, u and both ends."""
-    count = len(blocks)
-    return 2 * np.std(blocks, axis=0, ddof=1).max(axis=0) / math.sqrt(count)
 
 
 def _slices(block: int, numbers: int) -> list[int]:
@@ -314,12 +284,9 @@ class _RepeatedTask(NamedTuple):
         robust: LossName | None = None,
     ) -> "_RepeatedTask":
         _check_loss(result, capture, robust)
-        if lengths is not None and (
-            not isinstance(lengths, tuple | list)
-            or len(lengths) != 2
-            or np.ndim(lengths[0]) != 2
-            or np.shape(lengths[0]) != np.shape(lengths[1])
-        ):
+        two = isinstance(lengths, tuple | list) and len(lengths) == 2
+        shapes = [np.shape(poses) for poses in lengths] if lengths is not None and two else []
+        if lengths is not None and (not two or len(shapes[0]) != 2 or shapes[0] != shapes[1]):
             raise InputError(
                 "lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends."
             )
@@ -327,13 +294,21 @@ class _RepeatedTask(NamedTuple):
         u = np.array([float(length.u) for length in capture.lengths])
         return cls(result, capture, np.asarray(start), np.asarray(end), u, robust)
 
+    def in_order(self, values: Float[np.ndarray, " q"], others: Numbers) -> Float[np.ndarray, " p"]:
+        """Numbers of the parameters of a prior in the order of all, with others for those that it leaves out."""
+        names = self.result.space.names
+        ordered = np.array(np.broadcast_to(np.asarray(others), (len(names),)))
+        assert self.result.prior is not None
+        ordered[[names.index(name) for name in self.result.prior.names]] = values
+        return ordered
+
     def prior_means(
         self, count: int, random: np.random.Generator, centre: Float[np.ndarray, " p"] | None
     ) -> Float[np.ndarray, "t p"] | None:
         """Parameters of so many arms in which those with a prior have its means, drawn anew about a centre."""
         if self.result.prior is None or centre is None:
             return None
-        weight = _of_prior(self.result, np.asarray(self.result.prior.weight), missing=0.0)
+        weight = self.in_order(np.asarray(self.result.prior.weight), 0.0)
         sd = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
         return centre + sd * random.normal(size=(count, len(sd)))
 
@@ -364,15 +339,14 @@ class _RepeatedTask(NamedTuple):
         are off by more than follows from the parameters.
         """
         result, many = self.result, self._many(captures, means)
-        good = many.converged
         ends = (jnp.asarray(self.start), jnp.asarray(self.end))
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
-        shared = self.result.shared
+        shared = result.shared
         if coefficients is not None and shared is not None and shared.names:
             lengths = np.asarray(lengths) + coefficients @ self._by_functions(shared).T
-        scale = np.zeros((len(good), 0)) if many.k is None else many.k[:, None]
-        found = np.hstack([many.parameters, scale, np.asarray(lengths)])
-        return found[good], int(np.sum(~good))
+        scale = [] if many.k is None else [many.k[:, None]]
+        values = np.hstack([many.parameters, *scale, np.asarray(lengths)])
+        return values[many.converged], int(np.sum(~many.converged))
 
     def _by_functions(self, shared: SharedErrors) -> Float[np.ndarray, "v k"]:
         """Derivatives of the lengths by the coefficients of functions that the model lacks."""
@@ -382,26 +356,20 @@ class _RepeatedTask(NamedTuple):
         direction = between / np.linalg.norm(between, axis=1, keepdims=True)
         return np.einsum("vc,vck->vk", direction, by_tips[1] - by_tips[0])
 
-    def sampled(
-        self, result: Calibration, values: np.ndarray, stable: bool, failed: int, level: float, digits: int
-    ) -> Sampled:
+    def sampled(self, values: np.ndarray, failed: int, level: float, digits: int, stable: bool = True) -> Sampled:
         """The trials' distribution, with the linear result to compare it with."""
-        linear = uncertainty_of(result)
+        result, linear = self.result, uncertainty_of(self.result)
         u_length = np.asarray(linear.length(self.start, self.end))
-        factor_length = linear.expanded_length(self.start, self.end, level=level) / np.where(
-            u_length > 0, u_length, 1.0
-        )
-        u = values.std(axis=0, ddof=1)
+        expanded = linear.expanded_length(self.start, self.end, level=level)
+        factor_length = expanded / np.where(u_length > 0, u_length, 1.0)
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
-        start, end = (np.asarray(result.arm.position(q)) for q in (self.start, self.end))
-        lengths = np.linalg.norm(start - end, axis=1)
+        u, lengths = values.std(axis=0, ddof=1), _lengths_by(result.arm, (self.start, self.end))
         scale = result.scale if result.method == "two-stage" else None  # a joint solve divides by no k
         k, u_k = ([], []) if scale is None else ([float(scale.value)], [float(scale.u)])
         factor_k = [linear.expanded_k(level) / own for own in u_k]
-        estimate = np.concatenate([result.parameters, k, lengths])
         return Sampled(
             quantities=(*result.space.names, *("k" for _ in k), *(f"length {i + 1}" for i in range(len(self.start)))),
-            estimate=estimate,
+            estimate=np.concatenate([result.parameters, k, np.asarray(lengths)]),
             u=u,
             low=low,
             high=high,
@@ -416,10 +384,10 @@ class _RepeatedTask(NamedTuple):
         )
 
 
+def _lengths_by(arm: Arm, ends: tuple[AnyArray, AnyArray]) -> AnyArray:
+    return jnp.linalg.norm(arm.position(ends[0]) - arm.position(ends[1]), axis=-1)
+
+
 @eqx.filter_jit
 def _lengths_of(space: Parameters, parameters: Array, ends: tuple[Array, Array]) -> Array:
-    def one(vector: Array) -> Array:
-        arm = space.arm(vector)
-        return jnp.linalg.norm(arm.position(ends[0]) - arm.position(ends[1]), axis=-1)
-
-    return jax.lax.map(one, parameters, batch_size=256)
+    return jax.lax.map(lambda vector: _lengths_by(space.arm(vector), ends), parameters, batch_size=256)

@@ -17,11 +17,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
+from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
 from ..data.capture import Capture
-from ..data.observations.socket import position_of
 from ..kinematics.parameters import Bounds
-from ..model.observed import Observed
+from ..model.observed import Observed, ends_of
 from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
 from ..uncertainty.covariance import DISAGREEMENT, STATED
 from ..uncertainty.degrees_of_freedom import Components
@@ -52,21 +51,13 @@ def measured_scale(solution: Solution, capture: Capture) -> MeasuredScale:
 
     Its standard uncertainty includes that of the identified parameters, and takes those on a bound as exact.
     """
-    linear, influence = solution.linear, solution.influence
-    p, layout, positions = len(linear.space.names), linear.observed.layout, linear.observed.positions
-    xp, ends = namespace(linear.z), ends_between(linear.observed, linear.z[p:], influence.own, capture)
+    linear, influence, p = solution.linear, solution.influence, len(solution.linear.space.names)
+    geometry = linear.z[p:]
+    xp, ends = namespace(linear.z), ends_between(linear.observed, geometry, influence.own, capture)
     scale, relative = scale_and_weights(ends)
-    by_positions = xp.einsum("l,lec->ec", relative, ends.by_positions)
-    head = xp.zeros((1, linear.height))
-    components = [xp.zeros((1, count, size)) for count, size in layout.classes]
-    for name, derivative in zip(positions_at_ends(capture), by_positions, strict=True):
-        number, component, first = layout.component_of(int(positions[name][0]))
-        if number < 0:
-            head = set_at(head, (0, p + positions[name]), derivative)
-        else:
-            place = 0, component, slice(first, first + 3)
-            components[number] = set_at(components[number], place, derivative)
-    rows = rows_of_functions(influence, head, components)
+    _, pull = linear.observed.distances(geometry, ends_of(capture))
+    rows = rows_of_functions(influence, *linear.observed.by_unknowns((relative @ pull)[None], p))
+    # k = sum of weights m_i / n_i, with m_i measured and n_i certified: dk/dn_i = - (weight / n_i) m_i / n_i.
     by_lengths = -relative * scale.measured / scale.nominal
     of_lengths = xp.sum((by_lengths * ends.u) ** 2)
     u = xp.sqrt(solution.covariance_of(rows)[0, 0] + of_lengths + scale.surplus)
@@ -75,7 +66,7 @@ def measured_scale(solution: Solution, capture: Capture) -> MeasuredScale:
 
 def positions_at_ends(capture: Capture) -> list[str]:
     """Names of the positions at the ends of reference lengths."""
-    return list(dict.fromkeys(position_of(name) for pair in capture.lengths for name in (pair.start, pair.end)))
+    return list(dict.fromkeys(name for pair in ends_of(capture) for name in pair))
 
 
 def ends_between(
@@ -86,11 +77,10 @@ def ends_between(
     for name in used:
         number, component, first = observed.layout.component_of(int(observed.positions[name][0]))
         covariances.append(own[number][component, first : first + 3, first : first + 3])
-    pairs = [(length.start, length.end) for length in capture.lengths]
     return MeasuredEnds(
         positions=xp.stack([geometry[observed.positions[name]] for name in used]),
         covariances=xp.stack(covariances),
-        ends=np.array([[used.index(position_of(name)) for name in pair] for pair in pairs]),
+        ends=np.array([[used.index(name) for name in pair] for pair in ends_of(capture)]),
         nominal=xp.stack([length.value for length in capture.lengths]),
         u=xp.stack([length.u for length in capture.lengths]),
     )

@@ -96,12 +96,14 @@ def minimised(task: Task, begun: Begun) -> tuple[Float[AnyArray, " z"], State, F
     """The unknowns after all least squares, the state there, and the last result with the evaluations of all."""
     z, state, evaluations, losses = begun.z, begun.state, namespace(task).zeros((), dtype=int), losses_of(task)
     solution = of_prior = None
+    # The covariance of the rows depends on the arm, so each least squares has the weights of the last one's solution.
     for number, loss in enumerate(losses, 1):
         last = number == len(losses)
         prior = prior_of(task) if last else None
         if prior is not None:
             z, state, solution, of_prior = fitted_with_prior(task, prior, begun, state, z)
         else:
+            # Positions of sockets are eliminated: given the head, they are means of the tips (`model.elimination`).
             args, count = args_of(task, weights(task, begun, state, loss), loss, z)
             solution = fit(task, args, z[:count], begun, rules_of(number, len(losses)))
             z, point = with_linear_geometry(solution.parameters, args)
@@ -121,8 +123,10 @@ def concluded(
     whitening = whitening_at(task, state, prior_rows)
     active = Bounds(space, *(side[:p] for side in begun.sides)).active(z[:p])
     linear = Linearisation.of(task.observed, space, z, state.point, state.errors, whitening, task.loss)
+    # A parameter on a bound follows no row; `stages` adds the chance that it is not on its bound.
     influence = linear.influence(xp.concatenate([active != 0, xp.zeros(count, dtype=bool)]))
     noise = _noise_of(task, linear, influence, state)
+    # Cov z = G (sum over poses of A W Cov(w) W A^T) G (JCGM 100, section 5), plus what poses with one reading share.
     covariances, shared, reading = _of_rows(task, linear, influence, noise)
     by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales.added(influence.inverse)
     unknowns = propagated(influence, covariances, shared, by_scales)
@@ -176,6 +180,7 @@ def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: St
         return noise_from(Moments(xp.zeros(()), state.sigma**2))
     prior = None
     if whitening.prior is not None:
+        # The prior's rows are weight (x - mean), so that its information is weight^2; in natural steps.
         own = np.arange(whitening.prior.mean.shape[0])
         squares = xp.where(influence.fixed[own], 0.0, whitening.prior.weight * linear.steps[own]) ** 2
         prior = added_to(xp.zeros((linear.height, linear.height)), (own, own), squares)
@@ -203,6 +208,7 @@ def _of_parameters(
     """Of all parameters, of which the scale anchor is exact."""
     xp, free, size = namespace(linear.z), task.free, len(task.bounds.space.names)
     p, grid = len(free), np.ix_(free, free)
+    # x_i is a number of natural steps s_i: Cov(x_i s_i, x_j s_j) = s_i s_j Cov(x_i, x_j).
     scale = linear.steps[:p, None] * linear.steps[None, :p]
     stated = of_stated(influence, linear.point.rows, linear.whitening)[:p, :p] * scale
     parts = Components.of({STATED: (stated, np.inf)})
@@ -260,6 +266,7 @@ def observed_metrics(
         for square, weight in zip(squares, linear.weights, strict=False)
     ]
     rows = np.array([observation.rows for observation in observed.observations], dtype=float)
+    # Whitened rows have variance 1, so the mean of their squares is about 1 where the noise is as the weights say.
     total = sum(xp.sum(square) for square in squares)
     degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
     before_and_after = (

@@ -14,9 +14,8 @@ from jaxtyping import Bool, Float
 
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
 from ..data.capture import Capture
-from ..data.observations.socket import position_of
 from ..kinematics.parameters import Bounds, Parameters
-from ..model.observed import Observed
+from ..model.observed import Observed, ends_of
 from ..uncertainty.active_bounds import of_active_bounds
 from ..uncertainty.linear_propagation import covariance_with, rows_of_functions
 from ..uncertainty.linearisation import Linearisation
@@ -158,13 +157,15 @@ def _calibration(
     task: Task, capture: Capture, stage1: Identification, result: Identification, method: str, divided: bool
 ) -> Calibration:
     """With the fields of the last stage's result, and the measured lengths before and after."""
-    start = task.observed.split(task.observed.start(task.space, task.start[task.free]))
+    observed, ends = task.observed, ends_of(capture)
+    start = observed.start(task.space, task.start[task.free])
+    geometry = namespace(start).concatenate([result.observed.geometry[name] for name in observed.blocks])
     names = ("arm", "parameters", "de", "deltam", "active", "steps", "result", "parameter_covariance")
     return Calibration(
         **{name: getattr(result, name) for name in (*names, "before", "after", "observed")},
         scale=stage1.scale,
-        length_before=_measured_lengths(start, capture),
-        length_after=_measured_lengths(result.observed.geometry, capture),
+        length_before=observed.distances(start, ends)[0],
+        length_after=observed.distances(geometry, ends)[0],
         stage1=stage1,
         method=method,
         divided=namespace(result.parameters).asarray(divided),
@@ -177,6 +178,7 @@ def _at_divided(task: Task, solution: Solution, parameters: Float[AnyArray, " p"
     space = Parameters(task.bounds.space.arm(parameters), names)
     z = namespace(parameters).concatenate([vector, task.observed.start(space, vector)])
     weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "least": _LEAST_U}
+    # Rows are linear in the positions, so that one step takes these to where they fit the divided arm.
     z = Linearisation.at(task.observed, space, z, **weighing).with_fitted_geometry()
     return Linearisation.at(task.observed, space, z, **weighing)
 
@@ -216,27 +218,16 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
 
 def _of_lengths(solution: Solution, capture: Capture) -> Float[np.ndarray, "l 3 M"]:
     """Derivatives of the measured lengths by the tips, where the arm is given and positions are means."""
+    # With the inverse of the head's information 0, the parameters follow nothing: only the positions do.
     linear, influence = solution.linear, solution.influence._replace(inverse=np.zeros_like(solution.influence.inverse))
-    observed, p, count = linear.observed, len(linear.space.names), len(capture.lengths)
-    components = [np.zeros((count, *own.shape[:2])) for own in influence.own]
-    for i, length in enumerate(capture.lengths):
-        ends = [observed.positions[position_of(name)] for name in (length.start, length.end)]
-        between = np.asarray(linear.z[p + ends[1]] - linear.z[p + ends[0]])
-        for rows, sign in zip(ends, (-1.0, 1.0), strict=True):
-            number, component, first = observed.layout.component_of(int(rows[0]))
-            components[number][i, component, first : first + 3] = sign * between / np.linalg.norm(between)
-    return _by_tips(linear, rows_of_functions(influence, np.zeros((count, linear.height)), components))
-
-
-def _measured_lengths(parts: dict[str, Any], capture: Capture) -> Float[AnyArray, " l"]:
-    """Distances between the positions at the ends of the reference lengths, mm."""
-    pairs = [(parts[position_of(length.start)], parts[position_of(length.end)]) for length in capture.lengths]
-    xp = namespace(parts)
-    return xp.linalg.norm(xp.stack([end - start for start, end in pairs]), axis=1) if pairs else xp.zeros(0)
+    observed, p = linear.observed, len(linear.space.names)
+    _, pull = observed.distances(np.asarray(linear.z)[p:], ends_of(capture))
+    return _by_tips(linear, rows_of_functions(influence, *observed.by_unknowns(pull, p)))
 
 
 def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str) -> Stages:
     """Everything that the capture holds in one least squares; ``stage1`` is where lengths alone fix the scale."""
+    # The divided arm is near the solution, and saves most of the steps.
     near = None
     if stage1 is not None and stage1.measured is not None:
         first, k = stage1.identification, stage1.measured.scale.value

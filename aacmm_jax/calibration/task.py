@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core._compat import inside_trace
-from ..core.arguments import shown
+from ..core.arguments import Count
 from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
@@ -26,8 +26,8 @@ from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
 from ..model.observed import Observed
-from ..model.robust import Loss, check_loss
-from ..uncertainty.covariance import NOISE_MODELS, NoiseModel
+from ..model.robust import Loss
+from ..uncertainty.covariance import NoiseModel
 from ..uncertainty.identifiability import observability
 from .scale_anchor import Method, ScaleAnchor, default_method, fixes_scale, scale_anchor, scale_from_slides
 
@@ -43,7 +43,7 @@ class Solving(NamedTuple):
     noise_model: NoiseModel | None = None
     robust: LossName | None = None
     prior: Prior | None = None
-    max_steps: int = 300
+    max_steps: Count = 300
 
 
 class Task(NamedTuple):
@@ -96,9 +96,6 @@ def task_of(arm: Arm, capture: Capture, bounds: Bounds, solving: Solving) -> Tas
     space = based_on(bounds.space, arm)
     bounds = Bounds(space, bounds.lower, bounds.upper)
     vector = space.vector() if solving.start is None else as_array(solving.start, "the start")
-    if solving.max_steps < 1:
-        raise InputError(f"max_steps is {solving.max_steps}; give at least 1.")
-    check_loss(solving.robust)
     check_columns(space.base, capture.columns)
     _check_start(bounds, vector, "the start" if solving.start is not None else "the arm")
     anchor = anchor_of(space, capture, capture, solving.hold, noise)
@@ -146,8 +143,6 @@ def method_of(
     general = at_once or bool(capture.observations) or solving.robust is not None or solving.prior is not None
     general = general or by_slides
     method = default_method(arm, general) if method is None else method
-    if not isinstance(method, str) or method not in ("two-stage", "joint"):
-        raise InputError(f"method is {shown(method)}; it must be 'two-stage' or 'joint'.")
     if method == "two-stage" and general:
         raise InputError(
             "method='two-stage' is for sockets with reference lengths, without a robust loss, a prior and covariances "
@@ -211,8 +206,6 @@ def checked_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joi
         noise.check(joints)
     if noise_model is None:
         return "estimated" if noise is None else "given"
-    if noise_model not in NOISE_MODELS:
-        raise InputError(f"noise_model is '{noise_model}'; it must be one of {', '.join(NOISE_MODELS)}.")
     if noise_model == "given" and noise is None:
         raise InputError("noise_model='given' needs the noise; give noise=aj.Noise(encoder_arcsec=..., seating=...).")
     if noise_model == "estimated" and noise is not None:
@@ -253,6 +246,7 @@ def check_data(
 
 def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
     """Raise `InputError` where poses are too few: m poses in a socket give 3 (m - 1) equations."""
+    # 3 m coordinates, of which 3 find the position of the socket.
     equations = 3 * sum(size - 1 for size in sizes)
     if equations < unknowns:
         sockets, poses = len(sizes), sum(sizes)
@@ -285,6 +279,8 @@ def _check_targets(observed: Observed, forward: ForwardPass) -> None:
     for observation, part in zip(observed.observations, observed.slices, strict=True):
         if observation.target:
             poses.setdefault(observation.target, []).append(np.arange(part.start, part.stop))
+    # A target at t in the last frame (x, y, z) is seen at F (p + R t): where R is one matrix, t and the translation of
+    # the station's frame F cannot be told apart.
     for target, parts in poses.items():
         axes = [np.asarray(forward.frame[i])[:, np.concatenate(parts)] for i in (0, 2)]
         if max(np.ptp(axis, axis=1).max() for axis in axes) < _LEAST_TURN:

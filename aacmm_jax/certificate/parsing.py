@@ -17,8 +17,8 @@ class CertifiedValue(NamedTuple):
 
     Example:
         >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")
-        >>> found = aj.certificate.parse_dcc(text)["Nominal parameters", "Repeatability", "DE"]
-        >>> print(found.value, found.expanded)
+        >>> de = aj.certificate.parse_dcc(text)["Nominal parameters", "Repeatability", "DE"]
+        >>> print(de.value, de.expanded)
         1.8803 None
     """
 

@@ -83,10 +83,10 @@ class Capture(eqx.Module):
         _check_columns(given)
         different = [without_copies(part) for part in given]
         check_different(different)
-        own = different[: len(sockets)]
-        self.q = joined([part.q for part in own]) if own else jnp.zeros((0, given[0].q.shape[-1]))
-        self.names = tuple(part.name for part in own)
-        self.sizes = tuple(part.q.shape[0] for part in own)
+        seated = different[: len(sockets)]
+        self.q = joined([part.q for part in seated]) if seated else jnp.zeros((0, given[0].q.shape[-1]))
+        self.names = tuple(part.name for part in seated)
+        self.sizes = tuple(part.q.shape[0] for part in seated)
         self.observations = tuple(different[len(sockets) :])
         ends = [*self.names, *(part.name for part in self.observations if isinstance(part, Socket))]
         self.lengths, copies = _different_lengths(_checked_lengths(lengths, ends))
@@ -216,7 +216,7 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
     drawn[random_generator(seed).choice(total, count, replace=False)] = True
     of_parts = dict(zip(sizes, np.split(drawn, np.cumsum(list(sizes.values()))[:-1]), strict=True))
     rows = [{name: np.flatnonzero(part == wanted) for name, part in of_parts.items()} for wanted in (True, False)]
-    first, second = (part_of(capture, [name for name in own if len(own[name])], own) for own in rows)
+    first, second = (part_of(capture, [name for name in chosen if len(chosen[name])], chosen) for chosen in rows)
     return first, second
 
 

@@ -34,21 +34,21 @@ class Repeated(NamedTuple):
 
     def sentences(self) -> list[str]:
         """What was left out, for warnings."""
-        found = []
+        sentences = []
         if self.poses:
             number = pluralise(sum(count for _, count in self.poses), "pose")
             sockets = shorten([f"{name} ({count})" for name, count in self.poses])
-            found.append(
+            sentences.append(
                 f"Counted once: {number} with exactly the readings and values of another pose of the same socket or "
                 f"observation: {sockets}; a copy is no measurement of its own. Was the arm recorded at rest, or a file "
                 "pasted twice?"
             )
         if self.lengths:
             ends = shorten([f"{start} - {end}" for start, end in self.lengths])
-            found.append(
+            sentences.append(
                 f"Counted once: reference lengths given again with the same value and u: {ends}; delete the copies."
             )
-        return found
+        return sentences
 
 
 NOTHING_REPEATED = Repeated()

@@ -64,8 +64,8 @@ def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) ->
             ReferenceLength(f"{session}/{length.start}", f"{session}/{length.end}", length.value, length.u)
             for length in capture.lengths
         ]
-        own = f"probe of {session}" if number and own_probe else ""
-        observations += [observation.in_session(session, own) for observation in capture.observations]
+        probe = f"probe of {session}" if number and own_probe else ""
+        observations += [observation.in_session(session, probe) for observation in capture.observations]
     visits = {name: rows for name, rows in visits.items() if name in sockets}
     return Capture(sockets, lengths, observations, sessions=tuple(captures), visits=visits)
 

@@ -1,10 +1,13 @@
 """The noise of a measurement: errors of the encoders, and of the tip in its seat."""
 
+from typing import Annotated
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arrays import Numbers, as_floats, is_concrete
+from ..core.arguments import NOT_EMPTY, Range, checked
+from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
@@ -13,6 +16,10 @@ from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass
 from ..kinematics.jacobian import reading_columns
 
 _MOST = {"encoder_arcsec": 36_000.0, "linear_encoder": 100.0, "seating": 100.0}  # ten degrees; mm
+
+
+_ONE = Annotated[Float[AnyArray, ""], Range(least=0)]
+_ONE_OR_EACH = Annotated[Float[AnyArray, ""] | Float[AnyArray, " joints"], NOT_EMPTY, Range(least=0)]
 
 
 class Noise(eqx.Module):
@@ -38,17 +45,11 @@ class Noise(eqx.Module):
     linear_encoder: Float[AnyArray, "..."] | None  # mm; None: ``encoder`` at 1 m
 
     def __init__(self, *, encoder_arcsec: Numbers = 0.0, seating: Numbers = 0.0, linear_encoder: Numbers | None = None):
-        self.encoder = to_jax(to_numpy(as_floats(encoder_arcsec, "encoder_arcsec")) * ARCSEC)
-        self.seating = as_floats(seating, "seating")
-        self.linear_encoder = None if linear_encoder is None else as_floats(linear_encoder, "linear_encoder")
-        for what, values in self._given(self.encoder):
-            if values.ndim > (what != "seating"):
-                allowed = "one number" if what == "seating" else "one number, or one a joint"
-                raise InputError(f"{what} has shape {values.shape}; give {allowed}.")
-            if values.size == 0:
-                raise InputError(f"{what} is empty; give one number, or one a joint.")
-            if is_concrete(values) and np.any(np.asarray(values) < 0):
-                raise InputError(f"{what} must be a standard deviation: zero or positive.")
+        arcsec = checked(encoder_arcsec, _ONE_OR_EACH, "encoder_arcsec")
+        self.encoder = to_jax(to_numpy(arcsec) * ARCSEC)
+        self.seating = checked(seating, _ONE, "seating")
+        linear = None if linear_encoder is None else checked(linear_encoder, _ONE_OR_EACH, "linear_encoder")
+        self.linear_encoder = linear
 
     @property
     @numpy_if_known
@@ -71,8 +72,8 @@ class Noise(eqx.Module):
 
     def of_columns(self, kinds: JointKinds | None, joints: int, columns: int) -> Float[np.ndarray, " columns"]:
         """Standard deviations of all columns of readings, rad and mm; 0 for that of a thermometer."""
-        each = np.broadcast_to(np.asarray(self.of_readings(kinds)), (joints,))
-        return np.concatenate([each, np.zeros(columns - joints)])
+        of_joints = np.broadcast_to(np.asarray(self.of_readings(kinds)), (joints,))
+        return np.concatenate([of_joints, np.zeros(columns - joints)])
 
     def check(self, joints: int) -> None:
         """Check that this noise can weight the poses of an arm.
@@ -125,9 +126,9 @@ def at_tip(noise: Noise, arm: Arm, distance: float) -> tuple[float, float, float
     Standard deviations, each the root mean square of its joints; 0 without such joints.
     """
     kinds = arm.geometry.kinds
-    each = np.broadcast_to(np.asarray(noise.of_readings(kinds)), (arm.joints,))
+    u = np.broadcast_to(np.asarray(noise.of_readings(kinds)), (arm.joints,))
     linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()
-    turning, sliding = (float(np.sqrt(np.mean(x**2))) if len(x) else 0.0 for x in (each[~linear], each[linear]))
+    turning, sliding = (float(np.sqrt(np.mean(x**2))) if len(x) else 0.0 for x in (u[~linear], u[linear]))
     return turning * distance, sliding, float(noise.seating)
 
 
@@ -135,8 +136,8 @@ def linear_encoder_mm(noise: Noise, arm: Arm) -> float | list[float] | None:
     """Standard deviation of the readings of an arm's prismatic joints, mm, one or one each; None without any."""
     if not arm.prismatic:
         return None
-    each = np.asarray(noise.of_readings(arm.geometry.kinds))[np.array(arm.prismatic) - 1].tolist()
-    return each[0] if len(set(each)) == 1 else each
+    of_slides = np.asarray(noise.of_readings(arm.geometry.kinds))[np.array(arm.prismatic) - 1].tolist()
+    return of_slides[0] if len(set(of_slides)) == 1 else of_slides
 
 
 def one_arcsec(kinds: JointKinds | None) -> Float[np.ndarray, "..."]:
@@ -158,6 +159,6 @@ def encoder_covariances(
     """J_q S J_q^T of every pose, mm^2, for readings of standard deviation ``encoder``, scalar or ``(n,)``."""
     columns = reading_columns(forward_pass(geometry, motion))
     xp = namespace(columns, encoder)
-    each = xp.broadcast_to(encoder, (columns.shape[0],))
-    columns = columns * each.reshape(-1, *(1,) * (columns.ndim - 1))
+    deviations = xp.broadcast_to(encoder, (columns.shape[0],))
+    columns = columns * deviations.reshape(-1, *(1,) * (columns.ndim - 1))
     return xp.sum(columns[..., :, None, :] * columns[..., None, :, :], axis=0)

@@ -1,15 +1,19 @@
 """Reference lengths: certified distances between two sockets."""
 
+from typing import Annotated
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import shown
-from ..core.arrays import Numbers, as_array, is_concrete
+from ..core.arguments import Range, checked, shown
+from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
 from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
 
+_LENGTH = Annotated[Float[AnyArray, ""], Range(above=0, unit="mm")]
+_UNCERTAINTY = Annotated[Float[AnyArray, ""], Range(least=0, unit="mm")]
 _TEMPERATURES = (-50.0, 100.0)  # C; room temperatures in kelvins are outside
 _LARGEST_EXPANSION = 1e-3  # 1/K: plastics expand by up to 2e-4
 
@@ -54,18 +58,10 @@ class ReferenceLength(eqx.Module):
                 raise InputError(f"an end of a reference length is {shown(name)}; give the name of a socket.")
         self.start, self.end = start, end
         where = f"reference length '{start}' to '{end}'"
-        self.value, self.u = as_array(value, where), as_array(u, f"u of {where}")
         if start == end:
             raise InputError(f"{where} joins a socket to itself; name two different sockets.")
-        if self.value.ndim or self.u.ndim:
-            raise InputError(f"{where} needs one value and one u, in mm.")
-        # `float`, not JAX: inside jit even a constant becomes a tracer once JAX computes with it.
-        if is_concrete(self.value) and not 0 < float(self.value) < np.inf:
-            raise InputError(f"{where} is {float(self.value):g} mm; a length must be positive and finite.")
-        if is_concrete(self.u) and not 0 <= float(self.u) < np.inf:
-            raise InputError(
-                f"{where} has u = {float(self.u):g} mm; a standard uncertainty must be zero or positive, and finite."
-            )
+        self.value = checked(value, _LENGTH, where)
+        self.u = checked(u, _UNCERTAINTY, f"u of {where}")
 
     @classmethod
     def at_temperature(

@@ -1,15 +1,15 @@
 """Reference spheres probed for acceptance tests."""
 
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arrays import as_floats
+from ..core.arguments import NOT_EMPTY, Name, Range, checked_fields
 from ..core.errors import InputError
 
 SphereTest = Literal["effective-diameter", "probing", "articulation"]
-SPHERE_TESTS = get_args(SphereTest)
+NotNegativeMm = Annotated[float, Range(least=0, unit="mm")]
 
 
 class ProbedSphere(NamedTuple):
@@ -34,32 +34,22 @@ class ProbedSphere(NamedTuple):
         1 (9, 6)
     """
 
-    name: str
+    name: Name
     test: SphereTest
-    groups: tuple[Float[np.ndarray, "m n"], ...]
-    diameter: float
-    u: float = 0.0
-    stylus: float = 0.0
-    form: float = 0.0
-    u_form: float = 0.0
+    groups: tuple[Annotated[Float[np.ndarray, "_ columns"], NOT_EMPTY], ...]
+    diameter: Annotated[float, Range(above=0, unit="mm")]
+    u: NotNegativeMm = 0.0
+    stylus: NotNegativeMm = 0.0
+    form: NotNegativeMm = 0.0
+    u_form: NotNegativeMm = 0.0
 
 
 def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSphere:
     """The same sphere with its groups as arrays, or `InputError` that names the sphere."""
-    where = f"sphere '{sphere.name}'"
-    if sphere.test not in SPHERE_TESTS:
-        raise InputError(f"{where}: test is '{sphere.test}'; it must be one of {', '.join(SPHERE_TESTS)}.")
-    for what in ("diameter", "u", "stylus", "form", "u_form"):
-        value, positive = getattr(sphere, what), what == "diameter"
-        if not (np.isfinite(value) and (value >= 1e-6 if positive else value >= 0)):
-            raise InputError(f"{where}: {what} is {value:g} mm; it must be {'' if positive else 'zero or '}positive.")
-    groups = tuple(np.asarray(as_floats(group, where)) for group in sphere.groups)
-    for group in groups:
-        if group.ndim != 2 or not len(group) or (columns is not None and group.shape[1] != columns):
-            raise InputError(
-                f"{where} has a group of shape {group.shape}; give one row a probed point"
-                + (f" and {columns} columns." if columns is not None else ".")
-            )
-    if not groups:
-        raise InputError(f"{where} has no probed points; give at least one group.")
-    return sphere._replace(groups=groups)
+    checked = checked_fields(sphere, f"sphere '{sphere.name}'")
+    if not checked.groups:
+        raise InputError(f"sphere '{sphere.name}' has no probed points; give at least one group.")
+    width = checked.groups[0].shape[1]
+    if columns not in (None, width):
+        raise InputError(f"groups of sphere '{sphere.name}' have {width} columns; give {columns}.")
+    return checked

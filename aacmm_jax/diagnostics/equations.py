@@ -104,7 +104,7 @@ def in_chunks(equations: Equations) -> tuple[list[Rows], list[Block]]:
 
 def residual_rms(rows: Sequence[Rows]) -> float:
     """Root mean square of a coordinate of the residuals, mm."""
-    squares = [np.einsum("mcr,mr->mc", each.in_mm, each.residual).ravel() ** 2 for each in rows]
+    squares = [np.einsum("mcr,mr->mc", part.in_mm, part.residual).ravel() ** 2 for part in rows]
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
@@ -124,12 +124,12 @@ def linearisation_of(
     space, metrics = Parameters(arm, tuple(names)), record.observed
     geometry = [np.asarray(metrics.geometry[part]) for part in observed.blocks]
     z, sigma = np.concatenate([np.asarray(space.vector()), *geometry]), np.asarray(metrics.sigma)
-    found = Linearisation.at(observed, space, z, noise=noise, sigma=sigma, least=LEAST_U)
-    weights = [np.asarray(one) for one in metrics.weights]
-    if all(np.all(one == 1) for one in weights):
-        return found
+    linear = Linearisation.at(observed, space, z, noise=noise, sigma=sigma, least=LEAST_U)
+    weights = [np.asarray(weight) for weight in metrics.weights]
+    if all(np.all(weight == 1) for weight in weights):
+        return linear
     of_groups = [np.concatenate([weights[number] for number in group.members]) for group in observed.layout.groups]
-    return found._replace(weights=[*of_groups, *found.weights[len(of_groups) :]])
+    return linear._replace(weights=[*of_groups, *linear.weights[len(of_groups) :]])
 
 
 def lengths_in_solve(record: CalibrationRecord) -> bool:
@@ -141,8 +141,8 @@ def _kept(record: CalibrationRecord) -> str | None:
     """The length that the equations keep: none where anything but repeatability says what the scale is."""
     if lengths_in_solve(record):
         return None
-    known = record.prior is not None or any(one.fixes_scale for one in record.recording.capture.observations)
-    return record.hold if known else scale_anchor_of(record)
+    scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)
+    return record.hold if scaled else scale_anchor_of(record)
 
 
 def _rows_and_relations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple[list[Rows], list[Block]]:
@@ -177,7 +177,7 @@ def _rows_and_relations(record: CalibrationRecord, extra: tuple[str, ...]) -> tu
                 np.arange(part.poses.start, part.poses.stop),
             )
         )
-    rows = [one for one in rows if not _only_pose(record, one)]
+    rows = [part for part in rows if not _only_pose(record, part)]
     derivatives, residual, u = linear.relations()
     u = np.maximum(u, LEAST_U)
     chosen = np.concatenate([np.arange(free), p + common])
@@ -197,10 +197,10 @@ def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, share
     if prior is None:
         return []
     mean, weight = np.asarray(prior.mean), np.asarray(prior.weight)
-    known = np.flatnonzero(weight)
-    residual = weight[known] * (z[: len(steps)] - mean)[known]
-    derivatives = np.eye(shared)[known] * (weight * steps)[known][:, None]
-    return [Block(PRIOR, None, residual, derivatives, np.zeros((len(known), 0)))]
+    with_prior = np.flatnonzero(weight)
+    residual = weight[with_prior] * (z[: len(steps)] - mean)[with_prior]
+    derivatives = np.eye(shared)[with_prior] * (weight * steps)[with_prior][:, None]
+    return [Block(PRIOR, None, residual, derivatives, np.zeros((len(with_prior), 0)))]
 
 
 def _common(observed: Observed) -> np.ndarray:

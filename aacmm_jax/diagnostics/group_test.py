@@ -94,9 +94,9 @@ def _inverse(matrix: Float[np.ndarray, "p p"], diagonal: Float[np.ndarray, " p"]
     """The pseudo-inverse of a normal matrix whose columns are first scaled, and its rank."""
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(scale[:, None] * matrix * scale)
-    known = values > _NULL * values.max(initial=0.0)
-    rows = (scale[:, None] * vectors)[:, known]
-    return (rows / values[known]) @ rows.T, int(known.sum())
+    present = values > _NULL * values.max(initial=0.0)
+    rows = (scale[:, None] * vectors)[:, present]
+    return (rows / values[present]) @ rows.T, int(present.sum())
 
 
 def contradicting_groups(
@@ -108,18 +108,13 @@ def contradicting_groups(
     ratio, as long as it is significant, up to half of them (after Rosner 1983, Technometrics 25). Found are the last
     one that reaches ``least_ratio`` and all before it.
 
-    Args:
-        blocks: The equations at parameters near the solution, by fixture and group.
-        level: Probability of finding any group where nothing is wrong (Bonferroni's bound).
-        least_ratio: The smallest ratio of a group that is found.
-
-    Returns:
-        The test of each group that was found, without those before it; and after it, as its alternatives, the tests of
-        groups without which the others agree as well (of two groups that contradict each other, either).
+    ``level`` is the probability of finding any group where nothing is wrong (Bonferroni's bound). Returned are the test
+    of each group that was found, without those before it; and after it, as its alternatives, the tests of groups
+    without which the others agree as well (of two groups that contradict each other, either).
     """
     parts = _Parts.of(blocks)
     removed: list[Hashable] = []
-    found: list[list[GroupTest]] = []
+    contradicting: list[list[GroupTest]] = []
     number = 0
     for _ in range(len(parts.groups) // 2):
         tests = parts.tests(removed)
@@ -128,11 +123,11 @@ def contradicting_groups(
             break
         worst = max(significant, key=lambda test: test.ratio)
         alternatives = [test for test in significant if test is not worst and test.ratio >= least_ratio]
-        found.append([worst, *(test for test in alternatives if test.variance < _AS_WELL * worst.variance)])
+        contradicting.append([worst, *(test for test in alternatives if test.variance < _AS_WELL * worst.variance)])
         removed.append(worst.group)
         if worst.ratio >= least_ratio:
-            number = len(found)
-    return found[:number]
+            number = len(contradicting)
+    return contradicting[:number]
 
 
 def fit_of(blocks: Sequence[Block]) -> Fit:
@@ -153,13 +148,15 @@ def different_groups(blocks: Sequence[Block]) -> list[GroupTest]:
     for group in _Parts.of(blocks).groups:
         own = fit_of([block for block in blocks if block.group in (group, None)])
         others = fit_of([block for block in blocks if block.group != group])
-        spare = own.degrees_of_freedom + others.degrees_of_freedom
+        freedom = own.degrees_of_freedom + others.degrees_of_freedom
         again = sum(block.residual.size for block in blocks if block.group is None)
-        added = whole.degrees_of_freedom + again - spare
+        added = whole.degrees_of_freedom + again - freedom
         if added > 0 and min(own.degrees_of_freedom, others.degrees_of_freedom) > 0:
-            variance = max((own.cost + others.cost) / spare, 1e-300)
+            variance = max((own.cost + others.cost) / freedom, 1e-300)
             ratio = max(whole.cost - own.cost - others.cost, 0.0) / added / variance
-            tests.append(GroupTest(group, ratio, (added, spare), f_tail(ratio, added, spare), variance, others.step))
+            tests.append(
+                GroupTest(group, ratio, (added, freedom), f_tail(ratio, added, freedom), variance, others.step)
+            )
     return sorted(tests, key=lambda test: -test.ratio)
 
 
@@ -183,12 +180,12 @@ class _Parts(NamedTuple):
 
     def eliminated(self, without: Sequence[Hashable]) -> dict[Hashable, _Gram]:
         """The sum over each fixture's groups, less what its unknowns account for."""
-        found = {}
+        sums = {}
         for fixture, grams in self.grams.items():
             kept = [gram for group, gram in grams.items() if group is None or group not in without]
             if kept:
-                found[fixture] = reduce(_Gram.plus, kept).without_own(self.unknowns[fixture])
-        return found
+                sums[fixture] = reduce(_Gram.plus, kept).without_own(self.unknowns[fixture])
+        return sums
 
     def tests(self, removed: Sequence[Hashable]) -> list[GroupTest]:
         """Every group that is left against the others; not those that add no equation, or leave none to compare."""
@@ -208,10 +205,10 @@ class _Parts(NamedTuple):
             rest = reduce(_Gram.less, (whole[fixture] for fixture in fixtures), total)
             rest = reduce(_Gram.plus, part.eliminated([*removed, group]).values(), rest)
             others = Fit.of(rest, diagonal)
-            added, spare = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom
-            if added > 0 and spare > 0:
-                variance = max(others.cost / spare, 1e-300)
+            added, freedom = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom
+            if added > 0 and freedom > 0:
+                variance = max(others.cost / freedom, 1e-300)
                 ratio = max(everything.cost - others.cost, 0.0) / added / variance
-                probability = f_tail(ratio, added, spare)
-                tests.append(GroupTest(group, ratio, (added, spare), probability, variance, others.step))
+                probability = f_tail(ratio, added, freedom)
+                tests.append(GroupTest(group, ratio, (added, freedom), probability, variance, others.step))
         return tests

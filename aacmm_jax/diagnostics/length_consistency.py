@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.drawn_errors import covariance_of_lengths
 from ..calibration.record import CalibrationRecord
+from ..calibration.redrawn import covariance_of_lengths
 from ..calibration.scale_fix import ends_between, positions_at_ends
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
@@ -142,10 +142,10 @@ def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Relat
     covariance, scale = np.asarray(ends.covariance(np.ones(()))), None
     if anchor is not None:
         by_anchor = np.asarray(record.calibrated.arm.jacobian(capture.readings, (anchor,)))
-        scale = np.concatenate([(each.by_tip @ by_anchor[each.poses]).ravel() for each in rows]), slopes[:, ~kept][:, 0]
+        scale = np.concatenate([(p.by_tip @ by_anchor[p.poses]).ravel() for p in rows]), slopes[:, ~kept][:, 0]
     further = rows[0].shared.shape[2] - int(kept.sum())  # unknowns of sockets with very many poses
     relations = Block("", None, error, np.pad(slopes[:, kept], ((0, 0), (0, further))), np.zeros((len(error), 0)))
-    return Related(names, np.ones(len(names)), [each.block("") for each in rows], relations, covariance, scale)
+    return Related(names, np.ones(len(names)), [part.block("") for part in rows], relations, covariance, scale)
 
 
 def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> Related | None:
@@ -155,10 +155,13 @@ def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations:
     capture, anchor = record.recording.capture, scale_anchor_of(record)
     certified = Observed.of(capture, None).certified()
     names = [*_names_of_lengths(record), *(part for part, (value, _) in certified.items() for _ in np.asarray(value))]
-    own = [*(length.u for length in capture.lengths), *(u for _, of in certified.values() for u in np.asarray(of))]
-    units = np.maximum(np.array(own, dtype=float), LEAST_U)
+    u = [
+        *(length.u for length in capture.lengths),
+        *(x for _, stated in certified.values() for x in np.asarray(stated)),
+    ]
+    units = np.maximum(np.array(u, dtype=float), LEAST_U)
     # What a prior says counts as the poses do: lengths are compared with all else.
-    poses, (related,), scale = [each.block("") for each in rows], lengths, None
+    poses, (related,), scale = [part.block("") for part in rows], lengths, None
     poses += [block for block in relations if block.fixture == PRIOR]
     measured = any(one.fixes_scale and not one.certified for one in capture.observations)
     if anchor is not None and (record.hold is None or lengths_in_solve(record)) and not measured:

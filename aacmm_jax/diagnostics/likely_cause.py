@@ -50,15 +50,7 @@ class _Tried(NamedTuple):
 
 
 def likely_cause(arm: Arm, capture: Capture) -> str:
-    """The mistake whose correction makes the residuals far smaller, as a sentence; or nothing.
-
-    Args:
-        arm: the nominal arm.
-        capture: sockets and other observations.
-
-    Returns:
-        A sentence, with the root mean square of the residuals by the nominal arm before and after, mm.
-    """
+    """The mistake whose correction makes the residuals by the nominal arm far smaller, as a sentence; or nothing."""
     arm, capture = to_numpy((arm, capture))
     with np.errstate(all="ignore"):
         misfit = _Misfit.by(arm, capture)
@@ -69,9 +61,9 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
             return ""
         rms, cause, write = np.inf, "", ""
         for tried in misfit.corrections():
-            found = misfit.rms(tried)
-            if found < 0.98 * rms:  # of equally good corrections, the first
-                rms, cause, write = found, tried.cause, tried.write
+            corrected = misfit.rms(tried)
+            if corrected < 0.98 * rms:  # of equally good corrections, the first
+                rms, cause, write = corrected, tried.cause, tried.write
     if not rms < min(given / _BETTER, _SMALL * size):
         return ""
     return (
@@ -131,7 +123,7 @@ class _Misfit(NamedTuple):
         observed = self.observed.moved(self.arm, tried.q, tried.observations)
         space, lever = Parameters(self.arm, ("d_1",)), total_link_length(self.arm) / 4
         certified: dict[str, AnyArray] = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
-        known = [np.full(len(units), name in certified) for name, units in observed.blocks.items()]
+        fixed = [np.full(len(units), name in certified) for name, units in observed.blocks.items()]
         vector, best = np.asarray(space.vector()), np.inf
         try:
             start = observed.split(np.asarray(observed.start(space, vector))) | certified
@@ -142,10 +134,10 @@ class _Misfit(NamedTuple):
                 whitening = Whitening(roots, np.zeros(0), {name: 0 * value for name, value in certified.items()})
                 linear = Linearisation.of(observed, space, z, point, [], whitening, None)
                 squares = sum(float(np.sum(white**2)) for white in linear.white())
-                found = float(np.sqrt(squares / len(observed.q)))
-                if not found < 0.95 * best:
+                rms = float(np.sqrt(squares / len(observed.q)))
+                if not rms < 0.95 * best:
                     break
-                best, z = found, linear.fitted(np.concatenate([[True], *known]))
+                best, z = rms, linear.fitted(np.concatenate([[True], *fixed]))
         except np.linalg.LinAlgError:
             return np.inf
         return best if np.isfinite(best) else np.inf

@@ -52,13 +52,13 @@ class Effects(NamedTuple):
     def joined(self, columns: Float[np.ndarray, "R c"], variances: Float[np.ndarray, " c"]) -> "Effects":
         """With a further effect, whose columns the model has not explained; the variance of independent errors is the
         one with which the residuals are as large as they should be."""
-        found = self._replace(
+        effects = self._replace(
             columns=np.concatenate([self.columns, columns], axis=1),
             variances=np.concatenate([self.variances, variances]),
         )
         if self.given:
-            return found
-        d, r = found.columns * np.sqrt(found.variances), self.left.values
+            return effects
+        d, r = effects.columns * np.sqrt(effects.variances), self.left.values
         values, vectors = np.linalg.eigh(d.T @ d)
         seen, values = (vectors.T @ (d.T @ r)) ** 2, np.maximum(values, 0.0)
         variance = self.variance
@@ -68,7 +68,7 @@ class Effects(NamedTuple):
             change, variance = abs(np.log(new / variance)), new
             if change < _TOLERANCE:
                 break
-        return found._replace(variance=variance)
+        return effects._replace(variance=variance)
 
 
 class OneVariance(NamedTuple):
@@ -89,16 +89,13 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: flo
     its place; stated is the geometric mean of that sum, less the errors. Intervals do not follow from it alone, but
     from the whole distribution (`degrees_of_freedom`).
 
-    Args:
-        effects: What is known.
-        columns: Of the effect, as far as the model does not explain them.
-        usual: Standard deviation above which it is improbable, mm.
+    ``columns`` are those of the effect, as far as the model does not explain them; ``usual`` is in mm.
     """
     information = effects.product(columns, columns)
     values, vectors = np.linalg.eigh(information)
-    known = values > NULL * max(values.max(initial=0.0), 1e-300)
-    values, r = values[known], effects.left.values[:, None]
-    squares = (vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2
+    present = values > NULL * max(values.max(initial=0.0), 1e-300)
+    values, r = values[present], effects.left.values[:, None]
+    squares = (vectors[:, present].T @ effects.product(columns, r)[:, 0]) ** 2
     total, freedom = float(effects.product(r, r)[0, 0]), effects.left.degrees_of_freedom
     ratio = (usual * np.geomspace(*_RANGE, _GRID)) ** 2 / effects.variance
     explained = np.sum(ratio[:, None] * squares / (1 + ratio[:, None] * values), axis=1)
@@ -124,12 +121,9 @@ def group_deviations(
     of freedom that the residuals and what is expected beforehand give each: 2 over the variance of its log variance.
 
     Each group is expected, to a factor of 4.5, to explain an equal share of the residuals: else groups of which the
-    data say little would be as large as anybody fears, or collapse (`benchmarks/NOTES.md`).
-
-    Args:
-        effects: What is known.
-        columns: Of all groups in natural steps, as far as the model does not explain them.
-        members: 1 where a column belongs to a group.
+    data say little would be as large as anybody fears, or collapse (`benchmarks/NOTES.md`). ``columns`` are those of
+    all groups in natural steps, as far as the model does not explain them; ``members`` is 1 where a column is a
+    group's.
     """
     r, freedom = effects.left.values[:, None], effects.left.degrees_of_freedom
     information, right = effects.product(columns, columns), effects.product(columns, r)[:, 0]

@@ -28,8 +28,8 @@ class SharedProblem(NamedTuple):
     def moved(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "R k"]:
         """Columns of tips that move by a pattern over the poses, along x, y and z each."""
         blocks = [
-            np.einsum("mra,mc->mrca", each.by_tip, patterns[each.poses]).reshape(each.residual.size, -1)
-            for each in self.rows
+            np.einsum("mra,mc->mrca", part.by_tip, patterns[part.poses]).reshape(part.residual.size, -1)
+            for part in self.rows
         ]
         return self._columns(blocks, np.einsum("laN,Nc->lca", self.sensitivities.lengths, patterns))
 
@@ -41,8 +41,8 @@ class SharedProblem(NamedTuple):
         natural = np.array([1.0 if i + 1 in arm.prismatic else 1e-3 for i in range(arm.joints)])
         factors = values * (steps / natural[joints])
         blocks = [
-            (each.extra[..., joints] * factors[each.poses][:, None]).reshape(each.residual.size, -1)
-            for each in self.rows
+            (part.extra[..., joints] * factors[part.poses][:, None]).reshape(part.residual.size, -1)
+            for part in self.rows
         ]
         of_lengths = np.zeros((len(self.sensitivities.lengths), len(steps)))
         if len(of_lengths):
@@ -61,8 +61,8 @@ class SharedProblem(NamedTuple):
 
     def by_patterns(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "p k"]:
         """How the parameters follow `moved`."""
-        found = np.einsum("paN,Nc->pca", self.sensitivities.tips, patterns)
-        return found.reshape(len(found), -1)
+        by_tips = np.einsum("paN,Nc->pca", self.sensitivities.tips, patterns)
+        return by_tips.reshape(len(by_tips), -1)
 
     def by_functions(self, values: Float[np.ndarray, "M k"], joints: np.ndarray) -> Float[np.ndarray, "p k"]:
         """How the parameters follow `turned`, by coefficients in their own units."""
@@ -73,7 +73,7 @@ def problem_of_poses(
     record: CalibrationRecord, rows: list[Rows], prior: list[Block], sensitivities: Callable[[], Sensitivities]
 ) -> SharedProblem:
     """The equations of the poses, and of a prior."""
-    left = Residuals.of([*(each.block("") for each in rows), *prior])
+    left = Residuals.of([*(part.block("") for part in rows), *prior])
     return SharedProblem(record, rows, left, sensitivities(), None)
 
 
@@ -95,7 +95,7 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
     Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
     """
     record, rows = problem.record, problem.rows
-    blocks = [*(each.block("") for each in rows), *relations]
+    blocks = [*(part.block("") for part in rows), *relations]
     values = np.array([float(length.value) for length in record.recording.capture.lengths])
     if lengths_in_solve(record) or not len(values):
         u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.drawn_errors import functions_of, places_of
 from ..calibration.record import CalibrationRecord
+from ..calibration.redrawn import functions_of, places_of
 from ..calibration.results import Calibration
 from ..calibration.stages import Sensitivities
 from ..core.distributions import chi_square_tail, f_tail
@@ -95,32 +95,33 @@ def _addition(case: Case, sensitivities: Callable[[], Sensitivities]) -> _Additi
     rows = _trusted(record, rows)
     if not rows or residual_rms(rows) < EXACT:
         return None
-    known = [block for block in relations if block.fixture == PRIOR]
-    of_poses = problem_of_poses(record, rows, known, sensitivities)
-    whole = sum(float(np.sum(each.residual**2)) for each in rows)
+    prior = [block for block in relations if block.fixture == PRIOR]
+    of_poses = problem_of_poses(record, rows, prior, sensitivities)
+    whole = sum(float(np.sum(part.residual**2)) for part in rows)
     if lengths_in_solve(record) and of_poses.left.cost < _MOST_OF_POSES * whole:
         relations = [*relations, scale_of_lengths(record, relations)]
-        of_poses = problem_of_poses(record, rows, [*known, relations[-1]], sensitivities)
+        of_poses = problem_of_poses(record, rows, [*prior, relations[-1]], sensitivities)
     if of_poses.left.degrees_of_freedom < _FEWEST:
         return None
     problem = with_lengths(of_poses, relations)
     tips, functions = _visits(of_poses), _functions(of_poses)
     # All but places by the poses alone: lengths that contradict each other would be put down to whatever moves them.
     effects = Effects.none(of_poses.left, record.given_noise is not None)
-    for probability, effect in sorted([(tips.probability, tips.kind), (functions.probability, "")]):
+    chances = [(tips.probability, True)] + ([] if functions is None else [(functions.probability, False)])
+    for probability, of_tips in sorted(chances):  # the clearer effect first: it may explain the other
         if probability >= _GATE:
             continue
-        if effect == tips.kind:
+        if of_tips:
             tips = tips.of(of_poses, effects)
             effects = tips.joined(of_poses, effects)
-        else:
-            found = group_deviations(effects, functions.columns, functions.members)
-            functions = functions._replace(sd=found[0], degrees_of_freedom=found[1])
+        elif functions is not None:
+            functions = functions.of(effects)
             effects = effects.joined(functions.columns, functions.sd**2 @ functions.members)
+    functions = None if functions is None or not len(functions.sd) else functions
     with_tips = tips.joined(problem, Effects.none(problem.left, effects.given))
-    every = functions.joined(problem, with_tips)
+    every = with_tips if functions is None else functions.joined(problem, with_tips)
     places = _places(problem, every)
-    if tips.learned is None and places.learned is None and not len(functions.sd):
+    if tips.learned is None and places.learned is None and functions is None:
         return None
     return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
 
@@ -133,30 +134,29 @@ def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
 
 
 def _summed(
-    problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions", without: Effects, every: Effects
+    problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions | None", without: Effects, every: Effects
 ) -> _Addition:
     """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
-    found = [effect for effect in tips if effect.learned is not None]
-    kinds, units = [effect.kind for effect in found], ["mm" for _ in found]
-    laws = [effect.learned for effect in found if effect.learned is not None]
-    sds, p = [np.sqrt(law.variance) for law in laws], len(problem.record.names)
-    added = np.zeros((len(found), p, p))
-    for whole, effect, law in zip(added, found, laws, strict=True):
+    learned = [(effect, effect.learned) for effect in tips if effect.learned is not None]
+    kinds, units = [effect.kind for effect, _ in learned], ["mm" for _ in learned]
+    laws, p = [law for _, law in learned], len(problem.record.names)
+    sds, added = [np.sqrt(law.variance) for law in laws], np.zeros((len(laws), p, p))
+    for whole, (effect, law) in zip(added, learned, strict=True):
         by_effect = problem.by_patterns(effect.patterns[0])
         whole += law.variance * by_effect @ by_effect.T
     law = Law(
         np.full(len(laws), np.inf), np.array([law.ratios for law in laws]), np.array([law.weights for law in laws])
     )
     follow, moments, names = np.zeros((p, 0)), Moments(np.zeros((0, 0)), np.zeros((0, 0, 0))), ()
-    if len(functions.sd):
+    if functions is not None:
         names, follow, steps = functions.names, functions.follow, functions.steps
         moments = second_moments(without, problem.turned(*functions.turned), functions.sd, functions.members)
         moments = moments.in_units(steps)
         kinds, units = [*kinds, *functions.kinds], [*units, *functions.units]
-        sds += [sd * steps[np.argmax(own)] for sd, own in zip(functions.sd, functions.members, strict=True)]
+        sds += [sd * steps[np.argmax(group)] for sd, group in zip(functions.sd, functions.members, strict=True)]
         of_functions = Law.of(functions.degrees_of_freedom)
         law = law.joined(of_functions) if laws else of_functions
-    lengths = [effect.length for effect in found if np.isfinite(effect.length)]
+    lengths = [effect.length for effect, _ in learned if np.isfinite(effect.length)]
     shared = SharedErrors(
         kinds=tuple(kinds),
         units=tuple(units),
@@ -188,9 +188,9 @@ class _Tips(NamedTuple):
         Errors that poses share are about as large as those of single poses.
         """
         usual = _USUAL * residual_rms(problem.rows)
-        every = [one_variance(effects, problem.moved(patterns), usual) for patterns in self.patterns]
-        best = int(np.argmax([one.log_likelihood for one in every]))
-        return self._replace(patterns=[self.patterns[best]], learned=every[best], length=self.lengths[best])
+        fits = [one_variance(effects, problem.moved(patterns), usual) for patterns in self.patterns]
+        best = int(np.argmax([fit.log_likelihood for fit in fits]))
+        return self._replace(patterns=[self.patterns[best]], learned=fits[best], length=self.lengths[best])
 
     def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
         """Effects with this one."""
@@ -200,45 +200,52 @@ class _Tips(NamedTuple):
         return effects.joined(columns, np.full(columns.shape[1], self.learned.variance))
 
 
+def _chance_of_alike(problem: SharedProblem, alike: Callable[[Rows], np.ndarray]) -> float:
+    """Probability that tips of poses err so much alike by chance; ``alike`` says by how much each two poses of one part
+    of the rows would, (m, m), with a zero diagonal."""
+    kernels = [np.kron(alike(part), np.eye(3)) for part in problem.rows]
+    if not any(np.any(kernel) for kernel in kernels):
+        return 1.0
+    columns = [block_diagonal(part.by_tip) for part in problem.rows]
+    return form_test(problem.left, columns, kernels, problem.record.given_noise is None).probability
+
+
 def _visits(problem: SharedProblem) -> _Tips:
     """Of visits as they are marked, or of successive poses."""
-    capture, rows = problem.record.recording.capture, problem.rows
-    relative = problem.record.given_noise is None
-    total = len(np.asarray(capture.readings))
-    marked = np.full(total, -1)
+    capture, total = problem.record.recording.capture, len(np.asarray(problem.record.recording.capture.readings))
     if capture.visits is not None:
+        marked = np.full(total, -1)
         marked[: len(capture.visits)] = capture.visits
-    columns, kernel, patterns = [], [], []
-    for each in rows:
-        own = marked[each.poses]
-        columns.append(block_diagonal(each.by_tip))
-        if capture.visits is not None:
-            alike = ((own[:, None] == own) & (own >= 0)[:, None]).astype(float)
-        else:
-            alike = (np.eye(len(own), k=1) + np.eye(len(own), k=-1)) / 2
-        kernel.append(np.kron(alike - np.diag(np.diag(alike)), np.eye(3)))
-    nothing = _Tips(VISITS if capture.visits is not None else SUCCESSIVE, 1.0, [])
-    if not any(np.any(matrix) for matrix in kernel):
-        return nothing
-    probability = form_test(problem.left, columns, kernel, relative).probability
-    if not probability < _GATE:
-        return nothing
-    if capture.visits is not None:
+
+        def same_visit(part: Rows) -> np.ndarray:
+            visits = marked[part.poses]
+            return (visits[:, None] == visits) & (visits >= 0)[:, None] & ~np.eye(len(visits), dtype=bool)
+
         numbers = [number for number in np.unique(marked) if number >= 0]
-        return _Tips(VISITS, probability, [(marked[:, None] == numbers).astype(float)])
-    most = max(float(np.median([len(each.poses) for each in rows])) / _PART, _LENGTHS[0])
+        return _Tips(VISITS, _chance_of_alike(problem, same_visit), [(marked[:, None] == numbers).astype(float)])
+    probability = _chance_of_alike(problem, lambda part: _neighbours_in_order(len(part.poses)))
+    if not probability < _GATE:
+        return _Tips(SUCCESSIVE, 1.0, [])
+    most = max(float(np.median([len(part.poses) for part in problem.rows])) / _PART, _LENGTHS[0])
     lengths = tuple(length for length in _LENGTHS if length <= most)
-    for length in lengths:
-        found = []
-        for each in rows:
-            order = np.arange(len(each.poses))
-            values, vectors = np.linalg.eigh(np.exp(-np.abs(order[:, None] - order) / length))
-            chosen = np.argsort(values)[::-1][:_MOST_PATTERNS]
-            own = np.zeros((total, len(chosen)))
-            own[each.poses] = vectors[:, chosen] * np.sqrt(values[chosen])
-            found.append(own)
-        patterns.append(np.concatenate(found, axis=1))
+    patterns = [
+        np.concatenate([_smooth_patterns(part, length, total) for part in problem.rows], axis=1) for length in lengths
+    ]
     return _Tips(SUCCESSIVE, probability, patterns, lengths)
+
+
+def _neighbours_in_order(poses: int) -> Float[np.ndarray, "m m"]:
+    return (np.eye(poses, k=1) + np.eye(poses, k=-1)) / 2
+
+
+def _smooth_patterns(part: Rows, length: float, total: int) -> Float[np.ndarray, "M c"]:
+    """Principal patterns over successive poses whose correlation falls by 1 / e over a length, in poses."""
+    order = np.arange(len(part.poses))
+    values, vectors = np.linalg.eigh(np.exp(-np.abs(order[:, None] - order) / length))
+    largest = np.argsort(values)[::-1][:_MOST_PATTERNS]
+    patterns = np.zeros((total, len(largest)))
+    patterns[part.poses] = vectors[:, largest] * np.sqrt(values[largest])
+    return patterns
 
 
 class _Functions(NamedTuple):
@@ -256,44 +263,37 @@ class _Functions(NamedTuple):
     sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
     degrees_of_freedom: Float[np.ndarray, " g"] = np.zeros(0)
 
+    def of(self, effects: Effects) -> "_Functions":
+        """With the standard deviation of each group."""
+        sd, degrees_of_freedom = group_deviations(effects, self.columns, self.members)
+        return self._replace(sd=sd, degrees_of_freedom=degrees_of_freedom)
+
     def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
         """Effects with these."""
-        if not len(self.sd):
-            return effects
         return effects.joined(problem.turned(*self.turned), self.sd**2 @ self.members)
 
-    @classmethod
-    def none(cls, parameters: int) -> "_Functions":
-        """No function."""
-        empty, none = np.zeros(0), np.zeros((0, 0))
-        turned = none, np.zeros(0, dtype=int), empty
-        return cls(1.0, (), [], [], none, empty, turned, none, np.zeros((parameters, 0)))
 
-
-def _functions(problem: SharedProblem) -> _Functions:
+def _functions(problem: SharedProblem) -> _Functions | None:
     """What the arm does not have of the functions that joints may follow."""
     arm: Arm = to_numpy(problem.record.calibrated.arm)
-    q = np.asarray(problem.record.recording.capture.readings)
-    names, nothing = missing_functions(arm), _Functions.none(len(problem.record.names))
+    names = missing_functions(arm)
     if not names:
-        return nothing
-    values, joints = functions_of(names, arm, q)
+        return None
+    values, joints = functions_of(names, arm, np.asarray(problem.record.recording.capture.readings))
     steps = natural_steps(names)
     columns = problem.turned(values, joints, steps)
     prior = default_prior(with_further_corrections(arm, names)).of(names, np.zeros(len(names)))
     assert prior is not None
     members = np.zeros((len(prior.members), len(names)))
-    for row, own in zip(members, prior.members, strict=True):
-        row[list(own)] = 1.0
-    groups = [members[:, i] for i in range(len(names))]
-    candidates = {}
+    for row, group in zip(members, prior.members, strict=True):
+        row[list(group)] = 1.0
+    candidates: dict[tuple[int, tuple[float, ...]], list[int]] = {}
     for i in range(len(names)):
-        candidates.setdefault((joints[i], tuple(groups[i])), []).append(i)
-    tests = score_tests(problem.left, [columns[:, own] for own in candidates.values()])
+        candidates.setdefault((int(joints[i]), tuple(members[:, i])), []).append(i)
+    tests = score_tests(problem.left, [columns[:, together] for together in candidates.values()])
     number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
-    probability = min(min((test.probability for test in tests), default=1.0) * number, 1.0)
-    return nothing._replace(
-        probability=probability,
+    return _Functions(
+        probability=min(min((test.probability for test in tests), default=1.0) * number, 1.0),
         names=names,
         kinds=list(prior.groups),
         units=list(prior.units),
@@ -309,15 +309,15 @@ def missing_functions(arm: Arm) -> tuple[str, ...]:
     """Coefficients of the functions that joints may follow and that an arm does not have."""
     if arm.prismatic:
         return ()
-    known = correction_names(arm)
-    every = {name: coefficient_of(name) for name in correction_names(with_corrections(arm, shared_model()))}
+    present = correction_names(arm)
+    terms = {name: coefficient_of(name) for name in correction_names(with_corrections(arm, shared_model()))}
     # By known masses a joint bends with one coefficient, and by unknown ones with one for each link.
     by_gravity = [] if arm.corrections is None else arm.corrections.functions.by_gravity
     bends = bool(np.any(by_gravity))
     return tuple(
         name
-        for name, one in every.items()
-        if one is not None and name not in known and not (bends and one.kind.rows == 3)
+        for name, term in terms.items()
+        if term is not None and name not in present and not (bends and term.kind.rows == 3)
     )
 
 
@@ -331,36 +331,36 @@ def _places(problem: SharedProblem, effects: Effects) -> _Tips:
     columns = problem.moved(patterns)
     information, r = effects.product(columns, columns), effects.left.values[:, None]
     values, vectors = np.linalg.eigh(information)
-    known = values > NULL * max(values.max(initial=0.0), 1e-300)
-    if not known.any():
+    seen = values > NULL * max(values.max(initial=0.0), 1e-300)
+    if not seen.any():
         return nothing
-    by_poses = np.where(np.arange(len(r))[:, None] < sum(each.residual.size for each in problem.rows), r, 0.0)
-    explained = np.sum((vectors[:, known].T @ effects.product(columns, by_poses)[:, 0]) ** 2 / values[known])
+    by_poses = np.where(np.arange(len(r))[:, None] < sum(part.residual.size for part in problem.rows), r, 0.0)
+    explained = np.sum((vectors[:, seen].T @ effects.product(columns, by_poses)[:, 0]) ** 2 / values[seen])
     if explained > _MOST_OF_POSES * float(effects.product(by_poses, by_poses)[0, 0]):
         return nothing
-    number, spare = int(known.sum()), effects.left.degrees_of_freedom - int(known.sum())
-    found = nothing._replace(patterns=[patterns])
+    number = int(seen.sum())
+    freedom = effects.left.degrees_of_freedom - number
+    places = nothing._replace(patterns=[patterns])
     if number >= _FEW:
-        return found.of(problem, effects)
-    square = float(np.sum((vectors[:, known].T @ effects.product(columns, r)[:, 0]) ** 2 / values[known]))
+        return places.of(problem, effects)
+    square = float(np.sum((vectors[:, seen].T @ effects.product(columns, r)[:, 0]) ** 2 / values[seen]))
     if effects.given:
         probability = chi_square_tail(square, number)
     else:
         rest = max(float(effects.product(r, r)[0, 0]) - square, 1e-300)
-        probability = f_tail(square / number / (rest / spare), number, spare)
+        probability = f_tail(square / number / (rest / freedom), number, freedom)
     if not len(effects.variances):
-        probability = min(probability, _neighbours(problem))
-    return found.of(problem, effects) if probability < _GATE else nothing
+        probability = min(probability, _chance_of_neighbours(problem))
+    return places.of(problem, effects) if probability < _GATE else nothing
 
 
-def _neighbours(problem: SharedProblem) -> float:
+def _chance_of_neighbours(problem: SharedProblem) -> float:
     """Probability that poses of one socket at neighbouring configurations err so much alike by chance."""
     q = np.asarray(problem.record.recording.capture.readings)
-    columns, kernel = [], []
-    for each in problem.rows:
-        own = q[each.poses]
-        distance = np.sqrt(np.sum(4 * np.sin((own[:, None] - own) / 2) ** 2, axis=2))
-        columns.append(block_diagonal(each.by_tip))
-        kernel.append(np.kron(np.exp(-distance / _NEIGHBOURS) - np.eye(len(own)), np.eye(3)))
-    relative = problem.record.given_noise is None
-    return form_test(problem.left, columns, kernel, relative).probability
+
+    def alike(part: Rows) -> np.ndarray:
+        apart = q[part.poses][:, None] - q[part.poses]
+        distance = np.sqrt(np.sum(4 * np.sin(apart / 2) ** 2, axis=2))
+        return np.exp(-distance / _NEIGHBOURS) - np.eye(len(distance))
+
+    return _chance_of_alike(problem, alike)

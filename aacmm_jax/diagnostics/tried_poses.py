@@ -48,31 +48,31 @@ def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
     Raises:
         InputError: Fewer than two poses were calibrated with.
     """
-    known, other = (np.asarray(each, dtype=float)[:, : arm.joints] for each in (calibrated, q))
-    if len(known) < 2:
+    poses, others = (np.asarray(values, dtype=float)[:, : arm.joints] for values in (calibrated, q))
+    if len(poses) < 2:
         raise InputError(
-            f"{len(known)} pose has no distance from another; give at least two that were calibrated with."
+            f"{len(poses)} pose has no distance from another; give at least two that were calibrated with."
         )
     units = np.asarray(reading_units(arm.geometry))
     turns = np.array([joint + 1 not in arm.prismatic for joint in range(arm.joints)])
-    chosen = np.unique(np.linspace(0, len(known) - 1, min(len(known), _QUERIES)).round().astype(int))
-    own = _nearest(known / units, (known / units)[chosen], turns, chosen)
-    return TriedPoses(float(np.quantile(own, _NEAR)), _nearest(known / units, other / units, turns))
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _QUERIES)).round().astype(int))
+    among = _nearest(poses / units, (poses / units)[chosen], turns, chosen)
+    return TriedPoses(float(np.quantile(among, _NEAR)), _nearest(poses / units, others / units, turns))
 
 
 def _nearest(
-    known: Float[np.ndarray, "N n"],
+    poses: Float[np.ndarray, "N n"],
     q: Float[np.ndarray, "v n"],
     turns: Bool[np.ndarray, " n"],
-    own: np.ndarray | None = None,
+    same: np.ndarray | None = None,
 ) -> Float[np.ndarray, " v"]:
-    """Distance of each pose from the nearest known one; ``own``: which known pose each of them is itself."""
-    found = np.empty(len(q))
+    """Distance of each pose from the nearest of some ``poses``; ``same``: which of these each of them is itself."""
+    nearest = np.empty(len(q))
     for start in range(0, len(q), _AT_ONCE):
-        apart = q[start : start + _AT_ONCE, None] - known[None]
+        apart = q[start : start + _AT_ONCE, None] - poses[None]
         apart = np.where(turns, (apart + np.pi) % (2 * np.pi) - np.pi, apart)
         squares = np.mean(apart**2, axis=2)
-        if own is not None:
-            squares[np.arange(len(squares)), own[start : start + _AT_ONCE]] = np.inf
-        found[start : start + _AT_ONCE] = np.sqrt(squares.min(axis=1))
-    return found
+        if same is not None:
+            squares[np.arange(len(squares)), same[start : start + _AT_ONCE]] = np.inf
+        nearest[start : start + _AT_ONCE] = np.sqrt(squares.min(axis=1))
+    return nearest

@@ -162,12 +162,12 @@ def _of_each(drift: Drift) -> str:
     if not len(moved):
         return f"{start}."
     worst = sorted(moved, key=lambda i: -abs(drift.change[i]) / drift.expanded[i])
-    return f"{start}: {shorten([_moved(drift, int(i)) for i in worst])}."
-
-
-def _moved(drift: Drift, i: int) -> str:
-    unit = drift.units[i]
-    return f"{drift.names[i]} by {in_words(unit, drift.change[i])} (U = {in_words(unit, drift.expanded[i], '')})"
+    changes = [
+        f"{drift.names[i]} by {in_words(drift.units[i], drift.change[i])} "
+        f"(U = {in_words(drift.units[i], drift.expanded[i], '')})"
+        for i in map(int, worst)
+    ]
+    return f"{start}: {shorten(changes)}."
 
 
 def _of_lengths(drift: Drift) -> str:

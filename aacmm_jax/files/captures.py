@@ -17,11 +17,10 @@ from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior
 from .corrections import corrected_of, correction_variables
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
-from .observations import observation_tables, observations_of
+from .observations import observation_tables, observations_of, reading_variables, readings_of
 from .records import record_in, row_values, rows_table, table_of, values_in
 from .schema import LENGTHS, RECORDING, SPECIFICATION, SPHERES, USUAL_NOISE
 from .sense import read_checked
-from .temperatures import reading_variables, readings_of
 
 _GEOMETRY = {
     "alpha": ("rad", "link twist"),

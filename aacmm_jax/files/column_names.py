@@ -67,11 +67,6 @@ def are_units(cells: list[str], alone: bool) -> bool:
     )
 
 
-def with_units(names: list[str], cells: list[str]) -> list[str]:
-    """Names with the units of a row of their own in brackets; one that nobody knows is refused where it is picked."""
-    return [f"{name} [{_inside(cell)}]" if cell else name for name, cell in zip(names, cells, strict=True)]
-
-
 def _nearly_unit(text: str) -> bool:
     return bool(difflib.get_close_matches(text, _UNITS, n=1, cutoff=_ALIKE))
 
@@ -160,7 +155,10 @@ def names_of_columns(
     if len(names) > 1:
         names = [_recognised(path, names, wanted)]
     chosen = names[0][1] if names else [""] * width if units else []
-    return with_units(chosen, units[-1]) if units else chosen
+    if not units:
+        return chosen
+    # A unit that nobody knows is refused where its column is picked.
+    return [f"{name} [{_inside(cell)}]" if cell else name for name, cell in zip(chosen, units[-1], strict=True)]
 
 
 def _recognised(path: str | os.PathLike, lines: Sequence[Line], wanted: Sequence[Column]) -> Line:

@@ -163,14 +163,11 @@ def zero_offsets_csv(zeros: ZeroOffsets) -> str:
         f"# Distance of the tip from the calibrated arm's: RMS {zeros.rms:.4f} mm, largest {zeros.largest:.4f} mm; RMS",
         f"# {zeros.rms_nominal:.4f} mm without the offsets. Tip in the last frame: {_row(zeros.probe, ' ')} mm.",
     ]
-    if "mm" in zeros.units:
-        lines.append("joint,offset_deg,offset_rad,offset_mm")
-    else:
-        lines.append("joint,offset_deg,offset_rad")
-    for i, (offset, unit) in enumerate(zip(zeros.offsets, zeros.units, strict=True), start=1):
-        slide = f",,{_row((offset,))}" if unit == "mm" else None
-        angle = _row((offset / DEG, offset)) + ("," if "mm" in zeros.units else "")
-        lines.append(f"{i},{angle if slide is None else slide}")
+    units = ["deg", "rad", *(["mm"] if "mm" in zeros.units else [])]
+    lines.append(",".join(["joint", *(f"offset_{unit}" for unit in units)]))
+    for i, (offset, kind) in enumerate(zip(zeros.offsets, zeros.units, strict=True), start=1):
+        values = {"deg": offset / DEG, "rad": offset} if kind == "rad" else {"mm": offset}
+        lines.append(",".join([str(i), *(_row((values[unit],)) if unit in values else "" for unit in units)]))
     return "\n".join(lines) + "\n"
 
 

@@ -161,14 +161,11 @@ def provenance(kind: str) -> dict[str, Any]:
 def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
     """Attributes that are None are left out; HDF5 has no empty lists, which are "" instead."""
     for name, value in attributes.items():
-        if isinstance(value, tuple | list):
-            value = [_stored_scalar(entry) for entry in value] or ""
+        entries = value if isinstance(value, tuple | list) else [value]
+        # `str`: h5py cannot store NumPy's own texts.
+        entries = [storable(str(entry)) if isinstance(entry, str) else entry for entry in entries]
         if value is not None:
-            item.attrs[name] = _stored_scalar(value)
-
-
-def _stored_scalar(value: Any) -> Any:
-    return storable(str(value)) if isinstance(value, str) else value  # `str`: h5py cannot store NumPy's own
+            item.attrs[name] = entries[0] if not isinstance(value, tuple | list) else entries or ""
 
 
 def _write_group(group: Any, table: Table) -> None:

@@ -16,8 +16,7 @@ from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm, by_joint
 from .column_names import Column
 from .manifest_tables import Picked, Wanted, as_list
-from .table_columns import check_not_taken, reading_columns
-from .temperatures import TEMPERATURE, with_temperature
+from .table_columns import TEMPERATURE, check_not_taken, reading_columns
 from .text_table import TextTable
 from .toml import Strict
 
@@ -183,3 +182,18 @@ def _contradiction(text: TextTable, what: str, header: str, stated: str) -> Inpu
     return InputError(
         f"{text.path}: the header of the {what} says {header}, but the manifest {stated}; correct one of them."
     )
+
+
+def with_temperature(
+    q: Float[np.ndarray, "N n"], column: Float[np.ndarray, " N"] | None, stated: float | None, where: str
+) -> Float[np.ndarray, "N m"]:
+    """Readings with the temperature as a last column: of a table, or stated once for all; as they are without either.
+
+    Raises:
+        InputError: Both are given.
+    """
+    if column is not None and stated is not None:
+        raise InputError(f"{where} has a column {TEMPERATURE}, and {TEMPERATURE} is stated besides; give one of them.")
+    if stated is not None:
+        column = np.full(len(q), float(stated))
+    return q if column is None else np.concatenate([q, column[:, None]], axis=1)

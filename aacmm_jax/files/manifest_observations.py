@@ -66,22 +66,22 @@ def parts(
     check_name(session)
     labels, files_read = zip(*((label, fill(file, values)) for label, file in _files(table)), strict=True)
     try:
-        found = [reader.read(label, file, session) for label, file in zip(labels, files_read, strict=True)]
+        tables = [reader.read(label, file, session) for label, file in zip(labels, files_read, strict=True)]
     except InputError as error:  # a line to add is one of this table
         if where in str(error):
             raise
         raise InputError(f"{where}: {error}") from error
-    groups = np.concatenate([group for group, _, _ in found])
-    sessions = np.concatenate([session for _, session, _ in found])
-    files = np.repeat(np.arange(len(found)), [len(group) for group, _, _ in found])
-    for file, (*_, rows) in zip(files_read, found, strict=True):
-        different = sorted(found[0][2].keys() ^ rows.keys())
+    groups = np.concatenate([group for group, _, _ in tables])
+    sessions = np.concatenate([session for _, session, _ in tables])
+    files = np.repeat(np.arange(len(tables)), [len(group) for group, _, _ in tables])
+    for file, (*_, rows) in zip(files_read, tables, strict=True):
+        different = sorted(tables[0][2].keys() ^ rows.keys())
         if different:
             raise InputError(
                 f"{where}: only one of {files_read[0]} and {file} has '{different[0]}'; give it in all files of a "
                 "table, or make a table for each."
             )
-    by_pose = {key: np.concatenate([rows[key] for *_, rows in found]) for key in found[0][2]}
+    by_pose = {key: np.concatenate([rows[key] for *_, rows in tables]) for key in tables[0][2]}
     stated = reader.stated(values)
     both = sorted(by_pose.keys() & stated.keys())
     if both:
@@ -162,19 +162,19 @@ class _Reader:
             [i for columns in others for i in text.pick(columns)] if readings is text else [],
             table.temperature_C,
         )
-        found = {source.quantity: (rows := source.rows(readings, wanted))}
+        rows_of = {source.quantity: (rows := source.rows(readings, wanted))}
         for key, columns in chosen.items():
-            found[key] = self._column(text, self._entries[key], columns)
+            rows_of[key] = self._column(text, self._entries[key], columns)
         if label and self._label is not None:
-            found[self._label] = np.full(len(rows), label)
+            rows_of[self._label] = np.full(len(rows), label)
         sessions = np.full(len(rows), session) if of_session is None else text.texts(of_session[0])
-        for key, values in (found | {"session": sessions, "group": group}).items():
+        for key, values in (rows_of | {"session": sessions, "group": group}).items():
             if len(values) != len(rows):
                 raise InputError(
                     f"{self._where}: {file} has {len(values)} rows of '{key}', but there are {len(rows)} readings; "
                     "give a row of each for every pose."
                 )
-        return group, sessions, found
+        return group, sessions, rows_of
 
     def _open(self, file: str, skip: int) -> TextTable:
         table, source = self._table, self._source
@@ -217,7 +217,7 @@ class _Reader:
 
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
-        known = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
+        units = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
         unit = self._table.units.get(entry.name)
         if unit is not None and header is not None and unit != header:
             raise InputError(
@@ -230,10 +230,10 @@ class _Reader:
             if entry.unit == "1":
                 raise InputError(f"{self._where} has angles without a unit; give units = {{ {entry.name} = 'deg' }}.")
             return 1.0
-        if unit not in known:
+        if unit not in units:
             what = f"units.{entry.name} is" if unit != header else f"the header of {entry.name} says"
-            raise InputError(f"{self._where}: {what} '{unit}'; it must be one of {', '.join(known)}.")
-        return known[unit] ** (2 if entry.unit == "mm^2" else 1)
+            raise InputError(f"{self._where}: {what} '{unit}'; it must be one of {', '.join(units)}.")
+        return units[unit] ** (2 if entry.unit == "mm^2" else 1)
 
     def _rotations(self, entry: Entry, numbers: np.ndarray, header: str | None) -> np.ndarray:
         from scipy.spatial.transform import Rotation
@@ -259,19 +259,19 @@ class _Reader:
 
     def stated(self, values: Mapping[str, str]) -> dict[str, Any]:
         """What the manifest itself states, in mm and rad."""
-        found: dict[str, Any] = {}
+        stated: dict[str, Any] = {}
         for entry in self._kind.entries:
             value = getattr(self._table, entry.name, None)
             if value is None:
                 continue
             if isinstance(value, dict):
-                found[entry.dimensions[0]] = np.array(list(value))
-                found[entry.name] = np.array(list(value.values()), dtype=float) * self._unit(entry)
+                stated[entry.dimensions[0]] = np.array(list(value))
+                stated[entry.name] = np.array(list(value.values()), dtype=float) * self._unit(entry)
             elif entry.content == "text":
-                found[entry.name] = _filled(value, values, f"{self._where}: {entry.name}")
+                stated[entry.name] = _filled(value, values, f"{self._where}: {entry.name}")
             else:
-                found[entry.name] = value if entry.content == "truth" else value * self._unit(entry)
-        return found
+                stated[entry.name] = value if entry.content == "truth" else value * self._unit(entry)
+        return stated
 
     def check_complete(self, given: set[str]) -> None:
         """Raise `InputError` where something that the kind needs is nowhere."""

@@ -1,18 +1,18 @@
 """Observations in HDF5: one table each, of the entries that its kind declares; nothing here depends on a kind."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..core.errors import InputError
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
-from .hdf5 import Stored, StoredTable, Table
+from .hdf5 import Stored, StoredTable, Table, Variable
 from .records import Field, attribute_name, table_of
-from .temperatures import reading_variables, readings_of
 
 _PREFIX = "observation_"
 
@@ -66,3 +66,19 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
             value = source[name]
             values[entry.name] = value.astype(str) if entry.dimensions and entry.content == "text" else value
     return kind.rebuilt(attributes["name"], values)
+
+
+def reading_variables(
+    name: str, readings: Float[np.ndarray, "N n"], joints: int, unit: str, rows: str = "pose"
+) -> dict[str, Variable]:
+    """Readings as variables: those of the joints, and the temperature that may follow them."""
+    variables = {name: Variable((rows, "joint"), readings[:, :joints], unit, "joint reading")}
+    if readings.shape[1] > joints:
+        variables["temperature"] = Variable((rows,), readings[:, joints], "degC", "temperature of the arm")
+    return variables
+
+
+def readings_of(table: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, "N n"]:
+    """The readings that `reading_variables` wrote, with the temperature last where there is one."""
+    temperature = table.get("temperature")
+    return table[name] if temperature is None else np.concatenate([table[name], temperature[:, None]], axis=1)

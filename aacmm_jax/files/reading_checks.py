@@ -22,7 +22,7 @@ from ..core.units import ANGLE_UNITS, LENGTH_UNITS, length_unit
 from ..data.recording import Recording
 from ..diagnostics.reading_fit import Explanation
 from .inputs import InputFile
-from .manifest import manifest_model, read_manifest, readings_of_manifest
+from .manifest import PosesManifest, read_manifest, readings_of_manifest
 from .manifest_angles import Angles
 from .manifest_tables import Table
 from .outputs import as_path
@@ -53,7 +53,7 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
     numbers, stated, tables = list(range(1, joints + 1)), None, []
     as_read = Angles(unit=unit or "rad")  # pyright: ignore[reportArgumentType]
     if manifest is not None:
-        model, readings = read_toml(InputFile(as_path(manifest)), manifest_model()), readings_of_manifest(manifest)
+        model, readings = read_toml(InputFile(as_path(manifest)), PosesManifest), readings_of_manifest(manifest)
         numbers, stated, as_read = readings.columns, model.angles, readings.angles or as_read
         lists = [(key, part) for key, part in model if isinstance(part, list)]
         tables = [(key, table) for key, part in lists for table in part if isinstance(table, Table)]
@@ -124,7 +124,7 @@ def positions_unit(manifest: str | os.PathLike | None) -> str:
     """The unit in which a manifest takes the positions that an instrument measured, by default mm."""
     if manifest is None:
         return "mm"
-    model = read_toml(InputFile(as_path(manifest)), manifest_model())
+    model = read_toml(InputFile(as_path(manifest)), PosesManifest)
     tables = [*getattr(model, "points", ()), *getattr(model, "transforms", ())]
     stated = next((table.units["points"] for table in tables if "points" in table.units), "mm")
     return stated if stated in LENGTH_UNITS else "mm"

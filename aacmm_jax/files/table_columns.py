@@ -8,7 +8,6 @@ from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import LENGTH_UNITS
 from .column_names import bare_name, stem_and_number
-from .temperatures import TEMPERATURE
 from .text_table import TextTable
 
 # Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...
@@ -24,6 +23,7 @@ _NO_JOINT = re.compile("[xyzt]|time|timestamp|date|stamp|index|row|point|socket|
 # Universal Robots' joints in ROS, whose messages have them in alphabetical order.
 _OF_UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _POSITIONS = (("x", "y", "z"), ("px", "py", "pz"))
+TEMPERATURE = "temperature_C"  # the column of the arm's temperature
 LINE = "columns = [{}]"  # what a manifest states; of commands it is an option
 
 

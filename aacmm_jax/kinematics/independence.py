@@ -63,22 +63,26 @@ def determined_at(
     def changed(q: Any) -> Float[np.ndarray, "m n"]:
         return change(np.array(q)[:, : arm.joints])
 
-    rows = [
-        _of_positions(arm, observed, order, changed(observed.q)).reshape(-1, len(order))
-        for observed in capture.observations
-    ]
+    poses, lengths = _determining(arm, capture, order, changed(capture.q) if capture.sizes else None, changed)
+    return _independent(arm, list(order), np.concatenate([poses.reshape(-1, len(order)), lengths]))
+
+
+def _determining(
+    arm: Arm, capture: SocketPoses, names: Sequence[str], q: Any, change: Callable = np.asarray
+) -> tuple[Float[np.ndarray, "N 3 p"], Float[np.ndarray, "l p"]]:
+    """`equations` of the sockets at readings q, and the like of other observations, at readings that are changed."""
+    blocks, lengths = [np.zeros((0, 3, len(names)))], np.zeros((0, len(names)))
     if capture.sizes:
-        poses, lengths = equations(arm, capture, order, changed(capture.q))
-        rows += [poses.reshape(-1, len(order)), lengths]
-    return _independent(arm, list(order), np.concatenate(rows))
+        *blocks, lengths = equations(arm, capture, names, q)
+    blocks += [_of_positions(arm, observed, names, change(observed.q)) for observed in capture.observations]
+    return np.concatenate(blocks), lengths
 
 
 def _of_positions(
-    arm: Arm, observed: Any, names: Sequence[str], q: Float[np.ndarray, "m n"] | None = None
+    arm: Arm, observed: Any, names: Sequence[str], q: Float[np.ndarray, "m n"]
 ) -> Float[np.ndarray, "m 3 p"]:
     """Derivatives of tips that were measured in an unknown frame, less what that frame, an unknown place of a target
-    and, where nothing fixes it, the scale imitate; at other readings, where they are given."""
-    q = np.asarray(observed.q) if q is None else q
+    and, where nothing fixes it, the scale imitate."""
     tips = np.asarray(arm.position(q))
     # A frame that is not known imitates motions of the whole arm, a scale all tips, a target its probe. What these
     # explain is projected out of the columns: what is left is what the positions say of the parameters.
@@ -129,11 +133,8 @@ def independent_names(arm: Arm, capture: SocketPoses) -> tuple[Arm, tuple[str, .
             # Without the exact alignments of the nominal arm. Fixed parameters keep their nominal values, which may
             # make others redundant, so the choice is repeated.
             neighbour = neighbouring_arm(arm, taken or tuple(order))
-            blocks, lengths = [np.zeros((0, 3, len(order)))], np.zeros((0, len(order)))
-            if capture.sizes:
-                *blocks, lengths = equations(neighbour, capture, order, project_to_centroids(neighbour, capture, arm))
-            blocks += [_of_positions(neighbour, observed, order) for observed in capture.observations]
-            poses = np.concatenate(blocks)
+            q = project_to_centroids(neighbour, capture, arm) if capture.sizes else None
+            poses, lengths = _determining(neighbour, capture, order, q)
             rows = np.concatenate([poses.reshape(-1, len(order)), lengths])
             before, taken = taken, _independent(neighbour, order, rows)
             if taken == before or not taken:

@@ -12,7 +12,7 @@ A coefficient c_b moves one joint by phi_b, so that its column is phi_b times th
 all lengths moves the tip by itself, tip / scale, since the tip is linear in them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -122,44 +122,6 @@ def _parameter_of(kinds: JointKinds | None, kind: str, i: int) -> str:
     if kind != "q":
         return kind
     return "theta" if kinds is None or not kinds.prismatic[i] else "d"
-
-
-def moved_by_correction(forward: ForwardPass, kind: str, i: int) -> list[tuple[int, Float[AnyArray, "... 1 N"]]]:
-    """The joints that a coefficient, or a component of gravity, moves, and by how much; none of thermal expansion."""
-    assert forward.errors is not None
-    functions = forward.errors.functions
-    if kind == "coefficients":
-        return [(int(functions.moved[i]), forward.errors.by_coefficient[i])] if functions.moved[i] >= 0 else []
-    return [(joint, forward.errors.by_gravity[joint, i]) for joint in np.unique(functions.moved[functions.by_gravity])]
-
-
-def readings_gradient(
-    forward: ForwardPass, cotangents: Mapping[str, Float[AnyArray, "k 3 N"]]
-) -> Float[AnyArray, "n N"]:
-    """Derivative by the joint readings of a function of the Jacobian columns; ``cotangents`` are its derivatives by
-    them, by kind.
-
-    A revolute joint rotates each column that belongs to an axis after it (the change is z x column); a prismatic one
-    moves axis and tip alike. Of an axis before it, either moves the tip alone, which changes the column of a rotation
-    about u by u x (dtip/dq). Both sums over the columns are accumulated along the chain, one from the tip, the other
-    from the base.
-    """
-    columns, xp = jacobian_columns(forward), namespace(forward, cotangents)
-    axes = {"alpha": forward.x, "beta": forward.y, "theta": forward.z_before}
-    turned = xp.zeros_like(columns["theta"])
-    levered = turned
-    for kind, cotangent in cotangents.items():
-        moments = _cross(columns[kind], cotangent)
-        if kind == "probe":
-            from_probe = xp.sum(moments, axis=0)
-            turned = xp.concatenate([turned[:-1], turned[-1:] + from_probe[None]])
-        else:
-            turned = turned + moments
-        if kind in axes:
-            levered = levered + _cross(cotangent, axes[kind])
-    after = xp.flip(xp.cumsum(xp.flip(turned, 0), axis=0), 0)  # of this joint and those after it
-    before = xp.cumsum(levered, axis=0) - levered
-    return xp.sum(reading_rotations(forward) * after + reading_columns(forward) * before, axis=1)
 
 
 @compiled(jit=partial(jax.jit, static_argnames=("indices",)))

@@ -193,11 +193,8 @@ class Parameters(eqx.Module):
         Raises:
             InputError: The vector does not have p values.
         """
-        vector = self.checked_vector(vector, "vector")
-        base, indices = self.base, self.indices()
-        if base.beta is None and any(kind == "beta" for kind, _ in indices):
-            base = with_arrays(base, beta=0.0 * base.alpha)
-        return with_arrays(base, **with_values(base.geometry, vector, indices))
+        geometry = self.geometry(self.checked_vector(vector, "vector"))
+        return with_arrays(self.base, **{kind: getattr(geometry, kind) for kind, _ in self.indices()})
 
     def checked_vector(self, vector: Numbers, what: str) -> Float[AnyArray, "... p"]:
         """Values of the free parameters as an array, or `InputError`; NaN passes, as of an iteration that diverged."""

@@ -95,30 +95,24 @@ class Prior(eqx.Module):
         xp, steps = namespace(given, nominal), natural_steps(names)
         # Each parameter belongs to the closest of the groups that hold it, and has its standard deviation.
         owners = [_owner(self.groups, name) for name in names]
-        mean, sd = xp.asarray(nominal), xp.asarray(_BROAD * steps)
-        members, used = [], []
-        for number, group in enumerate(self.groups):
-            indices = tuple(i for i, owner in enumerate(owners) if owner == number)
-            if indices and (self.learned[number] or group in self.sd):
-                members.append(indices)
-                used.append(number)
-        if not members:
+        mean, sd, parts = xp.asarray(nominal), xp.asarray(_BROAD * steps), []
+        for number, (group, learned) in enumerate(zip(self.groups, self.learned, strict=True)):
+            indices, stated = tuple(i for i, owner in enumerate(owners) if owner == number), group in self.sd
+            if not indices or not (learned or stated):
+                continue
+            unit, index = _unit(names[i] for i in indices), np.array(indices)
+            if stated:
+                factors = steps[index] if unit == MIXED else np.ones(len(index))
+                sd = set_at(sd, index, given.sd[group] * xp.asarray(factors))
+            parts.append((group, learned, learned and stated, indices, unit))
+        if not parts:
             return None
         means = tuple(self.mean)
         for i, name in enumerate(names):
             owner = _owner(means, name)
             if owner is not None:
                 mean = set_at(mean, i, given.mean[means[owner]])
-        groups = tuple(self.groups[number] for number in used)
-        units = tuple(_unit(names[i] for i in indices) for indices in members)
-        for group, indices, unit in zip(groups, members, units, strict=True):
-            if group in self.sd:
-                index = np.array(indices)
-                factors = steps[index] if unit == MIXED else np.ones(len(index))
-                sd = set_at(sd, index, given.sd[group] * xp.asarray(factors))
-        learned = tuple(self.learned[number] for number in used)
-        expected = tuple(is_learned and group in self.sd for group, is_learned in zip(groups, learned, strict=True))
-        return ParameterPrior(mean, sd, groups, learned, expected, tuple(members), units)
+        return ParameterPrior(mean, sd, *zip(*parts, strict=True))
 
 
 MIXED = "mm and mrad"

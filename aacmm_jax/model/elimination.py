@@ -1,9 +1,15 @@
 """Normal equations in arrow form, and rows from which the private geometry is eliminated.
 
-With A the derivatives of whitened rows w by the head (parameters and shared geometry) and B those by the numbers of a
-component, the least squares for a given head has the component at -D^-1 (B w + C dx), where D = B B^T and C = B A^T. So
-the rows depend on the head as A~ = A - C^T D^-1 B, the eliminated derivatives, and their information is
-sum A~ A~^T, the Schur complement of the arrow.
+Let w be whitened rows, A their derivatives by the head x (parameters and shared geometry), and B those by the numbers y
+of a component. The normal equations of 1/2 |w + A dx + B dy|^2 are
+    [A A^T  C^T] [dx]     [A w]
+    [C      D  ] [dy] = - [B w]        with D = B B^T and C = B A^T
+(rows of A and B are unknowns here). For a given head the component is at dy = -D^-1 (B w + C dx). So the rows depend on
+the head as A~ = A - C^T D^-1 B, the eliminated derivatives, and their information sum A~ A~^T is the Schur complement
+A A^T - C^T D^-1 C of the arrow.
+
+A socket is the case in which B is minus the identity: D is the number m of its poses, so dy is the mean of the
+residuals, and the sum over its poses of squared distances from their centroid is what stage 1 minimises.
 """
 
 from typing import Any, NamedTuple
@@ -21,7 +27,15 @@ from .layout import Group
 from .observed import Observed
 from .robust import Loss
 from .rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at
-from .socket_sums import counts, means_over_sockets, sums_over_sockets, to_poses
+from .socket_sums import (
+    counts,
+    means_over_sockets,
+    membership,
+    owner_of,
+    starts,
+    sums_over_sockets,
+    to_poses,
+)
 
 _LONG = 40  # poses of a component, from which a product of matrices each is the fastest sum over them
 _NULL = 1e-12  # eigenvalues of a component's information below this, of the largest, are zero
@@ -48,21 +62,24 @@ class Args(NamedTuple):
 
 
 def sums_by_component(
-    one: Float[AnyArray, "k r m"], other: Float[AnyArray, "h r m"], sizes: tuple[int, ...]
+    first: Float[AnyArray, "k r m"], second: Float[AnyArray, "h r m"], sizes: tuple[int, ...]
 ) -> Float[AnyArray, "K k h"]:
     """Products of both, summed over the rows of each component."""
-    xp, count = namespace(one, other), len(sizes)
+    xp, count = namespace(first, second), len(sizes)
     if not count:
-        return xp.zeros((0, one.shape[0], other.shape[0]))
+        return xp.zeros((0, first.shape[0], second.shape[0]))
     if len(set(sizes)) == 1 and (xp is not np or sizes[0] >= _LONG):
-        first, second = (_by_component(part, count) for part in (one, other))
-        return first @ xp.swapaxes(second, -1, -2)
+        left, right = (_by_component(part, count) for part in (first, second))
+        return left @ xp.swapaxes(right, -1, -2)
     if sum(sizes) >= _LONG * count:
-        ends = np.cumsum(sizes)
-        pieces = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-        return xp.stack([_flat(one[..., of]) @ _flat(other[..., of]).T for of in pieces])
-    products: Any = sum(one[:, None, r] * other[None, :, r] for r in range(one.shape[1]))
+        return xp.stack([_flat(first[..., poses]) @ _flat(second[..., poses]).T for poses in _slices(sizes)])
+    products: Any = sum(first[:, None, r] * second[None, :, r] for r in range(first.shape[1]))
     return xp.moveaxis(_summed(products, sizes), -1, 0)
+
+
+def _slices(sizes: tuple[int, ...]) -> list[slice]:
+    ends = np.cumsum(sizes).tolist()
+    return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
 
 
 def _by_component(rows: Float[AnyArray, "k r m"], count: int) -> Float[AnyArray, "K k _"]:
@@ -74,37 +91,28 @@ def _by_component(rows: Float[AnyArray, "k r m"], count: int) -> Float[AnyArray,
 
 def _summed(values: Float[AnyArray, "... m"], sizes: tuple[int, ...]) -> Float[AnyArray, "... K"]:
     """Sums over the poses of each component, of which some may have none."""
-    some = [size for size in sizes if size]
-    xp = namespace(values)
-    if xp is np:
-        sums = np.add.reduceat(values, np.concatenate([[0], np.cumsum(some)[:-1]]), axis=-1)
-    else:
-        owner = np.repeat(np.arange(len(some)), some)
-        sums = values @ xp.asarray((owner[:, None] == np.arange(len(some))[None, :]).astype(float))
+    xp, some = namespace(values), tuple(size for size in sizes if size)
+    sums = np.add.reduceat(values, starts(some), axis=-1) if xp is np else values @ xp.asarray(membership(some).T)
     if len(some) == len(sizes):
         return sums
-    whole = xp.zeros((*values.shape[:-1], len(sizes)))
-    return added_to(whole, (..., np.flatnonzero(sizes)), sums)
+    return added_to(xp.zeros((*values.shape[:-1], len(sizes))), (..., np.flatnonzero(sizes)), sums)
 
 
 def followed(
-    by_own: Float[AnyArray, "k r m"], each: Float[AnyArray, "K k h"], sizes: tuple[int, ...]
+    by_own: Float[AnyArray, "k r m"], matrices: Float[AnyArray, "K k h"], sizes: tuple[int, ...]
 ) -> Float[AnyArray, "h r m"]:
     """The rows by numbers of their component, times a matrix of each component."""
-    xp, k = namespace(by_own, each), by_own.shape[0]
+    xp, (k, r, _) = namespace(by_own, matrices), by_own.shape
     if sum(sizes) >= _LONG * len(sizes):
-        ends, r = np.cumsum(sizes), by_own.shape[1]
-        pieces = [
-            (each[i].T @ _flat(by_own[..., end - size : end])).reshape(each.shape[-1], r, size)
-            for i, (end, size) in enumerate(zip(ends, sizes, strict=True))
-        ]
+        shapes = [(matrices.shape[-1], r, size) for size in sizes]
+        parts = zip(matrices, _slices(sizes), shapes, strict=True)
+        pieces = [(matrix.T @ _flat(by_own[..., poses])).reshape(shape) for matrix, poses, shape in parts]
         return pieces[0] if len(pieces) == 1 else xp.concatenate(pieces, axis=-1)
-    owner = np.repeat(np.arange(len(sizes)), sizes)
+    owner = owner_of(sizes)
     total: Any = 0.0
     for i in range(k):
-        mine = xp.moveaxis(each[:, i], 0, -1)  # (h, K)
-        mine = np.repeat(mine, sizes, axis=-1) if xp is np else mine[:, owner]
-        total = total + mine[:, None] * by_own[i][None]
+        of_number = xp.moveaxis(matrices[:, i], 0, -1)  # (h, K)
+        total = total + (of_number.repeat(sizes, -1) if xp is np else of_number[:, owner])[:, None] * by_own[i][None]
     return total
 
 
@@ -116,14 +124,9 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
     """The rows times the square roots of weights of their poses."""
     if weight is None:
         return block
-    root = namespace(weight).sqrt(weight)
-    return RowBlock(
-        block.white * root[None],
-        None if block.by_head is None else block.by_head * root[None, None],
-        None if block.by_own is None else block.by_own * root[None, None],
-        block.of,
-        block.sizes,
-    )
+    root = namespace(weight).sqrt(weight)[None]
+    by_head, by_own = (None if by is None else by * root[None] for by in (block.by_head, block.by_own))
+    return RowBlock(block.white * root, by_head, by_own, block.of, block.sizes)
 
 
 def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
@@ -135,6 +138,7 @@ def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
     def changed(by: Float[AnyArray, "k r m"] | None) -> Float[AnyArray, "k r m"] | None:
         if by is None:
             return None
+        # (1 - (1 - along) u u^T) A, with the direction u of the residual.
         less = (1 - along)[None] * xp.sum(direction[None] * by, axis=1)
         return by - less[:, None] * direction[None]
 
@@ -151,8 +155,8 @@ def cost_and_weights(
         if loss is None or number >= groups:
             total, weight = total + 0.5 * namespace(block.white).sum(block.white**2), None
         else:
-            each, weight = loss.cost_and_weight(block.white)
-            total = total + namespace(each).sum(each)
+            costs, weight = loss.cost_and_weight(block.white)
+            total = total + namespace(costs).sum(costs)
         weights.append(weight)
     return total, weights
 
@@ -167,19 +171,19 @@ def arrow_of(
     xp = namespace([block.white for block in blocks])
     heads = [_flat(block.by_head) for block in blocks if block.by_head is not None]
     whole = heads[0] if len(heads) == 1 else xp.concatenate(heads, axis=1)
-    head = whole @ whole.T
+    head = whole @ whole.T  # A A^T, over the rows of all blocks
     if prior is not None:
         own = np.arange(prior.weight.shape[0])
         head = added_to(head, (own, own), prior.weight**2)
     crossed, own, slopes = [], [], []
     for number, (count, size) in enumerate(classes):
+        # C = B A^T, D = B B^T and the gradient B w, summed over the blocks with components of this class.
         c, d, g = xp.zeros((count, size, height)), xp.zeros((count, size, size)), xp.zeros((count, size))
         for block in blocks:
             if block.of != number:
                 continue
             if block.by_own is None:
-                each = _of_points(block)
-                c, d, g = c + each[0], d + each[1], g + each[2]
+                c, d, g = (total + part for total, part in zip((c, d, g), _of_points(block), strict=True))
                 continue
             if block.by_head is not None:
                 c = c + sums_by_component(block.by_own, block.by_head, block.sizes)
@@ -196,6 +200,7 @@ def _of_points(block: RowBlock) -> tuple[AnyArray, AnyArray, AnyArray]:
     """C, D and B w of rows that are coordinates less those of their point."""
     assert block.by_head is not None
     xp = namespace(block.white)
+    # B is minus the identity at every pose, so that these are sums over the poses of a socket.
     crossed = -xp.moveaxis(sums_over_sockets(block.by_head, block.sizes), (0, 1, 2), (2, 1, 0))
     own = xp.asarray(np.asarray(block.sizes, dtype=float)[:, None, None] * np.eye(block.white.shape[0]))
     return crossed, own, -sums_over_sockets(block.white, block.sizes).T
@@ -206,10 +211,12 @@ def _shifts(block: RowBlock) -> Float[AnyArray, "h _"]:
     assert block.by_head is not None
     height, xp = block.by_head.shape[0], namespace(block.by_head)
     if block.by_own is None:
+        # D = m: the outer product of the sum of the rows' derivatives, over m.
         shifts = sums_over_sockets(block.by_head, block.sizes) / np.sqrt(counts(block.sizes, 3))
         return shifts.reshape(height, -1)
     sums = sums_by_component(block.by_own, xp.concatenate([block.by_own, block.by_head]), block.sizes)
     size = block.by_own.shape[0]
+    # With D = L L^T: C^T D^-1 C = (L^-1 C)^T (L^-1 C).
     return xp.moveaxis(inverse_cholesky(sums[..., :size]) @ sums[..., size:], -1, 0).reshape(height, -1)
 
 
@@ -223,6 +230,7 @@ def _fitted(block: RowBlock) -> RowBlock:
             white = white - to_poses(means_over_sockets(white, block.sizes), block.sizes)
         else:
             sums = sums_by_component(block.by_own, xp.concatenate([block.by_own, white[None]]), block.sizes)
+            # w - B^T D^-1 B w: the projection onto what the component cannot follow.
             step = inverse_positive_definite(sums[..., :-1]) @ sums[..., -1:]
             white = white - followed(block.by_own, step, block.sizes)[0]
     return RowBlock(white, block.by_head, block.by_own, block.of, block.sizes)
@@ -270,12 +278,12 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
 def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
     """Whitened residuals of observations, lengths, certified values and the prior; half their sum of squares is what
     is minimised."""
-    groups, found = len(args.observed.layout.groups), []
+    groups, rows = len(args.observed.layout.groups), []
     for number, block in enumerate(_blocks(z, args)):
         of_poses = number < groups
-        found.append(args.loss.transformed(block.white) if args.loss is not None and of_poses else block.white)
+        rows.append(args.loss.transformed(block.white) if args.loss is not None and of_poses else block.white)
     prior = args.whitening.prior
-    return tuple(found) if prior is None else (*found, prior.residual(z))
+    return tuple(rows) if prior is None else (*rows, prior.residual(z))
 
 
 def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> tuple[Float[AnyArray, " z"], PointRows]:
@@ -288,13 +296,13 @@ def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> tuple[Float[An
     first = len(layout.classes) - layout.linear
     fitted = [xp.zeros(shape) for shape in layout.classes[first:]]
     point = rows_at(space, observed, whole, batch is not None)
-    found = list(point.rows)
+    rows_of_groups = list(point.rows)
     for number, (group, root) in enumerate(zip(layout.groups, whitening.roots, strict=True)):
         if group.of >= first:
             rows = point.rows[number]
             fitted[group.of - first] = shift = _of_rows(rows, root, group)[1]
-            found[number] = rows._replace(values=rows.values - to_poses(shift.T, group.sizes))
-    return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)]), point._replace(rows=found)
+            rows_of_groups[number] = rows._replace(values=rows.values - to_poses(shift.T, group.sizes))
+    return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)]), point._replace(rows=rows_of_groups)
 
 
 def _of_rows(
@@ -314,16 +322,17 @@ def _of_rows(
 def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) -> list[Float[AnyArray, "_ 3 3"]]:
     """Covariances of the positions of sockets by a given arm, as entries of a list of all classes."""
     layout = observed.layout
-    found: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)
+    covariances: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
         if group.of >= 0 and stack.linear:
-            found[group.of] = inverse_positive_definite(_of_rows(rows, root, group)[0])
-    return found
+            covariances[group.of] = inverse_positive_definite(_of_rows(rows, root, group)[0])
+    return covariances
 
 
 def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, "h h"], Float[AnyArray, " h"]]:
     """Information and gradient of the head, with the components eliminated."""
     xp = namespace(arrow, gradient)
+    # A A^T - C^T D^-1 C, and the slope of the cost where the components follow the head.
     slope, parts = arrow.split(gradient)
     head = arrow.head
     for crossed, own, part in zip(arrow.crossed, arrow.own, parts, strict=True):
@@ -339,12 +348,12 @@ def pseudo_inverse(matrices: Float[AnyArray, "K k k"]) -> Float[AnyArray, "K k k
     xp, size = namespace(matrices), matrices.shape[-1]
     if xp is np:
         values, vectors = np.linalg.eigh(matrices)
-        known = values > _NULL * np.maximum(values[:, -1:], 1e-300)
-        return (vectors * np.where(known, 1 / np.where(known, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(-1, -2)
+        large = values > _NULL * np.maximum(values[:, -1:], 1e-300)
+        return (vectors * np.where(large, 1 / np.where(large, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(-1, -2)
     # Only a basis comes from the eigenvectors: their derivative is infinite where eigenvalues repeat.
     values, vectors = semidefinite_eigen(matrices)
-    known = values > _NULL * values[:, :1]
-    seen = xp.where(known[:, None, :], vectors, 0.0)
+    large = values > _NULL * values[:, :1]
+    seen = xp.where(large[:, None, :], vectors, 0.0)
     transposed = xp.swapaxes(seen, -1, -2)
-    inner = transposed @ matrices @ seen + xp.where(known, 0.0, 1.0)[..., None] * np.eye(size)[None]
+    inner = transposed @ matrices @ seen + xp.where(large, 0.0, 1.0)[..., None] * np.eye(size)[None]
     return seen @ inverse_positive_definite(inner) @ transposed

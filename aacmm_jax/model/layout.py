@@ -6,10 +6,15 @@ makes one of the components of its two sockets. A component of more than a few d
 since a dense block of that size costs as much.
 
 Everything here is static: it follows from names and numbers of poses, and fixes a compiled program.
+
+Example: of two sockets that a length joins, and a tracker that saw two targets,
+    layout = layout_of(observations, [("position of A", "position of B")])
+    layout.shared     # 6: the tracker's frame, which both targets use
+    layout.classes    # ((1, 6),): one component of two positions, coupled by the length
 """
 
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +54,7 @@ class Group(NamedTuple):
     @property
     def index(self) -> slice | np.ndarray:
         """Its poses among all."""
-        if all(one[1] == other[0] for one, other in zip(self.poses, self.poses[1:], strict=False)):
+        if all(pair[1] == following[0] for pair, following in zip(self.poses, self.poses[1:], strict=False)):
             return slice(self.poses[0][0], self.poses[-1][1])
         return np.concatenate([np.arange(first, last) for first, last in self.poses])
 
@@ -93,130 +98,126 @@ def _positions(parts: tuple[tuple[str, Units], ...]) -> dict[str, np.ndarray]:
 
 def unknowns_of(observation: AbstractObservation) -> dict[str, Units]:
     """Parts of the geometry that an observation uses, with the place of its target last."""
-    found = dict(observation.unknowns)
-    if observation.target:
-        found[offset_of(observation.target)] = POINT
-    return found
+    target = {offset_of(observation.target): POINT} if observation.target else {}
+    return dict(observation.unknowns) | target
 
 
 def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[str, str]]) -> Layout:
     """The layout of a problem; ``ends`` are the names of the positions at the ends of its reference lengths."""
-    return _Problem(observations, ends).layout()
+    used = [unknowns_of(observation) for observation in observations]
+    users: dict[str, list[int]] = {}
+    for number, parts in enumerate(used):
+        for name in parts:
+            users.setdefault(name, []).append(number)
+    alone = {name: numbers[0] for name, numbers in users.items() if len(numbers) == 1}
+    # A length with one shared end says something of what is shared alone.
+    half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
+    alone = {name: number for name, number in alone.items() if name not in half}
+    component = _connected(len(observations), [(alone[a], alone[b]) for a, b in ends if a in alone])
+    return _Problem(observations, used, alone, component).layout()
+
+
+def _connected(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
+    """For each of some things the first of those that pairs connect it with."""
+    parents = list(range(count))
+
+    def root(number: int) -> int:
+        while parents[number] != number:
+            parents[number] = parents[parents[number]]
+            number = parents[number]
+        return number
+
+    for pair in pairs:
+        low, high = sorted(map(root, pair))
+        parents[high] = low
+    return [root(number) for number in range(count)]
 
 
 class _Problem:
-    """What `layout_of` knows of each observation."""
+    """What follows from the parts that observations use, and from those that one alone uses."""
 
-    def __init__(self, observations: Sequence[AbstractObservation], ends: Sequence[tuple[str, str]]):
-        self.observations = observations
-        self.used = [unknowns_of(observation) for observation in observations]
-        self.units: dict[str, Units] = {}
-        users: dict[str, list[int]] = {}
-        for number, parts in enumerate(self.used):
-            self.units |= parts
-            for name in parts:
-                users.setdefault(name, []).append(number)
-        alone = {name: numbers[0] for name, numbers in users.items() if len(numbers) == 1}
-        # A length with one shared end says something of what is shared alone.
-        half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
-        alone = {name: number for name, number in alone.items() if name not in half}
-        # The first observation of the component of each.
-        self.component = _connected(len(observations), [(alone[a], alone[b]) for a, b in ends if a in alone])
-        self.size = np.zeros(len(observations), dtype=int)  # numbers of the component that an observation is first of
+    def __init__(
+        self,
+        observations: Sequence[AbstractObservation],
+        used: list[dict[str, Units]],
+        alone: dict[str, int],
+        component: list[int],  # the first observation of the component of each
+    ):
+        self.observations, self.used, self.component = observations, used, component
+        self.units = {name: units for parts in used for name, units in parts.items()}
+        size = np.zeros(len(observations), dtype=int)
         for name, number in alone.items():
-            self.size[self.component[number]] += len(self.units[name])
-        self.private = {name for name, number in alone.items() if self.numbers_of(number) <= _LARGEST_COMPONENT}
-        self.coupled = {one for number, one in enumerate(self.component) if one != number}
-
-    def numbers_of(self, number: int) -> int:
-        """How many numbers the component of an observation has."""
-        return int(self.size[self.component[number]])
+            size[component[number]] += len(self.units[name])
+        self.size = size[component].tolist()  # how many numbers the component of each observation has
+        self.private = {name for name, number in alone.items() if self.size[number] <= _LARGEST_COMPONENT}
+        coupled = {first for number, first in enumerate(component) if first != number}
+        self.coupled = [first in coupled for first in component]
 
     def own(self, number: int) -> list[str]:
         """The private parts of an observation."""
         return [name for name in self.used[number] if name in self.private]
 
     def kind(self, number: int) -> object:
-        """What the components of one class have in common; None without private parts."""
-        if not self.own(number):
-            return None
-        if self.component[number] in self.coupled:
-            return "coupled", self.numbers_of(number)
-        return self.key(number)
+        """What the components of one class have in common."""
+        return ("coupled", self.size[number]) if self.coupled[number] else self.key(number)
 
     def key(self, number: int) -> object:
         """What observations that are evaluated together have in common; the number itself of one that is alone."""
-        one, alike = self.observations[number], self.observations[number].alike
-        together = self.component[number] in self.coupled and bool(self.own(number))
-        if alike is None or one.q.shape[-2] > _MOST_STACKED:
+        observation = self.observations[number]
+        together = self.coupled[number] and bool(self.own(number))
+        if observation.alike is None or observation.q.shape[-2] > _MOST_STACKED:
             return number, together
         roles = tuple((units, name in self.private) for name, units in self.used[number].items())
-        return type(one), alike, bool(one.target), roles, self.numbers_of(number) if together else 0
+        size = self.size[number] if together else 0
+        return type(observation), observation.alike, bool(observation.target), roles, size
 
     def is_linear(self, number: int) -> bool:
         """Whether an observation is linear in a component that is its own."""
-        one = self.observations[number]
-        return one.linear and len(self.used[number]) == 1 and self.component[number] not in self.coupled
+        return self.observations[number].linear and len(self.used[number]) == 1 and not self.coupled[number]
+
+    @cached_property
+    def classes(self) -> list[list[int]]:
+        """Observations of the components of each class; classes with linear rows come last."""
+        by_kind: dict[object, list[int]] = {}
+        for number in range(len(self.observations)):
+            if self.own(number):
+                by_kind.setdefault(self.kind(number), []).append(number)
+        return sorted(by_kind.values(), key=lambda numbers: self.is_linear(numbers[0]))
 
     def layout(self) -> Layout:
         """The layout."""
-        everything = range(len(self.observations))
+        names = [name for name in self.units if name not in self.private]
+        shared, sizes, places, number_of = sum(len(self.units[name]) for name in names), [], {}, {}
+        for of, numbers in enumerate(self.classes):
+            components: dict[int, list[str]] = {}
+            for number in numbers:
+                components.setdefault(self.component[number], []).extend(self.own(number))
+            places |= {first: place for place, first in enumerate(components)}
+            number_of |= dict.fromkeys(numbers, of)
+            names += [name for parts in components.values() for name in parts]
+            sizes.append((len(components), self.size[numbers[0]]))
+        linear = sum(self.is_linear(numbers[0]) for numbers in self.classes)
+        layout = Layout(tuple((name, self.units[name]) for name in names), shared, tuple(sizes), linear, ())
         members: dict[object, list[int]] = {}
-        for number in everything:
+        for number in range(len(self.observations)):
             members.setdefault(self.key(number), []).append(number)
-        of_class: dict[object, list[int]] = {}
-        for number in everything:
-            if self.own(number):
-                of_class.setdefault(self.kind(number), []).append(number)
-        kinds = sorted(of_class, key=lambda kind: self.is_linear(of_class[kind][0]))
-        shared = [name for name in self.units if name not in self.private]
-        order, classes, place = list(shared), [], {}
-        for kind in kinds:
-            components = list(dict.fromkeys(self.component[number] for number in of_class[kind]))
-            place |= {one: i for i, one in enumerate(components)}
-            by_component: dict[int, list[str]] = {one: [] for one in components}
-            for number in of_class[kind]:
-                by_component[self.component[number]] += self.own(number)
-            order += [name for names in by_component.values() for name in names]
-            classes.append((len(components), self.numbers_of(of_class[kind][0])))
-        parts = tuple((name, self.units[name]) for name in order)
-        count = sum(len(self.units[name]) for name in shared)
-        linear = sum(self.is_linear(of_class[kind][0]) for kind in kinds)
-        layout = Layout(parts, count, tuple(classes), linear, ())
-        number_of = {kind: i for i, kind in enumerate(kinds)}
-        ordered = (sorted(some, key=lambda number: place.get(self.component[number], 0)) for some in members.values())
-        groups = (self._group(some, layout, number_of.get(self.kind(some[0]), -1), place) for some in ordered)
+        ordered = (sorted(some, key=lambda number: places.get(self.component[number], 0)) for some in members.values())
+        groups = (self._group(some, layout, number_of.get(some[0], -1), places) for some in ordered)
         return layout._replace(groups=tuple(groups))
 
-    def _group(self, members: list[int], layout: Layout, of: int, place: dict[int, int]) -> Group:
+    def _group(self, members: list[int], layout: Layout, of: int, places: dict[int, int]) -> Group:
         positions = layout.positions
         roles = tuple(
             Role(tuple(int(positions[name][0]) for name in names), len(self.units[names[0]]), names[0] in self.private)
             for names in zip(*(self.used[number] for number in members), strict=True)
         )
-        stops = np.cumsum([one.q.shape[-2] for one in self.observations]).tolist()
+        stops = np.cumsum([observation.q.shape[-2] for observation in self.observations]).tolist()
         counts = [self.observations[number].q.shape[-2] for number in members]
         poses = tuple((stops[number] - count, stops[number]) for number, count in zip(members, counts, strict=True))
         sizes, start = (), ()
         if of >= 0:
-            components = [place[self.component[number]] for number in members]
+            components = [places[self.component[number]] for number in members]
             sizes = tuple(np.bincount(components, weights=counts, minlength=layout.classes[of][0]).astype(int).tolist())
             own = next(role for role in roles if role.private)
             start = tuple(layout.component_of(index)[2] for index in own.first)
         return Group(tuple(members), poses, roles, bool(self.observations[members[0]].target), of, sizes, start)
-
-
-def _connected(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """For each of some things the first of those that pairs connect it with."""
-    found = list(range(count))
-
-    def root(number: int) -> int:
-        while found[number] != number:
-            found[number] = found[found[number]]
-            number = found[number]
-        return number
-
-    for one, other in pairs:
-        low, high = sorted((root(one), root(other)))
-        found[high] = low
-    return [root(number) for number in range(count)]

@@ -1,13 +1,13 @@
 """Repeatability of tip positions: how far the poses of one socket disagree (DE, Deltam, RMS)."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.arguments import items_of
-from ..core.arrays import as_array, is_concrete
+from ..core.arguments import ANY_NUMBER, Count, checked_arguments
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
 from .socket_sums import largest_of_sockets, means_over_sockets, to_poses
@@ -39,7 +39,10 @@ class Repeatability(eqx.Module):
     sigma: Float[AnyArray, ""]
 
 
-def repeatability(tips: Float[AnyArray, "N 3"], sizes: Sequence[int], *, fitted: int = 0) -> Repeatability:
+@checked_arguments
+def repeatability(
+    tips: Annotated[Float[AnyArray, "N 3"], ANY_NUMBER], sizes: Sequence[Count], *, fitted: int = 0
+) -> Repeatability:
     """Repeatability of tips, socket after socket.
 
     DE of several sockets is the mean over all poses of sockets with at least two; Deltam is the largest of all sockets.
@@ -60,12 +63,8 @@ def repeatability(tips: Float[AnyArray, "N 3"], sizes: Sequence[int], *, fitted:
         >>> print(f"DE {found.de:.4f} mm, Deltam {found.deltam:.4f} mm")
         DE 0.0127 mm, Deltam 0.0199 mm
     """
-    tips, sizes = as_array(tips, "tips", like=np.zeros(0)), tuple(items_of(sizes, "sizes"))
-    if not is_concrete(*sizes):
-        raise InputError("sizes must be known numbers; under jit or vmap close over them, or make them static.")
-    if not sizes or not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
-        raise InputError(f"sizes are {sizes}; give the number of tips of each socket, whole and positive.")
-    if tips.shape != (sum(sizes), 3):
+    sizes = tuple(sizes)
+    if not sizes or tips.shape[0] != sum(sizes):
         raise InputError(f"tips has shape {tips.shape}, but sizes add up to {sum(sizes)}; give ({sum(sizes)}, 3).")
     counts, rows, xp = np.asarray(sizes), tips.T, namespace(tips)
     centroids = means_over_sockets(rows, sizes)

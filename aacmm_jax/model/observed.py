@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray, namespace, to_numpy
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from ..core.pytree import pytree, static
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.measured_points import AbstractMeasured
@@ -24,6 +24,7 @@ from ..data.observations.socket import position_of, sockets_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import ForwardPass, Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
+from ..solver.arrow import split
 from .layout import Group, Layout, layout_of, unknowns_of
 from .socket_sums import means_over_sockets
 
@@ -57,16 +58,15 @@ class Observed:
         xp = namespace(capture)
         observations = to_numpy((*sockets_of(capture.sockets), *capture.observations))
         q = xp.concatenate([observation.q for observation in observations])
-        known = capture.lengths if lengths else ()
-        ends = tuple((position_of(length.start), position_of(length.end)) for length in known)
+        references, ends = (capture.lengths, ends_of(capture)) if lengths else ((), ())
         layout = layout_of(observations, ends)
         return cls(
             observations=observations,
             stacks=_stacks(observations, layout),
             q=q,
             motion=None if arm is None else joint_motion(to_numpy(arm.geometry), q),
-            nominal=xp.stack([length.value for length in known]) if known else np.zeros(0),
-            u=xp.stack([length.u for length in known]) if known else np.zeros(0),
+            nominal=xp.stack([length.value for length in references]) if references else np.zeros(0),
+            u=xp.stack([length.u for length in references]) if references else np.zeros(0),
             ends=ends,
             layout=layout,
         )
@@ -82,13 +82,15 @@ class Observed:
         self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]
     ) -> "Observed":
         """The same, had every instrument measured exactly the tips of this arm in this geometry."""
-        if not any(isinstance(one, AbstractMeasured) for one in self.observations):
+        if not any(isinstance(observation, AbstractMeasured) for observation in self.observations):
             return self
         forward, parts = self.forward(space, vector, geometry), self.split(geometry)
         return self._with_observations(
             tuple(
-                one.without_errors(tips_of(forward, rows), parts) if isinstance(one, AbstractMeasured) else one
-                for one, rows in zip(self.observations, self.slices, strict=True)
+                observation.without_errors(tips_of(forward, rows), parts)
+                if isinstance(observation, AbstractMeasured)
+                else observation
+                for observation, rows in zip(self.observations, self.slices, strict=True)
             )
         )
 
@@ -103,7 +105,7 @@ class Observed:
     @cached_property
     def names(self) -> list[str]:
         """The parts in the order in which the observations name them."""
-        return list(dict.fromkeys(name for one in self.observations for name in unknowns_of(one)))
+        return list(dict.fromkeys(name for observation in self.observations for name in unknowns_of(observation)))
 
     @property
     def positions(self) -> dict[str, np.ndarray]:
@@ -131,22 +133,44 @@ class Observed:
 
     def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
         """The numbers of each part."""
-        found, first = {}, 0
+        parts, first = {}, 0
         for name, units in self.layout.parts:
-            found[name] = geometry[first : first + len(units)]
+            parts[name] = geometry[first : first + len(units)]
             first += len(units)
-        return found
+        return parts
+
+    def distances(
+        self, geometry: Float[AnyArray, " g"], ends: Sequence[tuple[str, str]]
+    ) -> tuple[Float[AnyArray, " l"], Float[AnyArray, "l g"]]:
+        """Distances between the positions with these names, mm, and their derivatives by the numbers of the geometry:
+        the unit vector at the end, and its opposite at the start."""
+        xp = namespace(geometry)
+        index = np.array([[self.positions[name] for name in pair] for pair in ends], dtype=int).reshape(-1, 2, 3)
+        between = geometry[index[:, 1]] - geometry[index[:, 0]]
+        sizes = xp.sqrt(xp.sum(between**2, axis=1))
+        units, rows = between / sizes[:, None], np.arange(len(index))[:, None]
+        pull = set_at(xp.zeros((len(index), len(geometry))), (rows, index[:, 0]), -units)
+        return sizes, set_at(pull, (rows, index[:, 1]), units)
+
+    def by_unknowns(
+        self, derivatives: Float[AnyArray, "q g"], parameters: int
+    ) -> tuple[Float[AnyArray, "q h"], list[Float[AnyArray, "q _ _"]]]:
+        """Derivatives by the geometry as those by the head, with so many parameters, and by components; natural
+        steps."""
+        xp = namespace(derivatives)
+        head, components = split(derivatives * self.steps[None], self.layout.shared, self.layout.classes)
+        return xp.concatenate([xp.zeros((len(derivatives), parameters)), head], axis=1), components
 
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         """Parts that have certified values: the values and their standard uncertainties."""
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         # Sockets have none, and there may be thousands.
         others = [
             group.members for group, stack in zip(self.layout.groups, self.stacks, strict=True) if not stack.linear
         ]
         for number in sorted(itertools.chain(*others)):
-            found |= self.observations[number].certified_values()
-        return found
+            values |= self.observations[number].certified_values()
+        return values
 
     def forward(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> ForwardPass:
         """All poses by an arm, each with the tip that it held."""
@@ -173,31 +197,37 @@ class Observed:
         arm = space.geometry(vector)
         forward = forward_pass(arm, self.motion)
         tips = [tips_of(forward, rows) for rows in self.slices]
-        found: dict[str, Any] = {}
+        parts: dict[str, Any] = {}
         for observation, own in zip(self.observations, tips, strict=True):
             new = observation.start(own, arm.probe)
             if observation.target:
                 new = {offset_of(observation.target): arm.probe} | new
-            found = new | found  # what another observation has found stays
-        found |= platform_frames(self.observations, tips)
-        return namespace(arm, forward).concatenate([found[name] for name in self.blocks])
+            parts = new | parts  # what another observation says stays
+        parts |= platform_frames(self.observations, tips)
+        return namespace(arm, forward).concatenate([parts[name] for name in self.blocks])
 
     def mean_by_observation(self, by_group: Sequence[Float[AnyArray, " _"]]) -> Float[AnyArray, " k"]:
         """Means over the poses of each observation of values with the poses of each group."""
         xp = namespace(by_group)
         members = np.concatenate([group.members for group in self.layout.groups])
-        each = zip(self.layout.groups, by_group, strict=True)
-        return xp.concatenate([means_over_sockets(values, group.counts) for group, values in each])[np.argsort(members)]
+        pairs = zip(by_group, self.layout.groups, strict=True)
+        means = xp.concatenate([means_over_sockets(values, group.counts) for values, group in pairs])
+        return means[np.argsort(members)]
 
     def by_observation(self, by_group: Sequence[Float[AnyArray, "... _"]]) -> list[Float[AnyArray, "... _"]]:
         """Arrays with the poses of each group last, as one for each observation."""
-        found: list[Any] = [None] * len(self.observations)
+        by_observation: list[Any] = [None] * len(self.observations)
         for group, values in zip(self.layout.groups, by_group, strict=True):
             first = 0
             for number, count in zip(group.members, group.counts, strict=True):
-                found[number] = values[..., first : first + count]
+                by_observation[number] = values[..., first : first + count]
                 first += count
-        return found
+        return by_observation
+
+
+def ends_of(capture: Capture) -> tuple[tuple[str, str], ...]:
+    """Names of the positions at the ends of a capture's reference lengths."""
+    return tuple((position_of(length.start), position_of(length.end)) for length in capture.lengths)
 
 
 def _stacks(observations: tuple[AbstractObservation, ...], layout: Layout) -> tuple[AbstractObservation, ...]:

@@ -11,21 +11,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import shown
 from ..core.distributions import chi_square_quantile, chi_square_tail
-from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace
-from .loss_names import LOSSES, LossName
+from .loss_names import LossName
 
 _EFFICIENCY = 0.95  # for normal residuals
 # The least curvature of a loss along a residual, relative to that across it: beyond c it would be 0 or negative.
 _LEAST_CURVATURE = 0.01
-
-
-def check_loss(robust: object) -> None:
-    """Raise `InputError` for what is neither the name of a loss nor None."""
-    if robust is not None and not (isinstance(robust, str) and robust in LOSSES):
-        raise InputError(f"robust is {shown(robust)}; it must be one of {', '.join(LOSSES)}, or None.")
 
 
 def _curvature(name: LossName, s: Float[AnyArray, " m"]) -> Float[AnyArray, " m"]:

@@ -72,10 +72,10 @@ class PointRows(NamedTuple):
 def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], batch: bool = False) -> PointRows:
     """The residuals of every group, with their derivatives by tips and unknowns; in a ``batch`` in the way that is
     fastest there, through which no derivative passes."""
-    p, found = len(space.names), []
+    p, rows = len(space.names), []
     chain = observed.chain(space, z[:p], z[p:])
     if batch and chain.corrections is None and observed.motion is not None:
-        rotations = any(one.rotates for one in observed.stacks)
+        rotations = any(stack.rotates for stack in observed.stacks)
         forward = pose_columns(chain, observed.motion, space.indices(), rotations)
     else:
         forward = forward_pass(chain, observed.motion)
@@ -84,8 +84,8 @@ def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], bat
             name: _columns_of_role(z[p:], role.first, role.size, group.counts)
             for name, role in zip(stack.unknowns, group.roles, strict=False)
         }
-        found.append(stack.residual_with_errors(tips_of(forward, group.index), unknowns))
-    return PointRows(forward, found)
+        rows.append(stack.residual_with_errors(tips_of(forward, group.index), unknowns))
+    return PointRows(forward, rows)
 
 
 def _columns_of_role(
@@ -113,14 +113,14 @@ def row_blocks(
         rotates = any(rows.by_rotation is not None for rows in point.rows)
         turned = rotation_columns(forward, shared.few) if rotates else None
     own_probe = np.array([kind == "probe" for kind, _ in shared.few])
-    found = []
+    blocks = []
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
         poses = group.index
         mine = columns[..., poses]
         if root is None and stack.linear:  # a tip less a point
             by_parameters = shared.multiplied(mine, forward, poses)
             by_head = _by_head(by_parameters, [rows.values[None]], group, layout.shared)
-            found.append(RowBlock(rows.values, by_head, None, group.of, group.sizes))
+            blocks.append(RowBlock(rows.values, by_head, None, group.of, group.sizes))
             continue
         assert root is not None
         rows = _whitened(rows, root)
@@ -136,8 +136,8 @@ def row_blocks(
             by_roles.append(times(rows.by_tip, xp.stack([axis[:, poses] for axis in forward.frame])))
         by_head = _by_head(by_parameters, by_roles, group, layout.shared)
         size = 0 if group.of < 0 else layout.classes[group.of][1]
-        found.append(RowBlock(rows.values, by_head, _by_own(by_roles, group, size), group.of, group.sizes))
-    return [*found, *_relations(observed, z[p:], whitening, p)]
+        blocks.append(RowBlock(rows.values, by_head, _by_own(by_roles, group, size), group.of, group.sizes))
+    return [*blocks, *_relations(observed, z[p:], whitening, p)]
 
 
 def _by_head(
@@ -202,21 +202,21 @@ def _relations(observed: Observed, geometry: Float[AnyArray, " g"], whitening: W
     vectors = geometry[index[:, 1]] - geometry[index[:, 0]]
     size = xp.sqrt(xp.sum(vectors**2, axis=1))
     lengths = whitening.lengths * (size - observed.nominal)
-    each = certified.items()
-    values = [whitening.certified[name] * (geometry[positions[name]] - value) for name, (value, _) in each]
+    pairs = certified.items()
+    values = [whitening.certified[name] * (geometry[positions[name]] - value) for name, (value, _) in pairs]
     white = xp.concatenate([lengths, *values])
     slopes = vectors * (whitening.lengths / size)[:, None]
     # Derivatives as a list of numbers, in the order in which `_places` lists where they stand.
     numbers = xp.concatenate([(-slopes).ravel(), slopes.ravel(), *(whitening.certified[name] for name in certified)])
-    found = []
+    blocks = []
     for of, places in _places(observed.layout, observed.ends, tuple(certified)).items():
         height = p + layout.shared if of < 0 else layout.classes[of][1]
         whole = xp.zeros((height, len(places.rows)))
         at = places.columns + (p if of < 0 else 0), places.of_row
         whole = set_at(whole, at, numbers[places.numbers])[:, None]
         by = (whole, None) if of < 0 else (None, whole)
-        found.append(RowBlock(white[places.rows][None], *by, of, places.sizes))
-    return found
+        blocks.append(RowBlock(white[places.rows][None], *by, of, places.sizes))
+    return blocks
 
 
 @lru_cache(maxsize=32)
@@ -229,30 +229,30 @@ def _places(layout: Layout, ends: tuple[tuple[str, str], ...], certified: tuple[
     of_length = np.repeat(np.arange(count), 3)
     row = np.concatenate([of_length, of_length, count + np.arange(sum(map(len, own)))]).astype(int)
     located = [layout.component_of(int(i)) for i in index]
-    found = {}
+    by_class = {}
     for of in dict.fromkeys(place[0] for place in located):
         mine = np.array([i for i, place in enumerate(located) if place[0] == of])
         component = {int(row[i]): located[i][1] for i in mine}
         rows = sorted(component, key=lambda number: (component[number], number))
         sizes = np.bincount([component[n] for n in rows], minlength=0 if of < 0 else layout.classes[of][0])
-        found[of] = _Relations(
+        by_class[of] = _Relations(
             rows=np.array(rows),
             numbers=mine,
             columns=np.array([located[i][2] for i in mine]),
             of_row=np.array([rows.index(number) for number in row[mine].tolist()]),
             sizes=() if of < 0 else tuple(int(size) for size in sizes),
         )
-    return found
+    return by_class
 
 
 def _whitened(rows: Rows, root: Float[AnyArray, "m r r"]) -> Rows:
     """Rows in standard deviations: their few derivatives by tip and geometry cost less than those by all parameters."""
-    each = namespace(rows.values, root).moveaxis(root, 0, -1)
+    roots = namespace(rows.values, root).moveaxis(root, 0, -1)
     return rows._replace(
-        values=times(each, rows.values[None])[0],
-        by_tip=_product(each, rows.by_tip),
-        by_rotation=None if rows.by_rotation is None else _product(each, rows.by_rotation),
-        by_unknowns={name: times(each, derivative) for name, derivative in rows.by_unknowns.items()},
+        values=times(roots, rows.values[None])[0],
+        by_tip=_product(roots, rows.by_tip),
+        by_rotation=None if rows.by_rotation is None else _product(roots, rows.by_rotation),
+        by_unknowns={name: times(roots, derivative) for name, derivative in rows.by_unknowns.items()},
     )
 
 

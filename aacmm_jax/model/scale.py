@@ -4,15 +4,14 @@ The uncertainty of k comes from the lengths and the scatter at their ends (here,
 identified parameters (`calibration.scale_fix`).
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.arguments import check_finite, checked_arguments
-from ..core.arrays import Numbers, as_array, is_concrete
+from ..core.arguments import NOT_EMPTY, NotNegative, Range, check_finite, checked_arguments
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
@@ -21,6 +20,7 @@ from ..kinematics.parameters import Parameters
 from .metrics import repeatability
 from .socket_sums import means_over_sockets
 
+Length = Range(above=0, unit="mm")
 # Names of fixed lengths that free ones can replace, and for each free parameter its weight in place of each of them.
 Partners = tuple[tuple[str, ...], tuple[tuple[float, ...], ...]]
 
@@ -90,7 +90,9 @@ def divided_arm(arm: Arm, k: Float[AnyArray, "..."]) -> Arm:
 
 
 @checked_arguments
-def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> ScaleFix:
+def fix_scale(
+    arm: Arm, capture: Capture, *, sigma: Annotated[float, Range(least=0, unit="mm")] | None = None
+) -> ScaleFix:
     """Stage 2: k from every reference length of a capture, and the arm divided by it.
 
     k is the mean of measured / nominal weighted by uncertainty: the length's own u, and the scatter of the poses over
@@ -122,9 +124,7 @@ def fix_scale(arm: Arm, capture: Capture, *, sigma: float | None = None) -> Scal
     check_finite(arm=arm, capture=capture)
     if not is_single(arm):
         raise InputError("the arm is a batch, but one scale is fixed here; map over its arms with jax.vmap.")
-    if sigma is not None and is_concrete(sigma) and not 0 <= sigma < np.inf:
-        raise InputError(f"sigma is {float(sigma):g} mm; a standard deviation must be zero or positive, and finite.")
-    scatter = None if sigma is None else as_array(sigma, "sigma", like=np.zeros(0))
+    scatter = None if sigma is None else namespace(sigma).asarray(sigma, dtype=float)
     check_one_capture(capture)
     check_sockets_only(capture, "fix_scale")
     check_readings(capture, arm)
@@ -183,7 +183,7 @@ def ends_of_sockets(tips: Float[AnyArray, "N 3"], capture: Capture, sigma: Float
     used, ends = np.unique(pairs, return_inverse=True)
     means = means_over_sockets(tips.T, capture.sizes).T
     covariances = sigma**2 * xp.asarray(np.eye(3)[None] / np.asarray(capture.sizes, dtype=float)[used, None, None])
-    nominal, u = (xp.stack([getattr(one, name) for one in capture.lengths]) for name in ("value", "u"))
+    nominal, u = (xp.stack([getattr(length, name) for length in capture.lengths]) for name in ("value", "u"))
     return MeasuredEnds(means[used], covariances, ends.reshape(pairs.shape), nominal, u)
 
 
@@ -192,8 +192,8 @@ def scale_and_weights(measured: MeasuredEnds) -> tuple[Scale, Float[AnyArray, " 
     xp = namespace(measured)
     length = measured.measured
     ratio = length / measured.nominal
-    known = measured._replace(covariances=xp.where(xp.isnan(measured.covariances), 0.0, measured.covariances))
-    weight = measured.nominal**2 / xp.diagonal(known.covariance(ratio))
+    weighing = measured._replace(covariances=xp.where(xp.isnan(measured.covariances), 0.0, measured.covariances))
+    weight = measured.nominal**2 / xp.diagonal(weighing.covariance(ratio))
     weight_of = weight / xp.sum(weight)
     value = xp.sum(weight_of * ratio)
     relative = weight_of / measured.nominal
@@ -204,7 +204,11 @@ def scale_and_weights(measured: MeasuredEnds) -> tuple[Scale, Float[AnyArray, " 
 
 
 @checked_arguments
-def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> Scale:
+def scale_from_lengths(
+    measured: Annotated[Float[AnyArray, ""] | Float[AnyArray, " l"], Length, NOT_EMPTY],
+    nominal: Annotated[Float[AnyArray, ""] | Float[AnyArray, " l"], Length],
+    u: NotNegative = 0.0,
+) -> Scale:
     """k from repeated measurements of a length, measured / nominal (Cheng et al. 2018, section 2.3).
 
     The uncertainty of k combines that of the nominal value with the standard deviation of the mean of the measurements
@@ -226,19 +230,8 @@ def scale_from_lengths(measured: Numbers, nominal: Numbers, u: float = 0.0) -> S
         >>> print(f"k = {k.value:.6f}, u(k) = {k.u:.1e}")
         k = 0.996257, u(k) = 1.2e-05
     """
-    measured, nominal = jnp.atleast_1d(as_array(measured, "measured")), as_array(nominal, "nominal")
-    if nominal.shape not in ((), measured.shape):
-        raise InputError(
-            f"nominal has shape {nominal.shape}, but measured {measured.shape}; give one nominal length, or one each."
-        )
-    nominal = jnp.broadcast_to(nominal, measured.shape)
-    for what, values in (("measured", measured), ("nominal", nominal)):
-        if values.ndim != 1 or values.shape[0] == 0:
-            raise InputError(f"{what} must be a list of at least one length, in mm.")
-        if is_concrete(values) and not np.all(np.isfinite(np.asarray(values)) & (np.asarray(values) > 0)):
-            raise InputError(f"{what} holds {np.asarray(values).min():g} mm; a length must be positive and finite.")
-    if is_concrete(u) and not 0 <= float(u) < np.inf:
-        raise InputError(f"u is {float(u):g} mm; a standard uncertainty must be zero or positive, and finite.")
+    measured = jnp.atleast_1d(jnp.asarray(measured))
+    nominal = jnp.broadcast_to(jnp.asarray(nominal), measured.shape)
     ratio = measured / nominal
     count = ratio.shape[0]
     value = jnp.mean(ratio)

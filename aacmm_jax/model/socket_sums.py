@@ -18,7 +18,7 @@ _LARGEST_MATRIX = 1_000_000
 def sums_over_sockets(rows: Float[AnyArray, "... N"], sizes: tuple[int, ...]) -> Float[AnyArray, "... s"]:
     """The sum of each socket's poses."""
     if namespace(rows) is np:
-        return np.add.reduceat(rows, _starts(sizes), axis=-1)
+        return np.add.reduceat(rows, starts(sizes), axis=-1)
     return _product(rows, membership(sizes)) if _is_small(sizes) else _segmented(jax.ops.segment_sum, rows, sizes)
 
 
@@ -50,7 +50,7 @@ def counts(sizes: tuple[int, ...], rank: int) -> Float[np.ndarray, "... s"]:
 def largest_of_sockets(rows: Float[AnyArray, "... N"], sizes: tuple[int, ...]) -> Float[AnyArray, "... s"]:
     """The largest value of each socket's poses."""
     if namespace(rows) is np:
-        return np.maximum.reduceat(rows, _starts(sizes), axis=-1)
+        return np.maximum.reduceat(rows, starts(sizes), axis=-1)
     return _segmented(jax.ops.segment_max, rows, sizes)
 
 
@@ -73,5 +73,6 @@ def membership(sizes: tuple[int, ...]) -> Float[np.ndarray, "s N"]:
     return (owner_of(sizes)[None, :] == np.arange(len(sizes))[:, None]).astype(float)
 
 
-def _starts(sizes: tuple[int, ...]) -> np.ndarray:
+def starts(sizes: tuple[int, ...]) -> np.ndarray:
+    """Index of the first pose of each socket."""
     return np.concatenate([[0], np.cumsum(sizes)[:-1]])

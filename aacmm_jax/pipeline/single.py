@@ -22,7 +22,7 @@ from ..calibration.task import (
     without_lengths,
 )
 from ..core._compat import inside_trace
-from ..core.arguments import check_finite, checked_arguments, with_options
+from ..core.arguments import Count, check_finite, checked_arguments, with_options
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
@@ -57,7 +57,7 @@ class CalibrationOptions(NamedTuple):
     replace_noise: bool = True
     shared_errors: bool = True
     undetermined: Literal["warn", "raise", "ignore"] = "warn"
-    max_steps: int = 300
+    max_steps: Count = 300
 
     @property
     def of_stage1(self) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def identify(
     robust: LossName | None = None,
     prior: Prior | None = None,
     replace_noise: bool = _DEFAULT.replace_noise,
-    max_steps: int = _DEFAULT.max_steps,
+    max_steps: Count = _DEFAULT.max_steps,
 ) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..core.arguments import with_options
 from ..core.arrays import Numbers
@@ -14,7 +14,7 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
 from ..kinematics.cones import Cone, Cones
-from ..kinematics.workspace import reached
+from ..kinematics.workspace import configurations_at, reached
 from ..uncertainty.identifiability import observability
 from .fedorov_exchange import Candidates, exchange
 from .information import (
@@ -22,13 +22,13 @@ from .information import (
     DesignProblem,
     Pool,
     Prediction,
+    best_poses,
     candidates_of,
-    pool_at,
     pool_of,
     prediction_of,
     predictions,
 )
-from .motion import Motion, approaches, explained_place, ordered_motion
+from .motion import Motion, approaches, hardly_reached, ordered_motion
 from .options import (
     LEAST_POSES,
     Criterion,
@@ -42,7 +42,6 @@ from .options import (
     given_placement,
 )
 from .placement import best_placement
-from .pose_refinement import refined
 
 _CANDIDATES = 3000
 _LEAST_CANDIDATES, _ROUNDS = 20, 5  # in a socket, from so many rounds of random starts at most
@@ -97,7 +96,7 @@ def plan(
     """Choose the poses that determine an arm best in a joint calibration weighted by ``noise``.
 
     Candidate configurations reach the sockets from random starts; the best set is chosen by Fedorov's exchange (1972)
-    and then refined by a gradient method with the tips kept in their sockets. Poses outside their cone of approach, or
+    and again among poses near the chosen ones. Poses outside their cone of approach, or
     that touch an obstacle or the arm itself, are no candidates. The order is one of little joint travel, socket after
     socket, in which the straight moves of the joints between poses hit nothing where there is such an order.
 
@@ -193,36 +192,38 @@ def _chosen(
     """The candidates for a placement, and the best poses found."""
     region, retract = problem.region, problem.retract
 
-    def approachable(q: np.ndarray, owner: np.ndarray) -> Bool[np.ndarray, " c"]:
-        if not retract or region.cones is None:
-            return np.ones(len(q), dtype=bool)
-        return approaches(region, q, region.cones.normals[owner], retract).possible
+    def possible(q: np.ndarray, owner: np.ndarray) -> Pool:
+        """Those of the configurations that have an approach point."""
+        if retract and region.cones is not None:
+            good = approaches(region, q, region.cones.normals[owner], retract).possible
+            q, owner = q[good], owner[good]
+        return pool_of(problem, q, owner)
 
-    each, pools = max((options.candidates or _CANDIDATES) // len(names), 50), []
-    for _ in range(_ROUNDS):
-        drawn = pool_at(problem, placement.points, each)
-        pools.append(drawn.at(approachable(drawn.q, drawn.owner)))
-        pool = Pool(*(np.concatenate(parts) for parts in zip(*pools, strict=True)))
+    def near(chosen: Pool) -> Pool:
+        starts, which = problem.near(chosen.q)
+        owner = chosen.owner[which]
+        q, good = reached(region, starts, placement.points[owner], sockets=owner)
+        return chosen.joined(possible(q[good], owner[good]))
+
+    starts = max((options.candidates or _CANDIDATES) // len(names), 50)
+    pool = possible(*configurations_at(region, placement.points, starts))
+    for _ in range(1, _ROUNDS):
         few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
         if not len(few):
             break
+        pool = pool.joined(possible(*configurations_at(region, placement.points, starts)))
     else:
-        cones = None if region.cones is None else region.cones.at(few[:1])
-        share = _LEAST_CANDIDATES / (_ROUNDS * each)
-        name, point = f"socket '{names[few[0]]}'", placement.points[few[0]]
-        raise InputError(explained_place(region._replace(cones=cones), name, point, share, retract))
-    rows = exchange(
-        candidates_of(problem, placement, pool),
-        poses,
-        problem.objective,
-        least=LEAST_POSES,
-        progress=lambda done: options.report("Choosing poses", done),
+        raise InputError(hardly_reached(f"socket '{names[few[0]]}'", placement.points[few[0]]))
+    chosen = best_poses(
+        problem,
+        pool,
+        lambda pool: candidates_of(problem, placement, pool),
+        Pool.at,
+        near,
+        lambda candidates, report: exchange(candidates, poses, problem.objective, least=LEAST_POSES, progress=report),
+        options,
     )
-    owner = pool.owner[rows]
-    moved = refined(
-        problem, placement, pool.q[rows], owner, lambda done: options.report("Moving poses", done), approachable
-    )
-    return pool, moved, owner
+    return pool, chosen.q, chosen.owner
 
 
 def _predictions(

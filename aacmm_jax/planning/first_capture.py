@@ -90,13 +90,13 @@ def determined_by(arm: Arm) -> tuple[Determined, ...]:
         "a tracker, of the probe": Capture({}, observations=points),
         "a tracker, of a target at an unknown place": Capture({}, observations=target),
     }
-    found = []
+    rows = []
     for data, capture in kinds.items():
         free: tuple[str, ...] = ()
         if not capture.observations:
             free = Parameters.independent(arm, capture).names
-        found.append(Determined(data, observability(arm, capture, every), free))
-    return tuple(found)
+        rows.append(Determined(data, observability(arm, capture, every), free))
+    return tuple(rows)
 
 
 def still_joints(arm: Arm) -> tuple[StillJoint, ...]:
@@ -106,7 +106,7 @@ def still_joints(arm: Arm) -> tuple[StillJoint, ...]:
         arm: One arm.
     """
     arm = to_numpy(arm)
-    names, limits, found = Parameters.independent(arm).names, np.asarray(joint_limits(arm, None)), []
+    names, limits, still = Parameters.independent(arm).names, np.asarray(joint_limits(arm, None)), []
     for joint in range(arm.joints):
         lost = None
         for share in _STILL_AT:
@@ -118,8 +118,8 @@ def still_joints(arm: Arm) -> tuple[StillJoint, ...]:
             left = Parameters.independent(arm, Capture(sockets, length)).names
             lost = tuple(name for name in names if name not in left)
             break
-        found.append(StillJoint(joint + 1, lost))
-    return tuple(found)
+        still.append(StillJoint(joint + 1, lost))
+    return tuple(still)
 
 
 def first_capture(arm: Arm, noise: Noise, arm_class: str = "") -> FirstCapture:
@@ -197,15 +197,15 @@ def _expected(
 ) -> Expected:
     u = {}
     for count in COUNTS:
-        found = []
+        medians = []
         for candidates, number in placed:
             if not number:
-                found.append(np.inf)
+                medians.append(np.inf)
                 continue
             whole = candidates.information(candidates.rows) - candidates.base
             covariance = covariance_of(candidates.base + count / number * whole, candidates.parameters)
-            found.append(float(np.median(np.sqrt(np.einsum("vp,pq,vq->v", functions, covariance, functions)))))
-        u[count] = float(np.median(found)) if np.median(found) < _DETERMINED else np.inf
+            medians.append(float(np.median(np.sqrt(np.einsum("vp,pq,vq->v", functions, covariance, functions)))))
+        u[count] = float(np.median(medians)) if np.median(medians) < _DETERMINED else np.inf
         if sockets and count < 2 * sockets:
             u[count] = np.inf
     enough = next((count for count, value in u.items() if value <= u_reading), None)

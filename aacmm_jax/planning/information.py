@@ -1,8 +1,8 @@
 """What poses tell of an arm: their information in sockets, and the uncertainty of lengths after a calibration."""
 
 import math
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,12 +11,12 @@ from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import in_chunks, to_numpy
 from ..data.noise import Noise, tip_covariances
 from ..kinematics.arm import Arm, jacobian_at, joint_limits
-from ..kinematics.chain import Geometry, joint_motion
+from ..kinematics.chain import Geometry, joint_motion, reading_units
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import SearchRegion, configurations_at
 from ..uncertainty.volume import sample_lengths
 from .fedorov_exchange import Candidates, Kind, Objective, covariance_of, exchange
-from .options import Criterion, FixturePlacement, PlanTask
+from .options import Criterion, FixturePlacement, PlanOptions, PlanTask
 
 PRIOR = 1e-4  # parameters are known to 100 mm or 100 mrad in advance: makes the first information matrices invertible
 MORE = 10  # poses added in the prediction `Plan.more`
@@ -27,7 +27,11 @@ OBJECTIVES: dict[Criterion, tuple[Kind, float]] = {
     "D": ("determinant", 8.0),
     "E": ("trace", 8.0),
 }
+_NEAR = math.radians(12)  # of candidates near a chosen pose
+_ROUNDS, _NEIGHBOURS = 2, 12  # of the search about the chosen poses, and its candidates for each
 _OBJECTIVE_LENGTHS, _PREDICTION_LENGTHS = 300, 400  # predictions use other lengths than the objective
+
+Poses = TypeVar("Poses")
 
 
 class DesignProblem(NamedTuple):
@@ -44,6 +48,12 @@ class DesignProblem(NamedTuple):
     def arm(self) -> Arm:
         """The arm."""
         return self.region.arm
+
+    def near(self, q: Float[np.ndarray, "N n"]) -> tuple[Float[np.ndarray, "m n"], Int[np.ndarray, " m"]]:
+        """Configurations near some, with the tips off their places; and which of these each is near."""
+        which = np.repeat(np.arange(len(q)), _NEIGHBOURS)
+        steps = _NEAR * reading_units(self.arm.geometry) * self.region.random.normal(size=(len(which), q.shape[1]))
+        return q[which] + steps, which
 
     @classmethod
     def of(cls, task: PlanTask, region: SearchRegion) -> "DesignProblem":
@@ -85,6 +95,10 @@ class Pool(NamedTuple):
         """Some of these configurations."""
         return Pool(*(part[rows] for part in self))
 
+    def joined(self, other: "Pool") -> "Pool":
+        """Both."""
+        return Pool(*(np.concatenate(parts) for parts in zip(self, other, strict=True)))
+
     def fewest(self, sockets: int) -> int:
         """The number of configurations in the socket that has the fewest."""
         return int(np.bincount(self.owner, minlength=sockets).min())
@@ -98,9 +112,9 @@ def pool_of(problem: DesignProblem, q: Float[np.ndarray, "c n"], owner: Int[np.n
     return Pool(q, owner, roots @ jacobian, roots)
 
 
-def pool_at(problem: DesignProblem, points: Float[np.ndarray, "s 3"], each: int) -> Pool:
+def pool_at(problem: DesignProblem, points: Float[np.ndarray, "s 3"], starts: int) -> Pool:
     """Configurations that reach the points from ``each`` random starts a point."""
-    return pool_of(problem, *configurations_at(problem.region, points, each))
+    return pool_of(problem, *configurations_at(problem.region, points, starts))
 
 
 def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Pool) -> Candidates:
@@ -166,3 +180,30 @@ def predictions(
         "loose": typical(imprecise),
         "more": prediction_of(problem, planned, np.concatenate([planned.rows, pool.rows[added]])),
     }
+
+
+def best_poses(
+    problem: DesignProblem,
+    pool: Poses,
+    candidates_in: Callable[[Poses], Candidates],
+    taken: Callable[[Poses, np.ndarray], Poses],
+    near: Callable[[Poses], Poses],
+    choose: Callable[[Candidates, Callable[[float], None]], np.ndarray],
+    options: PlanOptions,
+) -> Poses:
+    """The best poses of a pool, then the best of these and of poses near them."""
+    best, best_value = pool, np.inf
+    for number in range(1 + _ROUNDS):
+
+        def report(done: float, number: int = number) -> None:
+            options.report("Choosing poses", (number + done) / (1 + _ROUNDS))
+
+        candidates = candidates_in(pool)
+        rows = choose(candidates, report)
+        covariance = covariance_of(candidates.information(candidates.rows[rows]), candidates.parameters)
+        value = problem.objective.value(covariance)
+        if value < best_value:
+            best, best_value = taken(pool, rows), value
+        if number < _ROUNDS:
+            pool = near(best)
+    return best

@@ -22,16 +22,14 @@ from ..kinematics.collisions import Cell
 from ..kinematics.cones import Cone, cones_of
 from ..kinematics.workspace import reached
 from ..uncertainty.identifiability import observability
-from .fedorov_exchange import covariance_of, exchange
-from .information import LOOSE, DesignProblem, Prediction, prediction_of, predictions
+from .fedorov_exchange import exchange
+from .information import LOOSE, DesignProblem, Prediction, best_poses, prediction_of, predictions
 from .kit_placement import KitItem, PlacedKit, approachable, candidates_of_kit, least_poses, place, region_of, set_up
 from .motion import Motion, ordered_motion
 from .options import Criterion, PlacementRegion, PlanOptions, PlanTask
 
 _CANDIDATES = 2000
 _RANDOM_SETS, _LOOSE_SETS = 30, 5  # of poses, for predictions
-_NEAR = math.radians(12)  # of candidates near a chosen pose
-_ROUNDS, _NEIGHBOURS = 2, 12  # of the search about the chosen poses, and its candidates for each
 
 Observations = Sequence[AbstractObservation]
 
@@ -146,9 +144,9 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
 
 def _pool(problem: DesignProblem, placed: PlacedKit, count: int) -> list[AbstractObservation]:
     """Poses to choose from in everything."""
-    each = count // len(placed.kit)
+    starts = count // len(placed.kit)
     things = zip(placed.kit, placed.items, strict=True)
-    return [set_up(problem.region, thing, each, item=item, retract=problem.retract) for thing, item in things]
+    return [set_up(problem.region, thing, starts, item=item, retract=problem.retract) for thing, item in things]
 
 
 def _in_order(
@@ -196,33 +194,30 @@ def _chosen(
     least: Int[np.ndarray, " s"],
     options: PlanOptions,
 ) -> list[AbstractObservation]:
-    """The best poses of the pool, then the best of these and of poses near them."""
-    best, best_value = None, np.inf
-    for number in range(1 + _ROUNDS):
+    """The best poses in everything."""
 
-        def report(done: float, number: int = number) -> None:
-            options.report("Choosing poses", (number + done) / (1 + _ROUNDS))
+    def near(chosen: list[AbstractObservation]) -> list[AbstractObservation]:
+        return [_near(problem, *thing) for thing in zip(placed.kit, placed.items, chosen, strict=True)]
 
-        possible = candidates_of_kit(problem, pool)
-        rows = exchange(possible, poses, problem.objective, least=least, progress=report)
-        value = problem.objective.value(covariance_of(possible.information(possible.rows[rows]), possible.parameters))
-        if best is None or value < best_value:
-            best, best_value = _taken(pool, rows), value
-        if number < _ROUNDS:
-            things = zip(placed.kit, placed.items, best, strict=True)
-            pool = [_near(problem, thing, item, chosen) for thing, item, chosen in things]
-    assert best is not None
-    return best
+    return best_poses(
+        problem,
+        pool,
+        lambda pool: candidates_of_kit(problem, pool),
+        _taken,
+        near,
+        lambda candidates, report: exchange(candidates, poses, problem.objective, least=least, progress=report),
+        options,
+    )
 
 
 def _taken(pool: Sequence[AbstractObservation], rows: Int[np.ndarray, " N"]) -> list[AbstractObservation]:
     """The observations with some of the poses of the pool, numbered through."""
-    found, first = [], 0
+    chosen, first = [], 0
     for one in pool:
         last = first + one.q.shape[0]
-        found.append(one.select(np.sort(rows[(rows >= first) & (rows < last)]) - first))
+        chosen.append(one.select(np.sort(rows[(rows >= first) & (rows < last)]) - first))
         first = last
-    return found
+    return chosen
 
 
 def _near(
@@ -230,8 +225,7 @@ def _near(
 ) -> AbstractObservation:
     """The poses of an observation, and others near each: joints changed, and the tip brought back."""
     region, q = region_of(problem.region, simulated, item), np.asarray(chosen.q)
-    which = np.repeat(np.arange(len(q)), _NEIGHBOURS)
-    starts = q[which] + _NEAR * region.random.normal(size=(len(which), q.shape[1]))
+    starts, which = problem.near(q)
     moved, good = reached(region, starts, np.asarray(region.arm.position(q))[which])
     good[good] = approachable(region, moved[good], item, problem.retract)
     rows = np.concatenate([np.arange(len(q)), which[good]])

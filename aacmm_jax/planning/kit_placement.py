@@ -21,7 +21,7 @@ from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation
 from .fedorov_exchange import Candidates, relaxed_value
 from .information import PRIOR, DesignProblem
-from .motion import approaches, explained_place
+from .motion import approaches, hardly_reached
 from .options import PlacementRegion
 from .placement import best_layout
 
@@ -106,34 +106,28 @@ def set_up(
     share: float = 0.0,
     item: KitItem | None = None,
     retract: float = 0.0,
-    explain: bool = True,
 ) -> AbstractObservation:
     """Poses in one thing from random starts, as the observation that they would give without errors of the arm.
 
     ``item`` says from which cone it is approached, and ``retract`` how far its approach points are, mm. Raises
-    `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever; it says which
-    constraint leaves too few, unless ``explain`` is False.
+    `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever.
     """
-    own = region_of(region, simulated, item)
-    each = len(simulated.changed(poses=1).tips(np.random.default_rng(0)))
-    many = simulated.changed(poses=max(starts // each, 2 * _LEAST_CANDIDATES))
+    seat = region_of(region, simulated, item)
+    places = len(simulated.changed(poses=1).tips(np.random.default_rng(0)))
+    many = simulated.changed(poses=max(starts // places, 2 * _LEAST_CANDIDATES))
     tips = many.tips(region.random)
-    q, good = reached(own, own.draw(len(tips)), tips, scattered=True)
+    q, good = reached(seat, seat.draw(len(tips)), tips, scattered=True)
     if item is not None:
-        good[good] = approachable(own, q[good], item, retract)
-    transforms = np.asarray(own.arm.pose(q)).copy()
+        good[good] = approachable(seat, q[good], item, retract)
+    transforms = np.asarray(seat.arm.pose(q)).copy()
     transforms[:, :3, 3] = tips
     # In NumPy: every number of poses would be another program of JAX.
     whole = to_numpy(many.recorded(q, transforms, _WithoutErrors(np.random.PCG64(0))))
     counts = np.bincount(whole.places[good], minlength=int(whole.places.max()) + 1)
     tried = np.bincount(whole.places)
     if np.any(counts < np.maximum(share * tried, _LEAST_CANDIDATES)):
-        if not explain:
-            raise InputError(f"'{simulated.name}' cannot be reached in enough poses; move it.")
         point = tips[whole.places == int(np.argmin(counts / tried))][0]
-        enough = max(share, _LEAST_CANDIDATES / float(tried.min()))
-        approach = retract if item is not None and item.has_cone else 0.0
-        raise InputError(explained_place(own, f"'{simulated.name}'", point, enough, approach))
+        raise InputError(hardly_reached(f"'{simulated.name}'", point))
     return whole.select(np.flatnonzero(good))
 
 
@@ -222,8 +216,8 @@ class _Search(NamedTuple):
                 scored.append((self._value(pools, 0), number, layout))
         if not scored:
             raise InputError(
-                "no placement of the kit was found that can be reached well; give a region nearer to the arm, or "
-                f"fewer places. In the last that was tried, {self._reason(layout)}"
+                "no placement of the kit was found that can be reached well; give a region nearer to the arm, fewer "
+                "places, or wider cones."
             )
         return best_layout(
             [layout for _, _, layout in sorted(scored)[:_DESIGNED]],
@@ -233,15 +227,6 @@ class _Search(NamedTuple):
             _NEIGHBOURS,
             lambda fraction: report(stage, fraction),
         )
-
-    def _reason(self, layout: PlacedKit) -> str:
-        """Why a placement cannot be reached well."""
-        for simulated, item in zip(layout.kit, layout.items, strict=True):
-            try:
-                set_up(self.problem.region, simulated, _STARTS, _REACHED, item)
-            except InputError as error:
-                return str(error)
-        return "single poses of it are hard to reach."
 
     def _value(self, pools: Sequence[AbstractObservation], iterations: int) -> float:
         candidates = candidates_of_kit(self.problem, pools)
@@ -261,8 +246,8 @@ class _Search(NamedTuple):
                 pools.append(known[i])
                 continue
             try:
-                share, stands = (0.0, True) if frame is None else (_REACHED, False)
-                pools.append(set_up(self.problem.region, simulated, starts, share, item, explain=stands))
+                share = 0.0 if frame is None else _REACHED
+                pools.append(set_up(self.problem.region, simulated, starts, share, item))
             except InputError:
                 if frame is None:
                     raise

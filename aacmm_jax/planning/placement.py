@@ -86,12 +86,12 @@ def best_placement(
             "no placement was found that can be reached well; give a region nearer to the arm, or a shorter "
             f"length{wider}."
         )
-    each = _STARTS // sockets
+    starts = _STARTS // sockets
 
     def pool_in(placement: FixturePlacement, best: FixturePlacement | None, pool: Pool | None) -> Pool:
         if best is None or pool is None:
-            return pool_at(problem, placement.points, each)
-        return _moved_pool(problem, pool, best, placement, each)
+            return pool_at(problem, placement.points, starts)
+        return _moved_pool(problem, pool, best, placement, starts)
 
     return best_layout(
         shortlist,
@@ -168,7 +168,7 @@ def _neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: Plac
 
 
 def _moved_pool(
-    problem: DesignProblem, pool: Pool, before: FixturePlacement, after: FixturePlacement, each: int
+    problem: DesignProblem, pool: Pool, before: FixturePlacement, after: FixturePlacement, count: int
 ) -> Pool:
     """The pool of a placement moved to another: what is in sockets that did not move stays; in the others the same
     configurations are moved along, and random ones take the place of those that cannot be."""
@@ -177,7 +177,7 @@ def _moved_pool(
     starts, owner = [], []
     for socket in np.flatnonzero(changed):
         followed = pool.q[pool.owner == socket]
-        new = problem.region.draw(max(each - len(followed), 0))
+        new = problem.region.draw(max(count - len(followed), 0))
         starts += [followed, new]
         owner.append(np.full(len(followed) + len(new), socket))
     sockets = np.concatenate(owner)

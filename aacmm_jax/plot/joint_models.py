@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.joint_functions import function_of_joint
+from ..calibration.joint_model import function_of_joint
 from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.units import DEG
@@ -43,13 +43,13 @@ def models_chart(
     return Chart("models", "Errors by model", description, (Plot(names("", named), y, marks, height=260),))
 
 
-def model_comparison(found: ComparedModels, axes: Any = None) -> Any:
+def model_comparison(compared: ComparedModels, axes: Any = None) -> Any:
     """Plot the errors of compared models inside and outside what they were fitted to, mm.
 
     Bars with the standard error of `ComparedModel.u_outside`; the recommended model is marked.
 
     Args:
-        found: What `compare_models` returned.
+        compared: What `compare_models` returned.
         axes: Axes to plot into; new ones if None.
 
     Returns:
@@ -61,11 +61,11 @@ def model_comparison(found: ComparedModels, axes: Any = None) -> Any:
         >>> print(len(axes.patches), "bars")
         4 bars
     """
-    models = found.models
+    models = compared.models
     columns = (
         np.array([getattr(model, key) for model in models]) for key in ("rms_inside", "rms_outside", "u_outside")
     )
-    chart = models_chart([model.model for model in models], models.index(found.recommended), *columns)
+    chart = models_chart([model.model for model in models], models.index(compared.recommended), *columns)
     return draw(chart.plots[0], axes)
 
 

@@ -25,20 +25,22 @@ def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
     labels = [row["parameter"] for row in parameters]
     x, change = np.arange(len(labels)), scale * np.array([row["calibrated"] - row["nominal"] for row in parameters])
     expanded = np.array([np.nan if row["expanded"] is None else scale * row["expanded"] for row in parameters])
-    known = np.isfinite(expanded)
+    finite = np.isfinite(expanded)
     words = []
     for name, value, bar in zip(labels, change.tolist(), expanded.tolist(), strict=True):
         decimals = decimals_for(bar)
         u = f"U {format_number(bar, decimals)} {label}" if np.isfinite(bar) else "no uncertainty of its own"
         words.append(f"{name}: {format_number(value, decimals, signed=True)} {label}, {u}")
-    words, low, high = np.array(words), (change - expanded)[known], (change + expanded)[known]
-    marks = [Marks("with U (95 %)", x[known], change[known], "dot", "main", words[known].tolist(), low, high)]
+    words, low, high = np.array(words), (change - expanded)[finite], (change + expanded)[finite]
+    marks = [Marks("with U (95 %)", x[finite], change[finite], "dot", "main", words[finite].tolist(), low, high)]
     # What has no uncertainty of its own has an arbitrary value: within the range of the others it has a cross.
-    axis = linear(f"calibrated − nominal [{label}]", *((change[known], low, high) if any(known) else (change,)), [0.0])
-    if not np.all(known):
-        at = np.clip(change[~known], axis.low, axis.high)
+    axis = linear(
+        f"calibrated − nominal [{label}]", *((change[finite], low, high) if any(finite) else (change,)), [0.0]
+    )
+    if not np.all(finite):
+        at = np.clip(change[~finite], axis.low, axis.high)
         name = "only determined with others, or on a bound"
-        marks.append(Marks(name, x[~known], at, "cross", "accent", words[~known].tolist()))
+        marks.append(Marks(name, x[~finite], at, "cross", "accent", words[~finite].tolist()))
     outside = int(np.sum((change < axis.low) | (change > axis.high)))
     plot = Plot(names("", labels), axis, (*marks, level(0.0)), height=260)
     description = "Calibrated minus nominal; bars are U, and smaller than the mark where none is visible."

@@ -101,10 +101,10 @@ def pose_chart(
     "standard deviations", whose expectation of 1 is drawn; ``far`` marks poses; ``most`` poses are drawn besides those.
     """
     last_arm, last = list(arms.items())[-1]
-    known, marked = np.flatnonzero(np.isfinite(last)), np.asarray(far[1], dtype=int)
-    if not len(known):
+    finite, marked = np.flatnonzero(np.isfinite(last)), np.asarray(far[1], dtype=int)
+    if not len(finite):
         return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", ())
-    drawn = np.union1d(known[thinned(len(known), most or len(known))], marked)
+    drawn = np.union1d(finite[thinned(len(finite), most or len(finite))], marked)
     labels = [f"{groups.names[i]}, pose {n}" for i, n in zip(groups.owner, groups.numbers, strict=True)]
 
     def series(name: str, of: str, values: np.ndarray, chosen: np.ndarray, style: Mapping[str, Any]) -> Marks:
@@ -132,11 +132,11 @@ def pose_chart(
     expected = [level(1.0)] if unit == "standard deviations" else []
     y = logarithmic(f"{quantity} [{unit}]", *(mark.y for mark in marks), *(mark.y for mark in expected))
     plot = Plot(x, y, (*marks, *expected, borders(edges)))
-    median, largest = (format_number(float(value)) for value in (np.median(last[known]), last[known].max()))
+    median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
     description = f"Dotted lines separate the {groups.word}s. " if len(edges) else ""
     description += f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
-    description += " The only pose of a socket has no distance." if len(known) < len(last) else ""
-    description += f" {len(drawn)} of {len(known)} poses are drawn." if len(drawn) < len(known) else ""
+    description += " The only pose of a socket has no distance." if len(finite) < len(last) else ""
+    description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
     return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
 
 
@@ -370,11 +370,11 @@ def _histogram(values: np.ndarray) -> Plot:
 
 def _pattern(x: np.ndarray, y: np.ndarray, x_title: str, title: str, limit: float, most: int) -> Plot:
     """Residuals, and the band of their means; the axis is symmetric, and what lies beyond it is drawn at its edge."""
-    known = np.flatnonzero(np.isfinite(y))
-    drawn = known[thinned(len(known), most)] if len(known) else known
+    finite = np.flatnonzero(np.isfinite(y))
+    drawn = finite[thinned(len(finite), most)] if len(finite) else finite
     points = Marks("pose", x[drawn], np.clip(y[drawn], -limit, limit), "dot", "soft", size=3.5)
     y_axis = linear("residual [mm]", [-limit, limit], margin=0.0)
-    marks = (level(0.0), points, *_mean_band(x[known], y[known]))
+    marks = (level(0.0), points, *_mean_band(x[finite], y[finite]))
     return Plot(linear(x_title, x, margin=0.02), y_axis, marks, title=title, height=150)
 
 
@@ -391,5 +391,5 @@ def _mean_band(x: np.ndarray, y: np.ndarray) -> list[Marks]:
 
 
 def _limit(values: np.ndarray) -> float:
-    known = np.abs(values[np.isfinite(values)])
-    return 1.15 * float(np.quantile(known, _INSIDE)) or 1.0
+    finite = np.abs(values[np.isfinite(values)])
+    return 1.15 * float(np.quantile(finite, _INSIDE)) or 1.0

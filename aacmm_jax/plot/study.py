@@ -18,6 +18,7 @@ from .uncertainty import correlation_plot
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
 _ENDS = (5, 50, 95)  # percentiles
+_MOST_PLOTS = 12  # of a metric, each with a combination of factors
 _WIDE = 20  # times: positive values over a wider range need a logarithmic axis
 
 
@@ -43,28 +44,20 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
     """
     if metric not in METRICS:
         raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")
-    along, runs = runs_of_metric(results, most=len(SERIES))
-    of_cells = lambda cells: _percentiles(results, metric, cells)  # noqa: E731
-    return draw(metric_plots(results, metric, along, [runs], of_cells)[0], axes)
-
-
-def runs_of_metric(results: Results, most: int) -> tuple[str | None, dict[str, list[int]]]:
-    """The factor with the most levels, and runs of cells along it by the levels of the others in words."""
-    factors = results.study.factors
-    along = max(factors, key=lambda name: len(factors[name])) if factors else None
-    return along, {"": [0]} if along is None else _runs(results, along, most)
+    return draw(metric_plots(results, metric, lambda cells: _percentiles(results, metric, cells), True)[0], axes)
 
 
 def metric_plots(
-    results: Results,
-    metric: str,
-    along: str | None,
-    groups: Sequence[dict[str, list[int]]],
-    percentiles: Callable[[Sequence[int]], np.ndarray],
+    results: Results, metric: str, percentiles: Callable[[Sequence[int]], np.ndarray], together: bool = False
 ) -> tuple[Plot, ...]:
-    """A metric of runs of cells, a plot for each group of runs: medians, with bars from the 5th to the 95th percentile
-    of the converged trials, which ``percentiles`` gives of each cell."""
-    unit, _ = metric_unit(metric)
+    """A metric against the factor with the most levels: medians of the converged trials, with bars from the 5th to the
+    95th percentile, which ``percentiles`` gives of each cell; for each combination of the other factors a plot, or all
+    ``together`` side by side."""
+    factors, (unit, _) = results.study.factors, metric_unit(metric)
+    along = max(factors, key=lambda name: len(factors[name])) if factors else None
+    most = len(SERIES) if together else _MOST_PLOTS
+    all_runs = {"": [0]} if along is None else _runs(results, along, most)
+    groups = [all_runs] if together else [{words: cells} for words, cells in all_runs.items()]
     values = [[percentiles(cells) for cells in runs.values()] for runs in groups]
     every = np.concatenate([part.ravel() for parts in values for part in parts])
     every = every[np.isfinite(every)]
@@ -159,8 +152,8 @@ def study_distributions(
     x, axis = np.arange(len(cells)), names(factor_title(factor), _levels(results, factor))
     plots = []
     for name in filter(None, (_available(results, metric) for metric in metrics)):
-        low, q25, median, q75, high = np.array([_quantiles(_values(results, name, of), (5, 25, 50, 75, 95))
-                                                for of in cells]).T  # fmt: skip
+        low, q25, median, q75, high = np.array([_quantiles(_values(results, name, level_cells), (5, 25, 50, 75, 95))
+                                                for level_cells in cells]).T  # fmt: skip
         marks = (
             Marks("", x, median, "bars", low=q25, high=q75, size=16),
             Marks("", x, median, "square", low=low, high=high, size=5),

@@ -125,25 +125,27 @@ def _marks(plot: Plot, marks: Marks) -> str:
 
 def _line(marks: Marks, x: np.ndarray, y: np.ndarray, tone: str) -> str:
     """A line through the points, interrupted where there is none."""
-    known = np.isfinite(x) & np.isfinite(y)
-    begins = [i == 0 or not known[i - 1] for i in range(len(x))]
+    finite = np.isfinite(x) & np.isfinite(y)
+    begins = [i == 0 or not finite[i - 1] for i in range(len(x))]
     d = [
-        f"{'M' if new else 'L'}{_number(a)} {_number(b)}" for a, b, new, k in zip(x, y, begins, known, strict=True) if k
+        f"{'M' if new else 'L'}{_number(a)} {_number(b)}"
+        for a, b, new, k in zip(x, y, begins, finite, strict=True)
+        if k
     ]
     return _path(d, f"curve {tone}" + (f" {marks.symbol}" if marks.symbol in ("dashed", "dotted") else ""))
 
 
 def _points(marks: Marks, x: np.ndarray, y: np.ndarray, tone: str) -> Iterable[str]:
     """Dots are lines without length, whose ends are round or square; in PDF, square ends need a direction."""
-    known = np.isfinite(x) & np.isfinite(y)
+    finite = np.isfinite(x) & np.isfinite(y)
     if marks.symbol not in ("dot", "square"):
-        for a, b in zip(x[known], y[known], strict=True):
+        for a, b in zip(x[finite], y[finite], strict=True):
             yield f'<use href="#{marks.symbol}" x="{a / 10:.2f}%" y="{b / 10:.2f}%" class="{tone}"/>'
         return
     length = "h0" if marks.symbol == "dot" else "h.1"
     shade = np.full(len(x), -1) if marks.shade is None else np.asarray(marks.shade)
-    for i in np.unique(shade[known]).tolist():
-        chosen = known & (shade == i)
+    for i in np.unique(shade[finite]).tolist():
+        chosen = finite & (shade == i)
         d = [f"M{_number(a)} {_number(b)}{length}" for a, b in zip(x[chosen], y[chosen], strict=True)]
         yield _path(d, f"{marks.symbol}s {tone if i < 0 else f's{i}'}", marks.size + 1.6 * max(i, 0))
 
@@ -152,8 +154,8 @@ def _ends(plot: Plot, marks: Marks) -> list[tuple[float, float, float]]:
     """Abscissa, lower and upper end of each bar, or of each place of a band."""
     x, low = _positions(plot, marks.x, marks.low)
     high = _positions(plot, marks.x, marks.high)[1]
-    known = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
-    return list(zip(x[known], low[known], high[known], strict=True))
+    finite = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
+    return list(zip(x[finite], low[finite], high[finite], strict=True))
 
 
 def _spans(plot: Plot, marks: Marks, kind: str, width: float | None) -> str:

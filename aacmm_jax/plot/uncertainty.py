@@ -22,8 +22,8 @@ _SAID, _SIGNED = 0.3, 0.5  # correlations from which they are said under the poi
 
 def volume_chart(volume: VolumetricUncertainty) -> Chart:
     """U of lengths over the working volume: half a section through it."""
-    known = np.isfinite(volume.expanded_length)
-    expanded, start = volume.expanded_length[known], volume.start[known]
+    finite = np.isfinite(volume.expanded_length)
+    expanded, start = volume.expanded_length[finite], volume.start[finite]
     shade, limits = shades(expanded)
     order = np.argsort(shade, kind="stable")
     words = [
@@ -31,7 +31,7 @@ def volume_chart(volume: VolumetricUncertainty) -> Chart:
         for point, u in zip(start[order], expanded[order].tolist(), strict=True)
     ]
     radius = np.hypot(start[:, 0], start[:, 1])
-    shaded = {"shade": shade[order], "limits": limits if np.any(known) else (), "unit": "mm"}
+    shaded = {"shade": shade[order], "limits": limits if np.any(finite) else (), "unit": "mm"}
     name = f"U of a {volume.length:g} mm length"
     marks = Marks(name, radius[order], start[order, 2], words=words, **shaded)
     axes = linear(_ACROSS, np.hypot(volume.start[:, 0], volume.start[:, 1]), [0.0]), linear(_UP, volume.start[:, 2])

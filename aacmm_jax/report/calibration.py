@@ -129,7 +129,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     blocks += observation_tables(record)
     if capture.lengths or not capture.observations:
 
-        def to_u(value: float, u: float) -> Cell:
+        def to_u(value: Any, u: Any) -> Cell:
             return number(float(value), decimals_for(float(u)))
 
         columns = {

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..plot.charts import Chart
-from ..plot.study import metric_plots, metric_unit, runs_of_metric
+from ..plot.study import metric_plots, metric_unit
 from ..study.results import Results
 from ..study.statistics import METRICS, factor_title, level_text, study_summary
 from ..study.tables import cell_table, label, metric_table, parameter_table
@@ -16,7 +16,7 @@ _SHOWN = (
     *("length_error", "angle_error", "de", "deltam", "scale_error"),
     *("length_error_stage1", "angle_error_stage1", "de_stage1", "deltam_stage1", "k"),
 )
-_NAMED, _MOST_PLOTS = 6, 12
+_NAMED = 6
 
 
 def study_report(results: Results) -> Report:
@@ -75,9 +75,7 @@ def _metric_section(results: Results, summary: dict[str, Any], name: str) -> Sec
     title = METRICS[name] if name == "k" else f"{METRICS[name][0].upper()}{METRICS[name][1:]}"
     heading = f"{title} [{unit}]" if unit else title
     cells = metric_table(summary, name, heading)
-    along, runs = runs_of_metric(results, _MOST_PLOTS)
-    groups = [{words: chosen} for words, chosen in runs.items()]
-    plots = metric_plots(results, name, along, groups, lambda chosen: factor * _ends(summary, name, chosen))
+    plots = metric_plots(results, name, lambda chosen: factor * _ends(summary, name, chosen))
     description = "Marks are medians, bars reach from the 5th to the 95th percentile of the converged trials."
     return Section(f"figure-{name}", title, [Chart(f"chart-{name}", heading, description, plots, cells)])
 

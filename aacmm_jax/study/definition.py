@@ -29,7 +29,7 @@ from .joint_models import (
     prior_of,
 )
 from .settings import CellValues, Fixture, Setting
-from .specification import Distribution, Point, Region, Specification, label
+from .specification import Distribution, Region, Specification, label
 
 _MODEL = "identification.model"
 _NONE = Distribution(uniform=0.0)
@@ -169,7 +169,9 @@ class Study:
         anchors = {key: self._scale_anchor(*key) for key in dict.fromkeys(keys)}
         recorded, capture = None, self.capture
         if capture is not None:
-            rows = zip(capture.names, capture.sizes, _centroids(self.nominal.arm, capture), strict=True)
+            tips = np.split(np.asarray(self.nominal.arm.position(capture.q)), np.cumsum(capture.sizes))[:-1]
+            points = [tuple(tip.mean(axis=0).tolist()) for tip in tips]
+            rows = zip(capture.names, capture.sizes, points, strict=True)
             recorded = tuple(Fixture(name, size, (point,)) for name, size, point in rows)
         return [self._setting(cell, anchors[key], recorded) for cell, key in zip(self.cells, keys, strict=True)]
 
@@ -358,11 +360,6 @@ def pool_capacity(study: Study, fixture: Fixture) -> tuple[int, int]:
         return 1, 2 ** int(math.log2(rows))
     poses = max(2 ** math.ceil(math.log2(1.25 * study.most_poses[fixture.ends])), 16)
     return rows // poses, poses
-
-
-def _centroids(arm: Arm, capture: Capture) -> list[Point]:
-    tips, ends = np.asarray(arm.position(capture.q)), np.cumsum(capture.sizes)
-    return [tuple(tips[end - size : end].mean(axis=0).tolist()) for size, end in zip(capture.sizes, ends, strict=True)]
 
 
 def _reference_fixtures(cell: Mapping[str, Any], region: Region | None) -> list[Fixture]:

@@ -279,15 +279,6 @@ def _stop_on_interrupt() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def _interruptible(function: Callable, *args: Any) -> Any:
-    """The result of a function that may compile, which Ctrl-C cannot interrupt in the thread that does it."""
-    thread = ThreadPoolExecutor(1, thread_name_prefix=THREADS)
-    try:
-        return thread.submit(function, *args).result()
-    finally:
-        thread.shutdown(wait=False)
-
-
 @contextmanager
 def _locked(output: OutputFile) -> Iterator[None]:
     """Keep other processes from writing the same study."""
@@ -311,7 +302,12 @@ def _locked(output: OutputFile) -> Iterator[None]:
 def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> tuple[Layout, bool]:
     """The layout of an existing or a new file, and whether it is finished."""
     if not path.exists():
-        _interruptible(check_reach, study)
+        # It may compile, which Ctrl-C cannot interrupt in the thread that does it.
+        thread = ThreadPoolExecutor(1, thread_name_prefix=THREADS)
+        try:
+            thread.submit(check_reach, study).result()
+        finally:
+            thread.shutdown(wait=False)
         chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
         # With what a worker computes: it may be another machine, with other devices.
         settings = computed_with() if executor is None else _result(executor.submit(computed_with), "the first task")

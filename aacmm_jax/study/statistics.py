@@ -20,6 +20,7 @@ from .results import Results
 from .specification import label, unit
 
 PERCENTILES = (5, 50, 95)
+_REASONS = ("gradient", "step", "rounding", "max_steps", "stalled", "nonfinite")
 _FACTORS = {
     "bounds.length_mm": "half-width of lengths [mm]",
     "bounds.angle_deg": "half-width of angles [deg]",
@@ -129,14 +130,19 @@ def cell_summary(results: Results, cell: int) -> dict[str, Any]:
     columns = {name: values[ran] for name, values in columns.items()}
     good = columns["converged"] == 1
     levels = results.study.cells[cell]
-    labels = {name: _label(levels[name], values) for name, values in results.study.factors.items()}
+    # A factor is shown by numbers where all of its levels are numbers.
+    labels = {
+        name: label(levels[name]) if isinstance(values[0], float) else str(label(levels[name]))
+        for name, values in results.study.factors.items()
+    }
+    reasons = {name: int(numbers_of(getattr(Reason, name))) for name in _REASONS}
     summary: dict[str, Any] = {
         "cell": cell + 1,
         "factors": labels,
         "trials_run": int(ran.sum()),
         "converged": statistic(np.mean, good.astype(float), columns["group"]),
         "truth_inside": statistic(np.mean, columns["truth_inside"].astype(float), columns["group"]),
-        "reasons": {name: int(np.sum(columns["reason"] == number)) for name, number in _reasons().items()},
+        "reasons": {name: int(np.sum(columns["reason"] == number)) for name, number in reasons.items()},
         "steps_mean": float(columns["steps"].mean()) if ran.any() else None,
         "figures": {},
     }
@@ -145,15 +151,6 @@ def cell_summary(results: Results, cell: int) -> dict[str, Any]:
         if finite.any():
             summary["figures"][name] = distribution(columns[name][finite], columns["group"][finite])
     return summary | _parameters(results, cell)
-
-
-def _label(level: Any, labels: list) -> float | str:
-    return label(level) if isinstance(labels[0], float) else str(label(level))
-
-
-def _reasons() -> dict[str, int]:
-    names = ("gradient", "step", "rounding", "max_steps", "stalled", "nonfinite")
-    return {name: int(numbers_of(getattr(Reason, name))) for name in names}
 
 
 def distribution(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
@@ -189,7 +186,7 @@ def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " 
 
 def _jackknife(rest: np.ndarray) -> np.ndarray:
     """The standard error of a statistic from its values with one group left out each (Efron and Stein 1981)."""
-    return np.sqrt((len(rest) - 1) / len(rest) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0))
+    return np.asarray(np.sqrt((len(rest) - 1) / len(rest) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0)))
 
 
 def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:

@@ -71,7 +71,7 @@ def _drawn(
     if study.observed:
         return draw_observed(study, setting, cells, trials)
     drawn = draw(study, setting, cells, trials, device)
-    return drawn, _captures_of(study, setting, drawn)
+    return drawn, batch_of_captures(_template(study, setting), drawn.q, drawn.value, drawn.u)
 
 
 def _identified(
@@ -141,11 +141,6 @@ def _identified_of_all(fixed: np.ndarray, chosen: np.ndarray, values: np.ndarray
 
 def _largest(error: np.ndarray, which: np.ndarray, present: bool = True) -> np.ndarray:
     return np.abs(error[:, which]).max(axis=1, initial=0.0) if present else np.full(len(error), np.nan)
-
-
-def _captures_of(study: Study, setting: Setting, drawn: DrawnTrials) -> Capture:
-    """The captures of drawn trials as a batch."""
-    return batch_of_captures(_template(study, setting), drawn.q, drawn.value, drawn.u)
 
 
 @lru_cache(maxsize=64)

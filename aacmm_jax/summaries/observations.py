@@ -84,7 +84,7 @@ def scale_sources(record: CalibrationRecord) -> list[str]:
 def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str, Any]:
     """How each observation and each kind agree, the geometry found, poses that lost weight, and poses not calibrated
     with; ``nominal`` is the evaluation of the nominal arm, with the geometry that fits it best."""
-    found: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "robust": record.robust,
         "scale_from": scale_sources(record),
         "observations": [],
@@ -105,20 +105,20 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
         residuals = observation_residuals(record)
         before = distances_of(record.recording.capture, nominal)
         pairs = list(zip(residuals, before, strict=True))
-        found["observations"] = [
+        summary["observations"] = [
             {"observation": one.observation.name, "kind": one.observation.kind, "target": one.observation.target}
             | _agreement([(one, distances)])
             for one, distances in pairs
         ]
         for kind in dict.fromkeys(one.observation.kind for one in residuals):
             of_kind = [pair for pair in pairs if pair[0].observation.kind == kind]
-            found["kinds"].append({"kind": kind, "observations": len(of_kind)} | _agreement(of_kind))
-        found["geometry"] = _geometry(record.recording.capture, observed)
-        found["base"] = _base_rows(record, observed)
-        found["less_weight"] = less_weight(residuals)
+            summary["kinds"].append({"kind": kind, "observations": len(of_kind)} | _agreement(of_kind))
+        summary["geometry"] = _geometry(record.recording.capture, observed)
+        summary["base"] = _base_rows(record, observed)
+        summary["less_weight"] = less_weight(residuals)
     if others is not None:
         angles = [None if np.isnan(angle) else float(angle) for angle in others.rms_angle]
-        found["other_poses"] = {
+        summary["other_poses"] = {
             "poses": int(others.poses.sum()),
             "rms_mm": others.rms_of_all,
             "observations": [
@@ -126,7 +126,7 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
                 for name, poses, distance, angle in zip(others.names, others.poses, others.rms, angles, strict=True)
             ],
         }
-    return found
+    return summary
 
 
 def _agreement(pairs: list[tuple[ObservationResiduals, np.ndarray]]) -> dict[str, Any]:
@@ -146,16 +146,16 @@ def _agreement(pairs: list[tuple[ObservationResiduals, np.ndarray]]) -> dict[str
 
 def _geometry(capture: Capture, metrics: ObservedMetrics) -> list[dict[str, Any]]:
     """Every part of the geometry with its numbers, in words too, and with the values certified of it."""
-    observed, found = Observed.of(capture, None), {}
+    observed, parts = Observed.of(capture, None), {}
     certified = observed.certified()
     for observation in observed.observations:
         for part, units in _parts(observation).items():
             values = np.asarray(metrics.geometry[part])
-            own = part in observation.unknowns
-            read = partial(observation.quantities, part) if own else partial(quantities_by_unit, units)
+            of_kind = part in observation.unknowns
+            read = partial(observation.quantities, part) if of_kind else partial(quantities_by_unit, units)
             found_u = _u_of_quantities(read, values, metrics.geometry_covariance[part])
             value, u = certified.get(part, (None, None))
-            found[part] = {
+            parts[part] = {
                 "part": part,
                 "units": list(units),
                 "values": values.tolist(),
@@ -167,7 +167,7 @@ def _geometry(capture: Capture, metrics: ObservedMetrics) -> list[dict[str, Any]
                 "certified": None if value is None else np.asarray(value).tolist(),
                 "certified_u": None if u is None else np.asarray(u).tolist(),
             }
-    return [found[part] for part in observed.blocks]
+    return [parts[part] for part in observed.blocks]
 
 
 def _u_of_quantities(

@@ -59,7 +59,7 @@ def _bytes(item: h5py.Dataset) -> object:
 def killed(process: subprocess.Popen, path: Path, blocks: int, delay: float) -> None:
     """Kill a study when so many blocks are kept and some time has passed, or when it has ended."""
     folder, deadline = path.with_name(path.name + ".parts"), time.monotonic() + SECONDS
-    while process.poll() is None and time.monotonic() < deadline and len(list(folder.glob("*.h5"))) < blocks:
+    while process.poll() is None and time.monotonic() < deadline and len(list(folder.glob("*.npz"))) < blocks:
         time.sleep(0.005)
     time.sleep(delay)
     process.kill()

@@ -120,5 +120,5 @@ def make(folder: Path) -> None:
 def studies(folder: Path) -> dict[str, tuple[Path, Path]]:
     """Those studies: for each kind the file that is attacked, and the study that is read with it."""
     whole, parts = folder / "study.h5", folder / "parts" / "study.h5"
-    block = min(parts.with_name("study.h5.parts").glob("*.h5"))
+    block = min(parts.with_name("study.h5.parts").glob("*.npz"))
     return {"study": (whole, whole), "study in blocks": (parts, parts), "block": (block, parts)}

@@ -123,8 +123,8 @@ def test_failure_is_data(paper_arm, noisy_capture, box, starts):
         ({"start": np.zeros((0, 21))}, "the batch is empty"),
         ({"lower": np.full((BATCH + 1, 21), -1e9)}, "batches of 50 and 51 problems do not fit together"),
         ({"upper": np.full(21, -1e9)}, "lower bound of alpha_1 is above its upper bound"),
-        ({"chunk": 0}, "chunk is 0; give at least 1"),
-        ({"slots": -1}, "slots is -1; give at least 1"),
+        ({"chunk": 0}, "chunk is 0; it must be at least 1"),
+        ({"slots": -1}, "slots is -1; it must be at least 1"),
     ],
 )
 def test_bad_input(paper_arm, noisy_capture, box, starts, change, message):

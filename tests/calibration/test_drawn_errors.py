@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.drawn_errors import draw_shared
+from aacmm_jax.calibration.redrawn import draw_shared
 from aacmm_jax.uncertainty.degrees_of_freedom import Law
 from aacmm_jax.uncertainty.shared_errors import SharedErrors
 from aacmm_jax.uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS

@@ -144,7 +144,7 @@ def test_refused_in_one_sentence(paper_arm, what):
     [
         ('units = { points = "m" }', ["units.points is 'm'", "says mm", "correct one of them"]),
         ('[[points]]\nname = "a"\nfile = "b.csv"', ["two observations have the name 'a'", "a name of its own"]),
-        ('target = "a\\nb"', ["a target has the name", "a name of one line"]),
+        ('target = "a\\nb"', ["target of observation 'a' has the name", "a name of one line"]),
     ],
 )
 def test_refused_in_a_manifest(tmp_path, text, parts):

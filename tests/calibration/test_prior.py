@@ -211,7 +211,7 @@ def test_trials_scatter_as_the_posterior_does(paper_arm, true):
     captures, coefficients = trials.drawn(1200, random, 1.0)
     values, failed = task.solved(captures, task.prior_means(1200, random, np.asarray(found.parameters)), coefficients)
     assert failed == 0
-    sampled = task.sampled(found, values, True, failed, 0.95, 1)
+    sampled = task.sampled(values, failed, 0.95, 1)
     np.testing.assert_allclose(sampled.u, sampled.linear_u, rtol=0.1)
     assert set(sampled.quantities) >= {"cos1_2", "sin1_3", "d_3"}
     drawn = aj.bootstrap(found, capture, trials=400)

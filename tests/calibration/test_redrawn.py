@@ -115,7 +115,7 @@ def test_what_cannot_be_drawn(paper_arm, bounds, mixed):
     singles, of_singles = calibrated(paper_arm, bounds, plate)
     with pytest.raises(aj.InputError, match="one pose in each point"):
         aj.bootstrap(of_singles, singles)
-    with pytest.raises(aj.InputError, match="knows nothing of the placement plate"):
+    with pytest.raises(aj.InputError, match="does not have the placement plate"):
         aj.monte_carlo(result, singles)
     points = capture.observations[0]
     twice = kinds.MeasuredPoints("again", points.q, points.points + 0.01, u=0.01)

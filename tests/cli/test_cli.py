@@ -15,7 +15,6 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files.hdf5_content import seal
-from aacmm_jax.planning import pose_refinement
 
 from ..conftest import command_line
 
@@ -207,7 +206,6 @@ PLAN = (
 
 
 def test_plan(aacmm, tmp_path, monkeypatch):
-    monkeypatch.setattr(pose_refinement, "_ITERATIONS", 10)
     summary = json.loads(aacmm(*PLAN, "--json").stdout)
     assert summary["poses"] == 12
     assert sum(row["poses"] for row in summary["sockets"]) == 12

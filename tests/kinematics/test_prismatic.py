@@ -34,25 +34,6 @@ def test_positions_by_hand(arm, q, expected):
     np.testing.assert_allclose(arm.position(q), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("prismatic", [(1, 4), (2, 5)])
-def test_the_gradient_by_the_readings_is_that_of_finite_differences(prismatic):
-    """Of any function of the Jacobian columns; prismatic joints shift what comes after them and rotate nothing."""
-    arm, random = to_numpy(random_arm(5, 2, beta=True, prismatic=prismatic)), np.random.default_rng(1)
-    q, units = random_readings(arm, 3, 2), chain.reading_units(arm.geometry)
-    sizes = {kind: 3 if kind == "probe" else 5 for kind in ("alpha", "a", "d", "theta", "beta", "probe")}
-    cotangents = {kind: random.normal(size=(size, 3, 2)) for kind, size in sizes.items()}
-
-    def product(q):
-        columns = jacobian.jacobian_columns(chain.forward_pass(arm.geometry, chain.joint_motion(arm.geometry, q)))
-        return sum((columns[kind] * cotangent).sum(axis=(0, 1)) for kind, cotangent in cotangents.items())
-
-    forward = chain.forward_pass(arm.geometry, chain.joint_motion(arm.geometry, q))
-    found = jacobian.readings_gradient(forward, cotangents) * units[:, None]
-    for joint, step in enumerate(1e-5 * units * np.eye(5)):
-        expected = (product(q + step) - product(q - step)) / 2e-5
-        np.testing.assert_allclose(found[joint], expected, rtol=1e-6, atol=1e-6 * np.abs(found).max())
-
-
 def test_rotations_by_readings_and_parameters():
     """A reading of a prismatic joint turns nothing; its theta does."""
     arm = random_arm(4, 5, prismatic=(2,))

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aacmm_jax.model.robust import LOSSES, Loss, bounded_square, median_square, tuning_constant
+from aacmm_jax.model.loss_names import LOSSES
+from aacmm_jax.model.robust import Loss, bounded_square, median_square, tuning_constant
 
 
 # Holland and Welsch 1977, table 1.

@@ -10,7 +10,7 @@ import aacmm_jax as aj
 from aacmm_jax.files.plans import kit_csv, plan_csv, plan_manifest
 from aacmm_jax.kinematics import Box, Cell, Cone, HalfSpace, body_along_links
 from aacmm_jax.kinematics.workspace import skeleton
-from aacmm_jax.planning import kit_placement, pose_refinement
+from aacmm_jax.planning import kit_placement
 from aacmm_jax.planning import placement as placements
 from aacmm_jax.summaries.planning import kit_plan_summary, plan_summary
 
@@ -27,13 +27,11 @@ def panda():
 
 @pytest.fixture(scope="module")
 def constrained(panda) -> aj.planning.Plan:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_refinement, "_ITERATIONS", 10)
-        return aj.planning.plan(
-            panda.arm, sockets=SOCKETS, lengths=[("A", "B"), ("A", "C")], poses=24, space=panda.space(), cone=CONE,
-            cell=Cell(body_along_links(panda.arm, RADIUS, 8.0), (BOX, WALL), clearance=3.0), retract=40.0,
-            unconstrained=True, candidates=600, seed=2,
-        )  # fmt: skip
+    return aj.planning.plan(
+        panda.arm, sockets=SOCKETS, lengths=[("A", "B"), ("A", "C")], poses=24, space=panda.space(), cone=CONE,
+        cell=Cell(body_along_links(panda.arm, RADIUS, 8.0), (BOX, WALL), clearance=3.0), retract=40.0,
+        unconstrained=True, candidates=600, seed=2,
+    )  # fmt: skip
 
 
 def body_points(arm, q) -> tuple[np.ndarray, np.ndarray]:
@@ -136,7 +134,6 @@ def test_sockets_are_placed_within_their_own_cones(panda, monkeypatch):
     """Through all stages: random placements, their neighbours, chosen and moved poses; the names keep their cones."""
     for name, value in {"_PLACEMENTS": 12, "_NEIGHBOURS": 20, "_DESIGNED": 1, "_STARTS": 200}.items():
         monkeypatch.setattr(placements, name, value)
-    monkeypatch.setattr(pose_refinement, "_ITERATIONS", 10)
     normals = {"A": (0.0, 0.0, 1.0), "B": (0.8, 0.0, 0.6)}
     found = aj.planning.plan(
         panda.arm, sockets=2, poses=14, space=panda.space(), candidates=200, length=300.0, seed=1,
@@ -154,7 +151,6 @@ def test_sockets_are_placed_within_their_own_cones(panda, monkeypatch):
 @pytest.mark.slow
 def test_a_low_ceiling(panda, monkeypatch):
     """Most poses would break through it, and nothing but the choice of poses keeps them below."""
-    monkeypatch.setattr(pose_refinement, "_ITERATIONS", 3)
     ceiling = HalfSpace("ceiling", (0.0, 0.0, -1.0), (0.0, 0.0, 480.0))
     options = dict(sockets=PAIR, lengths=[("A", "B")], poses=16, space=panda.space(), candidates=300)
     low = aj.planning.plan(panda.arm, cell=Cell(body_along_links(panda.arm, RADIUS), (ceiling,)), **options)
@@ -190,7 +186,7 @@ def test_a_plate_carries_its_normal(panda, monkeypatch):
     rows = [line.split(",")[1:3] for line in kit_csv(found).splitlines()[1:]]
     assert rows.count(["approach", "plate"]) == rows.count(["pose", "plate"]) == len(q)
     assert rows.count(["approach", "tracker"]) == 0
-    with pytest.raises(aj.InputError, match=r"'plate' at .* its cone of 2 deg"):
+    with pytest.raises(aj.InputError, match=r"'plate' at .* cannot be reached in enough poses"):
         aj.planning.plan_kit(
             panda.arm, [aj.planning.KitItem(plate, 0, "any", math.radians(2), (0, 0, -1.0))], candidates=100
         )
@@ -199,12 +195,15 @@ def test_a_plate_carries_its_normal(panda, monkeypatch):
 PAIR = {"A": (450, 100, 200), "B": (450, -300, 200)}
 LOW = {"A": (450, 100, 5), "B": (450, -300, 200)}
 REFUSED = {
-    "narrow": ({"cone": {"A": Cone(math.radians(20), (0, 0, -1.0))}, "sockets": LOW}, "socket 'A'.*cone of 20 deg"),
+    "narrow": (
+        {"cone": {"A": Cone(math.radians(20), (0, 0, -1.0))}, "sockets": LOW},
+        "'A' .* widen its cone",
+    ),
     "obstacle": (
         {"cell": True, "sockets": {"A": (300, 600, 300), "B": (450, -300, 200)}},
-        r"socket 'A' at \(300, 600, 300\) mm.* without touching an obstacle or the arm itself \(such as .* cabinet\)",
+        r"socket 'A' at \(300, 600, 300\) mm cannot be reached .* obstacles",
     ),
-    "approach": ({"retract": 990.0}, "by way of its approach point 990 mm along its normal"),
+    "approach": ({"retract": 990.0}, "cannot be reached .* shorten retract"),
     "unknown": ({"cone": {"Q": Cone()}}, "unknown socket 'Q'"),
     "retract": ({"retract": -1.0}, "retract is -1 mm; it must be"),
     "tool": ({"tool_axis": (0.0, 0.0, 0.0)}, "tool.s axis has the length 0"),

@@ -122,6 +122,8 @@ class Artefact(AbstractObservation):
             coordinates = unknowns[self.shape]
         p = coordinates.shape[1]
         held = coordinates.reshape(-1, 3, p)[owner, :, np.arange(m) if p > 1 else 0].T
+        # t - (R x + o) with the placement's R and o. On a platform, t - (R_i (R x + o) + o_i), so that derivatives by
+        # the placement are turned by R_i, and those by the coordinates x are -R_i R.
         points, by_frame, rotation = placed(unknowns[self.frame], held)
         by_unknowns = {}
         if self.index is not None:
@@ -132,29 +134,13 @@ class Artefact(AbstractObservation):
         by_unknowns[self.frame] = -by_frame
         if self.free:
             chosen = xp.asarray((owner[None, :] == np.arange(len(self.names))[:, None]).astype(float))
-            each = -chosen[:, None, None, :] * rotation.swapaxes(0, 1)[None]
-            by_unknowns[self.shape] = each.reshape(-1, 3, m)
-        return Rows(
-            values=tips.position - points,
-            by_tip=each_pose(xp.asarray(np.eye(3)), m),
-            by_unknowns=by_unknowns,
-            measured=no_covariance(3, m),
-        )
+            by_point = -chosen[:, None, None, :] * rotation.swapaxes(0, 1)[None]
+            by_unknowns[self.shape] = by_point.reshape(-1, 3, m)
+        return Rows(tips.position - points, each_pose(xp.asarray(np.eye(3)), m), by_unknowns, no_covariance(3, m))
 
 
 class SimulatedArtefact(AbstractSimulated):
     """Poses in every point of an artefact.
-
-    Args:
-        name: Name of the observation.
-        points: Name of a point -> its true coordinates in the artefact's frame ``(3,)``, mm.
-        poses: Number of poses in each point.
-        frame: The artefact's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
-        errors: Errors of the certified coordinates ``(c, 3)``, mm, which all placements share.
-        u: Their standard uncertainty, mm.
-        artefact: Name of the artefact, by default that of the observation.
-        placement: Name of the placement, likewise.
-        index: Name of the index of a platform.
 
     Example:
         >>> bar = {"near": (0, 0, 0), "far": (300, 0, 0)}
@@ -168,9 +154,11 @@ class SimulatedArtefact(AbstractSimulated):
     points: dict[str, Float[np.ndarray, "3"]] = points("true coordinates of each point")
     poses: int = count("number of poses")
     frame: Float[np.ndarray, "6"] = number(
-        "frame of the artefact in the base frame", "mm", default=(0.0,) * 6, moves="frame"
+        "its frame in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6, moves="frame"
     )
-    errors: Float[np.ndarray, "c 3"] | None = number("errors of the certified coordinates", "mm", default=None)
+    errors: Float[np.ndarray, "c 3"] | None = number(
+        "errors of the certified coordinates", "mm", default=None, more="all placements share them"
+    )
     u: float = number("their standard uncertainty", "mm", default=0.0)
     artefact: str = text("name of the artefact", default=NAME)
     placement: str | None = text("name of the placement", default=None)

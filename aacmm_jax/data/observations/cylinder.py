@@ -29,17 +29,6 @@ class Cylinder(AbstractRound):
     Outside (a pin, a plug gauge) that distance is (diameter + stylus) / 2, inside (a ring gauge, a bore)
     (diameter - stylus) / 2.
 
-    Args:
-        name: Name of the cylinder.
-        q: Joint readings ``(m, n)``, rad.
-        diameter: Certified diameter, mm; None where it is unknown.
-        u: Standard uncertainty (k = 1) of the diameter, mm.
-        stylus: Diameter of the tip's ball, mm; 0 where the tip itself is on the cylinder, or where the diameter is
-            unknown, which then includes it.
-        inside: Whether the ball was inside the cylinder.
-        form: Standard deviation of the surface about its cylinder, mm.
-        target: Name of the tip, by default the arm's own probe.
-
     Raises:
         InputError: Shapes do not fit, a value is negative, or the ball is larger than the bore.
 
@@ -52,7 +41,7 @@ class Cylinder(AbstractRound):
 
     kind, table, noun, rows = "cylinder", "touched_cylinder", "cylinder", 1
     diameter: Float[AnyArray, ""] | None = number(
-        "certified diameter", "mm", default=None, uncertainty="u", positive=True
+        "certified diameter", "mm", default=None, uncertainty="u", positive=True, more="None where it is unknown"
     )
     inside: bool = truth("whether the ball was inside")
     form: Float[AnyArray, ""] = number("standard deviation of the surface about its cylinder", "mm", default=0.0)
@@ -96,8 +85,8 @@ class Cylinder(AbstractRound):
         if tips.shape[1] < needed:
             raise InputError(f"{where} has {tips.shape[1]} touches, but {needed} unknowns; touch it more often.")
         middle = tips.mean(axis=1, keepdims=True)
-        known = None if self.radius is None else np.asarray(self.radius)
-        axis, radius = fitted_cylinder(tips - middle, known)
+        radius = None if self.radius is None else np.asarray(self.radius)
+        axis, radius = fitted_cylinder(tips - middle, radius)
         _, direction, _ = distances_from_axis(tips - middle, axis)
         turned = rotation_matrix(np.array([*axis[:2], 0.0]))
         across = turned.T[:2] @ direction
@@ -126,16 +115,6 @@ class Cylinder(AbstractRound):
 
 class SimulatedCylinder(AbstractSimulatedRound):
     """Touches all round a cylinder and along it.
-
-    Args:
-        name: Name of the cylinder.
-        ends: Both ends of its axis in the base frame ``(2, 3)``, mm.
-        diameter: Its true diameter, mm.
-        poses: Number of touches.
-        certified: Whether the diameter is certified.
-        u: Standard uncertainty of the certified diameter, mm.
-        stylus: Diameter of the tip's ball, mm.
-        inside: Whether the ball is inside.
 
     Example:
         >>> ends = [[400, 200, 300], [400, 200, 320]]

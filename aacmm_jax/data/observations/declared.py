@@ -9,7 +9,7 @@ import abc
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import FrozenInstanceError
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -37,8 +37,18 @@ class Entry(NamedTuple):
     raw: bool = False  # checked by `completed` of the class
     of_session: bool = False  # a name that means something else in another session
     moves: Literal["", "point", "vector", "frame"] = ""  # with what is simulated, where that is placed elsewhere
+    more: str = ""  # of its description, for whoever calls the constructor
     name: str = ""
     annotation: Any = None
+
+    @property
+    def described(self) -> str:
+        """Its line in the docstring of the class."""
+        alternatives = (self.annotation, *get_args(self.annotation))
+        names = next((one.dim_str for one in alternatives if getattr(one, "dim_str", "")), "").split()
+        shape = f" ``({', '.join(names)}{',' * (len(names) == 1)})``" if names else ""
+        unit = f", {self.unit}" if self.unit not in ("", "1") else ""
+        return f"{self.name}: {self.says[:1].upper()}{self.says[1:]}{shape}{unit}{self.more and '; '}{self.more}."
 
     @property
     def required(self) -> bool:
@@ -74,9 +84,9 @@ def text(says: str, *dimensions: str, **options: Any) -> Any:
     return Entry(says, "", dimensions, "text", **options)
 
 
-def truth(says: str, default: bool = False) -> Any:
+def truth(says: str, default: bool = False, more: str = "") -> Any:
     """Declares what is true or false."""
-    return Entry(says, content="truth", default=default)
+    return Entry(says, content="truth", default=default, more=more)
 
 
 def count(says: str) -> Any:
@@ -141,6 +151,8 @@ class Declared(abc.ABC):
             parameters = [one for one in parameters if one.default is not REQUIRED]
             parameters = [*(one for one in stated if one.kind is not one.VAR_KEYWORD), *parameters]
         cls.__signature__ = inspect.Signature(parameters)
+        if cls.__doc__ and "    Args:" not in cls.__doc__:
+            cls.__doc__ = _documented(cls.__doc__, cls.entries)
 
     def __init__(self, name: str, *values: Any, **options: Any):
         given = self._parameters.bind(name, *values, **options)
@@ -174,8 +186,17 @@ class Declared(abc.ABC):
     def stored(self) -> dict[str, Any]:
         """The values of the entries, without those that have none; text of each pose as an array."""
         values = {entry.name: getattr(self, entry.name) for entry in self.entries}
-        known = {name: value for name, value in values.items() if value is not None}
-        return {name: np.array(value) if isinstance(value, tuple) else value for name, value in known.items()}
+        stated = {name: value for name, value in values.items() if value is not None}
+        return {name: np.array(value) if isinstance(value, tuple) else value for name, value in stated.items()}
+
+
+def _documented(doc: str, entries: Sequence[Entry]) -> str:
+    """A docstring with the arguments, before the errors and examples."""
+    lines = ["name: Name of the observation.", *(entry.described for entry in entries)]
+    arguments = "".join(f"\n        {line}" for line in lines)
+    divided = [doc.partition(f"\n\n    {word}:") for word in ("Raises", "Example")]
+    before, heading, rest = min(divided, key=lambda parts: len(parts[0]))
+    return f"{before.rstrip()}\n\n    Args:{arguments}{heading}{rest}"
 
 
 def _signature(entries: Sequence[Entry], keyword_only: bool) -> inspect.Signature:

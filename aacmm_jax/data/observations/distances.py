@@ -19,14 +19,6 @@ from .simulated import AbstractInBox, Readings, Transforms
 class Distances(AbstractObservation):
     """Measured distances of the tip from a pivot whose position is unknown.
 
-    Args:
-        name: Name of the observation.
-        q: Joint readings ``(m, n)``, rad.
-        values: Measured distances ``(m,)``, mm.
-        u: Standard uncertainty (k = 1) of the distances, mm: one number, or one each ``(m,)``.
-        constant: Whether an unknown constant is added to all distances (a bar of unknown zero).
-        target: Name of the tip, by default the arm's own probe.
-
     Raises:
         InputError: Shapes do not fit, or a distance is not positive.
 
@@ -38,8 +30,12 @@ class Distances(AbstractObservation):
 
     kind, table, rows = "distances", "distances", 1
     values: Float[AnyArray, " m"] = number("measured distance from the pivot", "mm", "pose")
-    u: Float[AnyArray, " m"] = number("standard uncertainty of a distance", "mm", "pose", default=0.0, spread=True)
-    constant: bool = truth("whether an unknown constant is added to all distances")
+    u: Float[AnyArray, " m"] = number(
+        "standard uncertainty of a distance", "mm", "pose", default=0.0, spread=True, more="one number, or one each"
+    )
+    constant: bool = truth(
+        "whether an unknown constant is added to all distances", more="as to those of a bar of unknown zero"
+    )
     pivot = part("pivot of {name}", *POINT)
     zero = part("constant of {name}", "mm", when="constant")
     fixes_scale = True
@@ -81,13 +77,6 @@ class Distances(AbstractObservation):
 
 class SimulatedDistances(AbstractInBox):
     """Distances from a pivot to random places in a box.
-
-    Args:
-        name: Name of the observation.
-        box: Lowest and highest coordinates of the tip ``(2, 3)`` in the base frame, mm.
-        poses: Number of distances.
-        pivot: The pivot in the base frame ``(3,)``, mm.
-        u: Standard uncertainty of each distance, mm.
 
     Example:
         >>> box = [[200, -300, 100], [600, 300, 500]]

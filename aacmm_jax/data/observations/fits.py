@@ -3,12 +3,11 @@
 All in closed form but the cylinder, which has none. In NumPy and in JAX, so that studies start in a compiled program.
 """
 
-import functools
 import math
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from ...core.linear_algebra import length_and_direction, products_by_column, semidefinite_eigen, solve_positive_definite
 from ...core.numpy_or_jax import AnyArray, namespace, scan
@@ -18,7 +17,7 @@ from .observation import Tips
 
 _DIRECTIONS = 300  # of axes that are tried: a hemisphere in steps of about 8 degrees
 _LARGEST_RADIUS = 30.0  # root mean square distances from the middle
-_TRIED = 8  # directions that are refined
+_TRIED = 16  # directions that are refined
 _FEW_STEPS, _STEPS = 5, 8  # of their refinement, and of the best one's
 
 
@@ -86,11 +85,12 @@ def fitted_cylinder(
     size = xp.sqrt(xp.mean((tips - middle) ** 2)) + 1e-12
     centred = (tips - middle) / size
     frames = _frames(centred)
-    centres, radii = _circles(frames, centred)
-    if radius is not None:
-        radii = xp.zeros_like(radii) + radius / size
+    centres, distances = _circles(frames, centred)
+    radii = xp.mean(distances, axis=1) if radius is None else xp.zeros(len(frames)) + radius / size
     upwards = xp.where(frames[:, 2, 2] < 0, -1.0, 1.0)[:, None] * frames[:, :, 2]
-    tried = _worth_refining(centred, frames, centres, radii)
+    # The best circles, and the principal axes: a few touches may lie nearly on several cylinders.
+    error = xp.mean((distances - radii[:, None]) ** 2, axis=1)
+    tried = xp.concatenate([xp.arange(3), 3 + xp.argsort(error[3:])[:_TRIED]])
 
     def refined(best: AnyArray, i: AnyArray) -> tuple[AnyArray, AnyArray]:
         first = _moved(turned_z(upwards[i]), frames[i, :, :2] @ centres[i])
@@ -108,8 +108,9 @@ def fitted_cylinder(
 
 def _circles(
     frames: Float[AnyArray, "k 3 3"], centred: Float[AnyArray, "3 m"]
-) -> tuple[Float[AnyArray, "k 2"], Float[AnyArray, " k"]]:
-    """Centre and radius of the circle through the projections of points along the last axis of each frame."""
+) -> tuple[Float[AnyArray, "k 2"], Float[AnyArray, "k m"]]:
+    """Centres of the circles through the projections of points along the last axis of each frame, and the distances of
+    the projections from them."""
     xp, least = namespace(frames, centred), 1e-9 * centred.shape[1]
     y = xp.einsum("kca,cm->kam", frames[:, :, :2], centred)
     a, b, c = (xp.sum(y[:, i] * y[:, j], axis=1) for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -117,25 +118,7 @@ def _circles(
     right = xp.sum(xp.sum(y**2, axis=1)[:, None] * y, axis=2) / 2
     centre = xp.stack([c * right[:, 0] - b * right[:, 1], a * right[:, 1] - b * right[:, 0]], axis=1)
     centre = centre / (a * c - b**2)[:, None]
-    return centre, xp.mean(xp.sqrt(xp.sum((y - centre[:, :, None]) ** 2, axis=1)), axis=1)
-
-
-def _worth_refining(
-    centred: Float[AnyArray, "3 m"],
-    frames: Float[AnyArray, "k 3 3"],
-    centres: Float[AnyArray, "k 2"],
-    radii: Float[AnyArray, " k"],
-) -> Int[AnyArray, " t"]:
-    """The directions whose circle fits better than those around them, the best of them, and the principal axes: a few
-    touches may lie nearly on several cylinders, and the best direction tried need not be next to the best of all."""
-    xp = namespace(centred)
-    y = xp.einsum("kca,cm->kam", frames[:, :, :2], centred)
-    distance = xp.sqrt(xp.sum((y - centres[:, :, None]) ** 2, axis=1))
-    error = xp.mean((distance - radii[:, None]) ** 2, axis=1)[:_DIRECTIONS]
-    _, around = _hemisphere()
-    least = xp.min(xp.where(xp.asarray(around), error[None], np.inf), axis=1)
-    best = xp.argsort(xp.where(error <= least, error, error + 1e6))[:_TRIED]
-    return xp.concatenate([best, xp.arange(_DIRECTIONS, _DIRECTIONS + 3)])
+    return centre, xp.sqrt(xp.sum((y - centre[:, :, None]) ** 2, axis=1))
 
 
 def _moved(turn: Float[AnyArray, " 2"], point: Float[AnyArray, " 3"]) -> Float[AnyArray, " 4"]:
@@ -144,25 +127,17 @@ def _moved(turn: Float[AnyArray, " 2"], point: Float[AnyArray, " 3"]) -> Float[A
     return xp.concatenate([turn, (rotation_matrix(xp.concatenate([turn, xp.zeros(1)])).T @ point)[:2]])
 
 
-@functools.cache
-def _hemisphere() -> tuple[Float[np.ndarray, "k 3 3"], Bool[np.ndarray, "k k"]]:
-    """Frames whose last axes are all over a hemisphere, by the golden angle, and which of these axes are neighbours."""
-    height = (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
-    angle = np.pi * (3 - math.sqrt(5)) * np.arange(_DIRECTIONS)
-    turns = np.arccos(height) * np.stack([np.cos(angle), np.sin(angle), np.zeros(_DIRECTIONS)])
-    frames = np.stack([rotation_matrix(turn) for turn in turns.T])
-    axes = frames[:, :, 2]
-    return frames, np.abs(axes @ axes.T) > math.cos(1.7 * math.sqrt(2 * math.pi / _DIRECTIONS))
-
-
 def _frames(centred: Float[AnyArray, "3 m"]) -> Float[AnyArray, "k 3 3"]:
-    """Axes that are tried, each as the last column of a rotation: all over a hemisphere, and the points' principal
-    axes, since the axis of a long cylinder must be known to better than a step."""
+    """Axes that are tried, each as the last column of a rotation: the points' principal axes, since the axis of a long
+    cylinder must be known to better than a step, and axes all over a hemisphere, by the golden angle."""
     xp = namespace(centred)
     _, principal = semidefinite_eigen(centred @ centred.T)
     principal = principal / xp.sqrt(xp.sum(principal**2, axis=0) + 1e-300)[None]
     ordered = [principal[:, np.array(order)] for order in ((1, 2, 0), (2, 0, 1), (0, 1, 2))]
-    return xp.concatenate([xp.asarray(_hemisphere()[0]), xp.stack(ordered)])
+    height = (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    angle = np.pi * (3 - math.sqrt(5)) * np.arange(_DIRECTIONS)
+    turns = np.arccos(height) * np.stack([np.cos(angle), np.sin(angle), np.zeros(_DIRECTIONS)])
+    return xp.concatenate([xp.stack(ordered), xp.asarray(np.moveaxis(np.asarray(rotation_matrix(turns)), -1, 0))])
 
 
 def _refined(

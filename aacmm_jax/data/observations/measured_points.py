@@ -25,11 +25,28 @@ class AbstractMeasured(AbstractObservation):
     """What an instrument measured in a frame of its own, which all observations of one station share."""
 
     points: Float[AnyArray, "m 3"] = number("measured point", "mm", "pose", "axis")
-    u: AnyArray | None = number("standard uncertainty of a coordinate", "mm", "pose", "axis", default=None, spread=True)
-    covariance: Float[AnyArray, "m 3 3"] = number(
-        "covariance of a point", "mm^2", "pose", "axis", "axis_2", default=None, raw=True
+    u: AnyArray | None = number(
+        "standard uncertainty of a coordinate",
+        "mm",
+        "pose",
+        "axis",
+        default=None,
+        spread=True,
+        more="k = 1: one number, one for each coordinate, or one for each of all ``(m, 3)``",
     )
-    station: str = text("station of the instrument", default=NAME, of_session=True)
+    covariance: Float[AnyArray, "m 3 3"] = number(
+        "covariance of a point",
+        "mm^2",
+        "pose",
+        "axis",
+        "axis_2",
+        default=None,
+        raw=True,
+        more="instead of u: of all points ``(3, 3)``, or of each ``(m, 3, 3)``",
+    )
+    station: str = text(
+        "station of the instrument", default=NAME, of_session=True, more="observations of one station share its frame"
+    )
     frame = part("frame of {station}", *FRAME)
     fixes_scale = True
 
@@ -52,16 +69,6 @@ class AbstractMeasured(AbstractObservation):
 
 class MeasuredPoints(AbstractMeasured):
     """Points of the tip, measured by an instrument in a frame of its own, which is unknown.
-
-    Args:
-        name: Name of the observation, and of its station where that has none.
-        q: Joint readings ``(m, n)``, rad.
-        points: Measured points ``(m, 3)``, mm, in the instrument's frame.
-        u: Standard uncertainty (k = 1) of the points, mm: one number, one a coordinate, or one each ``(m, 3)``.
-        covariance: Instead of ``u``, the covariance of all points ``(3, 3)``, or of each ``(m, 3, 3)``, mm^2.
-        station: Name of the instrument's station; observations of one station share its frame.
-        target: Name of the tip that was seen, such as a reflector on the flange, whose place in the last frame is then
-            unknown; by default the arm's own probe.
 
     Raises:
         InputError: Shapes do not fit, a value is not finite, or a covariance is not positive.
@@ -131,15 +138,6 @@ def check_spread(where: str, points: Float[np.ndarray, "3 m"]) -> None:
 class SimulatedPoints(AbstractInBox, AbstractOfTarget):
     """Points that an instrument measures at random places in a box.
 
-    Args:
-        name: Name of the observation.
-        box: Lowest and highest coordinates of the tip ``(2, 3)`` in the base frame, mm.
-        poses: Number of points.
-        frame: The instrument's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
-        u: Standard uncertainty of each coordinate, mm.
-        target: Name of the target; by default the arm's probe.
-        place: The target's true place in the last frame ``(3,)``, mm.
-
     Example:
         >>> box = [[200, -300, 100], [600, 300, 500]]
         >>> tracker = aj.data.observations.SimulatedPoints("tracker", box, 50, (0, 0, 1.0, 2000, 0, 0), u=0.02)
@@ -149,7 +147,9 @@ class SimulatedPoints(AbstractInBox, AbstractOfTarget):
     """
 
     table = "points"
-    frame: Float[np.ndarray, "6"] = number("frame of the instrument in the base frame", "mm", default=(0.0,) * 6)
+    frame: Float[np.ndarray, "6"] = number(
+        "frame of the instrument in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6
+    )
     u: float = number("standard uncertainty of each coordinate", "mm", default=0.0)
 
     def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> MeasuredPoints:

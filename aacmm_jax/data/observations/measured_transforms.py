@@ -24,17 +24,6 @@ class MeasuredTransforms(AbstractMeasured):
 
     Both frames are unknown: the instrument's in the base frame, and the target's in the last frame.
 
-    Args:
-        name: Name of the observation, and of its station where that has none.
-        q: Joint readings ``(m, n)``, rad.
-        points: Measured positions ``(m, 3)``, mm, in the instrument's frame.
-        rotations: Measured orientations ``(m, 3, 3)``: the target's axes as columns, in the instrument's frame.
-        u_angle: Standard uncertainty (k = 1) of the orientation about each axis, rad.
-        u: Standard uncertainty (k = 1) of the positions, mm: one number, one a coordinate, or one each ``(m, 3)``.
-        covariance: Instead of ``u``, the covariance of all positions ``(3, 3)``, or of each ``(m, 3, 3)``, mm^2.
-        station: Name of the instrument's station; observations of one station share its frame.
-        target: Name of the target; by default that of the observation.
-
     Raises:
         InputError: Shapes do not fit, a matrix is no rotation, or a covariance is not positive.
 
@@ -113,15 +102,6 @@ class MeasuredTransforms(AbstractMeasured):
 class SimulatedTransforms(AbstractInBox):
     """Transforms of a target that an instrument measures at random places in a box.
 
-    Args:
-        name: Name of the observation, and of the target.
-        box: Lowest and highest coordinates of the target ``(2, 3)`` in the base frame, mm.
-        poses: Number of transforms.
-        offset_and_orientation: True place (mm) and rotation vector (rad) of the target in the last frame ``(6,)``.
-        frame: The instrument's frame in the base frame: rotation vector (rad) and origin (mm), ``(6,)``.
-        u: Standard uncertainty of each coordinate, mm.
-        u_angle: Standard uncertainty about each axis, rad.
-
     Example:
         >>> box = [[200, -300, 100], [600, 300, 500]]
         >>> probe = aj.data.observations.SimulatedTransforms("6-D probe", box, 20, u=0.01, u_angle=2e-4)
@@ -131,9 +111,11 @@ class SimulatedTransforms(AbstractInBox):
 
     table = "transforms"
     offset_and_orientation: Float[np.ndarray, "6"] = number(
-        "place and rotation of the target", "mm", default=(0.0,) * 6
+        "true place (mm) and rotation vector (rad) of the target in the last frame", default=(0.0,) * 6
     )
-    frame: Float[np.ndarray, "6"] = number("frame of the instrument in the base frame", "mm", default=(0.0,) * 6)
+    frame: Float[np.ndarray, "6"] = number(
+        "frame of the instrument in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6
+    )
     u: float = number("standard uncertainty of each coordinate", "mm", default=0.0)
     u_angle: float = number("standard uncertainty about each axis", "rad", default=1e-4)
 

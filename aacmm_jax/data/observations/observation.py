@@ -77,6 +77,8 @@ class AbstractObservation(Declared):
     q: Float[AnyArray, "m n"] = number("joint reading", "rad", "pose", "joint")
     target: str = text("tip that was held or seen; empty: the arm's own probe", default="")
 
+    _of_poses: ClassVar[tuple[str, ...]]
+
     # Of a repeated calibration: what is added to the residuals (r, m), and certified values in place of its own.
     shift: Float[AnyArray, "r m"] | None
     drawn: Parts | None
@@ -85,6 +87,7 @@ class AbstractObservation(Declared):
         super().__init_subclass__(**options)
         leaves = [entry.name for entry in cls.entries if entry.content == "number"] + ["shift", "drawn"]
         others = [entry.name for entry in cls.entries if entry.content != "number"]
+        cls._of_poses = tuple(entry.name for entry in cls.entries if entry.dimensions[:1] == ("pose",))
         register(cls, (*leaves,), ("name", *others, *cls.derived_fields))
 
     def __init__(self, name: str, *values: Any, **options: Any):
@@ -139,8 +142,7 @@ class AbstractObservation(Declared):
     @property
     def by_pose(self) -> tuple[str, ...]:
         """Fields with one row a pose."""
-        entries = (entry.name for entry in self.entries if entry.dimensions[:1] == ("pose",))
-        return tuple(name for name in entries if getattr(self, name) is not None)
+        return tuple(name for name in self._of_poses if getattr(self, name) is not None)
 
     @property
     def stated(self) -> tuple[str, ...]:
@@ -293,8 +295,8 @@ OTHER_KINDS: list[type[Declared]] = []  # observations and what simulates them, 
 
 def kinds() -> dict[str, type[AbstractObservation]]:
     """Every kind of observations by its name: those of the files of this folder, and others."""
-    found = {one.__name__: one for one in classes() if issubclass(one, AbstractObservation)}
-    return {found[name].kind: found[name] for name in sorted(found)}
+    by_class = {one.__name__: one for one in classes() if issubclass(one, AbstractObservation)}
+    return {by_class[name].kind: by_class[name] for name in sorted(by_class)}
 
 
 def classes() -> list[type[Declared]]:

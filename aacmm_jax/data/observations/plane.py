@@ -25,11 +25,7 @@ SIDES = ("one", "other")
 class Plane(AbstractObservation):
     """Touches of a plane whose position and direction are unknown.
 
-    Args:
-        name: Name of the plane.
-        q: Joint readings ``(m, n)``, rad; all from one side, so that the ball's radius is part of the unknown position.
-        form: Standard deviation of the surface about its plane, mm.
-        target: Name of the tip, by default the arm's own probe.
+    All are from one side, so that the radius of the tip's ball is part of the unknown position.
 
     Raises:
         InputError: Readings are not finite, or ``form`` is negative.
@@ -196,14 +192,6 @@ def check_plane(where: str, tips: Float[np.ndarray, "3 m"]) -> None:
 class SimulatedPlanes(AbstractSimulated):
     """Touches at random places of a rectangle, or of two that face each other.
 
-    Args:
-        name: Name of the plane, or of the pair.
-        corner: A corner of the (first) rectangle in the base frame ``(3,)``, mm.
-        sides: Its two sides as vectors ``(2, 3)``, mm.
-        poses: Number of touches of each plane.
-        distance: True distance to the second plane, along the cross product of the sides; None for one plane.
-        u: Standard uncertainty of the certified distance, mm.
-
     Example:
         >>> faces = aj.data.observations.SimulatedPlanes(
         ...     "block", (300, -200, 150), [[80, 0, 0], [0, 80, 0]], 8, distance=100.0, u=0.001
@@ -216,7 +204,12 @@ class SimulatedPlanes(AbstractSimulated):
     corner: Float[np.ndarray, "3"] = number("corner of the (first) rectangle in the base frame", "mm", moves="point")
     sides: Float[np.ndarray, "2 3"] = number("its two sides as vectors", "mm", moves="vector")
     poses: int = count("number of poses")
-    distance: float | None = number("true distance to the second plane", "mm", default=None)
+    distance: float | None = number(
+        "true distance to the second plane",
+        "mm",
+        default=None,
+        more="along the cross product of the sides; None for one",
+    )
     u: float = number("standard uncertainty of the certified distance", "mm", default=0.0)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:

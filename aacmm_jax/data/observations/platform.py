@@ -24,10 +24,10 @@ def platform_frames(observations: Sequence[AbstractObservation], tips: Sequence[
     """
     # By the name of the platform's frame. What does not stand on it, "", comes first: its frame is that of the base.
     waiting: dict[str, Held] = {"": []}
-    for observation, own in zip(observations, tips, strict=True):
+    for observation, tip in zip(observations, tips, strict=True):
         if isinstance(observation, Artefact):
             name = "" if observation.index is None else observation.platform
-            waiting.setdefault(name, []).append((observation, own.position))
+            waiting.setdefault(name, []).append((observation, tip.position))
     if len(waiting) == 1:
         return {}
     placements: dict[str, Frame] = {}
@@ -39,30 +39,30 @@ def platform_frames(observations: Sequence[AbstractObservation], tips: Sequence[
         }
         name = "" if "" in waiting else max(poses, key=lambda name: poses[name])
         held = waiting.pop(name)
-        known = [(artefact, own) for artefact, own in held if artefact.frame in placements]
-        indices[name] = _index(known, placements) if known else np.zeros(6)
+        placed_before = [(artefact, tip) for artefact, tip in held if artefact.frame in placements]
+        indices[name] = _index(placed_before, placements) if placed_before else np.zeros(6)
         placements |= _new_placements([one for one in held if one[0].frame not in placements], indices[name])
     del indices[""]
     return placements | indices
 
 
-def _index(known: Held, placements: dict[str, Frame]) -> Frame:
+def _index(held: Held, placements: dict[str, Frame]) -> Frame:
     """In which points on the platform come closest to the tips."""
-    points = [placed(placements[artefact.frame], _coordinates(artefact))[0] for artefact, _ in known]
-    xp = namespace(points, known)
-    return fitted_frame(xp.concatenate(points, axis=1), xp.concatenate([own for _, own in known], axis=1))
+    points = [placed(placements[artefact.frame], _coordinates(artefact))[0] for artefact, _ in held]
+    xp = namespace(points, held)
+    return fitted_frame(xp.concatenate(points, axis=1), xp.concatenate([tips for _, tips in held], axis=1))
 
 
 def _new_placements(held: Held, index: Frame) -> dict[str, Frame]:
     """On the platform, by all that was held in each at this index."""
-    found = {}
+    placements = {}
     for name in dict.fromkeys(artefact.frame for artefact, _ in held):
         same = [one for one in held if one[0].frame == name]
         xp = namespace(same, index)
-        tips = xp.concatenate([own for _, own in same], axis=1)
+        tips = xp.concatenate([position for _, position in same], axis=1)
         coordinates = xp.concatenate([_coordinates(artefact) for artefact, _ in same], axis=1)
-        found[name] = fitted_frame(coordinates, rotation_matrix(index[:3]).T @ (tips - index[3:, None]))
-    return found
+        placements[name] = fitted_frame(coordinates, rotation_matrix(index[:3]).T @ (tips - index[3:, None]))
+    return placements
 
 
 def _coordinates(artefact: Artefact) -> Float[AnyArray, "3 m"]:

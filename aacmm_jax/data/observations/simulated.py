@@ -89,5 +89,5 @@ class AbstractOfTarget(AbstractSimulated):
 
 def simulated_kinds() -> dict[str, type[AbstractSimulated]]:
     """Everything that can be simulated, by the name of its tables."""
-    found = {one.__name__: one for one in classes() if issubclass(one, AbstractSimulated)}
-    return {found[name].table: found[name] for name in sorted(found)}
+    by_class = {one.__name__: one for one in classes() if issubclass(one, AbstractSimulated)}
+    return {by_class[name].table: by_class[name] for name in sorted(by_class)}

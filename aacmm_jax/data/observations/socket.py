@@ -15,11 +15,6 @@ from .simulated import AbstractOfTarget, Readings, Transforms
 class Socket(AbstractObservation):
     """Poses with the tip at one point. The sockets of a `Capture` are the same, with their positions eliminated.
 
-    Args:
-        name: Name of the socket.
-        q: Joint readings ``(m, n)``, rad.
-        target: Name of the tip, by default the arm's own probe.
-
     Raises:
         InputError: Readings are not finite, or not ``(m, n)``.
 
@@ -55,13 +50,6 @@ def position_of(socket: str) -> str:
 
 class SimulatedSocket(AbstractOfTarget):
     """Poses with the tip in one socket.
-
-    Args:
-        name: Name of the socket.
-        point: Its position in the base frame ``(3,)``, mm.
-        poses: Number of poses.
-        target: Name of the tip, and ``place``, its true place in the last frame ``(3,)``, mm; by default the arm's own
-            probe.
 
     Example:
         >>> sockets_kind = aj.data.observations.SimulatedSocket

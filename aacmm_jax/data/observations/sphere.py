@@ -23,9 +23,14 @@ class AbstractRound(AbstractObservation):
     """Touches of a surface of one diameter, which may be certified: the tip's centre is at one distance, the radius,
     from what is in its middle."""
 
-    diameter: Float[AnyArray, ""] | None = number("certified diameter", "mm", default=None, uncertainty="u")
+    diameter: Float[AnyArray, ""] | None = number(
+        "certified diameter", "mm", default=None, uncertainty="u", more="None where it is unknown"
+    )
     u: Float[AnyArray, ""] = number("standard uncertainty of the diameter", "mm", default=0.0)
-    stylus: Float[AnyArray, ""] = number("diameter of the tip's ball", "mm", default=0.0)
+    stylus: Float[AnyArray, ""] = number(
+        "diameter of the tip's ball", "mm", default=0.0,
+        more="0 where the tip itself is on the surface, or where the diameter is unknown, which then includes it",
+    )  # fmt: skip
     free: bool = derived()  # whether the radius is an unknown
     fixes_scale: bool = derived()
     size: str
@@ -55,15 +60,6 @@ class AbstractRound(AbstractObservation):
 
 class Sphere(AbstractRound):
     """Touches of a sphere: the tip's centre is at (diameter + stylus) / 2 from an unknown centre.
-
-    Args:
-        name: Name of the sphere.
-        q: Joint readings ``(m, n)``, rad.
-        diameter: Certified diameter, mm; None where it is unknown.
-        u: Standard uncertainty (k = 1) of the diameter, mm.
-        stylus: Diameter of the tip's ball, mm; 0 where the tip itself is on the sphere, or where the diameter is
-            unknown, which then includes it.
-        target: Name of the tip, by default the arm's own probe.
 
     Raises:
         InputError: Shapes do not fit, or a diameter or uncertainty is negative.
@@ -147,15 +143,6 @@ class AbstractSimulatedRound(AbstractSimulated):
 
 class SimulatedSphere(AbstractSimulatedRound):
     """Touches all over a sphere, or over a cap of it.
-
-    Args:
-        name: Name of the sphere.
-        centre: Its centre in the base frame ``(3,)``, mm.
-        diameter: Its true diameter, mm.
-        poses: Number of touches.
-        certified: Whether the diameter is certified.
-        u: Standard uncertainty of the certified diameter, mm.
-        stylus: Diameter of the tip's ball, mm.
 
     Example:
         >>> ball = aj.data.observations.SimulatedSphere("ball", (300, 0, 300), 50.0, 25, u=0.001, stylus=6.0)
