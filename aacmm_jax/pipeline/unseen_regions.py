@@ -114,9 +114,9 @@ def _dense(equations: Equations, parameters: int) -> _Dense:
     relations = [np.pad(block.shared, ((0, 0), (0, size - shared))) for block in equations.relations]
     return _Dense(
         *(np.concatenate(part) for part in zip(*parts, strict=True)),
-        np.concatenate([np.zeros((0, size)), *relations]),
-        np.concatenate([np.zeros(0), *(block.residual for block in equations.relations)]),
-        np.arange(size) >= parameters,
+        relations=np.concatenate([np.zeros((0, size)), *relations]),
+        relation_residual=np.concatenate([np.zeros(0), *(block.residual for block in equations.relations)]),
+        geometry=np.arange(size) >= parameters,
     )
 
 
