@@ -57,8 +57,10 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
                 paths = table.get("files", [table.get("file")])
                 file = next(iter(paths.values() if isinstance(paths, dict) else paths))
                 comments.append(f"# and in [[{key}]] ({file}), instead of its columns:\n# {line}\n")
-    entries = as_read.model_dump(exclude_defaults=True, exclude={"sign", "offset", "columns"})
-    entries = {key: [value[i] for i in order] if isinstance(value, list) else value for key, value in entries.items()}
+    stated = as_read.model_dump(exclude_defaults=True, exclude={"sign", "offset", "columns"})
+    entries: dict[str, Any] = {
+        key: [value[i] for i in order] if isinstance(value, list) else value for key, value in stated.items()
+    }
     if explanation.angle != 1:
         entries |= {"unit": "deg" if explanation.angle < 1 else "rad"}
         entries.pop("counts_per_turn", None)

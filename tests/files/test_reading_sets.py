@@ -72,7 +72,10 @@ def test_the_better_ones_are_named_with_both_figures(both):
     assert measured["rms_mm"] == pytest.approx(0.045, abs=0.002)
     assert commanded["rms_mm"] > 0.3
     said = reading_sets_sentence((commanded, measured), 80)
-    assert f"the measured ones leave 0.045 mm RMS after a calibration, the commanded ones {commanded['rms_mm']:.3g}" in said
+    assert (
+        f"the measured ones leave 0.045 mm RMS after a calibration, the commanded ones {commanded['rms_mm']:.3g}"
+        in said
+    )
     (line,) = measured["lines"]
     assert line == (
         'columns = {q = ["q_1 [deg]", "q_2 [deg]", "q_3 [deg]", "q_4 [deg]", "q_5 [deg]", "q_6 [deg]"], '
