@@ -68,7 +68,7 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
         entries["columns"] = _reordered(as_read.columns, numbers, order)
     counts = entries.get("counts_per_turn")
     size = ANGLE_UNITS[entries["unit"]] if counts is None else 2 * np.pi / np.asarray(counts)
-    # A column c is read as s (c - o) size; with the sign S and zero Z of the explanation S s (c - (o - Z / (S s size))).
+    # With the explanation's sign S and zero Z: S s (c - o) size + Z = S s (c - (o - Z / (S s size))) size.
     sign, offset = (np.broadcast_to(np.asarray(x, float), joints)[order] for x in (as_read.sign, as_read.offset))
     sign = sign * explanation.signs
     offset = np.round(offset - sign * explanation.offsets / size, 9) + 0.0
