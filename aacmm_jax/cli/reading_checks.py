@@ -93,8 +93,8 @@ def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any
         frame = np.linalg.inv(urdf_chain(specification.urdf).base)
         positions = positions @ frame[:3, :3].T + frame[:3, 3]
         rotations = None if rotations is None else frame[:3, :3] @ rotations
-    known = {"sockets": table.sockets, "positions": positions, "rotations": rotations}
-    check = with_spinner("Comparing", lambda: check_readings(specification.arm, table.q, **known))
+    tips = {"sockets": table.sockets, "positions": positions, "rotations": rotations}
+    check = with_spinner("Comparing", lambda: check_readings(specification.arm, table.q, **tips))
     if positions is not None:
         capture = Capture({}, observations=[MeasuredPoints("table", table.q, positions, station="table")])
     else:
