@@ -49,13 +49,11 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
     return draw(metric_plots(results, metric, together=True)[0], axes)
 
 
-def metric_plots(
-    results: Results, metric: str, factor: str | None = None, *, together: bool = False
-) -> tuple[Plot, ...]:
+def metric_plots(results: Results, metric: str, factor: str = "", *, together: bool = False) -> tuple[Plot, ...]:
     """A metric against a factor, by default that with the most levels: a plot for each combination of the levels of
     the others, or all ``together`` side by side."""
     factors = results.study.factors
-    factor = factor or max(factors, key=lambda name: len(factors[name]), default=None)
+    factor = factor or max(factors, key=lambda name: len(factors[name]), default="")
     if together:
         runs = _runs(results, factor, len(SERIES))
         panels = {"": [(words if len(runs) > 1 else "", metric, cells) for words, cells in runs.items()]}
@@ -64,7 +62,7 @@ def metric_plots(
     return _plots(results, factor, panels)
 
 
-def _plots(results: Results, factor: str | None, panels: Mapping[str, Sequence[_Series]]) -> tuple[Plot, ...]:
+def _plots(results: Results, factor: str, panels: Mapping[str, Sequence[_Series]]) -> tuple[Plot, ...]:
     """Plots by their titles, on the same axes: at each level of the factor the median of every series with a bar from
     the 5th to the 95th percentile, side by side."""
     levels = _levels(results, factor)
@@ -73,6 +71,7 @@ def _plots(results: Results, factor: str | None, panels: Mapping[str, Sequence[_
     if len(metrics) > 1:  # before and after
         title = title.replace(" after the scale fix", "")
     marks: dict[str, list[Marks]] = {words: [] for words in panels}
+    ends = np.zeros(0)
     for words, series in panels.items():
         for i, (name, quantity, cells) in enumerate(series):
             low, middle, high = _percentiles(results, quantity, cells, (5, 50, 95))
@@ -80,10 +79,9 @@ def _plots(results: Results, factor: str | None, panels: Mapping[str, Sequence[_
                 f"{level}: median {format_number(b)}, 5 % {format_number(a)}, 95 % {format_number(c)}"
                 for level, a, b, c in zip(levels, low.tolist(), middle.tolist(), high.tolist(), strict=True)
             ]
+            ends = np.concatenate([ends, low[np.isfinite(low)], high[np.isfinite(high)]])
             x = np.arange(len(levels)) + 0.6 * ((i + 0.5) / len(series) - 0.5)
             marks[words].append(Marks(name, x, middle, **SERIES[i], words=said, low=low, high=high))
-    ends = np.concatenate([part for series in marks.values() for mark in series for part in (mark.low, mark.high)])
-    ends = ends[np.isfinite(ends)]
     wide = len(ends) and ends.min() > 0 and ends.max() > _WIDE * ends.min()
     axes = names(factor_title(factor) if factor else "", levels), (logarithmic if wide else linear)(title, ends)
     height = 280 if len(panels) == 1 else 200
@@ -163,7 +161,7 @@ def study_distributions(
                 box = Marks("", np.arange(len(cells)), low, "bars", low=low, high=high, size=16)
                 plots.append(plot._replace(marks=(box, *plot.marks)))
                 break
-    figure = draw_all(plots, len(plots), (4.3, 3.8))
+    figure = draw_all(plots, len(plots), (4.3, 4.4))
     others = [factor_title(name) for name in results.study.factors if name != factor]
     pooled = f"\ntrials pooled over all levels of: {', '.join(others)}" if others else ""
     figure.suptitle(f"boxes: quartiles and median; whiskers: 5 % and 95 %{pooled}", fontsize=9)
@@ -246,10 +244,10 @@ def study_convergence(results: Results) -> Any:
     Example:
         >>> aj.plot.study_convergence(results).savefig("convergence.svg")
     """
-    factors: list[str | None] = sorted(results.study.factors, key=lambda name: -len(results.study.factors[name]))
-    factors = [*factors, None, None][:2]
+    factors = sorted(results.study.factors, key=lambda name: -len(results.study.factors[name]))
+    factors = [*factors, "", ""][:2]
     levels, count = [_levels(results, name) for name in factors], len(results.study.cells)
-    i, j = (_index(results).get(name or "", np.zeros(count, dtype=int)) for name in factors)
+    i, j = (_index(results).get(name, np.zeros(count, dtype=int)) for name in factors)
     total, good = np.zeros((2, len(levels[1]), len(levels[0])))
     for cell in range(count):
         converged = results.column("converged", cell)
@@ -264,14 +262,14 @@ def study_convergence(results: Results) -> Any:
         Marks("", x, y, "boxes", shade=shade, box=(1.0, 1.0)),
         Marks("", x, y, "text", "ink", ["-" if np.isnan(p) else f"{p:.4g}" for p in percentage], size=8),
     )
-    axes = (
+    x_axis, y_axis = (
         names(fill(factor_title(name) if name else "", 14 + 8 * len(labels)), labels)._replace(
             low=-0.5, high=len(labels) - 0.5
         )
         for name, labels in zip(factors, levels, strict=True)
     )
     size = 1.9 + 0.75 * max(len(levels[0]), 4), 1.9 + 0.5 * len(levels[1])
-    return draw_all([Plot(*axes, marks, title="trials that converged [%]")], 1, size)
+    return draw_all([Plot(x_axis, y_axis, marks, title="trials that converged [%]")], 1, size)
 
 
 def _percentiles(
@@ -297,7 +295,7 @@ def _index(results: Results) -> dict[str, np.ndarray]:
     return dict(zip(factors, chosen, strict=True))
 
 
-def _runs(results: Results, factor: str | None, most: int) -> dict[str, list[list[int]]]:
+def _runs(results: Results, factor: str, most: int) -> dict[str, list[list[int]]]:
     """Runs of cells that differ in one factor only, in its order, by the levels of the other factors in words."""
     runs: dict[str, list[list[int]]] = {}
     for cell in range(len(results.study.cells)):
@@ -306,12 +304,12 @@ def _runs(results: Results, factor: str | None, most: int) -> dict[str, list[lis
     return {labels[i]: runs[labels[i]] for i in thinned(len(labels), most).tolist()}
 
 
-def _cell_label(results: Results, cell: int, without: str | None = None) -> str:
+def _cell_label(results: Results, cell: int, without: str = "") -> str:
     """The levels of a cell's factors in words."""
     factors = results.study.factors
     levels = {name: factors[name][at[cell]] for name, at in _index(results).items() if name != without}
     return ", ".join(level_title(name, level) for name, level in levels.items())
 
 
-def _levels(results: Results, factor: str | None) -> list[str]:
+def _levels(results: Results, factor: str) -> list[str]:
     return [level_text(level) for level in results.study.factors[factor]] if factor else ["all trials"]
