@@ -42,15 +42,15 @@ def draw(plot: Plot, axes: Any = None, size: tuple[float, float] = (6.4, 4.2), *
     if not any(marks.box[1] for marks in plot.marks):
         axes.grid(True, which="major", alpha=0.3)
     axes.set_axisbelow(True)
-    if plot.title:
-        axes.set_title(plot.title, fontsize=9)
     if plot.square:
         axes.set_aspect("equal")
     handles, labels = axes.get_legend_handles_labels()
     if legend and labels:
-        of_shades = next((marks.name for marks in plot.marks if marks.limits), None)
-        style = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 9, "title": of_shades}
-        axes.legend(handles, labels, ncols=_columns(labels), frameon=False, **style)
+        title = "\n".join(filter(None, (plot.title, *(marks.name for marks in plot.marks if marks.limits))))
+        style = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 9, "title_fontsize": 9}
+        axes.legend(handles, labels, ncols=_columns(labels), frameon=False, title=title, **style)
+    elif plot.title:
+        axes.set_title(plot.title, fontsize=9)
     return axes
 
 
