@@ -82,12 +82,11 @@ def simulate(
         469.0416 mm
     """
     noise = _noise(noise, encoder_arcsec, seating, resolution_arcsec, linear_resolution)
-    resolution = _Resolution(resolution_arcsec * ARCSEC, linear_resolution)
     if not is_single(arm):
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
     check_finite(arm=arm, noise=noise)
     noise.check_joints(arm.joints)
-    warmth = _Temperatures(arm, temperature, seed)
+    temperatures = _checked_temperatures(arm, temperature)
     simulated = items_of(observations, "observations")
     if not isinstance(sockets, Mapping) or not (sockets or simulated):
         raise InputError("simulate needs at least one socket with its position.")
@@ -95,92 +94,80 @@ def simulate(
     arm, noise = to_numpy((arm, noise))
     points = {name: socket_point(name, point) for name, point in sockets.items()}
     counts = _counts(points, poses)
+    linear = np.zeros(arm.joints, dtype=bool) if arm.geometry.kinds is None else arm.geometry.kinds.mask()
+    step = np.where(linear, linear_resolution, resolution_arcsec * ARCSEC)
+    recorder = _Recorder(arm, noise, limits_array, step, temperatures, random_generator(seed))
     reach_key, seat_key, encoder_key, length_key = jax.random.split(random_key(seed), 4)
-    owner = [name for name, count in counts.items() for _ in range(count)]
-    rows = np.array([np.asarray(point) for point in points.values()]).reshape(-1, 3)
-    exact = np.repeat(rows, list(counts.values()), axis=0)
-    targets = exact + noise.seating * random_numbers("normal", seat_key, exact.shape)
+    places = np.array([np.asarray(point) for point in points.values()]).reshape(-1, 3)
+    exact = np.repeat(places, list(counts.values()), axis=0)
     references = _reference_lengths(points, lengths, length_key)
-    labels = [f"socket '{name}'" for name in owner]
-    angles = warmth.configurations(arm, targets, reach_key, limits_array, labels)
-    angles = _read(arm, angles, noise, encoder_key, resolution)
-    others = [
-        _recorded(arm, one, noise, jax.random.fold_in(random_key(seed), number), limits_array, resolution, warmth)
-        for number, one in enumerate(simulated)
-    ]
+    labels = [f"socket '{name}'" for name, count in counts.items() for _ in range(count)]
+    angles = recorder.read(recorder.configurations(arm, exact, reach_key, seat_key, labels), encoder_key)
+    keys = [jax.random.fold_in(random_key(seed), number) for number in range(len(simulated))]
+    others = [recorder.recorded(one, key) for one, key in zip(simulated, keys, strict=True)]
     ends = np.cumsum(list(counts.values()))
     readings = {name: angles[end - count : end] for (name, count), end in zip(counts.items(), ends, strict=True)}
     return Capture(readings, references, others)
 
 
-class _Resolution(NamedTuple):
-    """Of the encoders of revolute joints, rad, and of prismatic ones, mm; 0 for exact ones."""
+class _Recorder(NamedTuple):
+    """How a simulated arm holds points, and what its encoders show."""
 
-    angular: float
-    linear: float
-
-
-def _read(
-    arm: Arm, q: Float[AnyArray, "m n"], noise: Noise, key: Array, resolution: _Resolution
-) -> Float[np.ndarray, "m n"]:
-    """What the encoders show; a thermometer is exact."""
-    kinds, q, temperature = arm.geometry.kinds, q[:, : arm.joints], q[:, arm.joints :]
-    q = np.asarray(q + noise.of_readings(kinds) * random_numbers("normal", key, q.shape))
-    linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()
-    step = np.where(linear, resolution.linear, resolution.angular)
-    q = np.where(step > 0, np.round(q / np.where(step > 0, step, 1.0)) * step, q)
-    return np.concatenate([q, temperature], axis=1)
-
-
-class _Temperatures:
-    """The temperatures of an arm with a thermometer; without one, nothing."""
-
-    def __init__(self, arm: Arm, given: Numbers | None, seed: int):
-        if given is not None and not arm.thermometer:
-            raise InputError("a temperature is given, but the arm has no thermometer; make it with thermometer=True.")
-        self._range = np.asarray(as_floats(REFERENCE_TEMPERATURE if given is None else given, "temperature"))
-        if self._range.shape not in ((), (2,)) or np.any(np.diff(np.atleast_1d(self._range)) < 0):
-            raise InputError("temperature must be one number, or the lowest and the highest; C.")
-        check_temperatures("the simulation", self._range)
-        self._columns, self._random = int(arm.thermometer), random_generator(seed)
+    arm: Arm
+    noise: Noise
+    limits: Float[np.ndarray, "n 2"]
+    step: Float[np.ndarray, " n"]  # readings are multiples of it, rad and mm; 0 for exact ones
+    temperatures: Float[np.ndarray, " 2"]  # the lowest and the highest, C
+    random: np.random.Generator  # of temperatures
 
     def configurations(
-        self, arm: Arm, targets: Float[AnyArray, "m 3"], key: Array, limits: np.ndarray, labels: Sequence[str]
-    ) -> Float[np.ndarray, "m n"]:
-        """Random configurations at the targets, with the temperature of each."""
-        low, high = np.broadcast_to(self._range, (2,))
-        temperature = self._random.uniform(low, high, (len(labels), self._columns))
-        joints = np.zeros((len(labels), arm.joints))
-        scale = length_scale(arm.geometry, np.concatenate([joints, temperature], axis=1))
-        angles = random_configurations(arm, targets / scale[:, None], key, limits, labels=labels)
+        self, holding: Arm, points: Float[np.ndarray, "m 3"], reach_key: Array, seat_key: Array, labels: Sequence[str]
+    ) -> Float[np.ndarray, "m columns"]:
+        """Random configurations of an arm at points, where the seat lets it be; with the temperature of each."""
+        targets = points + self.noise.seating * random_numbers("normal", seat_key, points.shape)
+        low, high = self.temperatures
+        temperature = self.random.uniform(low, high, (len(labels), int(holding.thermometer)))
+        at_zero = np.concatenate([np.zeros((len(labels), holding.joints)), temperature], axis=1)
+        targets = targets / length_scale(holding.geometry, at_zero)[:, None]
+        angles = random_configurations(holding, targets, reach_key, self.limits, labels=labels)
         return np.concatenate([angles, temperature], axis=1)
 
+    def read(self, q: Float[np.ndarray, "m columns"], key: Array) -> Float[np.ndarray, "m columns"]:
+        """What the encoders show; a thermometer is exact."""
+        angles, temperature = q[:, : self.arm.joints], q[:, self.arm.joints :]
+        errors = self.noise.of_readings(self.arm.geometry.kinds) * random_numbers("normal", key, angles.shape)
+        shown = np.asarray(angles + errors)
+        step = np.where(self.step > 0, self.step, 1.0)
+        return np.concatenate([np.where(self.step > 0, np.round(shown / step) * step, shown), temperature], axis=1)
 
-def _recorded(
-    arm: Arm,
-    simulated: AbstractSimulated,
-    noise: Noise,
-    key: Array,
-    limits: np.ndarray,
-    resolution: _Resolution,
-    warmth: _Temperatures,
-) -> AbstractObservation:
-    """One simulated observation."""
-    if not isinstance(simulated, AbstractSimulated):
-        raise InputError(
-            f"{simulated!r} cannot be simulated; give one of aj.data.observations, such as SimulatedSphere."
-        )
-    reach_key, seat_key, encoder_key, own_key = jax.random.split(key, 4)
-    random = np.random.default_rng(np.asarray(jax.random.key_data(own_key)))
-    holding = arm if simulated.offset is None else to_numpy(arm.replace(probe=simulated.offset))
-    exact = simulated.tips(random)
-    seated = exact + noise.seating * random_numbers("normal", seat_key, exact.shape)
-    labels = [f"observation '{simulated.name}'"] * len(exact)
-    angles = warmth.configurations(holding, seated, reach_key, limits, labels)
-    transforms = np.asarray(holding.pose(angles)).copy()
-    # An instrument sees the tip where it is; what is owed to the seat moves the tip, and not what it is compared with.
-    transforms[:, :3, 3] = exact
-    return simulated.recorded(_read(arm, angles, noise, encoder_key, resolution), transforms, random)
+    def recorded(self, simulated: AbstractSimulated, key: Array) -> AbstractObservation:
+        """One simulated observation."""
+        if not isinstance(simulated, AbstractSimulated):
+            raise InputError(
+                f"{simulated!r} cannot be simulated; give one of aj.data.observations, such as SimulatedSphere."
+            )
+        reach_key, seat_key, encoder_key, own_key = jax.random.split(key, 4)
+        random = np.random.default_rng(np.asarray(jax.random.key_data(own_key)))
+        holding = self.arm if simulated.offset is None else to_numpy(self.arm.replace(probe=simulated.offset))
+        exact = simulated.tips(random)
+        labels = [f"observation '{simulated.name}'"] * len(exact)
+        angles = self.configurations(holding, exact, reach_key, seat_key, labels)
+        # An instrument sees the tip where it is; what is owed to the seat moves the tip, and not what it is compared
+        # with.
+        transforms = np.asarray(holding.pose(angles)).copy()
+        transforms[:, :3, 3] = exact
+        return simulated.recorded(self.read(angles, encoder_key), transforms, random)
+
+
+def _checked_temperatures(arm: Arm, given: Numbers | None) -> Float[np.ndarray, " 2"]:
+    """The lowest and the highest temperature of an arm with a thermometer."""
+    if given is not None and not arm.thermometer:
+        raise InputError("a temperature is given, but the arm has no thermometer; make it with thermometer=True.")
+    values = np.asarray(as_floats(REFERENCE_TEMPERATURE if given is None else given, "temperature"))
+    if values.shape not in ((), (2,)) or np.any(np.diff(np.atleast_1d(values)) < 0):
+        raise InputError("temperature must be one number, or the lowest and the highest; C.")
+    check_temperatures("the simulation", values)
+    return np.broadcast_to(values, (2,))
 
 
 def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any, linear_resolution: Any) -> Noise:

@@ -18,7 +18,7 @@ from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat
 from ..core.errors import InputError, naming
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
 from ..kinematics.body import Body, body_along_links, segment_distance
-from ..kinematics.collisions import Box, Cell, HalfSpace, Obstacle, Post, check_obstacle
+from ..kinematics.collisions import Box, Cell, HalfSpace, Post, check_obstacle
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import total_link_length
 from .arms import load_specification, urdf_folder
@@ -114,23 +114,18 @@ def load_cell(
         >>> print(cell.body.names, [obstacle.name for obstacle in cell.obstacles], cell.clearance)
         ('shoulder', 'upper_arm', 'forearm') ['table'] 20.0
     """
-    content = _CellFile() if file is None else read_toml(file, _CellFile)
-    with contextlib.nullcontext() if file is None else naming(file):
-        obstacles = _obstacles(content)
-        stated = content.body.radius if radius is None else radius
-        body, notes = _body(arm, base, tip, stated, content.body.tool_radius)
-    return LoadedCell(Cell(body, obstacles, content.clearance), notes)
-
-
-def _obstacles(content: Any) -> tuple[Obstacle, ...]:
-    obstacles = (
+    content: Any = _CellFile() if file is None else read_toml(file, _CellFile)
+    obstacles: tuple[Any, ...] = (
         *(HalfSpace(row.name, tuple(row.normal), tuple(row.point)) for row in content.half_space),
         *(Box(row.name, tuple(row.centre), tuple(row.size), tuple(row.rotation)) for row in content.box),
         *(Post(row.name, tuple(row.start), tuple(row.end), row.radius) for row in content.capsule),
     )
-    for obstacle in obstacles:
-        check_obstacle(obstacle)
-    return obstacles
+    with contextlib.nullcontext() if file is None else naming(file):
+        for obstacle in obstacles:
+            check_obstacle(obstacle)
+        stated = content.body.radius if radius is None else radius
+        body, notes = _body(arm, base, tip, stated, content.body.tool_radius)
+    return LoadedCell(Cell(body, obstacles, content.clearance), notes)
 
 
 def _body(
@@ -317,35 +312,20 @@ def mesh_path(file: str, folder: Path) -> Path | None:
     return next((path for path in tried if path.is_file()), None)
 
 
-def mesh_vertices(path: str | os.PathLike) -> Float[np.ndarray, "m 3"]:
-    """The vertices of an STL (binary or text) or OBJ file, in the file's own unit.
-
-    Raises:
-        InputError: It is of another format, or holds no vertices.
-    """
-    content, suffix = InputFile(path).content, os.path.splitext(os.fspath(path))[1].lower()
-    try:
-        if suffix == ".obj":
-            vertices = _numbers_after(content, b"v")
-        elif suffix == ".stl":
-            vertices = _of_stl(content)
-        else:
-            raise InputError(f"{path} is neither STL nor OBJ; export the mesh as one of them.")
-    except ValueError as error:
-        raise InputError(f"{path} has a vertex that is not three numbers; export the mesh again.") from error
+def mesh_vertices(path: Path) -> Float[np.ndarray, "m 3"]:
+    """The vertices of an STL (binary or text) or OBJ file, in the file's own unit."""
+    content, obj = InputFile(path).content, path.suffix.lower() == ".obj"
+    count = int.from_bytes(content[_HEADER - 4 : _HEADER], "little")
+    if not obj and len(content) == _HEADER + count * _TRIANGLE:  # its header may begin with "solid" as that of a text
+        triangles = np.frombuffer(content, dtype=np.uint8, offset=_HEADER).reshape(count, _TRIANGLE)
+        vertices = triangles[:, 12:48].copy().view("<f4").reshape(-1, 3).astype(float)
+    else:
+        word, rows = b"v" if obj else b"vertex", map(bytes.split, content.splitlines())
+        try:
+            numbers = [[float(x) for x in row[1:4]] for row in rows if row and row[0] == word]
+            vertices = np.array(numbers).reshape(-1, 3)
+        except ValueError as error:
+            raise InputError(f"{path} has a vertex that is not three numbers; export the mesh again.") from error
     if not len(vertices) or not np.all(np.isfinite(vertices)):
         raise InputError(f"{path} has no vertices, or some that are not finite; export the mesh again.")
     return np.unique(vertices, axis=0)
-
-
-def _of_stl(content: bytes) -> Float[np.ndarray, "m 3"]:
-    count = int.from_bytes(content[_HEADER - 4 : _HEADER], "little")
-    if len(content) == _HEADER + count * _TRIANGLE:  # also of binary files whose header begins with "solid"
-        triangles = np.frombuffer(content, dtype=np.uint8, offset=_HEADER).reshape(count, _TRIANGLE)
-        return triangles[:, 12:48].copy().view("<f4").reshape(-1, 3).astype(float)
-    return _numbers_after(content, b"vertex")
-
-
-def _numbers_after(content: bytes, word: bytes) -> Float[np.ndarray, "m 3"]:
-    rows = (line.split() for line in content.splitlines())
-    return np.array([[float(x) for x in row[1:4]] for row in rows if row and row[0] == word]).reshape(-1, 3)

@@ -116,7 +116,7 @@ class _Poses(_Recorded):
     sessions: _Sessions | None = None
 
 
-_Manifest = create_model("_Manifest", __base__=_Poses, **FIELDS)
+PosesManifest: type[_Poses] = create_model("PosesManifest", __base__=_Poses, **FIELDS)
 
 
 class PointsManifest(_Recorded):
@@ -134,11 +134,6 @@ class PointsManifest(_Recorded):
                     f"'{entry.name or entry.paths[0]}' has points, which say where the tip was; leave them out."
                 )
         return self
-
-
-def manifest_model() -> type[_Poses]:
-    """What a manifest of poses may state."""
-    return _Manifest
 
 
 def read_manifest(path: str | os.PathLike) -> Recording:
@@ -206,7 +201,7 @@ def readings_of_manifest(path: str | os.PathLike) -> Readings:
 
 
 def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
-    model = read_toml(manifest := InputFile(path), _Manifest)
+    model = read_toml(manifest := InputFile(path), PosesManifest)
     path = as_path(path)
     with naming(path):
         arm = arm_beside(path.parent, model.arm)

@@ -44,7 +44,12 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     """Read a TOML file into a pydantic model. Raises `InputError` that names the file and the place in it."""
     try:
         text = InputFile(path).text
-        _check_text(path, text)
+        # What would take a parser gigabytes or minutes.
+        if len(text) > _MOST_CHARACTERS:
+            raise InputError(f"{path} has {len(text):,} characters, over {_MOST_CHARACTERS:,}; name a shorter file.")
+        if long_key := _LONG_KEY.search(text):
+            line = text.count("\n", 0, long_key.start()) + 1
+            raise InputError(f"{path} line {line} has a key of more than {_DEEPEST} parts; correct it.")
         content = tomllib.loads(text)
     except InputError:
         raise
@@ -58,16 +63,6 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
         raise InputError(f"{path} holds a number of thousands of digits; correct it.") from error
     _check_content(path, content)
     return validated(model, content, str(path))
-
-
-def _check_text(path: str | os.PathLike, text: str) -> None:
-    """Refuse what would take a parser gigabytes or minutes."""
-    if len(text) > _MOST_CHARACTERS:
-        raise InputError(f"{path} has {len(text):,} characters, and {_MOST_CHARACTERS:,} are the most; name a shorter.")
-    long_key = _LONG_KEY.search(text)
-    if long_key:
-        line = text.count("\n", 0, long_key.start()) + 1
-        raise InputError(f"{path} line {line} has a key of more than {_DEEPEST} parts; correct it.")
 
 
 def _check_content(path: str | os.PathLike, value: Any, place: str = "", depth: int = 0) -> None:

@@ -1,20 +1,26 @@
 """How an arm gets from pose to pose: approach points, the order, whether a move hits anything."""
 
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..core.numpy_or_jax import to_numpy
+from ..kinematics.arm import Arm
 from ..kinematics.collisions import clearances, is_clear, nearest_contact
 from ..kinematics.cones import Cone, cones_of, tilts
 from ..kinematics.correction import readings_at_poses
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.workspace import SearchRegion, lowest_point
-from .pose_order import joint_weights, short_order, travel
 
 _STEP = np.radians(2.0)  # largest step of a joint between samples of a move
 _ROUNDS = 25  # of ordering and checking
+_LEAST_WEIGHT = 0.1
+_BLOCKED = 1e4  # rad: what a move that hits something counts, more than any detour
+_MOST, _MANY = 2000, 150  # poses: beyond the first only nearest neighbours; up to the second every start is tried
+_IMPROVED = 6  # starts that are improved
 
 
 class Motion(NamedTuple):
@@ -140,3 +146,96 @@ def hardly_reached(name: str, point: Float[np.ndarray, " 3"]) -> str:
         f"{name} at ({where}) mm cannot be reached in enough poses within joint limits, cone and obstacles; move it, "
         "widen its cone, shorten retract, or give more candidates."
     )
+
+
+def joint_weights(arm: Arm) -> Float[np.ndarray, " n"]:
+    """What a radian of each joint counts: how much of the arm is beyond it, relative to the most; 0.1 at least."""
+    arm = to_numpy(arm)
+    lengths = np.abs(arm.a) + np.abs(arm.d)
+    beyond = np.cumsum(lengths[::-1])[::-1] + np.linalg.norm(arm.probe)
+    beyond = beyond - np.abs(arm.d)  # along its own axis a joint moves nothing
+    return np.maximum(beyond / max(beyond.max(), 1e-9), _LEAST_WEIGHT)
+
+
+def travel(q: Float[np.ndarray, "N n"], weights: Float[np.ndarray, " n"]) -> float:
+    """Weighted sum of what the joints move from each configuration to the next, rad."""
+    return float(np.abs(np.diff(q, axis=0) @ np.diag(weights)).sum())
+
+
+def short_order(
+    q: Float[np.ndarray, "N n"],
+    groups: Int[np.ndarray, " N"],
+    weights: Float[np.ndarray, " n"],
+    blocked: Iterable[tuple[int, int]] = (),
+) -> list[int]:
+    """An order with little travel in which the poses of a group (a socket) follow each other.
+
+    It is no longer than the given order, group after group. Poses are ordered by nearest neighbours from many starts;
+    of the best, runs are reversed, of poses within their group and of whole groups, until nothing becomes shorter.
+
+    Args:
+        q: The configurations between which the arm moves, rad.
+        groups: The group of each.
+        weights: What a radian of each joint counts.
+        blocked: Pairs between which the arm cannot move directly; they are avoided where possible.
+    """
+    given = np.argsort(groups, kind="stable")
+    if len(q) < 3:
+        return given.tolist()
+    scaled = q * weights
+    if len(q) > _MOST:
+        return min(
+            (given, _nearest(lambda i, rows: np.abs(scaled[rows] - scaled[i]).sum(axis=1), groups, int(given[0]))),
+            key=lambda order: float(np.abs(np.diff(scaled[order], axis=0)).sum()),
+        ).tolist()
+    cost = np.zeros((len(q) + 1, len(q) + 1))  # the last one stands for what is before the first and after the last
+    for i in range(len(q)):
+        cost[i, :-1] = np.abs(scaled - scaled[i]).sum(axis=1)
+    for i, j in blocked:
+        cost[i, j] += _BLOCKED
+        cost[j, i] += _BLOCKED
+    starts = range(len(q)) if len(q) <= _MANY else [int(np.argmin(np.abs(scaled).sum(axis=1)))]
+    orders = [_nearest(lambda i, rows: cost[i, rows], groups, start) for start in starts]
+    orders = [given, *sorted(orders, key=lambda order: _length(cost, order))[:_IMPROVED]]
+    best = min((_reversed(cost, order, groups) for order in orders), key=lambda order: _length(cost, order))
+    return best.tolist()
+
+
+def _length(cost: Float[np.ndarray, "M M"], order: Int[np.ndarray, " N"]) -> float:
+    return float(cost[order[:-1], order[1:]].sum())
+
+
+def _nearest(cost_from, groups: Int[np.ndarray, " N"], start: int) -> Int[np.ndarray, " N"]:
+    """From pose to nearest pose; a group is left when none of it is left."""
+    left = np.ones(len(groups), dtype=bool)
+    order = [start]
+    left[start] = False
+    while left.any():
+        of_group = left & (groups == groups[order[-1]])
+        rows = np.flatnonzero(of_group if of_group.any() else left)
+        order.append(int(rows[np.argmin(cost_from(order[-1], rows))]))
+        left[order[-1]] = False
+    return np.array(order)
+
+
+def _reversed(
+    cost: Float[np.ndarray, "M M"], order: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"]
+) -> Int[np.ndarray, " N"]:
+    """2-opt: for each place the best run from there is reversed, of one group or of whole groups, until nothing becomes
+    shorter."""
+    none, before = len(order), np.inf
+    while _length(cost, order) < before - 1e-9:
+        before = _length(cost, order)
+        for i in range(len(order) - 1):
+            path, group, j = np.concatenate([[none], order, [none]]), groups[order], np.arange(i + 1, len(order))
+            begins = i == 0 or group[i - 1] != group[i]
+            ends = np.append(group[1:] != group[:-1], True)[j]
+            possible = (group[j] == group[i]) | (begins & ends)
+            first, last = path[i + 1], path[j + 1]
+            change = cost[path[i], last] + cost[first, path[j + 2]] - cost[path[i], first] - cost[last, path[j + 2]]
+            change = np.where(possible, change, np.inf)
+            best = int(np.argmin(change))
+            if change[best] < -1e-9:
+                end = int(j[best]) + 1
+                order = np.concatenate([order[:i], order[i:end][::-1], order[end:]])
+    return order

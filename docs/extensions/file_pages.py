@@ -24,7 +24,7 @@ from aacmm_jax.study import specification
 FOLDER = DOCS / "reference" / "files"
 # Page: title, what it is for, the model that reads it.
 FORMATS: dict[str, tuple[str, str, type[BaseModel]]] = {
-    "manifest": ("Manifest of a capture", "`aacmm import FILE`, `aj.files.read_manifest`", manifest.manifest_model()),
+    "manifest": ("Manifest of a capture", "`aacmm import FILE`, `aj.files.read_manifest`", manifest.PosesManifest),
     "points": ("Manifest of points", "`aacmm evaluate FILE`, `aj.files.read_points`", manifest.PointsManifest),
     "arm": ("Arm", "an arm of every command, `aj.load_arm`", arm_tables.ArmFile),
     "study": ("Study", "`aacmm study FILE`, `aj.study.read_study`", specification.Specification),

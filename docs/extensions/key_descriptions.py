@@ -163,7 +163,7 @@ DESCRIPTIONS = {
     # Where one key is several things
     "IdentificationTable.start": "The nominal arm, or random within the bounds.",
     "Certificate.end": "Last day of the calibration.",
-    "_Manifest.points": "Points that an instrument measured.",
+    "PosesManifest.points": "Points that an instrument measured.",
     "_Kit.points": "An instrument that measures points.",
     "Distribution.normal": "Standard deviation of a normal distribution.",
     "_Box.rotation": "Rotation vector, rad.",

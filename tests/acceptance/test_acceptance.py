@@ -254,7 +254,7 @@ def test_limits_that_cannot_be_are_refused(texts, said):
         ),
         (
             lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probe", (PLACE + AXES,), 25.0),))),
-            "must be one of",
+            "test of sphere 'S' is 'probe'; did you mean 'probing'?",
         ),
         (
             lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probing", (AXES, AXES[:3]), 25.0),))),

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import aacmm_jax as aj
-from aacmm_jax.planning import pose_order
-from aacmm_jax.planning.pose_order import joint_weights, short_order, travel
+from aacmm_jax.planning import motion
+from aacmm_jax.planning.motion import joint_weights, short_order, travel
 from tests.example_counts import example_count
 
 WEIGHTS = np.array([1.0, 0.5, 0.1])
@@ -51,7 +51,7 @@ def test_a_blocked_move_is_avoided_where_there_is_another_way():
 
 
 def test_many_poses_are_ordered_by_nearest_neighbours(monkeypatch):
-    monkeypatch.setattr(pose_order, "_MOST", 20)
+    monkeypatch.setattr(motion, "_MOST", 20)
     q, owner = problem(0, 60, 3)
     order = short_order(q, owner, WEIGHTS)
     assert sorted(order) == list(range(60))
