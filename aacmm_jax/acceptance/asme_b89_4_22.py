@@ -13,7 +13,7 @@ from ..core.errors import InputError, naming
 from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
 from .geometry import LEAST_SPREAD, LEFT_OR_RIGHT, elbow_sides, least_turn
-from .influences import Influences
+from .judgement import ASME_B89_4_22, Influences
 from .lengths import deviation_metrics, distinct_lengths, length_readings, values_by_artefact
 from .procedure_items import (
     OutOfReach,
@@ -33,10 +33,9 @@ from .requirements import (
     Origin,
     Requirement,
     StandardTest,
-    all_directions,
-    different_positions,
     groups_of_touches,
     groups_where,
+    of_bars,
     of_spheres,
     sphere_size,
     spheres_for,
@@ -46,7 +45,6 @@ from .requirements import (
 )
 from .results import Measured, Metric, metric_value, percent
 from .spheres import points_of, size_error
-from .standards import ASME_B89_4_22
 
 ZONES = {"near": (0.0, 0.2), "middle": (0.2, 0.8), "far": (0.8, 1.0)}  # fractions of the reach
 BARS = ((0.5, 0.75), (1.2, 1.5))  # fractions of the reach
@@ -213,8 +211,8 @@ TESTS = (
         (
             Requirement("two bars, each in 5 positions or more", *_BACKGROUND, _two_bars_lacking),
             Requirement("bars of 50 to 75 % and of 120 to 150 % of the reach", *_BACKGROUND, _bar_lengths_lacking),
-            different_positions(_POSITIONS, False, _READING),
-            all_directions(False, _READING),
+            of_bars("positions", _POSITIONS, _READING),
+            of_bars("directions", 1, _READING),
             spread_places(False, LEAST_SPREAD, _READING),
             RANGE_STATED,
             CALIBRATED,

@@ -12,7 +12,7 @@ import numpy as np
 from ..core.arrays import Numbers
 from ..core.errors import naming
 from .geometry import LEAST_SPREAD, unit_rows
-from .influences import Influences
+from .judgement import ISO_10360_12, Influences
 from .lengths import length_readings
 from .procedure_items import PlannedItems, PlannedSphere, ProcedureRegion, bar_items, socket_in_zone, touch_item
 from .requirements import (
@@ -21,11 +21,8 @@ from .requirements import (
     RANGE_STATED,
     Requirement,
     StandardTest,
-    all_directions,
-    different_positions,
     groups_of_touches,
-    lengths_given,
-    readings_of_each,
+    of_bars,
     sphere_positions,
     sphere_size,
     spheres_for,
@@ -35,7 +32,6 @@ from .requirements import (
 )
 from .results import Measured, Metric, metric_value
 from .spheres import EXACT_POINTS, enclosing_sphere, fit_sphere, size_error
-from .standards import ISO_10360_12
 
 _PROBING_POINTS, _ORIENTATIONS, _ORIENTATION_POINTS = 25, 5, 5
 _LENGTHS, _POSITIONS, _REPEATS = 5, 7, 3
@@ -192,10 +188,10 @@ TESTS = (
         _LENGTH_ERROR,
         _length_metrics,
         (
-            lengths_given(_LENGTHS, ("as in ISO 10360-2 (a maker's public summary: 5 gauges)", "background")),
-            different_positions(_POSITIONS, True, ("as in ISO 10360-2 (the same: 7 directions)", "own reading")),
-            readings_of_each(_REPEATS, ("as in ISO 10360-2 (the same: 3 times)", "background")),
-            all_directions(True, ("as in ISO 10360-2, with diagonals of the volume", "own reading")),
+            of_bars("lengths", _LENGTHS, ("as in ISO 10360-2 (a maker's public summary: 5 gauges)", "background")),
+            of_bars("positions of each", _POSITIONS, ("as in ISO 10360-2 (the same: 7 directions)", "own reading")),
+            of_bars("readings", _REPEATS, ("as in ISO 10360-2 (the same: 3 times)", "background")),
+            of_bars("directions of each", 1, ("as in ISO 10360-2, with diagonals of the volume", "own reading")),
             spread_places(True, LEAST_SPREAD, ("the lengths are to sample the volume", "own reading")),
             RANGE_STATED,
             Requirement(

@@ -44,10 +44,7 @@ def check_recording(specification: Any, recording: Any, manifest: Path | None) -
         from ..files.reading_checks import compare_reading_sets, reading_sets_sentence
 
         sets = with_spinner("Calibrating", lambda: compare_reading_sets(manifest, recording))
-        summary["reading_sets"] = [
-            {"role": table.role, "lines": list(table.lines), "rms_mm": table.rms, "taken": table.taken}
-            for table in sets
-        ]
+        summary["reading_sets"] = sets
         summary["reading_sets_sentence"] = reading_sets_sentence(sets, check.poses)
     return summary
 

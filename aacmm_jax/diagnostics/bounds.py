@@ -17,32 +17,26 @@ def test(case: Case) -> list[Finding]:
         return []
     traded = {name for trade_off in case.once(determined).trade_offs for name in trade_off.names}
     findings = []
-    for weak in (True, False):
+    for code, weak in (("weak-on-bounds", True), ("on-bounds", False)):
         names = [name for name in sides if (name in traded) == weak]
+        if not names:
+            continue
         texts = shorten([f"{name} ({sides[name]})" for name in names])
+        finding = (
+            Finding(
+                code,
+                f"On a bound because the data hardly determine them: {texts}.",
+                "The width of the bounds is part of their uncertainties.",
+                "Fix one parameter of each combination named below (--held), and do not widen the bounds.",
+            )
+            if weak
+            else Finding(
+                code,
+                f"On a bound: {texts}.",
+                "Every uncertainty, that of k too, takes these values as exact.",
+                "Widen the bounds unless they are known limits.",
+            )
+        )
         doubt = f"on a bound: {shorten(sorted(names), 3)}"
-        if names and weak:
-            findings.append(
-                Finding(
-                    "weak-on-bounds",
-                    f"On a bound because the data hardly determine them: {texts}.",
-                    "The width of the bounds is part of their uncertainties.",
-                    "Fix one parameter of each combination named below (--held), and do not widen the bounds.",
-                    severity="doubt",
-                    doubt=doubt,
-                    concerns=tuple(names),
-                )
-            )
-        elif names:
-            findings.append(
-                Finding(
-                    "on-bounds",
-                    f"On a bound: {texts}.",
-                    "Every uncertainty, that of k too, takes these values as exact.",
-                    "Widen the bounds unless they are known limits.",
-                    severity="doubt",
-                    doubt=doubt,
-                    concerns=tuple(names),
-                )
-            )
+        findings.append(finding._replace(severity="doubt", doubt=doubt, concerns=tuple(names)))
     return findings

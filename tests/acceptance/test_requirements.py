@@ -223,7 +223,7 @@ BROKEN = [
     ("iso", ISO[2], without_length("bar1"), "5 different lengths"),
     ("iso", ISO[2], without_length("bar2/07"), "7 different positions of every length"),
     ("iso", ISO[2], repeated, "7 different positions of every length"),
-    ("iso", ISO[2], fewer_readings, "3 readings in each position are required (one has 2"),
+    ("iso", ISO[2], fewer_readings, "3 readings in each position are required (a position has 2"),
     ("iso", ISO[2], lambda m: bars(m, along(lambda n: (1, 0, 0)), one_bar), "not in one plane"),
     ("iso", ISO[2], lambda m: bars(m, along(lambda n: (math.cos(n), math.sin(n), 0)), one_bar), "not in one plane"),
     ("iso", ISO[2], lambda m: bars(m, to_one_place, one_bar), "scatter by 0.0 %"),
@@ -348,7 +348,7 @@ def test_the_certified_form_and_its_uncertainty_count_in_the_form_error():
 
 @pytest.mark.parametrize("text", ["bar=11.5,1,20,0", "artefact=11.5,1,20", "artefact=a,1,20,0", "arm"])
 def test_expansions_that_cannot_be_read_are_refused(text):
-    from aacmm_jax.acceptance.influences import read_expansions
+    from aacmm_jax.acceptance.judgement import read_expansions
     from tests.refusals import assert_refused
 
     assert_refused(lambda: read_expansions([text]), "--expansion", "artefact=11.5,1,20.8,0.2")

@@ -216,7 +216,7 @@ def test_sessions_have_a_probe_each(aacmm, folder):
     together = json.loads(aacmm("show", "d.h5", "--json").stdout)
     assert together["calibrated"]["rms_mm"] > 0.1
     assert any("Session tuesday contradicts the other sessions" in says for says in together["warnings"])
-    offsets = re.search(r"remounted, displaced by (\S+), (\S+), (\S+) mm", " ".join(together["warnings"]))
+    offsets = re.search(r"probe seems displaced by (\S+), (\S+), (\S+) mm", " ".join(together["warnings"]))
     assert offsets is not None
     np.testing.assert_allclose([float(offset) for offset in offsets.groups()], [0.3, -0.2, 0.1], atol=0.005)
     assert "Sessions, RMS distance of poses" in " ".join(said.split())
