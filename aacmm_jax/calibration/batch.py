@@ -181,9 +181,9 @@ def _in_two_stages(batch: "_Batch", stage1: ManyIdentifications, method: Method)
     anchor, shape = batch.form.anchor, stage1.parameters.shape
     sides = (np.broadcast_to(side, shape) for side in (stage1.bounds.lower, stage1.bounds.upper))
     bounds = Bounds(stage1.space, *sides)
-    division = divided(anchor, bounds, stage1.active, stage1.parameters, stage1.k)
+    parameters, against = divided(anchor, bounds, stage1.active, stage1.parameters, stage1.k)
     # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
-    parameters = np.array(division.parameters, order="C")
+    parameters = np.array(parameters, order="C")
     if method == "joint":
         joint = _of_joint(batch.jointly(np.arange(len(parameters)), parameters), stage1, stage1.k)
         return dataclasses.replace(joint, steps=stage1.steps + joint.steps)
@@ -197,7 +197,7 @@ def _in_two_stages(batch: "_Batch", stage1: ManyIdentifications, method: Method)
         "reason": np.array(numbers_of(stage1.result)),
         "active": np.array(bounds.active(parameters) if anchor.can_scale else stage1.active),
     }
-    rows = np.flatnonzero(division.stands_against)
+    rows = np.flatnonzero(against)
     if len(rows):
         many = batch.jointly(rows, parameters[rows])
         for name in ("parameters", "de", "deltam", "active"):
@@ -205,7 +205,7 @@ def _in_two_stages(batch: "_Batch", stage1: ManyIdentifications, method: Method)
         columns["steps"][rows] += many.steps
         columns["reason"][rows] = numbers_of(many.result)
     result = to_jax(reasons(np.asarray(columns.pop("reason"))))
-    kept = ~np.asarray(division.stands_against)
+    kept = ~np.asarray(against)
     return ManyCalibrations(k=stage1.k, result=result, stage1=stage1, method=method, divided=kept, **columns)
 
 

@@ -166,11 +166,6 @@ class PriorProblem(NamedTuple):
         effective = effective_parameters(model, self.sd(xp.concatenate([scales[:1], variances])))
         return xp.concatenate([self.log_sigma(z, effective), variances])
 
-    def allowed(self, scales: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
-        """Extrapolated scales, those of learned groups not below the least."""
-        least = np.concatenate([[-np.inf], np.where(self.learned, _LEAST_LOG, -np.inf)])
-        return namespace(scales).maximum(scales, least)
-
     def mismatch(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> Float[AnyArray, " s"]:
         """Zero at the fixed point: the equations that `updated` solves."""
         xp, model, sd, variances = namespace(scales, z), self.model(scales, z), self.sd(scales), scales[1:]
@@ -309,6 +304,7 @@ def _settled(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[Any
     none = xp.zeros((), dtype=np.int64)
     # Constants of differentiation, which passes through the fixed point alone.
     constant, begin = stop_gradient((problem, z))
+    least = np.concatenate([[-np.inf], np.where(problem.learned, _LEAST_LOG, -np.inf)])
 
     def again(state: _Rounds) -> _Rounds:
         solution = constant.fit(state.scales, state.z, differentiable=False)
@@ -317,7 +313,7 @@ def _settled(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[Any
         change = xp.max(xp.abs(new - state.scales))
         # Few data can lead to and fro between two sets of scales.
         damped = xp.where(state.count < _UNDAMPED, new, 0.5 * (new + state.scales))
-        after = xp.where(change < _NEAR, constant.allowed(history.extrapolated()), damped)
+        after = xp.where(change < _NEAR, xp.maximum(history.extrapolated(), least), damped)
         evaluations = state.evaluations + solution.steps
         return _Rounds(state.count + 1, after, solution.parameters, evaluations, change, history)
 

@@ -274,24 +274,20 @@ def _reason(calibration: Calibration | Identification) -> str:
     stage1 = calibration.stage1
     result = calibration.result if bool(stage1.converged) else stage1.result
     sentence, number = Reason[result], int(member_numbers(result))
-    together = _trading_off(calibration) if number in (MAX_STEPS, STALLED) else []
-    if len(together) < 2:
-        return sentence
-    return f"{sentence.partition(';')[0]}; {', '.join(together)} trade off: hold one of them, or give it a prior."
-
-
-def _trading_off(calibration: Calibration | Identification) -> list[str]:
-    """The parameters of the combination that is known best beside what is known of each: those that slide along each
-    other where a solve does not end, the first most; none where they are hardly correlated."""
     covariance = np.asarray(calibration.covariance)
     sd = np.sqrt(np.diag(covariance))
     moving = np.flatnonzero(sd > 0)
-    if not len(moving) or not np.all(np.isfinite(covariance)):
-        return []
+    if number not in (MAX_STEPS, STALLED) or not len(moving) or not np.all(np.isfinite(covariance)):
+        return sentence
+    # The combination that is known best beside what is known of each parameter: where a solve does not end, these slide
+    # along each other, the first most.
     values, vectors = np.linalg.eigh(covariance[np.ix_(moving, moving)] / sd[moving] / sd[moving, None])
     share = np.abs(vectors[:, 0])
     leading = [i for i in np.argsort(-share)[:_MOST_NAMED] if share[i] > _LEAST_SHARE * share.max()]
-    return [calibration.space.names[moving[i]] for i in leading] if values[0] < _CORRELATED else []
+    if values[0] >= _CORRELATED or len(leading) < 2:
+        return sentence
+    together = ", ".join(calibration.space.names[moving[i]] for i in leading)
+    return f"{sentence.partition(';')[0]}; {together} trade off: hold one of them, or give it a prior."
 
 
 @checked_arguments

@@ -86,18 +86,14 @@ def ends_between(
     )
 
 
-class Division(NamedTuple):
-    """The parameters of stage 1 divided by k."""
-
-    parameters: Float[AnyArray, "*batch p"]
-    stands_against: Bool[AnyArray, "*batch"]  # whether a bound or a fixed length does not allow it
-
-
-def divided(anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], parameters: Any, k: Any) -> Division:
-    """Of one problem or of a batch; ``active`` is what was on a bound in stage 1."""
+def divided(
+    anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], parameters: Any, k: Any
+) -> tuple[Float[AnyArray, "*batch p"], Bool[AnyArray, "*batch"]]:
+    """The parameters of stage 1 divided by k, of one problem or of a batch, and whether a bound or a fixed length
+    stands against that; ``active`` is what was on a bound in stage 1."""
     space = bounds.space
     if not anchor.can_scale:
-        return Division(parameters, namespace(parameters).zeros(parameters.shape[:-1], dtype=bool))
+        return parameters, namespace(parameters).zeros(parameters.shape[:-1], dtype=bool)
     xp, scaled = namespace(parameters, k), divide_lengths(space, parameters, k, anchor.partners)
     lengths = np.broadcast_to(divisible(space), scaled.shape)
     below, above = _on_bounds(anchor, bounds, active, scaled)
@@ -108,7 +104,7 @@ def divided(anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"],
     lower, upper = bounds.lower, bounds.upper
     inside = xp.clip(scaled, lower, upper)
     inside = xp.where(inside - lower <= _ROUNDING, lower, xp.where(upper - inside <= _ROUNDING, upper, inside))
-    return Division(xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled), against)
+    return xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled), against
 
 
 def _on_bounds(
@@ -137,18 +133,10 @@ def against_division(calibration: Calibration) -> tuple[str, ...]:
     return tuple(names)
 
 
-class DividedUncertainty(NamedTuple):
-    """Of the divided parameters, mm and rad."""
-
-    covariance: Float[AnyArray, "p p"]
-    components: Components | None
-    rows: list[Float[AnyArray, "p _ _"]]  # how they follow the whitened rows of every block
-
-
 def divided_uncertainty(
     solution: Solution, measured: MeasuredScale, parameters: Float[AnyArray, " p"]
-) -> DividedUncertainty:
-    """Of parameters that were divided by k.
+) -> tuple[Float[AnyArray, "p p"], Components | None, list[Float[AnyArray, "p _ _"]]]:
+    """Covariance of parameters that were divided by k, its parts, and how they follow the whitened rows of every block.
 
     x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_lengths`), so
     dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
@@ -165,4 +153,4 @@ def divided_uncertainty(
         STATED: (measured.variance_of_lengths * of_k, np.inf),
         DISAGREEMENT: (measured.scale.surplus * of_k, max(len(measured.by_lengths) - 1, 1)),
     }
-    return DividedUncertainty(solution.covariance_of(rows) + measured.added * of_k, Components.of(parts), rows)
+    return solution.covariance_of(rows) + measured.added * of_k, Components.of(parts), rows

@@ -11,6 +11,7 @@ Example, of the parameters of stage 1 and their standard uncertainties:
     solution.identification.parameters, jnp.sqrt(jnp.diag(solution.identification.covariance))
 """
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -136,6 +137,10 @@ def concluded(
         task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent
     )
     after = repeatability_of(state, task.observed, state.sigma)
+    # Of all equations, or of poses where each has a variance of its own.
+    spare = float(task.observed.equations - p - count)
+    if task.noise_model == "robust":
+        spare *= task.observed.q.shape[0] / task.observed.equations
     identification = Identification(  # pyright: ignore[reportCallIssue] - `stage1` is itself
         arm=task.bounds.space.arm(parameters),
         parameters=parameters,
@@ -153,21 +158,11 @@ def concluded(
         bounds=task.bounds,
         anchor=task.anchor,
         noise_model=task.noise_model,
-        fitted_degrees_of_freedom=_degrees_of_freedom(task, p + count),
+        fitted_degrees_of_freedom=math.inf if task.noise_model == "given" else max(spare, 1.0),
         observed=observed,
         prior_metrics=None if of_prior is None else of_prior.metrics,
     )
     return Solution(identification, linear, influence, covariances, reading, state)
-
-
-def _degrees_of_freedom(task: Task, unknowns: int) -> float:
-    """Of a noise model: of all equations, or of poses where each has a variance of its own."""
-    if task.noise_model == "given":
-        return float("inf")
-    spare = float(task.observed.equations - unknowns)
-    if task.noise_model == "robust":
-        spare *= task.observed.q.shape[0] / task.observed.equations
-    return max(spare, 1.0)
 
 
 def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: State) -> Noise:

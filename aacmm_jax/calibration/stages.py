@@ -106,19 +106,15 @@ def _of_bounds(task: Task, solution: Solution, capture: Capture) -> Float[AnyArr
         return xp.zeros((size, size))
     active = solution.identification.active[free]
     if capture.lengths and not (xp is np and not np.any(active)):
-        linear = _with_lengths(task, solution, capture)
+        # The linearisation of stage 1 with reference lengths besides.
+        observed, p = Observed.of(capture, task.bounds.space.base), len(free)
+        parts = linear.observed.split(linear.z[p:])
+        z = xp.concatenate([linear.z[:p], *(parts[name] for name in observed.blocks)])
+        weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "loss": task.loss}
+        linear = Linearisation.at(observed, linear.space, z, least=_LEAST_U, **weighing)
     box = Bounds(task.space, task.bounds.lower[free], task.bounds.upper[free])
     added = of_active_bounds(linear, active, box, solution.state.sigma)
     return set_at(xp.zeros((size, size)), np.ix_(free, free), added)
-
-
-def _with_lengths(task: Task, solution: Solution, capture: Capture) -> Linearisation:
-    """The linearisation of stage 1 with reference lengths besides."""
-    observed, old, p = Observed.of(capture, task.bounds.space.base), solution.linear, len(task.free)
-    parts = old.observed.split(old.z[p:])
-    z = namespace(old.z).concatenate([old.z[:p], *(parts[name] for name in observed.blocks)])
-    weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "loss": task.loss}
-    return Linearisation.at(observed, old.space, z, least=_LEAST_U, **weighing)
 
 
 def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
@@ -126,9 +122,9 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     task, solution, measured, of_bounds = stage1
     assert measured is not None
     identification, bounds = solution.identification, task.bounds
-    division = divided(task.anchor, bounds, identification.active, identification.parameters, measured.scale.value)
-    parameters = division.parameters
-    uncertainty = divided_uncertainty(solution, measured, parameters)
+    k = measured.scale.value
+    parameters, against = divided(task.anchor, bounds, identification.active, identification.parameters, k)
+    covariance, components, rows = divided_uncertainty(solution, measured, parameters)
     linear = _at_divided(task, solution, parameters)
     state = state_at(task, linear.space, linear.z)
     after = repeatability_of(state, task.observed, state.sigma)
@@ -140,7 +136,7 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
         deltam=after.deltam,
         active=bounds.active(parameters),
         parameter_covariance=identification.parameter_covariance._replace(
-            matrix=uncertainty.covariance + of_bounds, components=uncertainty.components
+            matrix=covariance + of_bounds, components=components
         ),
         after=after,
         observed=_divided_metrics(solution, measured, linear),
@@ -148,9 +144,15 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     calibration = _calibration(task, capture, identification, result, "two-stage", True)
 
     def sensitivities() -> Sensitivities:
-        return Sensitivities.of(linear, uncertainty.rows, _of_lengths(solution, capture))
+        # Of measured lengths by the tips, where the arm is given and positions are means: with the inverse of the
+        # head's information 0, the parameters follow nothing, and only the positions do.
+        influence = solution.influence._replace(inverse=np.zeros_like(solution.influence.inverse))
+        found, observed, p = solution.linear, solution.linear.observed, len(solution.linear.space.names)
+        _, pull = observed.distances(np.asarray(found.z)[p:], ends_of(capture))
+        of_lengths = _by_tips(found, rows_of_functions(influence, *observed.by_unknowns(pull, p)))
+        return Sensitivities.of(linear, rows, of_lengths)
 
-    return Stages(calibration, sensitivities, division.stands_against)
+    return Stages(calibration, sensitivities, against)
 
 
 def _calibration(
@@ -216,22 +218,13 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
     )
 
 
-def _of_lengths(solution: Solution, capture: Capture) -> Float[np.ndarray, "l 3 M"]:
-    """Derivatives of the measured lengths by the tips, where the arm is given and positions are means."""
-    # With the inverse of the head's information 0, the parameters follow nothing: only the positions do.
-    linear, influence = solution.linear, solution.influence._replace(inverse=np.zeros_like(solution.influence.inverse))
-    observed, p = linear.observed, len(linear.space.names)
-    _, pull = observed.distances(np.asarray(linear.z)[p:], ends_of(capture))
-    return _by_tips(linear, rows_of_functions(influence, *observed.by_unknowns(pull, p)))
-
-
 def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str) -> Stages:
     """Everything that the capture holds in one least squares; ``stage1`` is where lengths alone fix the scale."""
     # The divided arm is near the solution, and saves most of the steps.
     near = None
     if stage1 is not None and stage1.measured is not None:
         first, k = stage1.identification, stage1.measured.scale.value
-        near = divided(stage1.task.anchor, task.bounds, first.active, first.parameters, k).parameters
+        near = divided(stage1.task.anchor, task.bounds, first.active, first.parameters, k)[0]
     solution = solve(task, near)
     result = _with_bounds(solution.identification, _of_bounds(task, solution, capture))
     first = result

@@ -184,7 +184,12 @@ def arrow_of(
             if block.of != number:
                 continue
             if block.by_own is None:
-                c, d, g = (total + part for total, part in zip((c, d, g), _of_points(block), strict=True))
+                # Coordinates less those of their point: B is minus the identity at every pose, so that these are sums
+                # over the poses of a socket.
+                assert block.by_head is not None
+                c = c - xp.moveaxis(sums_over_sockets(block.by_head, block.sizes), (0, 1, 2), (2, 1, 0))
+                d = d + np.asarray(block.sizes, dtype=float)[:, None, None] * np.eye(block.white.shape[0])
+                g = g - sums_over_sockets(block.white, block.sizes).T
                 continue
             if block.by_head is not None:
                 c = c + sums_by_component(block.by_own, block.by_head, block.sizes)
@@ -195,16 +200,6 @@ def arrow_of(
         own.append(d)
         slopes.append(g)
     return Arrow(head, tuple(crossed), tuple(own)), slopes
-
-
-def _of_points(block: RowBlock) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """C, D and B w of rows that are coordinates less those of their point."""
-    assert block.by_head is not None
-    xp = namespace(block.white)
-    # B is minus the identity at every pose, so that these are sums over the poses of a socket.
-    crossed = -xp.moveaxis(sums_over_sockets(block.by_head, block.sizes), (0, 1, 2), (2, 1, 0))
-    own = xp.asarray(np.asarray(block.sizes, dtype=float)[:, None, None] * np.eye(block.white.shape[0]))
-    return crossed, own, -sums_over_sockets(block.white, block.sizes).T
 
 
 def _shifts(block: RowBlock) -> Float[AnyArray, "h _"]:
