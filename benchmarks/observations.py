@@ -7,7 +7,6 @@
 """
 
 import argparse
-import dataclasses
 import datetime
 import itertools
 import json
@@ -80,9 +79,7 @@ class Trials:
         self.space, self.bounds = space, aj.Bounds.around(self.nominal, space)
         self.true = aj.perturbed_arm(space, length=1.0, angle=np.deg2rad(0.1), seed=1)
         # Of a pair each kind has half of its poses, so that a pair has about as many as a kind alone.
-        self.simulated = [
-            dataclasses.replace(one, poses=-(-one.poses // len(chosen))) for kind in chosen for one in SIMULATED[kind]
-        ]
+        self.simulated = [one.changed(poses=-(-one.poses // len(chosen))) for kind in chosen for one in SIMULATED[kind]]
         exact = aj.simulate(self.true, {}, observations=self.simulated, noise=aj.Noise(), seed=3)
         self.exact = []
         for one, observation in zip(self.simulated, exact.observations, strict=True):

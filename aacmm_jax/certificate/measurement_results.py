@@ -18,8 +18,9 @@ from ..kinematics.parameters import Parameters
 from ..summaries.calibration import prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.degrees_of_freedom import LEVEL
 from . import xml_elements as xml
-from .xml_elements import LEVEL, MILLIMETRE, ONE, RADIAN, element, english, named, optional, real, text
+from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, optional, real, text
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
 _METRICS = {

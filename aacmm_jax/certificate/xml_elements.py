@@ -13,9 +13,9 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from ..files.administrative_data import NOT_STATED, Contact
+from ..uncertainty.degrees_of_freedom import LEVEL
 
 DCC, SI, XSI = "https://ptb.de/dcc", "https://ptb.de/si", "http://www.w3.org/2001/XMLSchema-instance"
-LEVEL = 0.95  # coverage probability of every expanded uncertainty
 MILLIMETRE, RADIAN, ONE, CELSIUS = r"\milli\metre", r"\radian", r"\one", r"\degreecelsius"
 
 Child = Element | str | None | Iterable[Any]  # whose items are children, too

@@ -1,46 +1,16 @@
-"""What all commands share: the application, checks of what was typed, and how results are printed."""
+"""What all commands share: the application, and how results are printed."""
 
-import contextlib
-import inspect
 import json
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import typer
-import typer.core
 
 from ..core.backend import prepare_command
-from ..core.errors import InputError
-from ..core.text import in_short, is_number, printable, quoted
-
-
-class _Commands(typer.core.TyperGroup):
-    """The commands; what typer says of wrong options is printable and no longer than people read."""
-
-    def make_context(self, *arguments: Any, **options: Any) -> Any:
-        with _said_in_short():
-            return super().make_context(*arguments, **options)
-
-    def invoke(self, ctx: Any) -> Any:
-        with _said_in_short():
-            return super().invoke(ctx)
-
-
-@contextlib.contextmanager
-def _said_in_short() -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:
-        message = getattr(error, "message", "")  # of typer's exceptions; that of several lines is the help
-        if isinstance(message, str) and "\n" not in message:
-            error.message = printable(in_short(message))  # pyright: ignore[reportAttributeAccessIssue]
-        raise
-
+from ..core.text import printable
 
 app = typer.Typer(
-    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -111,35 +81,6 @@ def _printable(item: Any) -> Any:
     if isinstance(item, dict):
         return {_printable(key): _printable(value) for key, value in item.items()}
     return [_printable(value) for value in item] if isinstance(item, list | tuple) else item
-
-
-def check_numbers(arguments: Sequence[str]) -> None:
-    """Refuse values of numeric options that only Python takes for numbers (1_0, digits of other scripts), and NaN."""
-    command = next((info.callback for info in app.registered_commands if arguments[:1] == [_name(info)]), None)
-    if command is None:
-        return
-    numeric = set()
-    for name, parameter in inspect.signature(command).parameters.items():
-        kinds = {parameter.annotation, *get_args(parameter.annotation)}
-        if {int, float} & {kind for outer in kinds for kind in (outer, *get_args(outer))}:
-            numeric |= set(parameter.default.param_decls or [f"--{name.replace('_', '-')}"])
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        name, equals, value = word.partition("=")
-        value = value if equals else following
-        if name in numeric and _is_pythons(value) and not (is_number(value) and math.isfinite(float(value))):
-            raise InputError(f"{name} {quoted(value)} is not a finite number; write plain decimal digits.")
-
-
-def _name(info: Any) -> str:
-    return info.name or info.callback.__name__.replace("_", "-")
-
-
-def _is_pythons(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def warn_of_unusable(calibration: Path, record: Any) -> None:

@@ -114,6 +114,7 @@ def calibrate(
     """
     from ..diagnostics.usability import does_not_fit
     from ..files.calibrations import save_calibration
+    from ..files.joint_models import with_model
     from ..pipeline.capture_calibration import CaptureOptions, calibrate_capture
     from ..summaries.calibration import calibration_summary
 
@@ -144,7 +145,7 @@ def calibrate(
             check_format(figure)
         recording = _recording(capture, same_probe)
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
-        nominal = _with_model(recording.nominal, model)
+        nominal = recording.nominal if model is None else with_model(recording.nominal, model)
         nominal = _bounded(nominal, (held, free), length_bound_mm, angle_bound_deg, bound or [])
         chosen = chosen._replace(prior=_prior(nominal, prior, model))
         record = calibrate_capture(recording._replace(nominal=nominal), **chosen._asdict())
@@ -174,14 +175,6 @@ def _recording(files: Sequence[Path], same_probe: bool) -> Any:
             raise InputError(f"two captures have the name '{file.stem}', which names their session; rename one.")
         sessions[file.stem] = recording._replace(sources=(fingerprint(read), *recording.sources))
     return join_recordings(sessions, same_probe=same_probe)
-
-
-def _with_model(nominal: Any, model: str | None) -> Any:
-    if model is None:
-        return nominal
-    from ..files.joint_models import with_model
-
-    return with_model(nominal, model)
 
 
 def _bounded(

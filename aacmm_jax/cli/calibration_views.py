@@ -81,12 +81,14 @@ def arm(summary: dict[str, Any]) -> View:
 
 def _corrections(rows: Sequence[Mapping[str, Any]]) -> View:
     """The coefficients of an arm's corrections that are known, and what the others are."""
-    known = [row for row in rows if row["value"] != 0]
-    if known:
-        units = [people_read_change(row["unit"]) if row["unit"] == "rad" else people_read(row["unit"]) for row in known]
+    calibrated = [row for row in rows if row["value"] != 0]
+    if calibrated:
+        units = [
+            people_read_change(row["unit"]) if row["unit"] == "rad" else people_read(row["unit"]) for row in calibrated
+        ]
         cells = [
             (row["coefficient"], f"{scale * row['value']:.4g}", unit, row["of"])
-            for row, (scale, unit) in zip(known, units, strict=True)
+            for row, (scale, unit) in zip(calibrated, units, strict=True)
         ]
         yield listed("Joint corrections", cells, ("coefficient", "value", "unit", ""))
     zero: dict[str, list[str]] = {}

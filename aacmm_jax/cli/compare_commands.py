@@ -16,8 +16,6 @@ from .app import app, examples, show_summary, with_spinner
 from .calibration_views import View
 from .options import argument, option
 
-_COLUMNS = 9  # calibrations side by side
-
 
 @app.command(
     epilog=examples(
@@ -59,7 +57,10 @@ def compare(
         check_format(figure)
     with together(figure, csv):
         records = [load_calibration(file) for file in files]
-        created = [record.recording.measured or _created(file) for record, file in zip(records, files, strict=True)]
+        created = [
+            record.recording.measured or read_tables(file, ("calibration",)).attributes["created"]
+            for record, file in zip(records, files, strict=True)
+        ]
         labels = [str(file) for file in files]
         settings = {"level": level, "length": length_mm, "labels": labels}
         trend = with_spinner("Comparing", lambda: _compared(records, created, settings))
@@ -105,14 +106,9 @@ def _compared(records: list, created: list[str], settings: dict[str, Any]) -> An
     return Trend((old, new), (0, 1), (drift,))
 
 
-def _created(file: Path) -> str:
-    """When a calibration's file was made."""
-    return read_tables(file, ("calibration",)).attributes["created"]
-
-
 def comparison(summary: dict[str, Any]) -> View:
     """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
-    new, old = (f"{summary[which]} ({_day(summary[f'{which}_created'])})" for which in ("new", "old"))
+    new, old = (f"{summary[which]} ({summary[f'{which}_created'][:10]})" for which in ("new", "old"))
     yield [Styled(summary["arm"]), f": {new} against {old}"]
     yield from warnings_of(summary)
     yield from summary["findings"]
@@ -126,14 +122,17 @@ def comparison(summary: dict[str, Any]) -> View:
     )
     if len(summary["trend"]) > 2:
         yield _trend(summary["trend"])
-        yield from _changes(summary["trend"])
+        yield "The change of every parameter from the first calibration: --csv, --json, --figure."
     yield from limits_of(summary)
     yield from written_of(summary)
 
 
 def _parameters(summary: dict[str, Any]) -> View:
     """Values to the digits that the uncertainty of their change allows, changes in small units: um, arcsec."""
-    names, rows = _listed([summary["parameters"]]), []
+    # Of hundreds of harmonics, those that moved.
+    names = {row["parameter"] for row in summary["parameters"] if row["moved"]}
+    names |= {row["parameter"] for row in listed_apart(summary["parameters"])[0]}
+    rows = []
     for row in (row for row in summary["parameters"] if row["parameter"] in names):
         (factor, unit), (fine, small_unit) = people_read(row["unit"]), people_read_change(row["unit"])
         expanded = row["expanded"]
@@ -151,12 +150,6 @@ def _parameters(summary: dict[str, Any]) -> View:
         yield f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv."
 
 
-def _listed(tables: list[list[dict[str, Any]]]) -> set[str]:
-    """Names of the parameters to print: of hundreds of harmonics, those that moved."""
-    moved = {row["parameter"] for rows in tables for row in rows if row["moved"]}
-    return moved | {row["parameter"] for row in listed_apart(tables[0])[0]}
-
-
 def _trend(calibrations: list[dict[str, Any]]) -> Table:
     rows = []
     for i, row in enumerate(calibrations, start=1):
@@ -166,31 +159,7 @@ def _trend(calibrations: list[dict[str, Any]]) -> Table:
             probability = "-" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
             numbers = (lengths[key] for key in ("rms_mm", "rms_by_chance_mm", "largest_mm"))
             cells = [row["moved"], probability, *numbers, number(lengths["mean_um_per_m"], 1, signed=True)]
-        rows.append((str(i), row["calibration"], _day(row["created"]), *cells))
+        rows.append((str(i), row["calibration"], row["created"][:10], *cells))
     headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
     title = "Each calibration against the first (whose own error is in all of them)"
     return listed(title, rows, (*headings, "mean [um/m]"))
-
-
-def _changes(calibrations: list[dict[str, Any]]) -> View:
-    """Change of every parameter from the first calibration; of many calibrations, the last ones."""
-    shown = list(enumerate(calibrations, start=1))[1:][-_COLUMNS:]
-    title = "Change from the first calibration (*: beyond its uncertainty)"
-    if len(calibrations) - 1 > len(shown):
-        title += f", the last {_COLUMNS}; --csv and --json have all"
-    names, rows = _listed([row["parameters"] for _, row in shown]), []
-    marks = {True: "*", False: " ", None: "?"}
-    for of_parameter in zip(*(row["parameters"] for _, row in shown), strict=True):
-        name = of_parameter[0]["parameter"]
-        if name in names:
-            fine, unit = people_read_change(of_parameter[0]["unit"])
-            changes = (fine * row["change"] for row in of_parameter)
-            texts = (Cell(f"{x:+.1f}{marks[row['moved']]}", x) for x, row in zip(changes, of_parameter, strict=True))
-            rows.append((name, unit, *texts))
-    yield listed(title, rows, ("parameter", "unit", *(str(i) for i, _ in shown)))
-    if any(row["moved"] is None for _, entry in shown for row in entry["parameters"]):
-        yield "?: without an uncertainty, since it is fixed, on a bound or not determined in one of the two."
-
-
-def _day(moment: str) -> str:
-    return moment[:10]

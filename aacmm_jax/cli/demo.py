@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import evaluate
-from ..calibration.record import CalibrationRecord, record_of
+from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.extras import MissingExtra, require
 from ..core.text import shorten
-from ..data.capture import Capture
+from ..data.noise import Noise
 from ..data.recording import Recording
 from ..data.simulation import simulate
 from ..files.arms import load_specification, save_arm, usual_noise
@@ -20,19 +20,19 @@ from ..files.captures import load_capture, save_capture
 from ..files.inputs import fingerprint
 from ..files.outputs import together
 from ..kinematics.parameters import ArmSpecification, perturbed_arm
-from ..pipeline.single import calibrate
+from ..pipeline.capture_calibration import calibrate_capture
 from ..summaries.calibration import calibration_summary, capture_summary
 
+_ARM, _TRUE = "cheng2018-simulation", ", true"  # what the name of the true arm ends in
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
-_ENCODER_ARCSEC, _SEATING_MM, _LENGTH_U_MM = 2.0, 0.005, 0.002
+_NOISE = Noise(encoder_arcsec=2.0, seating=0.005)
+_LENGTH_U_MM = 0.002
+_SOCKETS, _POSES = {"A": (400.0, 200.0, 300.0), "B": (700.0, 500.0, 500.0)}, {"A": 70, "B": 10}
+_CHECKS, _CHECK_MM = 30, 300.0
 _DATA = ("capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml")
 _FIGURE, _REPORT = "calibration.png", "report.html"
 _EXTRAS = {_FIGURE: "plot", _REPORT: "report"}  # what these files need
 _FILES = (*_DATA, *_EXTRAS)
-_ARM = "cheng2018-simulation"
-_TRUE = ", true"  # what the name of the true arm ends in
-_CHECKS, _CHECK_MM = 30, 300.0
-_START, _END = (400.0, 200.0, 300.0), (700.0, 500.0, 500.0)
 
 
 def run(folder: Path, seed: int) -> dict[str, Any]:
@@ -55,31 +55,31 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
 
 def _left_out() -> dict[str, str]:
     """The files whose extra is not installed, and what is said of each."""
-    found = {}
+    missing = {}
     for name, extra in _EXTRAS.items():
         try:
             require(extra, name)
         except MissingExtra as error:
-            found[name] = str(error)
-    return found
+            missing[name] = str(error)
+    return missing
 
 
 def _prepare(folder: Path, true_name: str) -> None:
     """Make the folder, or make sure that all that is in it was left by an earlier demonstration."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        found = {item.name for item in folder.iterdir() if not item.name.endswith(".part")}
+        there = {item.name for item in folder.iterdir() if not item.name.endswith(".part")}
     except OSError as error:
         raise InputError(
             f"{folder} cannot be used as a folder: {(error.strerror or str(error)).lower()}; name another."
         ) from error
-    foreign = sorted(found - set(_FILES))
-    if not foreign and found:
+    foreign = sorted(there - set(_FILES))
+    if not foreign and there:
         try:
             true = load_capture(folder / _FILES[0]).true
         except InputError:
             true = None
-        foreign = [] if true is not None and true.name == true_name else sorted(found)
+        foreign = [] if true is not None and true.name == true_name else sorted(there)
     if foreign:
         raise InputError(
             f"{folder} holds files that are not of a demonstration ({shorten(foreign)}); name a new or an empty folder."
@@ -87,29 +87,17 @@ def _prepare(folder: Path, true_name: str) -> None:
 
 
 def _made(folder: Path, nominal: ArmSpecification, seed: int, *, figure: bool) -> dict[str, Any]:
-    bounds = nominal.bounds()
-    true = nominal._replace(
-        arm=perturbed_arm(bounds.space, length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed),
-        name=nominal.name + _TRUE,
-    )
-    capture = simulate(
-        true.arm,
-        {"A": _START, "B": _END},
-        poses={"A": 70, "B": 10},
-        lengths=[("A", "B", _LENGTH_U_MM)],
-        encoder_arcsec=_ENCODER_ARCSEC,
-        seating=_SEATING_MM,
-        seed=seed,
-    )
+    drawn = perturbed_arm(nominal.space(), length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed)
+    true = nominal._replace(arm=drawn, name=nominal.name + _TRUE)
+    lengths = [("A", "B", _LENGTH_U_MM)]
+    capture = simulate(true.arm, _SOCKETS, poses=_POSES, lengths=lengths, noise=_NOISE, seed=seed)
     recording = Recording(capture, nominal, true, seed, usual=usual_noise(_ARM))
     save_capture(folder / "capture.h5", recording, capture_summary(recording))
-    recording = recording._replace(sources=(fingerprint(folder / "capture.h5"),))
-    record = record_of(calibrate(nominal.arm, capture, bounds), recording)
+    record = calibrate_capture(recording._replace(sources=(fingerprint(folder / "capture.h5"),)))
     whole = calibration_summary(record)
     save_calibration(folder / "calibration.h5", record, whole)
-    save_arm(nominal.arm, folder / "nominal.toml", name=nominal.name)
-    save_arm(true.arm, folder / "true.toml", name=true.name)
-    save_arm(record.calibrated.arm, folder / "calibrated.toml", name=record.calibrated.name)
+    for file, specification in (("nominal", nominal), ("true", true), ("calibrated", record.calibrated)):
+        save_arm(specification.arm, folder / f"{file}.toml", name=specification.name)
     if figure:
         from ..plot import save_calibration_figure
 
@@ -120,7 +108,6 @@ def _made(folder: Path, nominal: ArmSpecification, seed: int, *, figure: bool) -
 def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:
     """RMS error of lengths that were not used, all over the volume, measured with the same noise by each arm."""
     random = np.random.default_rng(seed)
-    assert record.recording.true is not None
     sockets = {}
     for i in range(_CHECKS):
         middle = np.array([500.0, 300.0, 400.0]) + random.uniform(-250, 250, 3)
@@ -128,15 +115,9 @@ def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:
         half = 0.5 * _CHECK_MM * direction / np.linalg.norm(direction)
         sockets[f"{i}-"], sockets[f"{i}+"] = tuple(middle - half), tuple(middle + half)
     pairs = [(f"{i}-", f"{i}+") for i in range(_CHECKS)]
-    capture: Capture = simulate(
-        record.recording.true.arm,
-        sockets,
-        poses=1,
-        lengths=pairs,
-        encoder_arcsec=_ENCODER_ARCSEC,
-        seating=_SEATING_MM,
-        seed=seed + 1,
-    )
+    assert record.recording.true is not None
+    true = record.recording.true.arm
+    capture = simulate(true, sockets, poses=1, lengths=pairs, noise=_NOISE, seed=seed + 1)
     arms = {"nominal": record.recording.nominal, "stage1": record.stage1, "calibrated": record.calibrated}
     return {
         stage: float(np.sqrt(np.mean(np.asarray(evaluate(specification.arm, capture).error) ** 2)))
@@ -152,8 +133,8 @@ def _summary(record: CalibrationRecord, whole: dict[str, Any], checks: dict[str,
         "more_poses": record.recording.capture.sizes[1],
         "deviation_mm": _DEVIATION_MM,
         "deviation_deg": _DEVIATION_DEG,
-        "encoder_arcsec": _ENCODER_ARCSEC,
-        "seating_um": 1e3 * _SEATING_MM,
+        "encoder_arcsec": float(_NOISE.encoder_arcsec),
+        "seating_um": 1e3 * float(_NOISE.seating),
         "length_mm": float(length.value),
         "length_u_um": 1e3 * _LENGTH_U_MM,
         "checks": _CHECKS,

@@ -20,7 +20,14 @@ def argument(metavar: str, help: str, default: Any = ...) -> Any:
 def option(metavar: str | None, help: str, *names: str, default: Any = None, **limits: Any) -> Any:
     """An option of a command: the word for its value (None: its choices), what it does, and its names if they are not
     the parameter's."""
-    return typer.Option(default, *names, metavar=metavar, help=help, **limits)
+    return typer.Option(default, *names, metavar=metavar, help=help, callback=_finite, **limits)
+
+
+def _finite(ctx: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
+    """Refuse numbers that are not finite, which limits do not."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{param.opts[0]} '{value}' is not a finite number; write plain decimal digits.")
+    return value
 
 
 def flag(name: str, help: str) -> Any:

@@ -15,10 +15,9 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 class PlannedArm(NamedTuple):
     """What plans assume of an arm, by its file and the options."""
 
-    options: dict[str, Any]  # of `planning.plan` and `planning.plan_kit`
+    options: Any  # `PlanOptions`
     cone: Any  # of `planning.plan`: a `Cone`, or socket name -> `Cone`
-    noise_source: str
-    notes: tuple[str, ...]
+    stated: dict[str, Any]  # of the plan's summary: where the noise comes from, and notes
 
 
 def assumed_noise(
@@ -57,24 +56,21 @@ def planned_arm(
     """
     from ..data.arm_classes import CLASSES
     from ..files.cells import load_cell
+    from ..planning.options import PlanOptions
 
     assumed = assumed_noise(arm, links, noise)
-    default = CLASSES[assumed.arm_class]
     file, wanted, radius = cell
     loaded = load_cell(arm, file, **links, radius=radius) if wanted or file is not None or radius is not None else None
     sign, axis = (-1.0, tool_axis[1:]) if tool_axis.startswith("-") else (1.0, tool_axis)
     if axis not in _AXES:
         bad_option("--tool-axis", tool_axis, "x, y, z, -x, -y or -z")
+    options = PlanOptions.usual(assumed)._replace(
+        tool_axis=tuple(sign * x + 0.0 for x in _AXES[axis]), cell=None if loaded is None else loaded.cell
+    )
     return PlannedArm(
-        {
-            "noise": assumed.noise,
-            "tool_axis": tuple(sign * x + 0.0 for x in _AXES[axis]),
-            "cell": None if loaded is None else loaded.cell,
-            "retract": default.retract if retract is None else retract,
-        },
-        _cones(*cones, default.cone, sockets),
-        assumed.source,
-        () if loaded is None else loaded.notes,
+        options if retract is None else options._replace(retract=retract),
+        _cones(*cones, CLASSES[assumed.arm_class].cone, sockets),
+        {"noise_source": assumed.source, "notes": [] if loaded is None else list(loaded.notes)},
     )
 
 

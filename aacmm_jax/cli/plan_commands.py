@@ -149,7 +149,10 @@ def plan(
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
+    from ..files.kits import read_kit
     from ..files.plans import kit_csv, kit_manifest, plan_csv, plan_manifest, procedure_csv, procedure_manifest
+    from ..planning.design import plan as run
+    from ..planning.kit import plan_kit
     from ..summaries.planning import kit_plan_summary, plan_summary, procedure_summary
     from . import evaluation_views, plan_views
 
@@ -172,47 +175,36 @@ def plan(
     points = _given_sockets(socket, sockets, length, region)
     names = list(points) or [chr(ord("A") + i) for i in range(min(sockets or _SOCKETS, 26))]
     with together(output, manifest):
+        things = None if kit is None else read_kit(kit)
         assumed = planned_arm(
             arm, links, (encoder_arcsec, seating_mm, linear_encoder_mm), (cone_deg, normal), tool_axis, retract_mm,
             (cell, collisions, link_radius_mm), names,
         )  # fmt: skip
-    shared: dict[str, Any] = {
-        "poses": poses,
-        "region": _region(region),
-        "farthest": _FARTHEST if farthest is None else farthest,
-        "space": specification.space(),
-        "criterion": criterion,
-        "margin": margin_deg * DEG,
-        "above": above_mm,
-        "candidates": candidates,
-        "check_length": check_length_mm,
-        "unconstrained": unconstrained,
-        "seed": seed,
-        **assumed.options,
-    }
-    stated = {"noise_source": assumed.noise_source, "notes": list(assumed.notes), "angles": angles, "model": model}
-    if kit is not None:
-        planned = _planned_kit(specification.arm, kit, output, manifest, shared)
-        summary = kit_plan_summary(planned, specification.name) | stated
-        summary["written"] = files.write(planned, kit_csv, kit_manifest)
-        show_summary(summary, as_json, plan_views.kit_plan)
-        return
-    from ..planning.design import plan as run
-
-    with plan_views.progress() as report_progress:
-        planned = run(
-            specification.arm,
-            sockets=points or sockets or _SOCKETS,
-            length=_range(length_mm),
-            u=u_mm,
-            lengths=[length_option(text) for text in length or ()],
-            cone=assumed.cone,
-            **shared,
-            progress=report_progress,
-        )
-    summary = plan_summary(planned, specification.name) | stated
-    summary["written"] = files.write(planned, plan_csv, plan_manifest)
-    show_summary(summary, as_json, plan_views.plan)
+    chosen = assumed.options._replace(
+        space=specification.space(),
+        criterion=criterion,
+        region=_region(region),
+        farthest=_FARTHEST if farthest is None else farthest,
+        margin=margin_deg * DEG,
+        above=above_mm,
+        unconstrained=unconstrained,
+        candidates=candidates,
+        check_length=check_length_mm,
+        seed=seed,
+    )
+    planned: Any
+    with plan_views.progress() as progress:
+        settings = {"poses": poses, **chosen._replace(progress=progress)._asdict()}
+        if things is not None:
+            planned, made = plan_kit(specification.arm, things, **settings), (kit_plan_summary, kit_csv, kit_manifest)
+        else:
+            placed = {"sockets": points or sockets or _SOCKETS, "length": _range(length_mm), "u": u_mm}
+            placed |= {"lengths": [length_option(text) for text in length or ()], "cone": assumed.cone}
+            planned, made = run(specification.arm, **placed, **settings), (plan_summary, plan_csv, plan_manifest)
+    summarise, table, manifest_of = made
+    stated = assumed.stated | {"angles": angles, "model": model}
+    summary = summarise(planned, specification.name) | stated | {"written": files.write(planned, table, manifest_of)}
+    show_summary(summary, as_json, plan_views.plan if kit is None else plan_views.kit_plan)
 
 
 def _specification(arm: str, links: Mapping[str, Any], held: str | None, model: str | None) -> Any:
@@ -260,17 +252,6 @@ def _given_sockets(
     if region and socket:
         raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
     return sockets_option(socket)
-
-
-def _planned_kit(arm: Any, kit: Path, output: Path, manifest: Path | None, options: Mapping[str, Any]) -> Any:
-    from ..files.kits import read_kit
-    from ..planning.kit import plan_kit
-    from .plan_views import progress
-
-    with together(output, manifest):
-        things = read_kit(kit)
-    with progress() as report_progress:
-        return plan_kit(arm, things, **options, progress=report_progress)
 
 
 class _Files(NamedTuple):

@@ -44,10 +44,7 @@ def check_recording(specification: Any, recording: Any, manifest: Path | None) -
         from ..files.reading_checks import compare_reading_sets, reading_sets_sentence
 
         sets = with_spinner("Calibrating", lambda: compare_reading_sets(manifest, recording))
-        summary["reading_sets"] = [
-            {"role": table.role, "lines": list(table.lines), "rms_mm": table.rms, "taken": table.taken}
-            for table in sets
-        ]
+        summary["reading_sets"] = sets
         summary["reading_sets_sentence"] = reading_sets_sentence(sets, check.poses)
     return summary
 
@@ -93,8 +90,8 @@ def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any
         frame = np.linalg.inv(urdf_chain(specification.urdf).base)
         positions = positions @ frame[:3, :3].T + frame[:3, 3]
         rotations = None if rotations is None else frame[:3, :3] @ rotations
-    known = {"sockets": table.sockets, "positions": positions, "rotations": rotations}
-    check = with_spinner("Comparing", lambda: check_readings(specification.arm, table.q, **known))
+    tips = {"sockets": table.sockets, "positions": positions, "rotations": rotations}
+    check = with_spinner("Comparing", lambda: check_readings(specification.arm, table.q, **tips))
     if positions is not None:
         capture = Capture({}, observations=[MeasuredPoints("table", table.q, positions, station="table")])
     else:

@@ -12,8 +12,10 @@ from typing import Any
 
 from ..core.errors import InputError
 from ..files.outputs import together
+from ..summaries.tables import Styled
 from . import INTERRUPTED, INTERRUPTED_SENTENCE, options
 from .app import Stopped, app, examples, show_summary, with_spinner
+from .calibration_views import View
 from .options import argument, flag, option, output
 
 
@@ -182,7 +184,6 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
     from ..plot import save_study_figures
     from ..study.results import Results
     from ..study.statistics import study_summary
-    from . import study_views
 
     results = Results.of(file)
     if cell is not None and cell > len(results.study.cells):
@@ -192,4 +193,27 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
         with together():
             paths = with_spinner("Drawing", lambda: save_study_figures(results, figures))
         summary["figures_written"] = [str(path) for path in paths]
-    show_summary(summary, as_json, study_views.study if cell is None else study_views.one_cell)
+    show_summary(summary, as_json, study_view)
+
+
+def study_view(summary: dict[str, Any]) -> View:
+    """What people see of a study, or of one cell with every parameter."""
+    from ..study.tables import cell_table, metric_tables, parameter_table
+
+    yield [
+        Styled(summary["name"] or "Study"),
+        f" of {summary['arm']}: {summary['cells']} cells of {summary['trials']:,} trials, seed {summary['seed']}",
+    ]
+    if not summary["finished"]:
+        yield [Styled("Not finished:", "yellow"), f" {summary['trials_run']:,} trials so far."]
+    if any(cell["trials_run"] for cell in summary["results"]):
+        yield cell_table(summary)
+        yield from metric_tables(summary)
+        yield "Length and angle error: the largest of all parameters."
+        if len(summary["results"]) == 1:
+            yield parameter_table(summary)
+        else:
+            yield "One cell with every parameter's bias: --cell N. Figures: --figures FOLDER."
+    else:
+        yield "No trial has ended yet."
+    yield from (f"Written: {path}" for path in summary.get("figures_written", ()))

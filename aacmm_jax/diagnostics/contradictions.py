@@ -13,7 +13,7 @@ from ..core.units import DEG
 from ..data.capture import Capture, part_of
 from ..data.observations.socket import Socket
 from .equations import PROBE, Equations, Rows
-from .findings import Case, Finding, case_of
+from .findings import Case, Finding, case_of, chance_text
 from .group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of
 
 ORDER, NEEDS = 30, "scale"
@@ -60,20 +60,17 @@ class Contradiction(NamedTuple):
 
 def test(case: Case) -> list[Finding]:
     """What the calibration left out, and groups that contradict the others; nearly always nothing."""
-    record = case.record
-    removed = [removal(group) for group in record.removed]
-    sessions = len(record.recording.capture.sessions)
-    return removed + [_finding(contradiction, sessions) for contradiction in contradictions_of(record)]
+    removed = [removal(group) for group in case.record.removed]
+    return removed + [_finding(contradiction) for contradiction in case.once(_contradictions)]
 
 
 def removal(removed: Removed) -> Finding:
     """A group that the calibration left out."""
-    probability = "< 0.0001" if removed.probability < 1e-4 else f"= {removed.probability:.2g}"
     first, second = removed.degrees_of_freedom
     return Finding(
         LEFT_OUT,
         f"Left out: {removed.kind} {removed.group}, which contradicts the rest (F = {removed.ratio:.3g} with {first} "
-        f"and {second} degrees of freedom, p {probability}).",
+        f"and {second} degrees of freedom, {chance_text(removed.probability)}).",
         f"Without it, the rest is {removed.rms_without:.3g} mm RMS from its geometry instead of "
         f"{removed.rms_with:.3g} mm, and {removed.changed_most} changed most, by {removed.change:.2g} standard "
         "uncertainties.",
@@ -82,39 +79,32 @@ def removal(removed: Removed) -> Finding:
     )
 
 
-def _finding(contradiction: Contradiction, sessions: int) -> Finding:
+def _finding(contradiction: Contradiction) -> Finding:
     kind, suspects = contradiction
-    concerns = tuple(name for suspect in suspects for name in suspect.members)
-    probability = max(suspect.test.probability for suspect in suspects)
-    remounted = [suspect.cause for suspect in suspects if suspect.cause is not None and suspect.cause.names == PROBE]
-    if kind == "session" and remounted and len(suspects) in (1, sessions):
-        cause, session = remounted[-1], next(s.group for s in reversed(suspects) if s.cause is remounted[-1])
-        return Finding(
-            "probe-remounted",
-            f"Session {session} contradicts the other sessions, and a probe of its own explains "
-            f"{100 * cause.share:.0f} % of that: the probe seems remounted, displaced by {_offset(cause)}.",
-            advice="Calibrate with a probe for each session (without --same-probe).",
-            probability=probability,
-            concerns=concerns,
-        )
-    changes = "; ".join(_change(suspect) for suspect in suspects)
+    cause = suspects[-1].cause
+    remounted = kind == "session" and cause is not None and cause.names == PROBE
+    # Whichever session is the wrong one, the probe of each other one is displaced from it.
+    suspects = suspects[-1:] if remounted else suspects
     options = " or ".join(f"--without '{_pattern(kind, suspect)}'" for suspect in suspects)
-    plural = "indices" if kind == "index" else f"{kind}s"
-    alone = len(suspects) == 1
-    says = (
-        f"{kind.capitalize()} {suspects[0].group} contradicts the other {plural}: {changes}."
-        if alone
-        else f"Some {plural} contradict each other, and the data do not show which of these is wrong: {changes}."
+    changes = "; ".join(
+        f"without {suspect.group}, the others scatter by {suspect.rms_others[1]:.2g} mm RMS instead of "
+        f"{suspect.rms_others[0]:.2g} mm, and it by {suspect.rms[1]:.2g} mm instead of {suspect.rms[0]:.2g} mm"
+        for suspect in suspects
     )
-    as_if = _as_if(suspects[-1].cause, "it" if alone else suspects[-1].group)
+    plural = "indices" if kind == "index" else f"{kind}s"
+    says = (
+        f"{kind.capitalize()} {suspects[0].group} contradicts the other {plural}"
+        if len(suspects) == 1
+        else f"Some {plural} contradict each other, and the data do not show which of these is wrong"
+    )
     return Finding(
         "contradiction",
-        f"{says} {as_if}".rstrip(),
-        advice=f"Check its readings, and calibrate without it ({options})."
-        if alone
-        else f"Check their readings, and calibrate without the wrong one ({options}).",
-        probability=probability,
-        concerns=concerns,
+        f"{says}: {changes}. {_as_if(cause, suspects[-1].group)}".rstrip(),
+        advice="Calibrate with a probe for each session (without --same-probe)."
+        if remounted
+        else f"Check the readings, and calibrate without what is wrong ({options}).",
+        probability=max(suspect.test.probability for suspect in suspects),
+        concerns=tuple(name for suspect in suspects for name in suspect.members),
     )
 
 
@@ -126,26 +116,15 @@ def _pattern(kind: str, suspect: Suspect) -> str:
     return f"{inside}*" if all(name.startswith(inside) for name in suspect.members) else "' '".join(suspect.members)
 
 
-def _change(suspect: Suspect) -> str:
-    others, own = suspect.rms_others, suspect.rms
-    return (
-        f"without {suspect.group}, the others scatter by {others[1]:.2g} mm RMS instead of {others[0]:.2g} mm, and it "
-        f"by {own[1]:.2g} mm instead of {own[0]:.2g} mm"
-    )
-
-
 def _as_if(cause: Cause | None, group: str) -> str:
     if cause is None:
         return ""
     if cause.names == PROBE:
-        return f"In {group}, the probe seems displaced by {_offset(cause)}."
+        offset = ", ".join(f"{value:+.3g}" for value in cause.values)
+        return f"In {group}, the probe seems displaced by {offset} mm (x, y, z of the last frame)."
     kind, joint = cause.names[0].split("_")
     more = f"{-cause.values[0]:+.3g} mm" if kind == "d" else f"{-cause.values[0] / DEG:+.3g} deg"
     return f"In {group}, joint {joint} seems to read {more} more."
-
-
-def _offset(cause: Cause) -> str:
-    return f"{', '.join(f'{value:+.3g}' for value in cause.values)} mm (x, y, z of the last frame)"
 
 
 def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
@@ -164,17 +143,13 @@ def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
     single: dict[str, str | None] = {name: name for name in names}
     # Of equal divisions the first is kept, and it is named in the words of a user.
     divisions |= {"socket": single, "placement": placed} if alone else {"placement": placed, "observation": single}
-    kinds: dict[str, dict[str, str | None]] = {}
-    seen: set[frozenset[frozenset[str]]] = set()
+    kinds: dict[frozenset[frozenset[str]], tuple[str, dict[str, str | None]]] = {}
     for kind, labels in divisions.items():
-        members: dict[str | None, set[str]] = {}
-        for name, label in labels.items():
-            members.setdefault(label, set()).add(name)
-        division = frozenset(frozenset(group) for group in members.values())
-        if set(members) != {None} and len(division) > 1 and division not in seen:
-            kinds[kind] = labels
-            seen.add(division)
-    return kinds
+        groups = dict.fromkeys(labels.values())
+        division = frozenset(frozenset(n for n, label in labels.items() if label == group) for group in groups)
+        if len(division) > 1:
+            kinds.setdefault(division, (kind, labels))
+    return dict(kinds.values())
 
 
 def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:

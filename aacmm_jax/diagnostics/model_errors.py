@@ -24,7 +24,7 @@ from .findings import Case, Finding, case_of, chance_text
 from .length_consistency import Lengths, lengths_of
 from .missing_terms import FoundTerm, explained, missing
 from .noisy_encoders import NoisyJoint, noisiest_joint
-from .residual_tests import LEVEL, FormTest, Residuals, block_diagonal, form_test, pose_form_test
+from .residual_tests import LEVEL, FormTest, Residuals, alike, form_test, in_succession
 
 ORDER, NEEDS = 62, "fit"
 # Of the noise of a class: its members differ by a quarter or so, which is what 8 degrees of freedom say (JCGM 100,
@@ -147,7 +147,7 @@ def noisy_observations(case: Case) -> tuple[NoisyObservation, ...]:
     for name in names:
         sizes = [part.residual.shape if part.name == name else None for part in rows]
         kernels = [None if size is None else np.broadcast_to(np.eye(size[1]), (*size, size[1])) for size in sizes]
-        tests.append((pose_form_test(left, kernels, not given), name))
+        tests.append((form_test(left, kernels, not given), name))
     noisy, tests = [], sorted(tests, key=lambda pair: pair[0].probability)
     for number, (form, name) in enumerate(tests):
         probability = min(form.probability * (len(tests) - number), 1.0)
@@ -162,16 +162,15 @@ def successive_of(case: Case) -> Successive | None:
     if not case.shows_noise:
         return None
     rows = case.chunks[0]
-    # Half a correlation with the pose before, half with the one after: the derivative of the covariance by it.
-    kernel = [np.kron(np.eye(len(part.poses), k=1) + np.eye(len(part.poses), k=-1), np.eye(3)) / 2 for part in rows]
-    if not any(np.any(matrix) for matrix in kernel):
+    # The derivative of the covariance by a correlation with the pose before, and the one after.
+    kernels = [alike(part.by_tip, in_succession(len(part.poses))) for part in rows]
+    if not any(np.any(kernel) for kernel in kernels):
         return None
     left = case.left
     if case.once(missing):
         with_terms, relations = case.once(explained)
         left = Residuals.of([*(part.block("") for part in with_terms), *relations])
-    columns = [block_diagonal(part.by_tip) for part in rows]
-    form = form_test(left, columns, kernel, relative=True)
+    form = form_test(left, kernels, relative=True)
     product = total = 0.0
     for part, own in zip(rows, left.slices, strict=False):
         tips = np.einsum("mrc,mr->mc", part.by_tip, left.values[own].reshape(part.residual.shape))

@@ -194,82 +194,45 @@ class FormTest(NamedTuple):
 Kernels = Sequence[Float[np.ndarray, "_ _ _"] | None]
 
 
-def form_test(
-    left: Residuals, columns: Sequence[np.ndarray | None], kernels: Sequence[np.ndarray | None], relative: bool
-) -> FormTest:
+def form_test(left: Residuals, kernels: Kernels, relative: bool) -> FormTest:
     """Whether a quadratic form r'A r of the residuals is larger than independent errors make it.
 
-    A = Z K Z' part by part, with columns Z (r, c) of the part's rows and symmetric K (c, c), the identity where it is
-    None. Parts without columns, and those that follow, have no part in it. Where it is ``relative``, the form is
-    compared with the variance of all residuals instead of 1.
+    A is block by block: the symmetric ones (m, r, r) of each part stand for its m r rows, one for each pose or one for
+    all (``alike``). Parts without any, and those that follow, have no part in it. Where it is ``relative``, the form
+    is compared with the variance of all residuals instead of 1.
     """
-    return _tested(left, *_value_and_traces(left, columns, kernels), relative)
-
-
-def pose_form_test(left: Residuals, kernels: Kernels, relative: bool) -> FormTest:
-    """The same of a form in which rows of different poses do not meet: r'A r is the sum of r_i' K_i r_i, with the
-    symmetric K of each pose of a part, whose rows follow each other."""
-    return _tested(left, *_value_and_traces_by_pose(left, kernels), relative)
-
-
-def chance_above_zero(left: Residuals, kernels: Kernels) -> float:
-    """Probability that independent errors make a form by pose (as of `pose_form_test`) positive: with A - x B for A,
-    where x is the ratio of r'A r to r'B r that was found, that of a larger ratio."""
-    return _tail(0.0, _value_and_traces_by_pose(left, kernels)[1])
-
-
-def block_diagonal(columns: Float[np.ndarray, "m r c"]) -> Float[np.ndarray, "R C"]:
-    """Columns of single poses, 0 in the rows of all others."""
-    poses, size, width = columns.shape
-    whole = np.zeros((poses, size, poses, width))
-    whole[np.arange(poses), :, np.arange(poses)] = columns
-    return whole.reshape(poses * size, poses * width)
-
-
-def _tested(left: Residuals, value: float, traces: tuple[float, float, float], relative: bool) -> FormTest:
-    spare = left.degrees_of_freedom
+    spare, (value, traces) = left.degrees_of_freedom, _value_and_traces(left, kernels)
+    one, two, three = traces
     if relative:
         # r'A r > x r'r, which is r'(A - x I) r > 0.
         x = value / max(left.cost, 1e-300)
-        one, two, three = traces
         shifted = (one - x * spare, two - 2 * x * one + x**2 * spare)
         shifted = (*shifted, three - 3 * x * two + 3 * x**2 * one - x**3 * spare)
-        probability, expected = _tail(0.0, shifted), traces[0] * left.cost / max(spare, 1)
+        probability, expected = _tail(0.0, shifted), one * left.cost / max(spare, 1)
     else:
-        probability, expected = _tail(value, traces), traces[0]
+        probability, expected = _tail(value, traces), one
     ratio = value / expected if expected > 0 else float("nan")
-    return FormTest(ratio, probability, traces[0] ** 2 / max(traces[1], 1e-300))
+    return FormTest(ratio, probability, one**2 / max(two, 1e-300))
 
 
-def _value_and_traces(
-    left: Residuals, columns: Sequence[np.ndarray | None], kernels: Sequence[np.ndarray | None]
-) -> tuple[float, tuple[float, float, float]]:
-    """r'A r, and the traces of the first powers of MA.
-
-    With W = Z' M Z = V - B B', V of the parts less their own unknowns and B = Z' times the basis, tr (MA)^k is
-    tr (KW)^k. V is block by block, so that only V's blocks and the small products with B are formed.
-    """
-    size = left.basis.shape[1]
-    g, h, h2 = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
-    value = one = two = three = 0.0
-    for rows, basis, part, kernel in zip(left.slices, left.own, columns, kernels, strict=False):
-        if part is None:
-            continue
-        seen, z = basis.T @ part, part.T @ left.values[rows]
-        v, b = part.T @ part - seen.T @ seen, part.T @ left.basis[rows]
-        kv, kb, kz = (v, b, z) if kernel is None else (kernel @ v, kernel @ b, kernel @ z)
-        kv2 = kv @ kv
-        value += float(z @ kz)
-        one, two, three = one + float(np.trace(kv)), two + float(np.trace(kv2)), three + float(np.sum(kv2 * kv.T))
-        g, h, h2 = g + b.T @ kb, h + b.T @ (kv @ kb), h2 + b.T @ (kv2 @ kb)
-    return value, (
-        one - float(np.trace(g)),
-        two - 2 * float(np.trace(h)) + float(np.sum(g * g.T)),
-        three - 3 * float(np.trace(h2)) + 3 * float(np.sum(h * g.T)) - float(np.trace(g @ g @ g)),
-    )
+def alike(columns: Float[np.ndarray, "m r c"], poses: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "1 R R"]:
+    """The block of errors that poses share by some columns each, as much as ``poses`` says of each two."""
+    flat, rows = columns.reshape(-1, columns.shape[2]), columns.shape[1]
+    return (np.kron(poses, np.ones((rows, rows))) * (flat @ flat.T))[None]
 
 
-def _value_and_traces_by_pose(left: Residuals, kernels: Kernels) -> tuple[float, tuple[float, float, float]]:
+def in_succession(poses: int) -> Float[np.ndarray, "m m"]:
+    """For `alike`: half a correlation with the pose before and half with the one after."""
+    return (np.eye(poses, k=1) + np.eye(poses, k=-1)) / 2
+
+
+def chance_above_zero(left: Residuals, kernels: Kernels) -> float:
+    """Probability that independent errors make a form positive: with A - x B for A, where x is the ratio of r'A r to
+    r'B r that was found, that of a larger ratio."""
+    return _tail(0.0, _value_and_traces(left, kernels)[1])
+
+
+def _value_and_traces(left: Residuals, kernels: Kernels) -> tuple[float, tuple[float, float, float]]:
     """r'A r, and the traces of the first powers of MA, with M = I - Q Q' and the columns Q of all unknowns.
 
     With G_k = Q' A^k Q, tr (MA)^2 = tr A^2 - 2 tr G_2 + tr G_1^2, and tr (MA)^3 = tr A^3 - 3 tr G_3 + 3 tr G_1 G_2 -

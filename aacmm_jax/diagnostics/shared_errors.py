@@ -33,7 +33,7 @@ from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import EXACT, PRIOR, Rows, lengths_in_solve, residual_rms
 from .findings import Case
 from .random_effects import NULL, Effects, Moments, OneVariance, group_deviations, one_variance, second_moments
-from .residual_tests import block_diagonal, form_test, score_tests
+from .residual_tests import alike, form_test, in_succession, score_tests
 from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
@@ -200,14 +200,13 @@ class _Tips(NamedTuple):
         return effects.joined(columns, np.full(columns.shape[1], self.learned.variance))
 
 
-def _chance_of_alike(problem: SharedProblem, alike: Callable[[Rows], np.ndarray]) -> float:
-    """Probability that tips of poses err so much alike by chance; ``alike`` says by how much each two poses of one part
+def _chance_of_alike(problem: SharedProblem, pairs: Callable[[Rows], np.ndarray]) -> float:
+    """Probability that tips of poses err so much alike by chance; ``pairs`` says by how much each two poses of one part
     of the rows would, (m, m), with a zero diagonal."""
-    kernels = [np.kron(alike(part), np.eye(3)) for part in problem.rows]
+    kernels = [alike(part.by_tip, pairs(part)) for part in problem.rows]
     if not any(np.any(kernel) for kernel in kernels):
         return 1.0
-    columns = [block_diagonal(part.by_tip) for part in problem.rows]
-    return form_test(problem.left, columns, kernels, problem.record.given_noise is None).probability
+    return form_test(problem.left, kernels, problem.record.given_noise is None).probability
 
 
 def _visits(problem: SharedProblem) -> _Tips:
@@ -223,7 +222,7 @@ def _visits(problem: SharedProblem) -> _Tips:
 
         numbers = [number for number in np.unique(marked) if number >= 0]
         return _Tips(VISITS, _chance_of_alike(problem, same_visit), [(marked[:, None] == numbers).astype(float)])
-    probability = _chance_of_alike(problem, lambda part: _neighbours_in_order(len(part.poses)))
+    probability = _chance_of_alike(problem, lambda part: in_succession(len(part.poses)))
     if not probability < _GATE:
         return _Tips(SUCCESSIVE, 1.0, [])
     most = max(float(np.median([len(part.poses) for part in problem.rows])) / _PART, _LENGTHS[0])
@@ -232,10 +231,6 @@ def _visits(problem: SharedProblem) -> _Tips:
         np.concatenate([_smooth_patterns(part, length, total) for part in problem.rows], axis=1) for length in lengths
     ]
     return _Tips(SUCCESSIVE, probability, patterns, lengths)
-
-
-def _neighbours_in_order(poses: int) -> Float[np.ndarray, "m m"]:
-    return (np.eye(poses, k=1) + np.eye(poses, k=-1)) / 2
 
 
 def _smooth_patterns(part: Rows, length: float, total: int) -> Float[np.ndarray, "M c"]:
@@ -358,9 +353,9 @@ def _chance_of_neighbours(problem: SharedProblem) -> float:
     """Probability that poses of one socket at neighbouring configurations err so much alike by chance."""
     q = np.asarray(problem.record.recording.capture.readings)
 
-    def alike(part: Rows) -> np.ndarray:
+    def near(part: Rows) -> np.ndarray:
         apart = q[part.poses][:, None] - q[part.poses]
         distance = np.sqrt(np.sum(4 * np.sin(apart / 2) ** 2, axis=2))
         return np.exp(-distance / _NEIGHBOURS) - np.eye(len(distance))
 
-    return _chance_of_alike(problem, alike)
+    return _chance_of_alike(problem, near)

@@ -2,6 +2,7 @@
 
 import difflib
 import fnmatch
+import itertools
 import os
 import re
 from collections.abc import Sequence
@@ -49,7 +50,11 @@ def _inside(cell: str) -> str:
 
 
 def _is_unit(cell: str) -> bool:
-    return _inside(cell) in _UNITS or _inside(cell) in _OTHERS
+    return _inside(cell) in {*_UNITS, *_OTHERS}
+
+
+def _nearly_unit(text: str) -> bool:
+    return bool(difflib.get_close_matches(text, _UNITS, n=1, cutoff=_ALIKE))
 
 
 def are_units(cells: list[str], alone: bool) -> bool:
@@ -58,17 +63,10 @@ def are_units(cells: list[str], alone: bool) -> bool:
     ``alone``: there are no names, so that one must be of lengths or angles, as the names of columns may be letters.
     """
     texts = [_inside(cell) for cell in cells if cell]
-    if not texts:
-        return False
-    if all(map(_is_unit, texts)):
+    if texts and all(map(_is_unit, texts)):
         return not alone or any(text in _UNITS for text in texts)
-    return 2 * sum(text in _WORDS for text in texts) > len(texts) or (
-        len(set(texts)) == 1 and len(texts[0]) > 3 and _nearly_unit(texts[0])
-    )
-
-
-def _nearly_unit(text: str) -> bool:
-    return bool(difflib.get_close_matches(text, _UNITS, n=1, cutoff=_ALIKE))
+    misspelt = len(set(texts)) == 1 and len(texts[0]) > 3 and _nearly_unit(texts[0])
+    return misspelt or 2 * sum(text in _WORDS for text in texts) > len(texts)
 
 
 def unit_in(name: str) -> str | None:
@@ -111,9 +109,7 @@ def stem_and_number(name: str) -> tuple[str, int] | None:
 def along_axes(names: Sequence[str]) -> list[int] | None:
     """The places of names in the order w, x, y, z, where they differ in nothing but these; None where they do not."""
     plain = [plain_name(name) for name in names]
-    if len(set(map(len, plain))) > 1:
-        return None
-    letters = [column for column in zip(*plain, strict=True) if len(set(column)) > 1]
+    letters = [column for column in itertools.zip_longest(*plain) if len(set(column)) > 1]
     if len(letters) != 1 or not set(letters[0]) <= set("wxyz") or len(set(letters[0])) < len(names):
         return None
     return [letters[0].index(letter) for letter in sorted(letters[0])]
@@ -153,26 +149,21 @@ def names_of_columns(
     if not names and len(units) > 1:
         names, units = [(0, units[0])], units[1:]
     if len(names) > 1:
-        names = [_recognised(path, names, wanted)]
+        texts = [column for column in wanted if isinstance(column, str)]
+        fitting = [line for line in names if texts and all(matching(line[1], text) for text in texts)]
+        (first, upper), (last, lower) = names[0], names[-1]
+        names = fitting if len(fitting) == 1 else [line for line in names if are_numbered(line[1])]
+        if len(names) != 1:
+            raise InputError(
+                f"{path} has a word for each column in lines {first} ({quoted(shorten(upper, 3))}) and {last} "
+                f"({quoted(shorten(lower, 3))}); add skip = {last - 1} if line {last} names the columns, or leave it "
+                "out."
+            )
     chosen = names[0][1] if names else [""] * width if units else []
     if not units:
         return chosen
     # A unit that nobody knows is refused where its column is picked.
     return [f"{name} [{_inside(cell)}]" if cell else name for name, cell in zip(chosen, units[-1], strict=True)]
-
-
-def _recognised(path: str | os.PathLike, lines: Sequence[Line], wanted: Sequence[Column]) -> Line:
-    """The one line that has all names that are wanted, or numbered ones."""
-    texts = [column for column in wanted if isinstance(column, str)]
-    fitting = [line for line in lines if texts and all(matching(line[1], text) for text in texts)]
-    fitting = fitting if len(fitting) == 1 else [line for line in lines if are_numbered(line[1])]
-    if len(fitting) != 1:
-        (first, above), (last, below) = lines[0], lines[-1]
-        raise InputError(
-            f"{path} has a word for each column in lines {first} ({quoted(shorten(above, 3))}) and {last} "
-            f"({quoted(shorten(below, 3))}); add skip = {last - 1} if line {last} names the columns, or leave it out."
-        )
-    return fitting[0]
 
 
 def are_numbered(names: list[str]) -> bool:
@@ -183,14 +174,14 @@ def are_numbered(names: list[str]) -> bool:
 
 def matching(header: list[str], column: str) -> list[int]:
     """Indices, from 0, of the names that are this one, or match this pattern."""
-    wanted, plain = plain_name(column), [plain_name(name) for name in header]
+    plain = [plain_name(name) for name in header]
     # As it stands first: q[1] is also a pattern, of q1.
-    for names, text in ((header, column), (plain, wanted)):
-        same = [i for i, name in enumerate(names) if name == text]
-        if same:
-            return same
-    exact = [i for i, name in enumerate(header) if fnmatch.fnmatchcase(name, column)]
-    return exact or [i for i, name in enumerate(plain) if fnmatch.fnmatchcase(name, wanted)]
+    for fits in (str.__eq__, fnmatch.fnmatchcase):
+        for names, text in ((header, column), (plain, plain_name(column))):
+            indices = [i for i, name in enumerate(names) if fits(name, text)]
+            if indices:
+                return indices
+    return []
 
 
 def stripped(cells: list[str]) -> list[str]:

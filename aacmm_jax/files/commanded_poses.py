@@ -14,7 +14,7 @@ from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
 from .column_names import Column
 from .manifest_angles import header_units
-from .table_columns import TEMPERATURE, columns_of_joints, find_named, position_columns, reading_columns
+from .table_columns import TEMPERATURE, find_named, position_columns, reading_columns
 from .text_table import TextTable
 
 Columns = tuple[list[int], str | None]  # columns of a quantity, from 0, and the unit that the header states
@@ -160,7 +160,7 @@ def _reading_columns(
         return picked
     position = position_columns(table)
     taken = position[0] if position is not None else []
-    return reading_columns(table, joints, taken, _OPTION) if alone else columns_of_joints(table, joints, taken)[0]
+    return reading_columns(table, joints, taken, _OPTION, required=alone)
 
 
 def _angle_unit(path: str | os.PathLike, header: str | None, stated: str | None) -> str | None:

@@ -104,22 +104,16 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
 def _checked(
     path: str | os.PathLike, table: str, kind: type[AbstractSimulated], stated: dict[str, Any]
 ) -> AbstractSimulated:
-    """The simulated observation, tried once: shapes that do not fit are an `InputError`."""
+    """The simulated observation, tried once, so that what cannot be recorded is refused here."""
     where = f"{path}: [[{table}]] '{stated['name']}'"
     try:
         simulated = kind(**stated)
-        random = np.random.default_rng(0)
-        tips = simulated.tips(random)
-        if tips.ndim != 2 or tips.shape[1] != 3 or not np.all(np.isfinite(tips)):
-            raise ValueError
+        tips = simulated.tips(np.random.default_rng(0))
+        if not np.all(np.isfinite(tips)):
+            raise InputError("numbers that do not fit together, such as two ends in one point; correct them.")
         transforms = np.tile(np.eye(4), (len(tips), 1, 1))
         transforms[:, :3, 3] = tips
-        simulated.recorded(np.zeros((len(tips), 1)), transforms, random)
+        simulated.recorded(np.zeros((len(tips), 1)), transforms, np.random.default_rng(0))
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-    except (ValueError, IndexError, TypeError) as error:
-        raise InputError(
-            f"{where} has numbers that do not fit together; points are [x, y, z], a box two of them, and a frame six "
-            f"numbers (see aj.data.observations.{kind.__name__})."
-        ) from error
     return simulated

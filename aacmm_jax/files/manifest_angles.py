@@ -100,6 +100,7 @@ class Readings:
         self._arm, self._angles = arm, angles
         self._first: tuple[int, str | os.PathLike] | None = None  # columns of readings of the first table, and its file
         self.columns: list[int] = []  # of the joints in the first table, from 1
+        self.header: list[str] = []  # of the first table
         self.angles: Angles | None = None  # with which the first table was read, its header and units considered
 
     def __call__(self, text: TextTable, wanted: Wanted) -> Float[np.ndarray, "N n"]:
@@ -122,6 +123,7 @@ class Readings:
         readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
         self._first = self._first or (readings.shape[1], text.path)
         self.columns, self.angles = self.columns or [i + 1 for i in picked], self.angles or angles
+        self.header = self.header or list(text.header)
         if self._first[0] != readings.shape[1]:
             (_, without), (_, other) = sorted((self._first, (readings.shape[1], text.path)), key=lambda table: table[0])
             raise InputError(

@@ -35,55 +35,24 @@ def _words(stem: str) -> list[str]:
 class _Family(NamedTuple):
     """Columns whose names differ in the last number only."""
 
-    words: list[str]
     columns: list[int]  # from 0
-    whole: bool  # whether they count to the number of joints, from 0 or 1
-
-    @property
-    def of_joints(self) -> bool:
-        """Whether the words are those of joint readings."""
-        return any(map(_OF_JOINTS.fullmatch, self.words)) and not any(map(_OF_OTHERS.fullmatch, self.words))
+    of_joints: bool  # whether its words are those of joint readings
+    whole: bool  # whether its numbers count the joints, from 0 or 1
 
 
 def _families(table: TextTable, joints: int) -> list[_Family]:
-    families: dict[str, list[tuple[str, int, int]]] = {}
+    members: dict[str, list[tuple[int, str, int]]] = {}
     for column, name in enumerate(table.header):
         if (numbered := stem_and_number(name)) is not None:
-            families.setdefault(numbered[0].casefold(), []).append((*numbered, column))
-    whole = (list(range(joints)), list(range(1, joints + 1)))
-    return [
-        _Family(
-            _words(members[0][0]),
-            [column for *_, column in members],
-            sorted(number for _, number, _ in members) in whole,
-        )
-        for members in families.values()
-    ]
-
-
-def columns_of_joints(
-    table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE
-) -> tuple[list[int], bool]:
-    """The columns, from 0, whose names are those of the joints, and whether there are any names of joints at all.
-
-    ``taken`` are columns that hold something else, and ``line`` is what states columns, for messages. Raises
-    `InputError` where several sets of columns have such names, or their numbers do not ascend.
-    """
-    families = _families(table, joints)
-    named = [family for family in families if family.of_joints and not set(family.columns) & set(taken)]
-    whole = [family.columns for family in named if family.whole]
-    if len(whole) > 1:
-        choices = [f"{_line(line, columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
-        raise InputError(f"{table.path} has several columns of each joint; add {' or '.join(choices[:4])}.")
-    # Where none is whole, one of as many columns is there twice.
-    for columns in whole or [family.columns for family in named if len(family.columns) == joints]:
-        table.check_ascending(columns, line)
-    if whole:
-        return whole[0], True
-    for family in families:
-        if family.whole and 0 < len(set(family.columns) & set(taken)) < joints:
-            check_not_taken(table, family.columns, taken)
-    return [], bool(named)
+            members.setdefault(numbered[0].casefold(), []).append((column, *numbered))
+    families = []
+    for family in members.values():
+        columns, (stem, *_), numbers = zip(*family, strict=True)
+        words = _words(stem)
+        of_joints = any(map(_OF_JOINTS.fullmatch, words)) and not any(map(_OF_OTHERS.fullmatch, words))
+        whole = sorted(numbers) == list(range(min(numbers), joints + min(numbers))) and min(numbers) < 2
+        families.append(_Family(list(columns), of_joints, whole))
+    return families
 
 
 def check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[int]) -> None:
@@ -97,21 +66,34 @@ def check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[in
         )
 
 
-def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE) -> list[int]:
+def reading_columns(
+    table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE, required: bool = True
+) -> list[int]:
     """The columns of the joint readings, from 0: those with names of joints, or all that are not ``taken`` where these
-    are as many as the joints, and nothing in the header contradicts it. Else `InputError`, with the line to add.
+    are as many as the joints, and nothing in the header contradicts it.
+
+    ``line`` is what states columns, for messages. Raises `InputError` with the line to add where several sets of
+    columns have such names, their numbers do not ascend, or they are ``required`` and not clear.
     """
-    columns, any_names = columns_of_joints(table, joints, taken, line)
-    if columns:
-        return columns
+    families = _families(table, joints)
+    named = [family for family in families if family.of_joints and not set(family.columns) <= set(taken)]
+    whole = [family.columns for family in named if family.whole]
+    if len(whole) > 1:
+        choices = [f"{_line(line, columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
+        raise InputError(f"{table.path} has several columns of each joint; add {' or '.join(choices[:4])}.")
+    # Where none is whole, one of as many columns is there twice.
+    for columns in whole or [family.columns for family in named if len(family.columns) == joints]:
+        table.check_ascending(columns, line)
+        check_not_taken(table, columns, taken)
+    if whole or not required:
+        return whole[0] if whole else []
     temperature = table.pick([TEMPERATURE]) if table.has([TEMPERATURE]) else []
     free = [i for i in range(table.width) if i not in taken and i not in temperature]
-    names, families = [bare_name(table.header[i]) for i in free if table.header], _families(table, joints)
-    foreign = any(map(_NO_JOINT.fullmatch, (word for name in names for word in _words(name)[:1])))
-    if len(free) == joints and not foreign and not any_names and not table.misnumbered:
+    names = [bare_name(table.header[i]) for i in free if table.header]
+    foreign = any(_NO_JOINT.fullmatch(word) for name in names for word in _words(name)[:1])
+    if len(free) == joints and not foreign and not named and not table.misnumbered:
         table.check_ascending(free, line)
-        alike = [family for family in families if len(family.columns) == joints]
-        if alike[0].whole if alike else joints == 1 or not any(names):
+        if _Family(free, False, True) in families or joints == 1 or not any(names):
             return free
     guess = [family.columns for family in families if family.whole and all(map(table.is_numeric, family.columns))]
     of_ur = [[i for i, name in enumerate(table.header) if joint in name.casefold()] for joint in _OF_UR]
@@ -119,12 +101,15 @@ def reading_columns(table: TextTable, joints: int, taken: Sequence[int] = (), li
         guess = [[columns[0] for columns in of_ur]]
     proposed = guess[0] if guess else proposed_columns(table, joints, taken)
     add = f"add {_line(line, proposed)} if these are the joints in their order"
-    if table.misnamed:
-        add = "correct the header, or the delimiter where decimal commas are taken for it"
-    elif not proposed:
-        add = f"pick one column a joint with {line.format('...')}, or name them q_1 to q_{joints}"
-    unclear = "but the arm has" if len(free) < joints else "and it is not clear which of them are those of the"
-    raise InputError(f"{table.path} has {table.shown()}, {unclear} {joints} joints; {add}.")
+    if not proposed:
+        add = (
+            "correct the header, or the delimiter where decimal commas are taken for it, or pick one column a joint "
+            f"with {line.format('...')}"
+        )
+    raise InputError(
+        f"{table.path} has {table.shown()}, and it is not clear which of them are those of the arm's {joints} joints; "
+        f"{add}."
+    )
 
 
 def proposed_columns(table: TextTable, count: int, taken: Sequence[int] = ()) -> list[int]:

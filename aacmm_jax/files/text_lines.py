@@ -1,18 +1,19 @@
 """Lines and cells of a text table, from the bytes that recorders and spreadsheets write."""
 
+import codecs
 import csv
 import os
 import re
 from collections.abc import Sequence
 
 from ..core.errors import InputError
-from .inputs import InputFile, largest_file
+from .inputs import InputFile
 
 # A table of numbers takes twelve times its size as Python objects: 128 MiB, a million poses, take 1.5 GiB. One of
 # digits and ends of lines takes a hundred times its size, so that lines are limited, too.
 TABLE_SHARE = 1 / 8
 _MOST_LINES = 2_000_000
-_LONGEST_LINE = 2**20  # bytes; ten thousand columns have a tenth of it
+_LONGEST_LINE = 2**20  # characters; ten thousand columns have a tenth of it
 _DELIMITERS = (";", "\t", ",")
 _SAMPLED = 50  # lines from which the delimiter is found
 _LATIN = b"\xb0\xb5"  # degree sign and mu in the 8-bit encodings of recorders, western and Cyrillic
@@ -26,39 +27,24 @@ def table_lines(path: str | os.PathLike) -> tuple[list[str], bool]:
     UTF-8, UTF-16 with a byte order mark (spreadsheets' "Unicode text"), and the degree sign of 8-bit encodings. What is
     not text, or larger than a table is, is refused before it is decoded.
     """
-    file = path if isinstance(path, InputFile) else InputFile(path, TABLE_SHARE)
-    content = file.content
-    limit = largest_file() * TABLE_SHARE
-    if len(content) > limit:
-        raise InputError(f"{file} has more than the {limit / 2**20:,.0f} MiB that a text table may have; divide it.")
-    sixteen = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    if b"\0" in content and not sixteen:
-        raise InputError(f"{file} cannot be read as text: it holds NUL bytes; save it as text in UTF-8.")
-    _check_lines(file, content)
+    content = (path if isinstance(path, InputFile) else InputFile(path, TABLE_SHARE)).content
+    sixteen = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    latin = not set(content.translate(None, bytes(range(128)))) - set(_LATIN)
+    if max(map(content.count, (b"\n", b"\r"))) > _MOST_LINES:
+        raise InputError(f"{path} has more than the {_MOST_LINES:,} lines that a text table may have; divide it.")
     try:
-        text = content.decode("utf-16" if sixteen else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        if sixteen or set(content.translate(None, bytes(range(128)))) - set(_LATIN):
-            raise InputError(f"{file} cannot be read as text; save it as text in UTF-8.") from error
-        text = content.decode("latin-1")
+        text = content.decode("utf-16" if sixteen else "latin-1" if latin else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
     if "\0" in text:
-        raise InputError(f"{file} cannot be read as text: it holds NUL characters; save it as text in UTF-8.")
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
-    return text.split("\n"), text.endswith("\n")
-
-
-def _check_lines(file: InputFile, content: bytes) -> None:
-    """Refuse lines that no table has, which would take minutes to divide into cells."""
-    end = b"\n" if b"\n" in content else b"\r"
-    if content.count(end) > _MOST_LINES:
-        raise InputError(f"{file} has more than the {_MOST_LINES:,} lines that a text table may have; divide it.")
-    start = 0
-    while len(content) - start > _LONGEST_LINE:
-        last = content.rfind(end, start, start + _LONGEST_LINE)
-        if last < 0:
-            line = content.count(end, 0, start) + 1
-            raise InputError(f"{file} line {line} is longer than 1 MiB, so it is not a row of a table; check the file.")
-        start = last + 1
+        raise InputError(f"{path} cannot be read as text; save it as text in UTF-8.")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    for line_number, line in enumerate(lines, start=1):
+        if len(line) > _LONGEST_LINE:  # which would take minutes to divide into cells
+            raise InputError(
+                f"{path} line {line_number} is longer than 1 MiB, so it is not a row of a table; check the file."
+            )
+    return lines, not lines[-1]
 
 
 def delimiter_of(lines: Sequence[str], decimal: str) -> str:

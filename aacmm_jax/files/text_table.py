@@ -2,18 +2,18 @@
 
 import contextlib
 import itertools
-import math
 import os
 import re
 from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.errors import InputError, nearest
+from ..core.errors import InputError
 from ..core.text import is_number, number, quoted, shorten
 from .column_names import (
     AMBIGUOUS,
     Column,
+    Line,
     along_axes,
     are_numbered,
     has_number,
@@ -31,8 +31,6 @@ from .text_lines import cells_of, delimiter_of, table_lines
 
 _LARGEST = 1e15  # encoder counts reach 1e10; beyond it squares lose what is measured
 _PLAIN = frozenset("0123456789+-eE \t")  # and the decimal mark: float takes these as people read them, or not at all
-_WITH_COMMA = re.compile("[+-]?[0-9]*,[0-9]+")
-_DECIMALS = re.compile(r"[+-]?[0-9]*(?:\.([0-9]*))?(?:[eE][+-]?([0-9]*))?")
 _FEW = 3  # rows from which equal columns, or a shorter last number, are no coincidence
 _LONG = 12  # columns, or characters of a name, that a message shows
 
@@ -57,40 +55,37 @@ class TextTable:
         skip: int = 0,
         wanted: Sequence[Column] = (),
     ):
-        self.path, self._decimal = path, decimal
+        self.path, self._decimal, self._hashes = path, decimal, False
         lines, self._ended = table_lines(path)
         if lines[skip : skip + 1] and (stated := re.fullmatch('"?sep=(.)"?', lines[skip])):  # of spreadsheets
             delimiter, skip = delimiter or stated[1], skip + 1
         delimiter = delimiter or delimiter_of(lines[skip:], decimal)
-        words: list[tuple[int, list[str]]] = []
-        comments: list[tuple[int, list[str]]] = []
-        rows: list[tuple[int, list[str]]] = []
-        hashed: set[int] = set()  # rows that begin like comments
+        words: list[Line] = []
+        comments: list[Line] = []
+        rows: list[Line] = []
         for line_number, line in enumerate(lines[skip:], start=skip + 1):
-            if not line or line[0] in ' \t#"':
-                text = line.strip(' \t"')
-                if not text:
-                    continue
-                if text[0] == "#":
-                    if not (words or rows) or not has_number(stripped(cells_of(line, delimiter)[1:])):
-                        comments.append((line_number, header_cells(text[1:].strip(" \t"), delimiter)))
-                        continue
-                    hashed.add(line_number)
             cells = cells_of(line, delimiter)
-            if not cells[0] and not any(cell.strip() for cell in cells):
+            if not any(cell.strip(' \t"') for cell in cells):
                 continue
-            if len(rows) == len(hashed) and not is_row(stripped(cells)):
+            text, above = line.strip(' \t"'), (rows or words)[-1:]
+            # A line that begins with "#" is a row only where it is as wide as what is above it, and has numbers.
+            if text[:1] == "#" and not (above and len(cells) >= len(above[0][1]) and has_number(stripped(cells[1:]))):
+                comments += [] if rows else [(line_number, header_cells(text[1:].strip(" \t"), delimiter))]
+            elif not rows and not is_row(stripped(cells)):
                 words.append((line_number, header_cells(line, delimiter)))
             else:
                 rows.append((line_number, cells))
-        if hashed:  # lines that begin with "#" and are not as wide as the rows are comments
-            width = next((len(cells) for number, cells in rows if number not in hashed), len(rows[0][1]))
-            rows = [(number, cells) for number, cells in rows if number not in hashed or len(cells) == width]
         if not rows:
             raise InputError(f"{path} holds no numbers; give one line a pose.")
+        width = len(rows[0][1])
+        for line_number, cells in rows:
+            if len(cells) != width:
+                raise InputError(
+                    f"{path} line {line_number} has {len(cells)} columns, the lines before it {width}; give all the "
+                    f"same, copy the file again if it is cut there, or add skip = {line_number - 1} if the table "
+                    "begins there."
+                )
         self._lines, self._rows = [number for number, _ in rows], [cells for _, cells in rows]
-        self._hashed = [number for number in self._lines if number in hashed]
-        self._check_widths()
         # Columns at the end that are empty in all rows and without a name: lines that end with delimiters.
         named = max((len(trimmed(cells, 1)) for _, cells in words), default=0)
         while len(self._rows[0]) > max(1, named) and not any(row[-1].strip() for row in self._rows):
@@ -101,21 +96,6 @@ class TextTable:
         self._title = words[-1][1] if words else []  # a line of words that does not name the columns
         # Names of the columns; empty where the table has none.
         self.header = [name.strip("\"'") for name in names_of_columns(path, self.width, words, comments, wanted)]
-
-    def _check_widths(self) -> None:
-        width = len(self._rows[0])
-        wrong = next((i for i, row in enumerate(self._rows) if len(row) != width), None)
-        if wrong is None:
-            return
-        where, given = f"{self.path} line {self._lines[wrong]}", len(self._rows[wrong])
-        if wrong == len(self._rows) - 1 > 0 and not self._ended and given < width:
-            raise InputError(
-                f"{where}, the last, ends after {given} of {width} columns, and without the end of a line, so the file "
-                "is cut there; copy it again, or leave out that line."
-            )
-        begins = f", or add skip = {self._lines[wrong] - 1} if the table begins there"
-        skip = begins if wrong < _LONG and width < given else ""
-        raise InputError(f"{where} has {given} columns, the lines before it {width}; give all the same{skip}.")
 
     @property
     def misnamed(self) -> bool:
@@ -161,16 +141,12 @@ class TextTable:
         names = {unit_in(self.header[i]): self.header[i] for i in picked if self.header}
         names.pop(None, None)
         if len(names) > 1:
-            (unit, name), (other_unit, other), *_ = names.items()
-            raise InputError(
-                f"{self.path} mixes units: {quoted(name)} is in {str(unit)[:_LONG]}, {quoted(other)} in "
-                f"{str(other_unit)[:_LONG]}; convert one of them, and change its header."
-            )
+            shown = shorten([f"{quoted(name)} is in {str(unit)[:_LONG]}" for unit, name in names.items()], 2)
+            raise InputError(f"{self.path} mixes units: {shown}; convert one of them, and change its header.")
         if AMBIGUOUS in names and stated_unit not in ("deg", "gon"):
-            but = f", but the manifest says {stated_unit}" if stated_unit else ""
             raise InputError(
                 f"{self.path}: the header says {quoted(names[AMBIGUOUS])}, and grad is deg in German and gon elsewhere"
-                f'{but}; add units = {{ {key} = "deg" }}, or "gon", or write it in the header.'
+                f'; add units = {{ {key} = "deg" }}, or "gon", or write it in the header.'
             )
         return stated_unit if AMBIGUOUS in names else next(iter(names), None)
 
@@ -180,12 +156,14 @@ class TextTable:
         for column in wanted:
             indices = self._matching(column)
             if not indices:
-                raise InputError(f"{self.path} has {self._missing(column)}")
-            if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self.header):
-                numbers = shorten([str(i + 1) for i in indices])
                 raise InputError(
-                    f"{self.path} names the columns {numbers} all {quoted(column)}; give each name once, or pick them "
-                    "by number."
+                    f"{self.path} has no column {quoted(str(column))}; it has {self.shown()}: pick others, by name "
+                    "or by number, or correct the header."
+                )
+            if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self.header):
+                raise InputError(
+                    f"{self.path} names the columns {shorten([str(i + 1) for i in indices])} all {quoted(column)}; "
+                    "give each name once, or pick them by number."
                 )
             self.check_ascending(indices)
             picked += indices
@@ -193,53 +171,32 @@ class TextTable:
             raise InputError(f"{self.path}: one column is picked twice by {shorten([str(x)[:99] for x in wanted])}.")
         return picked
 
-    def _missing(self, column: Column) -> str:
-        if isinstance(column, int):
-            return f"{self.width} columns, so there is no column {column}; pick others."
-        if self.header:
-            return f"no column {quoted(column)}{nearest(column, [quoted(name)[1:-1] for name in self.header[:999]])}"
-        if self._title:
-            return (
-                f"no column {quoted(column)}: its header has {len(self._title)} names, but its rows {self.width} "
-                "columns; correct the header, or give numbers (decimal commas need another delimiter)."
-            )
-        first = [cell.strip(" \t\"'") for cell in self._rows[0]]
-        if column in first:
-            line = self._lines[0]
-            return (
-                f"no column {quoted(column)}: line {line} names it, but has numbers for names besides, so it is not a "
-                f"header; add skip = {line}, and pick column {first.index(column) + 1} by its number."
-            )
-        return f"no column {quoted(column)}; it has no header: give numbers."
-
     def check_ascending(self, picked: Sequence[int], line: str = "columns = [{}]") -> None:
         """Refuse columns whose names are numbered, or of axes, but not in their order; ``line``: what states it."""
         if len(picked) < 2 or not self.header:
             return
-        columns = [self.header[i] for i in picked]
-        axes, numbered = along_axes(columns), [stem_and_number(name) for name in columns]
-        stems = {stem.casefold() for stem, _ in filter(None, numbered)}
-        numbers = [number for _, number in filter(None, numbered)] if len(stems) == 1 and all(numbered) else []
-        if len(set(numbers)) < len(numbers):
-            twice = next(name for name, number in zip(columns, numbers, strict=True) if numbers.count(number) > 1)
-            raise InputError(f"{self.path} names the column {quoted(twice)} twice; give each column once.")
-        order = axes or np.argsort(numbers).tolist()
-        if order == sorted(order):
+        names = [self.header[i] for i in picked]
+        axes, numbered = along_axes(names), [pair for pair in map(stem_and_number, names) if pair]
+        alike = len(numbered) == len(names) and len({stem.casefold() for stem, _ in numbered}) == 1
+        numbers = [number for _, number in numbered] if alike else []
+        order = axes or np.argsort(numbers, stable=True).tolist()
+        if order == sorted(order) and len(set(numbers)) == len(numbers):
             return
         ordered = ", ".join(str(picked[i] + 1) for i in order)
-        advice = f"add {line.format(ordered)} for that of their numbers, or the order of the joints."
+        advice = f"add {line.format(ordered)} for that of their numbers, each once, or the order of the joints."
         if axes is not None:
             advice = f"pick them as a list, [{ordered}], in that of the axes."
-        names = shorten([quoted(name[:_LONG]) for name in columns], _LONG)
-        raise InputError(f"{self.path} has its columns in the order {names}; {advice}")
+        shown = shorten([quoted(name[:_LONG]) for name in names], _LONG)
+        raise InputError(f"{self.path} has its columns in the order {shown}; {advice}")
 
     def numbers(self, picked: Sequence[int], *, measured: bool = False, stated: bool = False) -> np.ndarray:
         """The numbers of columns, counted from 0, ``(rows, columns)``; ``measured``: they are not numbers of columns,
         and no two of them are the same unless somebody ``stated`` the columns."""
-        if self._hashed:
+        hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip(' \t"').startswith("#")), None)
+        if hashed is not None and not self._hashes:
             raise InputError(
-                f"{self.path} line {self._hashed[0]} begins with #, but has as many columns as the rows; leave it out "
-                "if it is a comment, else write its first cell without #."
+                f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; leave it "
+                "out if it is a comment, else write its first cell without #."
             )
         self._check_end(picked)
         if measured:
@@ -250,40 +207,27 @@ class TextTable:
         return table
 
     def _column(self, index: int) -> np.ndarray:
-        cells = [row[index] for row in self._rows]
+        cells = [row[index].strip(" \t") for row in self._rows]
         # Together where they are plain numbers: one by one they are most of the time that a large table takes.
         if set().union(*cells) <= _PLAIN | {self._decimal}:
             with contextlib.suppress(ValueError):
-                values = np.array([float(cell) for cell in cells] if self._decimal == "." else
-                                  [float(cell.replace(",", ".")) for cell in cells])  # fmt: skip
+                values = np.array([float(cell.replace(self._decimal, ".")) for cell in cells])
                 if np.abs(values).max() <= _LARGEST:
                     return values
-        return np.array([self._number(i, index, cell.strip(" \t")) for i, cell in enumerate(cells)])
+        return np.array([self._number(i, index, cell) for i, cell in enumerate(cells)])
 
     def _number(self, row: int, index: int, cell: str) -> float:
         place = f"{self.path} line {self._lines[row]} column {index + 1}: {quoted(cell)}"
-        plain = cell
-        if self._decimal == ",":
-            if "." in cell:
-                raise InputError(
-                    f"{place} has a point, but the decimal mark is stated to be a comma; write numbers without "
-                    'separators of thousands, or leave out decimal = ",".'
-                )
-            plain = cell.replace(",", ".")
-        if not is_number(plain):
-            advice = "write it without quotes" if cell[:1] in "\"'" and cell else "correct it"
-            if _WITH_COMMA.fullmatch(cell):
-                advice = 'write it with a decimal point, or add decimal = "," to its table in the manifest'
-            elif re.fullmatch(r"[+-]?[0-9]{1,3}(?:[,.' \u00a0\u2009\u202f][0-9]{3})+(?:[.,][0-9]*)?", cell):
-                advice = "write it without separators of thousands"
-            elif row == 0 and advice == "correct it":
-                advice = f"correct it, or add skip = {self._lines[0]} if the table begins after that line"
-            raise InputError(f"{place} is not a number; {advice}.")
+        plain = cell.replace(self._decimal, ".")
+        if not is_number(plain) or (self._decimal == "," and "." in cell):
+            mark = 'add decimal = "," to its table' if self._decimal == "." else 'leave out decimal = ","'
+            raise InputError(
+                f"{place} is not a number with the decimal mark '{self._decimal}'; write it without quotes and "
+                f"separators of thousands, or {mark}, or add skip = {self._lines[row]} if the table begins below."
+            )
         value = number(plain)
-        if not math.isfinite(value):
-            raise InputError(f"{place} is not finite; correct it.")
-        if abs(value) > _LARGEST:
-            raise InputError(f"{place} is larger than anything that is measured; correct it.")
+        if not abs(value) <= _LARGEST:
+            raise InputError(f"{place} is not finite, or larger than anything that is measured; correct it.")
         return value
 
     def is_numeric(self, index: int) -> bool:
@@ -301,36 +245,29 @@ class TextTable:
     def texts(self, column: Column) -> np.ndarray:
         """The cells of one column."""
         (index,) = self.pick([column])
-        self._hashed = self._hashed if index else []  # "#2" is a text
+        self._hashes = self._hashes or index == 0  # "#2" is a text
         return np.array([row[index].strip(" \t").strip("\"'") for row in self._rows])
 
     def _check_first(self, picked: Sequence[int]) -> None:
         """Refuse numbers of columns as the first row."""
         cells = [self._rows[0][i].strip(" \t") for i in picked]
-        counted = [[str(i + first) for i in range(len(cells))] for first in (0, 1)]
-        if len(cells) < 2 or (cells not in counted and cells[::-1] not in counted):
-            return
-        order = ", ".join(str(i + 1) for i in sorted(picked, key=lambda i: int(self._rows[0][i])))
-        add = f"add skip = {self._lines[0]}" + (f" and columns = [{order}]" if cells not in counted else "")
-        raise InputError(
-            f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; {add}, or "
-            "write it with decimal points if it was measured."
-        )
+        count = len(cells)
+        if count > 1 and any(sorted(cells) == sorted(map(str, range(i, i + count))) for i in (0, 1)):
+            order = ", ".join(str(i + 1) for i in sorted(picked, key=lambda i: int(self._rows[0][i])))
+            raise InputError(
+                f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; add "
+                f"skip = {self._lines[0]} and columns = [{order}], or write it with decimal points if it was measured."
+            )
 
     def _check_end(self, picked: Sequence[int]) -> None:
-        """Refuse a last number that is shorter than all others of its column, in a file whose last line has no end."""
-        if self._ended or self.length < _FEW or self.width - 1 not in picked:
-            return
-        cells = [row[-1].strip(" \t").replace(self._decimal, ".") for row in self._rows]
-        digits = [tuple(map(len, match.groups(""))) if (match := _DECIMALS.fullmatch(x)) else None for x in cells]
-        if digits[-1] is not None and any(
-            all(other is not None and last < other[part] for other in digits[:-1])
-            for part, last in enumerate(digits[-1])
-        ):
+        """Refuse a last number with fewer decimals than all others of its column, in a file without a last line's end,
+        which may be cut."""
+        decimals = [len(row[-1].strip(" \t").partition(self._decimal)[2]) for row in self._rows]
+        if self.width - 1 in picked and not self._ended and len(decimals) >= _FEW and decimals[-1] < min(decimals[:-1]):
             raise InputError(
-                f"{self.path} line {self._lines[-1]}: the last number, {quoted(cells[-1])}, has fewer digits than all "
-                "above it and no end of the line after it, so the file may be cut; copy it again, or end that line if "
-                "it is complete."
+                f"{self.path} line {self._lines[-1]}: the last number, {quoted(self._rows[-1][-1])}, has fewer digits "
+                "than all above it and no end of the line after it, so the file may be cut; copy it again, or end that "
+                "line if it is complete."
             )
 
     def _check_twice(self, picked: Sequence[int], table: np.ndarray) -> None:

@@ -5,7 +5,9 @@ c the tuning constant of `Loss`, the cost of a pose is c^2 / 2 rho(s), and its w
 Sources: Huber 1964; Holland and Welsch 1977 (Cauchy); Beaton and Tukey 1974; Triggs et al. 2000.
 """
 
+from collections.abc import Callable
 from functools import cache
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -20,28 +22,43 @@ _EFFICIENCY = 0.95  # for normal residuals
 _LEAST_CURVATURE = 0.01
 
 
-def _curvature(name: LossName, s: Float[AnyArray, " m"]) -> Float[AnyArray, " m"]:
-    """Curvature of the cost along the residual over that across it, which is the weight: 1 + 2 s rho'' / rho'."""
-    xp = namespace(s)
-    if name == "huber":
-        return xp.where(s <= 1, 1.0, 0.0)
-    if name == "cauchy":
-        return (1 - s) / (1 + s)
-    inside = xp.minimum(s, 0.5)  # beyond a fifth it is negative
-    return (1 - 5 * inside) / (1 - inside)
+class _Shape(NamedTuple):
+    """A loss by three functions of s: rho, the weight rho', and the curvature of the cost along the residual over that
+    across it, which is the weight: 1 + 2 s rho'' / rho'. The first argument of each is NumPy or JAX's NumPy."""
+
+    rho: Callable[[Any, Any], Any]
+    weight: Callable[[Any, Any], Any]
+    curvature: Callable[[Any, Any], Any]
 
 
-def _rho_and_slope(name: LossName, s: Float[AnyArray, " m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
-    """rho(s) and its derivative."""
-    xp = namespace(s)
-    if name == "huber":
-        inside = s <= 1
-        root = xp.sqrt(xp.where(inside, 1.0, s))
-        return xp.where(inside, s, 2 * root - 1), 1 / root
-    if name == "cauchy":
-        return xp.log1p(s), 1 / (1 + s)
+def _root_outside(xp: Any, s: Any) -> Any:
+    """The square root of s beyond 1, and 1 inside, where its derivative would be infinite at 0."""
+    return xp.sqrt(xp.where(s <= 1, 1.0, s))
+
+
+def _rho_of_tukey(xp: Any, s: Any) -> Any:
+    """(1 - (1 - s)^3) / 3 up to 1, without its cancellation at small s."""
     inside = xp.minimum(s, 1.0)
-    return inside * (1 - inside + inside**2 / 3), (1 - inside) ** 2
+    return inside * (1 - inside + inside**2 / 3)
+
+
+_SHAPES: dict[LossName, _Shape] = {
+    "huber": _Shape(
+        rho=lambda xp, s: xp.where(s <= 1, s, 2 * _root_outside(xp, s) - 1),
+        weight=lambda xp, s: 1 / _root_outside(xp, s),
+        curvature=lambda xp, s: xp.where(s <= 1, 1.0, 0.0),
+    ),
+    "cauchy": _Shape(
+        rho=lambda xp, s: xp.log1p(s),
+        weight=lambda xp, s: 1 / (1 + s),
+        curvature=lambda xp, s: (1 - s) / (1 + s),
+    ),
+    "tukey": _Shape(
+        rho=_rho_of_tukey,
+        weight=lambda xp, s: (1 - xp.minimum(s, 1.0)) ** 2,
+        curvature=lambda xp, s: (1 - 5 * xp.minimum(s, 0.5)) / (1 - xp.minimum(s, 0.5)),  # negative beyond a fifth
+    ),
+}
 
 
 @cache
@@ -60,7 +77,7 @@ def tuning_constant(name: LossName, rows: int) -> float:
     low, high = np.sqrt(chi_square_quantile(0.25, rows)), 20.0 + 2 * np.sqrt(rows)
     while high - low > 1e-6:
         c = 0.5 * (low + high)
-        weight = _rho_and_slope(name, (root / c) ** 2)[1]
+        weight = _SHAPES[name].weight(np, (root / c) ** 2)
         # w' |x|^2 as half the derivative by |x|, times |x|.
         a = np.sum(density * (weight + np.gradient(weight, root) * root / rows))
         b = np.sum(density * weight**2 * root**2) / rows
@@ -90,8 +107,8 @@ class Loss(eqx.Module):
     def cost_and_weight(self, white: Float[AnyArray, "r m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
         """Cost and weight of every pose."""
         xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
-        rho, weight = _rho_and_slope(self.name, xp.sum(white**2, axis=0) / c2)
-        return 0.5 * c2 * rho, weight
+        shape, s = _SHAPES[self.name], xp.sum(white**2, axis=0) / c2
+        return 0.5 * c2 * shape.rho(xp, s), shape.weight(xp, s)
 
     def along(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
         """Square roots of the ratios q of two curvatures of the cost of every pose: along its residual, and across it.
@@ -101,7 +118,7 @@ class Loss(eqx.Module):
         4.3). Steps by weights alone (q = 1) converge the more slowly the more poses of a socket are beyond c.
         """
         xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
-        return xp.sqrt(xp.maximum(_curvature(self.name, xp.sum(white**2, axis=0) / c2), _LEAST_CURVATURE))
+        return xp.sqrt(xp.maximum(_SHAPES[self.name].curvature(xp, xp.sum(white**2, axis=0) / c2), _LEAST_CURVATURE))
 
     def transformed(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, "r m"]:
         """Residuals whose squares are twice the cost."""

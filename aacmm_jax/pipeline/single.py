@@ -1,7 +1,6 @@
 """Stage 1 (`identify`), both stages (`calibrate`), and the joint solve."""
 
 import warnings
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,7 @@ import numpy as np
 from ..calibration.joint_model import with_joint_model
 from ..calibration.results import Calibration, Identification
 from ..calibration.scale_anchor import Method, warn_of_known_scale
-from ..calibration.stages import Sensitivities, identified, in_two_stages, jointly
+from ..calibration.stages import Stages, identified, in_two_stages, jointly
 from ..calibration.task import (
     Solving,
     Task,
@@ -219,7 +218,14 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     given = given._replace(model=None, prior=prior)
     method, at_once = method_of(arm, capture, bounds.space, given.solving, given.method)
     given = given._replace(method=method)
-    _check_solvable(arm, capture, bounds, given, at_once)
+    if at_once:
+        check_single(arm, capture, bounds, "calibrate_many")
+        check_finite(arm=arm, capture=capture, noise=given.noise)
+    elif given.hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
+        raise InputError(
+            "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
+            "hold."
+        )
     first = None if at_once else _stage1_task("calibrate_many", arm, capture, bounds, given)
     task = task_of(arm, capture, bounds, given.solving._replace(hold=None))
     if given.undetermined != "ignore":
@@ -227,7 +233,10 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     if method == "two-stage" and first is not None and not inside_trace():
         warn_of_known_scale(first.anchor.set_by, bool(arm.prismatic))
     first, task, capture = to_numpy((first, task, capture))
-    result, sensitivities = _calibrated(first, task, capture, method)
+    if namespace((first, task, capture)) is not np:
+        return to_jax(_traced(first, task, capture, method))
+    with np.errstate(all="ignore"):
+        result, sensitivities, _ = _stages(first, task, capture, method)
     case = amendable(result, capture)
     if case is not None and given.may_replace_noise:
         again = given._replace(noise_model=None, replace_noise=False, undetermined="ignore")
@@ -238,57 +247,33 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         replaced = noisy_encoders.amend(result, case, with_noise)
         if replaced is not result:
             return replaced
-    if case is not None and given.shared_errors and sensitivities is not None:
+    if case is not None and given.shared_errors:
         result = shared_errors.amend(result, case, sensitivities)
     return to_jax(result)
 
 
-def _check_solvable(arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions, at_once: bool) -> None:
-    """Raise `InputError` where a single solve cannot take what was given; ``at_once``: everything is one solve."""
-    if at_once:
-        check_single(arm, capture, bounds, "calibrate_many")
-        check_finite(arm=arm, capture=capture, noise=options.noise)
-    elif options.hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
-        raise InputError(
-            "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
-            "hold."
-        )
+def _stages(first: Task | None, task: Task, capture: Capture, method: str) -> Stages:
+    """Both stages, or the joint solve; ``first`` is stage 1's task where reference lengths alone fix the scale."""
+    stage1 = None if first is None else identified(first, capture)
+    if method == "joint" or stage1 is None:
+        return jointly(task, capture, stage1, method)
+    divided = in_two_stages(stage1, capture)
+    if not stage1.solution.identification.anchor.can_scale:
+        return divided
 
-
-def _calibrated(
-    first: Task | None, task: Task, capture: Capture, method: str
-) -> tuple[Calibration, Callable[[], Sensitivities] | None]:
-    """Both stages, or the joint solve; and how the parameters follow the data, where values are known.
-
-    ``first`` is stage 1's task where reference lengths alone fix the scale.
-    """
-    if namespace((first, task, capture)) is not np:
-        return _traced(first, task, capture, method), None
-    with np.errstate(all="ignore"):
-        stage1 = None if first is None else identified(first, capture)
-        if method == "joint" or stage1 is None:
-            found = jointly(task, capture, stage1, method)
-            return found.calibration, found.sensitivities
-        found = in_two_stages(stage1, capture)
-        if not bool(found.stands_against):
-            return found.calibration, found.sensitivities
+    def joint() -> Stages:
         joint = jointly(task, capture, stage1, method)
-        return _with_components_of(found.calibration, joint.calibration), joint.sensitivities
+        return joint._replace(calibration=_with_components_of(divided.calibration, joint.calibration))
+
+    if namespace(divided.stands_against) is np:
+        return joint() if divided.stands_against else divided
+    calibration = jax.lax.cond(divided.stands_against, lambda: joint().calibration, lambda: divided.calibration)
+    return divided._replace(calibration=calibration)
 
 
 @eqx.filter_jit
 def _traced(first: Task | None, task: Task, capture: Capture, method: str) -> Calibration:
-    stage1 = None if first is None else identified(first, capture)
-    if method == "joint" or stage1 is None:
-        return jointly(task, capture, stage1, method).calibration
-    found = in_two_stages(stage1, capture)
-    if not stage1.solution.identification.anchor.can_scale:
-        return found.calibration
-    return jax.lax.cond(
-        found.stands_against,
-        lambda: _with_components_of(found.calibration, jointly(task, capture, stage1, method).calibration),
-        lambda: found.calibration,
-    )
+    return _stages(first, task, capture, method).calibration
 
 
 def _with_components_of(other: Calibration, result: Calibration) -> Calibration:
@@ -297,5 +282,5 @@ def _with_components_of(other: Calibration, result: Calibration) -> Calibration:
     lacking = None if others is None else others.without(STATED)
     if components is None or lacking is None:
         return result
-    none = eqx.tree_at(lambda one: one.matrices, lacking, 0 * lacking.matrices)
+    none = eqx.tree_at(lambda lacking: lacking.matrices, lacking, 0 * lacking.matrices)
     return eqx.tree_at(lambda one: one.parameter_covariance.components, result, components.joined(none))

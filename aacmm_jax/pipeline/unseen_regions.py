@@ -17,7 +17,7 @@ from ..core.errors import InputError
 from ..core.linear_algebra import inverse_cholesky
 from ..core.text import common_labels
 from ..data.capture import Capture, names_in
-from ..diagnostics.equations import PRIOR, Equations, equations_of
+from ..diagnostics.equations import Equations, equations_of
 from .cross_validation import groups_of
 
 _GROUPS = 3  # of placements or stations, fewer of which say nothing of the scatter between them
@@ -85,39 +85,38 @@ def _halves(q: Float[np.ndarray, "M n"]) -> list[Region]:
 class _Dense(NamedTuple):
     """All equations of a calibration, by all unknowns: what is shared, then the geometry of each observation."""
 
-    white: Float[np.ndarray, "M r P"]  # derivatives, in standard deviations; rows that a kind does not have are 0
-    residual: Float[np.ndarray, "M r"]
-    in_mm: Float[np.ndarray, "M 3 r"]
+    white: Float[np.ndarray, "R P"]  # derivatives of all rows of poses, in standard deviations
+    residual: Float[np.ndarray, " R"]
+    pose: np.ndarray  # of each row, its number among all poses
+    moved: Float[np.ndarray, "M3 P"]  # derivatives of the position of each pose, mm
+    errors: Float[np.ndarray, " M3"]
+    noise: Float[np.ndarray, "M 3 3"]  # its covariance
+    poses: np.ndarray  # the number of each among all poses
     relations: Float[np.ndarray, "l P"]
     relation_residual: Float[np.ndarray, " l"]
-    of_prior: Bool[np.ndarray, " l"]
-    poses: np.ndarray  # number of each among all poses
     geometry: Bool[np.ndarray, " P"]  # which unknowns are no parameters
 
 
 def _dense(equations: Equations, parameters: int) -> _Dense:
-    shared = equations.rows[0].shared.shape[2]
-    size = shared + sum(rows.own.shape[2] for rows in equations.rows)
-    most, first, parts = max(rows.residual.shape[1] for rows in equations.rows), shared, []
+    first = shared = equations.rows[0].shared.shape[2]
+    size, parts = shared + sum(rows.own.shape[2] for rows in equations.rows), []
     for rows in equations.rows:
         (m, r), k = rows.residual.shape, rows.own.shape[2]
-        white, residual, in_mm = np.zeros((m, most, size)), np.zeros((m, most)), np.zeros((m, 3, most))
-        white[:, :r, :shared], white[:, :r, first : first + k] = rows.shared, rows.own
-        residual[:, :r], in_mm[:, :, :r] = rows.residual, rows.in_mm
-        parts.append((white, residual, in_mm))
+        white = np.zeros((m, r, size))
+        white[..., :shared], white[..., first : first + k] = rows.shared, rows.own
         first += k
+        parts.append((
+            *(white.reshape(-1, size), rows.residual.ravel(), np.repeat(rows.poses, r)),
+            (rows.in_mm @ white).reshape(-1, size),
+            np.einsum("mcr,mr->mc", rows.in_mm, rows.residual).ravel(),
+            *(rows.in_mm @ rows.in_mm.swapaxes(1, 2), rows.poses),
+        ))  # fmt: skip
     relations = [np.pad(block.shared, ((0, 0), (0, size - shared))) for block in equations.relations]
-    of_prior = [np.full(len(block.residual), block.fixture == PRIOR) for block in equations.relations]
-    white, residual, in_mm = (np.concatenate(part) for part in zip(*parts, strict=True))
     return _Dense(
-        white,
-        residual,
-        in_mm,
-        np.concatenate([np.zeros((0, size)), *relations]),
-        np.concatenate([np.zeros(0), *(block.residual for block in equations.relations)]),
-        np.concatenate([np.zeros(0, dtype=bool), *of_prior]),
-        np.concatenate([rows.poses for rows in equations.rows]),
-        np.arange(size) >= parameters,
+        *(np.concatenate(part) for part in zip(*parts, strict=True)),
+        relations=np.concatenate([np.zeros((0, size)), *relations]),
+        relation_residual=np.concatenate([np.zeros(0), *(block.residual for block in equations.relations)]),
+        geometry=np.arange(size) >= parameters,
     )
 
 
@@ -132,38 +131,33 @@ def unseen_regions(
     dense = _dense(
         equations_of(record) if equations is None else equations, len(record.names) - (record.hold is not None)
     )
-    flat = dense.white.reshape(-1, dense.white.shape[2])
-    whole = flat.T @ flat, flat.T @ dense.residual.ravel()
+    whole = dense.white.T @ dense.white, dense.white.T @ dense.residual
     return tuple(_without(dense, *whole, region) for region in regions)
 
 
 def _without(
     dense: _Dense, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"], region: Region
 ) -> UnseenRegion:
-    left = region.poses[dense.poses]
-    out = dense.white[left].reshape(-1, len(gram))
-    lost = dense.geometry & ~np.any(dense.white[~left] != 0, axis=(0, 1))
+    out, left = region.poses[dense.pose], region.poses[dense.poses]
+    gone = dense.white[out]
+    lost = dense.geometry & ~np.any(dense.white[~out] != 0, axis=0)
     kept = ~lost
-    related = dense.of_prior | ~np.any(dense.relations[:, lost] != 0, axis=1)
+    related = ~np.any(dense.relations[:, lost] != 0, axis=1)
     rows, values = dense.relations[related][:, kept], dense.relation_residual[related]
-    information = (gram - out.T @ out)[np.ix_(kept, kept)] + rows.T @ rows
-    slope = (gradient - out.T @ dense.residual[left].ravel())[kept] + rows.T @ values
+    information = (gram - gone.T @ gone)[np.ix_(kept, kept)] + rows.T @ rows
+    slope = (gradient - gone.T @ dense.residual[out])[kept] + rows.T @ values
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     root = inverse_cholesky(scale[:, None] * information * scale + _RIDGE * np.eye(len(scale))) * scale
     step = -root.T @ (root @ slope)
-    in_mm = dense.in_mm[left]
-    errors = np.einsum("mcr,mr->mc", in_mm, dense.residual[left])
-    moved = np.einsum("mcr,mrp->mcp", in_mm, dense.white[left])
-    by_kept, by_lost = (moved[:, :, which].reshape(errors.size, -1) for which in (kept, lost))
-    errors, of_parameters = errors.ravel() + by_kept @ step, by_kept @ root.T
-    noise = in_mm @ np.swapaxes(in_mm, 1, 2)
+    moved, noise = dense.moved[np.repeat(left, 3)], dense.noise[left]
+    errors, of_parameters = dense.errors[np.repeat(left, 3)] + moved[:, kept] @ step, moved[:, kept] @ root.T
     variance = np.diagonal(noise, axis1=1, axis2=2).ravel()
     if lost.any():
-        basis, sizes, _ = np.linalg.svd(by_lost, full_matrices=False)
+        basis, sizes, _ = np.linalg.svd(moved[:, lost], full_matrices=False)
         basis = basis[:, sizes > 1e-9 * sizes.max(initial=1e-300)]
         errors = errors - basis @ (basis.T @ errors)
         of_parameters = of_parameters - basis @ (basis.T @ of_parameters)
-        crossed = (noise @ basis.reshape(*in_mm.shape[:2], -1)).reshape(basis.shape)
+        crossed = (noise @ basis.reshape(len(noise), 3, -1)).reshape(basis.shape)
         variance = variance + np.sum(basis * (basis @ (basis.T @ crossed) - 2 * crossed), axis=1)
     variance = variance + np.sum(of_parameters**2, axis=1)
     seen = variance > _NOTHING

@@ -11,7 +11,7 @@ from ..core.arguments import Count, Range, checked_fields
 from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import to_numpy
-from ..data.arm_classes import small_arm_noise
+from ..data.arm_classes import CLASSES, ArmNoise, small_arm_noise
 from ..data.noise import Noise
 from ..data.simulation import socket_point
 from ..kinematics.arm import Arm, is_single
@@ -79,6 +79,16 @@ class PlanOptions(NamedTuple):
     check_length: float | None = None
     seed: int = 0
     progress: Callable[[str, float], None] | None = None
+
+    @classmethod
+    def usual(cls, assumed: ArmNoise) -> "PlanOptions":
+        """Those for an arm that was not calibrated: the noise and approach points that are usual for its class.
+
+        Example:
+            >>> aj.planning.PlanOptions.usual(aj.files.load_noise("panda")).retract
+            50.0
+        """
+        return cls(noise=assumed.noise, retract=CLASSES[assumed.arm_class].retract)
 
     def report(self, stage: str, fraction: float) -> None:
         """Say how much of a stage is done."""

@@ -67,21 +67,21 @@ def arm_survey(
     empty |= {"determined": [], "still": [], "needed": [], "advice": ""}
     summary |= empty | {"warnings": _warnings(arm)}
     try:
-        found, chosen, still = determined_by(arm), Parameters.independent(arm), still_joints(arm)
+        best, chosen, still = determined_by(arm), Parameters.independent(arm), still_joints(arm)
         summary |= {
-            "parameters": len(found[0].seen.names),
-            "redundant": _redundant(found),
-            "weak": [trade_off.text for trade_off in found[1].seen.trade_offs],
-            "parallel": list(found[1].seen.parallel),
+            "parameters": len(best[0].seen.names),
+            "redundant": _redundant(best),
+            "weak": [trade_off.text for trade_off in best[1].seen.trade_offs],
+            "parallel": list(best[1].seen.parallel),
             "free": list(chosen.names),
             "fixed": [name for name in chosen.held if not name.startswith("beta_")],
-            "determined": [_row(one) for one in found],
-            "still": [{"joint": one.joint, "lost": None if one.lost is None else list(one.lost)} for one in still],
+            "determined": [_row(data) for data in best],
+            "still": [{"joint": row.joint, "lost": None if row.lost is None else list(row.lost)} for row in still],
         }
         needed = [first_capture(arm, usual.noise, usual.arm_class)]
-        moving = [one.joint for one in still if one.lost is None or one.lost]
+        moving = [row.joint for row in still if row.lost is None or row.lost]
         summary |= {
-            "needed": [_needed(one, usual.source) for one in needed],
+            "needed": [_needed(capture, usual.source) for capture in needed],
             "advice": _advice(needed, moving, arm.joints),
         }
     except InputError as error:
@@ -101,17 +101,17 @@ def _frames(arm: Arm, base: Transform) -> list[dict[str, Any]]:
 
 
 def _warnings(arm: Arm) -> list[str]:
-    found, links = [], total_link_length(arm)
+    warnings, links = [], total_link_length(arm)
     if not _SHORTEST <= links <= _LONGEST:
-        found.append(f"The links together measure {links:.4g} mm; is the unit of the lengths right?")
+        warnings.append(f"The links together measure {links:.4g} mm; is the unit of the lengths right?")
     if arm.limits is None:
-        found.append("No joint limits are given, so joints are taken to go from -180 to 180 deg; add them.")
-    return found
+        warnings.append("No joint limits are given, so joints are taken to go from -180 to 180 deg; add them.")
+    return warnings
 
 
-def _redundant(found: Sequence[Determined]) -> list[str]:
+def _redundant(best: Sequence[Determined]) -> list[str]:
     """What no data on the tip can separate, whatever is recorded."""
-    seen = found[1].seen
+    seen = best[1].seen
     return [text for text, always in zip(seen.undetermined, seen.structural, strict=True) if always]
 
 
@@ -119,8 +119,8 @@ def _left_out(arm: Arm, model: str | None) -> list[str]:
     """Terms of a model that the arm's corrections leave out, and why."""
     if model is None or arm.corrections is None:
         return []
-    loads, known = loads_of(arm), correction_names(arm)
-    gone = [term for term in terms_of(model, arm.joints, loads) if term.name not in known]
+    loads, left = loads_of(arm), correction_names(arm)
+    gone = [term for term in terms_of(model, arm.joints, loads) if term.name not in left]
     if not gone:
         return []
     limits = joint_limits(arm, None)

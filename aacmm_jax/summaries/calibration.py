@@ -26,7 +26,7 @@ from ..uncertainty.identifiability import Observability
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .observations import capture_observations, observed_summary
-from .validation import cross_validation_summary
+from .validation import cross_validation_summary, finite
 from .verdicts import calibration_verdict, checked_lengths
 
 _CORRELATED = 0.95
@@ -119,8 +119,8 @@ def metrics(evaluation: Evaluation) -> dict[str, Any]:
     repeatability, error = evaluation.repeatability, np.asarray(evaluation.error)
     values = {"de_mm": repeatability.de, "deltam_mm": repeatability.deltam, "rms_mm": repeatability.rms}
     # With one pose in every socket none of them is finite: there is no scatter.
-    found: dict[str, Any] = {key: float(value) for key, value in values.items() if np.isfinite(value)}
-    return found | (length_metrics(error) if len(error) else {})
+    finite_values = {key: float(value) for key, value in values.items() if np.isfinite(value)}
+    return finite_values | (length_metrics(error) if len(error) else {})
 
 
 def length_metrics(error: np.ndarray) -> dict[str, float]:
@@ -136,8 +136,8 @@ def metrics_by_socket_and_length(
 ) -> dict[str, Any]:
     """Repeatability socket by socket and errors length by length; mm. With the uncertainty of a calibration that the
     lengths belong to, their errors' U."""
-    found = evaluation.repeatability
-    columns = (np.asarray(column) for column in (found.socket_de, found.socket_deltam, found.socket_rms))
+    scatter = evaluation.repeatability
+    columns = (np.asarray(column) for column in (scatter.socket_de, scatter.socket_deltam, scatter.socket_rms))
     sockets = zip(capture.names, capture.sizes, *columns, strict=True)
     columns = [np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u)]
     stated = np.array([float(length.u) for length in capture.lengths])
@@ -157,7 +157,7 @@ def metrics_by_socket_and_length(
                 "value_mm": float(length.value),
                 "measured_mm": float(measured),
                 "error_mm": float(error),
-                "error_u_mm": float(u) if np.isfinite(u) else None,
+                "error_u_mm": finite(u),
             }
             | ({} if expanded is None else {"expanded_mm": float(expanded[i]) if np.isfinite(u) else None})
             for i, (length, measured, error, u) in enumerate(lengths)
@@ -201,8 +201,8 @@ def calibration_summary(
         "steps": record.steps,
         "poses": len(record.recording.capture.readings),
         "sockets_used": list(record.recording.capture.names),
-        "scale_k": record.k if np.isfinite(record.k) else None,
-        "scale_u": record.u_k if np.isfinite(record.u_k) else None,
+        "scale_k": finite(record.k),
+        "scale_u": finite(record.u_k),
         "scale_expanded": uncertainty.expanded_k() if np.isfinite(record.u_k) else None,
         "fixed_by_one_length": record.fixed_by_one_length,
         "held": list(record.held),
@@ -279,7 +279,11 @@ def uncertainty_summary(
     """Noise behind the uncertainty, standard uncertainties (k = 1) over the working volume, and observability."""
     uncertainty = uncertainty_of(record)
     volume = volumetric_uncertainty(uncertainty) if volume is None else volume
-    found = {
+    readings, nearby = np.asarray(record.recording.capture.readings), None
+    if len(readings) > 1:  # a single pose has no distance from another
+        poses = tried_poses(record.calibrated.arm, readings, volume.q)
+        nearby = {"poses": len(poses.distance), "tried": int(poses.tried.sum()), "spacing_rad": poses.spacing}
+    return {
         "form": record.noise_model,
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(record.noise, record.calibrated.arm),
@@ -288,27 +292,16 @@ def uncertainty_summary(
         "misfit": record.reduced_chi,
         # Of the unknown geometry, whose uncertainty follows from the scatter of single poses.
         "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(1), np.zeros(1))[0]),
-        "volume": volume.summary,
-        "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
+        "volume": {key: finite(value) for key, value in volume.summary.items()},
+        "correlated": [
+            dict(zip(("one", "other", "r"), pair, strict=True)) for pair in uncertainty.correlated(_CORRELATED)
+        ],
         "rank": observability.rank,
         "parameters": len(observability.names),
-        "condition": observability.condition,
+        "condition": finite(observability.condition),
         "indices": observability.indices,
+        "tried": nearby,
     }
-    # JSON has no infinity: None for what is not determined.
-    found["volume"] = {key: value if np.isfinite(value) else None for key, value in found["volume"].items()}
-    found["tried"] = _tried(record, volume)
-    found["condition"] = found["condition"] if np.isfinite(found["condition"]) else None
-    return found
-
-
-def _tried(record: CalibrationRecord, volume: VolumetricUncertainty) -> dict[str, Any] | None:
-    """How many of the volume's poses are near those of the calibration; None of a single pose."""
-    readings = np.asarray(record.recording.capture.readings)
-    if len(readings) < 2:
-        return None
-    found = tried_poses(record.calibrated.arm, readings, volume.q)
-    return {"poses": len(found.distance), "tried": int(found.tried.sum()), "spacing_rad": found.spacing}
 
 
 def active_names_of(record: CalibrationRecord, active: np.ndarray) -> dict[str, str]:

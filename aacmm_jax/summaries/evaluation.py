@@ -57,24 +57,19 @@ def evaluation_summary(
             summary[group] = None
             continue
         part = None if not names else capture if len(names) == len(names_in(capture)) else part_of(capture, names)
-        found = {
-            stage: whole[stage]
-            if part is capture
-            else None
-            if part is None
-            else _evaluated(arm, part, noise.get(stage))
-            for stage, arm in arms.items()
-        }
-        summary[group] = {stage: _grouped(found[stage], whole[stage], lengths) for stage in whole}
+        parts: dict[str, Evaluation | None] = dict(whole) if part is capture else dict.fromkeys(arms)
+        if part is not None and part is not capture:
+            parts = {stage: _evaluated(arm, part, noise.get(stage)) for stage, arm in arms.items()}
+        summary[group] = {stage: _grouped(parts[stage], whole[stage], lengths) for stage in whole}
         summary[group]["sockets"] = [row for row in rows["sockets"] if row["socket"] in names]
-        summary[group]["observations"] = _observation_rows(found["nominal"], found["calibrated"])
+        summary[group]["observations"] = _observation_rows(parts["nominal"], parts["calibrated"])
         summary[group]["lengths"] = [rows["lengths"][i] for i in lengths]
         summary[group]["fixed_by_one_length"] = fixed_scale in lengths
         if not wanted:
             summary["warnings"] += _add_prediction(summary[group], record, part, lengths)
     summary["kept"], summary["failed"] = _exceeded(summary, record)
-    found = record.acceptance() if tests is None else tests
-    summary["acceptance"] = acceptance_summary(found["calibrated"], found["nominal"])
+    tests = record.acceptance() if tests is None else tests
+    summary["acceptance"] = acceptance_summary(tests["calibrated"], tests["nominal"])
     summary["standards"] = list(record.standards)
     summary["u_test_mm"] = record.u_test
     summary["influences"] = influences_row(record.influences)
@@ -115,13 +110,13 @@ def _add_prediction(
     capture = record.recording.capture
     compared = None if part is None else unseen_errors(record.uncertainty, part)
     of_lengths = compared if part is capture or not lengths else unseen_errors(record.uncertainty, capture)
-    each: dict[str, Agreement] = {}
-    poses = lengths_found = NOTHING
+    by_name: dict[str, Agreement] = {}
+    poses = agreement_of_lengths = NOTHING
     if compared is not None and part is not None:
-        each, poses = {name: compared.of([name]) for name in compared.parts}, compared.of(compared.parts)
+        by_name, poses = {name: compared.of([name]) for name in compared.parts}, compared.of(compared.parts)
         for row in (*group["sockets"], *group["observations"]):
-            found = agreement_row(each[row.get("socket", row.get("observation"))])
-            row |= {key: found[key] for key in ("rms_predicted_mm", "reduced_chi", "probability")}
+            agreement = agreement_row(by_name[row.get("socket", row.get("observation"))])
+            row |= {key: agreement[key] for key in ("rms_predicted_mm", "reduced_chi", "probability")}
         kinds: dict[str, list[str]] = {"socket": list(part.names)} if part.names else {}
         for observation in part.observations:
             kinds.setdefault(observation.kind, []).append(observation.name)
@@ -134,7 +129,7 @@ def _add_prediction(
             for label, names in zip(common_labels(groups_of(part)), groups_of(part), strict=True)
         ]
     if of_lengths is not None and lengths:
-        lengths_found = of_lengths.of_lengths(lengths)
+        agreement_of_lengths = of_lengths.of_lengths(lengths)
         every = of_lengths.expanded()
         for row, i in zip(group["lengths"], lengths, strict=True):
             row["expanded_mm"] = expanded = finite(every[i])
@@ -142,13 +137,13 @@ def _add_prediction(
     group["predicted"] = {
         "poses": agreement_row(poses),
         "lengths": {
-            "lengths": lengths_found.count,
-            "normalised_error_rms": finite(lengths_found.rms / lengths_found.predicted),
-            "probability": finite(lengths_found.probability),
+            "lengths": agreement_of_lengths.count,
+            "normalised_error_rms": finite(agreement_of_lengths.rms / agreement_of_lengths.predicted),
+            "probability": finite(agreement_of_lengths.probability),
         },
     }
     before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
-    unseen = surprise(poses, lengths_found, each, lambda: _with_probe_fitted(record.uncertainty, part))
+    unseen = surprise(poses, agreement_of_lengths, by_name, lambda: _with_probe_fitted(record.uncertainty, part))
     return sentences(unseen + no_better(before, after))
 
 
@@ -157,13 +152,13 @@ def _with_probe_fitted(uncertainty: Uncertainty | None, part: Capture | None) ->
     if uncertainty is None or part is None or any(observation.target for observation in part.observations):
         return None
     poses = [Socket(name, q) for name, q in part.sockets.items()]
-    capture = Capture({}, [], [one.changed(target="probe") for one in (*poses, *part.observations)])
+    capture = Capture({}, [], [held.changed(target="probe") for held in (*poses, *part.observations)])
     try:
         check_geometry(uncertainty.arm, capture)
     except InputError:
         return None
-    found = unseen_errors(uncertainty, capture)
-    return found.of(found.parts)
+    errors = unseen_errors(uncertainty, capture)
+    return errors.of(errors.parts)
 
 
 def points_summary(record: PointsRecord, tests: list[AcceptanceTest] | None = None) -> dict[str, Any]:
@@ -243,14 +238,14 @@ def _part(part: MetricValue) -> dict[str, Any]:
 
 def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> dict[str, Any]:
     """Repeatability of a group's own sockets, and errors of the lengths that count for it."""
-    found = {} if part is None else metrics(part)
+    row = {} if part is None else metrics(part)
     if part is not None and part.observed is not None:
         pairs = zip(part.observed.kinds, part.observed.residuals, strict=True)
         # The only pose of a socket shows no scatter.
-        known = [np.asarray(values)[:3] for kind, values in pairs if kind != "socket" or values.shape[1] > 1]
-        squares = [np.zeros(0), *(np.sum(values**2, axis=0) for values in known)]
-        found["observed_rms_mm"] = float(np.sqrt(np.concatenate(squares).mean()))
-    return found | (length_metrics(np.asarray(whole.error)[lengths]) if lengths else {})
+        scattered = [np.asarray(values)[:3] for kind, values in pairs if kind != "socket" or values.shape[1] > 1]
+        squares = [np.zeros(0), *(np.sum(values**2, axis=0) for values in scattered)]
+        row["observed_rms_mm"] = float(np.sqrt(np.concatenate(squares).mean()))
+    return row | (length_metrics(np.asarray(whole.error)[lengths]) if lengths else {})
 
 
 def _exceeded(summary: dict[str, Any], record: EvaluationRecord) -> tuple[list[str], list[str]]:

@@ -30,8 +30,8 @@ def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
         }
         for i, (name, point) in enumerate(plan.sockets.items())
     ]
-    placed = {"kind": "plan", "sockets": rows, "lengths": reference_length_rows(plan.lengths)}
-    return placed | _plan_rows(plan, arm, [plan.motion], list(plan.sockets), plan.owner)
+    stated = _plan_rows(plan, arm, [plan.motion], list(plan.sockets), plan.owner)
+    return {"kind": "plan", **stated, "sockets": rows, "lengths": reference_length_rows(plan.lengths)}
 
 
 def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
@@ -49,8 +49,8 @@ def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
     names = [row["observation"] for row in rows]
     owner = np.repeat(np.arange(len(rows)), [row["poses"] for row in rows])
     without = {name: _prediction(u) if np.isfinite(u.largest) else None for name, u in plan.without.items()}
-    placed = {"kind": "kit plan", "observations": rows, "without": without}
-    return placed | _plan_rows(plan, arm, list(plan.motions), names, owner)
+    stated = _plan_rows(plan, arm, list(plan.motions), names, owner)
+    return {"kind": "kit plan", **stated, "observations": rows, "without": without}
 
 
 def _plan_rows(

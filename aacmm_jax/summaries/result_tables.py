@@ -86,8 +86,8 @@ def validation_tables(summary: Row) -> list[Table]:
         "by chance [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
         "": state,
     }
-    found = listed(caption, pooled, ("", "residual", "predicted by u"))
-    return [found, *([listed("Groups held out [mm]", rows, groups)] if rows else [])]
+    of_all = listed(caption, pooled, ("", "residual", "predicted by u"))
+    return [of_all, *([listed("Groups held out [mm]", rows, groups)] if rows else [])]
 
 
 def prior_table(rows: Rows) -> Table:
@@ -237,7 +237,7 @@ def observations_table(caption: str, rows: Rows) -> Table:
         "poses": "poses",
         "nominal": "nominal_rms_mm",
         "calibrated": "rms_mm",
-        "predicted": "rms_predicted_mm",
+        "predicted": "rms_predicted_mm" if any("rms_predicted_mm" in row for row in rows) else None,
         "calibrated, in standard deviations": lambda row: number(row["reduced_chi"], 2),
     })  # fmt: skip
 

@@ -173,8 +173,8 @@ def quantity_words(row: Mapping[str, Any], u: bool = True, coverage: float | Non
     known and ``u`` is true. With a coverage factor, what was found is rounded to its expanded uncertainty."""
     factor, unit = (180 / math.pi, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
     default = 6 if unit == "1" else 4
-    found = [None] * len(row["values"]) if coverage is None else row["u_found"]
-    expanded = [None if own is None else (coverage or 0.0) * factor * own for own in found]
+    uncertainties = [None] * len(row["values"]) if coverage is None else row["u_found"]
+    expanded = [None if value is None else (coverage or 0.0) * factor * value for value in uncertainties]
     decimals = [min(decimals_for(u, default), _MOST_DECIMALS) for u in expanded]
     pairs = zip(row["values"], decimals, strict=True)
     values = ", ".join(f"{factor * value:z.{digits}f}" for value, digits in pairs)
@@ -225,7 +225,7 @@ def volume_rows(volume: Mapping[str, Any]) -> list[tuple[str, list[float | None]
         "expanded_length_reading": f"{length}: with the noise of both readings",
     }
     which = ("median", "95", "largest")
-    return [(title, [volume[f"{key}_{one}_mm"] for one in which]) for key, title in titles.items()]
+    return [(title, [volume[f"{key}_{statistic}_mm"] for statistic in which]) for key, title in titles.items()]
 
 
 def encoders_in_words(found: Mapping[str, Any]) -> str:
@@ -252,8 +252,8 @@ def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, floa
 
 def difference_from_best(row: Mapping[str, Any], best_rms: float) -> tuple[float | None, float | None]:
     """`rms_difference`, mm; nothing of the best model itself, and where the regions say nothing."""
-    known = row["difference"] is not None and row["u_difference"] is not None
-    return rms_difference(row, best_rms) if known and row["rms_outside"] > best_rms else (None, None)
+    compared = row["difference"] is not None and row["u_difference"] is not None
+    return rms_difference(row, best_rms) if compared and row["rms_outside"] > best_rms else (None, None)
 
 
 def lengths_sentence(found: Mapping[str, Any]) -> str:

@@ -116,7 +116,8 @@ def observed_calls(nominal: aj.Arm, sockets: aj.Capture) -> dict[str, tuple[Call
     for one in capture.observations:
         kind, stored = type(one), one.stored()
         if isinstance(one, observations.ParallelPlanes):
-            sides = {"one": one.q[: one.first], "other": one.q[one.first :]}
+            first = one.side.count("one")
+            sides = {"one": one.q[:first], "other": one.q[first:]}
             stored = sides | {key: value for key, value in stored.items() if key not in ("q", "side")}
         if isinstance(one, observations.Artefact):
             points = dict(zip(one.names, one.coordinates, strict=True))

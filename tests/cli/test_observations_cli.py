@@ -215,8 +215,8 @@ def test_sessions_have_a_probe_each(aacmm, folder):
     said = aacmm("calibrate", *both, "-o", "d.h5", "--same-probe", "--method", "joint", expect=1).stdout
     together = json.loads(aacmm("show", "d.h5", "--json").stdout)
     assert together["calibrated"]["rms_mm"] > 0.1
-    assert "Session tuesday contradicts the other sessions" in together["warnings"][0]
-    offsets = re.search(r"the probe seems remounted, elsewhere by (\S+), (\S+), (\S+) mm", together["warnings"][0])
+    assert any("Session tuesday contradicts the other sessions" in says for says in together["warnings"])
+    offsets = re.search(r"probe seems displaced by (\S+), (\S+), (\S+) mm", " ".join(together["warnings"]))
     assert offsets is not None
     np.testing.assert_allclose([float(offset) for offset in offsets.groups()], [0.3, -0.2, 0.1], atol=0.005)
     assert "Sessions, RMS distance of poses" in " ".join(said.split())
@@ -396,6 +396,6 @@ def test_a_plan_with_a_kit(aacmm, tmp_path):
     for part in ("bar", "tracker", "without tracker: ", "16 random poses in the same places"):
         assert part in shown
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 17
-    assert '"a" = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()
+    assert 'a = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()
     refused = aacmm("plan", "cheng2018-simulation", "-o", "p.csv", "--kit", "kit.toml", "--sockets", 3, expect=2)
     assert "--kit names what is used and where it is, and ignores --sockets" in refused.stderr

@@ -11,11 +11,11 @@ import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
+from aacmm_jax.data.observations.artefact import platform_frames
 from aacmm_jax.data.observations.fits import distances_from_axis, fitted_cylinder
 from aacmm_jax.data.observations.frames import placed
 from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
 from aacmm_jax.data.observations.observation import kinds as known_kinds
-from aacmm_jax.data.observations.platform import platform_frames
 
 RANDOM = np.random.default_rng(1)
 POSES = 12

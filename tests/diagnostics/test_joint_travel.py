@@ -1,10 +1,12 @@
 """Joints that stand still are found, with what is lost by it."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.diagnostics.joint_travel import lost_by_standing, standing_joints
+from aacmm_jax.diagnostics.joint_travel import lost_by_standing, standing_joints, standing_rows
 
 DEG = np.pi / 180
 
@@ -36,3 +38,28 @@ def test_two_joints_lose_twice_as_much(paper_arm, paper_capture):
     lost = lost_by_standing(paper_arm, paper_capture, [3, 5])
     assert [len(names) for names in lost] == [4, 4]
     assert not set(lost[0]) & set(lost[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [0.1, 0.9])
+def test_the_list_for_held_is_complete(width):
+    """Joint 5 of a UR5e stands still: with the list a calibration converges, and nothing is left open."""
+    nominal = aj.load_arm("ur5e").replace(probe=np.array([0.0, 0.0, 100.0]))
+    random = np.random.default_rng(3)
+    q = random.uniform(-2.5, 2.5, (60, 6))
+    q[:, 4] = 0.7 + np.radians(width) * random.uniform(size=60)
+    true = aj.perturbed_arm(aj.Parameters.free_of(nominal), length=1.0, angle=2e-3, seed=1)
+    seen = np.asarray(true.position(q)) + random.normal(0, 0.02, (60, 3))
+    capture = aj.Capture({}, observations=[aj.data.observations.MeasuredPoints("t", q, seen, u=0.02)])
+    held = None if width == 0.1 else ("theta_1", "d_1", "alpha_6", "a_6", "probe_x", "probe_y")
+    specification = aj.kinematics.ArmSpecification(nominal, held=held, free=("beta_2", "beta_3"))
+    (row,) = standing_rows(nominal, capture, specification)
+    fixed = row["says"].split("--held ")[1].removesuffix(".").split(",")
+    space = aj.Parameters.free_of(nominal, held=fixed, free=("beta_2", "beta_3"))
+    found = aj.observability(space.base, capture, space, sigma=0.05)
+    assert (found.null.shape[1], found.trade_offs) == (0, ())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", aj.IdentifiabilityWarning)
+        result = aj.calibrate(space.base, capture, aj.Bounds.around(space.base, space))
+    assert result.converged
+    assert not np.any(result.active)

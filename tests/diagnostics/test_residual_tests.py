@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import linalg, stats
 
 from aacmm_jax.diagnostics.group_test import Block
-from aacmm_jax.diagnostics.residual_tests import Residuals, consistency, form_test, pose_form_test, score_tests
+from aacmm_jax.diagnostics.residual_tests import Residuals, alike, consistency, form_test, score_tests
 
 SIZES, PARAMETERS = (12, 9, 15), 4
 
@@ -77,19 +77,17 @@ def test_a_column_of_which_the_model_leaves_too_little_is_its_own(problem, rng):
 
 
 @pytest.mark.parametrize("relative", [True, False])
-@pytest.mark.parametrize("kernel", [None, "neighbours"])
-def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, relative, kernel):
+@pytest.mark.parametrize("positive", [True, False])
+def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, relative, positive):
+    """With a block for each pose of three rows, none, and one block for five poses."""
     blocks, columns = problem
-    size = 3
-    parts = [rng.normal(size=(rows, size)) for rows in SIZES]
-    parts[1] = None
-    inner = None if kernel is None else np.eye(size, k=1) / 2 + np.eye(size, k=-1) / 2
-    form = parts, [None if part is None else inner for part in parts]
-    matrix = np.zeros((sum(SIZES), sum(SIZES)))
-    for part, end, rows in zip(parts, np.cumsum(SIZES), SIZES, strict=True):
-        if part is not None:
-            of = slice(end - rows, end)
-            matrix[of, of] = part @ (np.eye(size) if inner is None else inner) @ part.T
+    by_pose = rng.normal(size=(4, 3, 3))
+    tips, near = rng.normal(size=(5, 3, 2)), np.eye(5) if positive else np.eye(5, k=1) + np.eye(5, k=-1)
+    by_pose = by_pose @ by_pose.swapaxes(1, 2) if positive else by_pose + by_pose.swapaxes(1, 2)
+    kernels = [by_pose, None, alike(tips, near)]
+    pairs = np.einsum("mac,mn,nbc->manb", tips, near, tips)
+    np.testing.assert_allclose(kernels[2][0], pairs.reshape(15, 15), atol=1e-12)
+    matrix = linalg.block_diag(*by_pose, np.zeros((SIZES[1], SIZES[1])), kernels[2][0])
     projector = annihilator(columns)
     errors = projector @ rng.normal(size=(sum(SIZES), 20_000))
     draws = np.einsum("rn,rs,sn->n", errors, matrix, errors)
@@ -97,25 +95,12 @@ def test_quadratic_forms_have_the_distribution_of_their_draws(problem, rng, rela
     value = residual @ matrix @ residual
     if relative:
         draws, value = draws / np.sum(errors**2, axis=0), value / (residual @ residual)
-    found = form_test(Residuals.of(blocks), *form, relative)
+    found = form_test(Residuals.of(blocks), kernels, relative)
     assert found.probability == pytest.approx(np.mean(draws > value), abs=0.02)
-    if kernel is None:
+    product = projector @ matrix
+    assert found.degrees_of_freedom == pytest.approx(np.trace(product) ** 2 / np.trace(product @ product))
+    if positive:
         assert found.ratio == pytest.approx(value / draws.mean(), rel=0.03)
-        product = projector @ matrix
-        assert found.degrees_of_freedom == pytest.approx(np.trace(product) ** 2 / np.trace(product @ product))
-
-
-@pytest.mark.parametrize("relative", [True, False])
-def test_forms_by_pose_are_those_with_one_large_kernel(problem, rng, relative):
-    left = Residuals.of(problem[0])
-    kernels = [k + k.swapaxes(1, 2) for k in (rng.normal(size=(size // 3, 3, 3)) for size in SIZES[:2])]
-    large = [np.kron(np.eye(len(k)), np.ones((3, 3))) for k in kernels]
-    for whole, each in zip(large, kernels, strict=True):
-        for number, k in enumerate(each):
-            whole[3 * number : 3 * number + 3, 3 * number : 3 * number + 3] = k
-    form = [np.eye(SIZES[0]), np.eye(SIZES[1])], large
-    found, expected = pose_form_test(left, kernels, relative), form_test(left, *form, relative)
-    assert found == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("opened", [False, True])

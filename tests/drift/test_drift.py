@@ -521,7 +521,7 @@ def test_command_on_three_calibrations(run, files):
     assert (files / "trend.svg").stat().st_size > 10_000
     printed = " ".join(run("c.h5", "a.h5", "b.h5").stdout.split())
     assert "Each calibration against the first" in printed
-    assert "Change from the first calibration (*: beyond its uncertainty)" in printed
+    assert "The change of every parameter from the first calibration: --csv" in printed
 
 
 def test_command_refuses(run, files):

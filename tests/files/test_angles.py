@@ -1,13 +1,11 @@
 """What a check prints for a manifest: pasted into it, its readings are those of the arm."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.diagnostics.joint_travel import fixed_parameters
 from aacmm_jax.diagnostics.reading_fit import Explanation
 from aacmm_jax.files.manifest import read_manifest
 from aacmm_jax.files.reading_checks import angles_toml
@@ -83,28 +81,3 @@ def test_degrees_read_as_rad(tmp_path, table, angles, part):
         read_manifest(manifest)
     assert part in str(refused.value)
     assert "numpy" not in str(refused.value)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("width", [0.1, 0.9])
-@pytest.mark.parametrize("held", [None, ("theta_1", "d_1", "alpha_6", "a_6", "probe_x", "probe_y")])
-def test_the_list_for_held_is_complete(held, width):
-    """Joint 5 of a UR5e stands still: with the list a calibration converges, and nothing is left open."""
-    nominal = aj.load_arm("ur5e").replace(probe=np.array([0.0, 0.0, 100.0]))
-    random = np.random.default_rng(3)
-    q = random.uniform(-2.5, 2.5, (60, 6))
-    q[:, 4] = 0.7 + np.radians(width) * random.uniform(size=60)
-    true = aj.perturbed_arm(aj.Parameters.free_of(nominal), length=1.0, angle=2e-3, seed=1)
-    seen = np.asarray(true.position(q)) + random.normal(0, 0.02, (60, 3))
-    capture = aj.Capture({}, observations=[aj.data.observations.MeasuredPoints("t", q, seen, u=0.02)])
-    own = aj.Parameters.free_of(nominal, held=held, free=("beta_2", "beta_3"))
-    fixed = fixed_parameters(aj.Bounds.around(own.base, own), capture, [5], 0.05)
-    assert set(own.held) - {f"beta_{i}" for i in range(1, 7)} < set(fixed)
-    space = aj.Parameters.free_of(nominal, held=fixed, free=("beta_2", "beta_3"))
-    found = aj.observability(space.base, capture, space, sigma=0.05)
-    assert (found.null.shape[1], found.trade_offs) == (0, ())
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", aj.IdentifiabilityWarning)
-        result = aj.calibrate(space.base, capture, aj.Bounds.around(space.base, space))
-    assert result.converged
-    assert not np.any(result.active)

@@ -240,8 +240,8 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        (ALL.replace('"x"', '"xx"'), ["a.csv has no column 'xx'", "did you mean 'x'?"]),
-        (ALL.replace('"x"', "20"), ["a.csv has 12 columns", "no column 20"]),
+        (ALL.replace('"x"', '"xx"'), ["a.csv has no column 'xx'; it has the columns 1 'q1', 2 'q2'"]),
+        (ALL.replace('"x"', "20"), ["a.csv has no column '20'; it has"]),
         (ALL.replace('"x"', '"y"'), ["one column is picked twice"]),
         (ALL.replace('"q?"', '"q[1-3]"'), ["picks 3 columns for the readings", "6 joints"]),
         (ALL.replace("points =", "point ="), ["no 'point'", "did you mean 'points'?"]),
@@ -251,7 +251,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         # Mixed units: in one header, or in header and manifest.
         (
             ALL.replace('"x", "y"', '"x [m]", "y [mm]"'),
-            ["mixes units: 'x [m]' is in m, 'y [mm]' in mm", "convert one of them"],
+            ["mixes units: 'x [m]' is in m, 'y [mm]' is in mm", "convert one of them"],
         ),
         (ALL.replace('"x", "y"', '"y", "y_mm"') + 'units = { points = "inch" }', ["units.points is 'inch'", "says mm"]),
         (ALL.replace('"x", "y", "z"', '"a", "b", "c"'), ["the header of points says 'cm'", "one of mm, m, um, inch"]),
@@ -260,7 +260,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         (ALL + "u = 0.1", ["u is given and also in columns"]),
         (ALL + 'readings = "short.csv"', ["5 rows of 'points'", "2 readings"]),
         (ALL + 'files = ["a.csv"]', ["needs either file or files"]),
-        (ALL + "group = 99", ["no column 99"]),
+        (ALL + "group = 99", ["no column '99'"]),
         (ALL + "skip = -1", ["'points 1.skip' must be greater"]),
         (ALL + 'preset = "excel"', ["'points 1.preset' must be"]),
         (ALL + "dimaeter = 3", ["unknown key 'points 1.dimaeter'"]),
@@ -298,8 +298,8 @@ def test_bad_rotations(tmp_path, text, parts):
 @pytest.mark.parametrize(
     ("header", "parts"),
     [
-        (NAMES[:11], ["no column 'q?': its header has 11 names, but its rows 12 columns", "or give numbers"]),
-        (None, ["no column 'q?'; it has no header: give numbers"]),
+        (NAMES[:11], ["no column 'q?'; it has 12 columns, but its header 11 names: pick"]),
+        (None, ["no column 'q?'; it has 12 columns without names: pick others"]),
         ([*NAMES[:9], "u_x", "U95 Y", "U(95) Z"], ["no column 'U*95* X', but columns U*95* Y, U*95* Z; correct its"]),
     ],
 )

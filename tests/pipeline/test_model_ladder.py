@@ -178,15 +178,15 @@ def test_the_evidence_is_that_of_a_gaussian(paper_arm, space, bounds):
         record = record_of(result, Recording(capture, ArmSpecification(paper_arm)))
         equations = equations_of(record)
         dense = _dense(equations, len(record.names))
-        data = [dense.white.reshape(-1, dense.white.shape[2]), dense.relations[~dense.of_prior]]
-        by, of_geometry = np.concatenate(data), dense.geometry
-        left = np.concatenate([dense.residual.ravel(), dense.relation_residual[~dense.of_prior]])
-        prior = dense.relations[dense.of_prior][:, ~of_geometry]
+        first = len(dense.relations) - len(record.names)  # row of the prior
+        by, of_geometry = np.concatenate([dense.white, dense.relations[:first]]), dense.geometry
+        left = np.concatenate([dense.residual, dense.relation_residual[:first]])
+        prior = dense.relations[first:, ~of_geometry]
         basis = np.linalg.qr(by[:, of_geometry], mode="complete")[0][:, int(of_geometry.sum()) :]
         by = basis.T @ by[:, ~of_geometry] @ np.linalg.inv(prior)
         covariance = by @ by.T + np.eye(len(by))
         # At the prior's mean, where the residual is what the solution left and what the parameters explain.
-        mean = basis.T @ left - by @ dense.relation_residual[dense.of_prior]
+        mean = basis.T @ left - by @ dense.relation_residual[first:]
         expected = -0.5 * (mean @ np.linalg.solve(covariance, mean) + np.linalg.slogdet(covariance)[1])
         found.append((log_evidence(equations, record.prior, {}), expected))
     (one, first), (other, second) = found
