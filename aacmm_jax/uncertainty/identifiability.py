@@ -92,11 +92,14 @@ class Observability(NamedTuple):
         """What a user should know, one sentence each: directions that are not or hardly determined, and what to do."""
         always = [text for text, never in zip(self.undetermined, self.structural, strict=True) if never]
         now = [text for text, never in zip(self.undetermined, self.structural, strict=True) if not never]
-        fix, sentences = "Fix one of each (--held).", []
+        sentences = []
         if always:
-            sentences.append(f"No measurement of this kind can separate: {'; '.join(always)}. {fix}")
+            sentences.append(
+                f"No measurement of this kind can separate: {'; '.join(always)}. Fix one of each (--held)."
+            )
         if now:
-            sentences.append(f"Not determined by these data: {_first(now)}. {self.remedy or fix}")
+            remedy = f" {self.remedy}" if self.remedy else " Fix one of each (--held)."
+            sentences.append(f"Not determined by these data: {_first(now)}.{remedy}")
         if self.by_prior:
             sentences.append(f"Determined by the prior and not, or hardly, by these data: {_first(self.by_prior)}.")
         if self.trade_offs:
@@ -279,10 +282,8 @@ class _Spectrum(NamedTuple):
             size, followers = np.abs(direction).max(), self.geometry @ direction
             names = [name for name, x in zip(space.names, np.abs(direction), strict=True) if x > _PRESENT * size]
             parts = [name for name, at in self.agreeing.parts if np.abs(followers[at]).max() > _MOVED * size]
-            items = [
-                *_some(names, _PARAMETERS_NAMED, "more"),
-                *_some(parts, _PARTS_NAMED, "more parts of the geometry"),
-            ]
+            items = _some(names, _PARAMETERS_NAMED, "more")
+            items += _some(parts, _PARTS_NAMED, "more parts of the geometry")
             alone = f"{items[0]} (changes nothing that is measured)"
             texts.append(f"{listed(items)} trade off" if len(items) > 1 else alone)
             directions.append(direction / np.linalg.norm(direction))
@@ -361,9 +362,8 @@ def _remedy(arm: Arm, capture: Capture, space: Parameters, left: int) -> str:
     for name, q in capture.sockets.items():
         first = np.tile(np.asarray(q)[:1], (60, 1))
         if not more_poses:  # other configurations with the tip in the same place
-            starts = first + np.pad(
-                random.uniform(-1.5, 1.5, (60, arm.joints)), [(0, 0), (0, capture.columns - arm.joints)]
-            )
+            starts = first.copy()
+            starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
             moved, reached = project_to_targets(arm, starts, np.asarray(arm.position(first)))
             more_poses[f"\0 {name}"] = moved[reached] if reached.any() else first[:1]
         if capture.columns > arm.joints:
