@@ -5,7 +5,7 @@ import numpy as np
 from ..core.arrays import Numbers
 from .influences import Influences
 from .lengths import deviation_metrics, length_readings
-from .requirements import CALIBRATED, CONDITIONS, Requirement, StandardTest, different_positions
+from .requirements import CALIBRATED, CONDITIONS, Requirement, StandardTest, of_bars
 from .results import Measured, Metric, metric_value
 from .spheres import points_of
 from .standards import JJF_1408
@@ -65,7 +65,7 @@ TESTS = (
                 "own reading",
                 _socket_lacking,
             ),
-            different_positions(_LENGTH_POSITIONS, False, (f"{_PAPER}: a length measured 30 times", "own reading")),
+            of_bars("positions", _LENGTH_POSITIONS, (f"{_PAPER}: a length measured 30 times", "own reading")),
             CALIBRATED,
             CONDITIONS,
         ),

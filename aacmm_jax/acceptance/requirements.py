@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..core.text import pluralise
 from ..data.sphere import ProbedSphere, SphereTest
 from .geometry import BarPositions, all_bars, bar_positions, covers_hemisphere, separate_places, size_of
 from .influences import Influences
@@ -114,11 +113,10 @@ def touches(test: SphereTest, points: int, origin: Origin) -> Requirement:
     """So many touches in every group."""
 
     def wrong(sphere: ProbedSphere) -> list[str]:
-        fewest = min(map(len, sphere.groups))
-        return [f"'{sphere.name}' has a group of {fewest}"] if fewest < points else []
+        return groups_where(sphere, lambda group: len(group) < points)
 
-    sentence = f"{points} points per group are required ({{}})."
-    return of_spheres(f"{points} points in every group of touches", test, wrong, sentence, origin)
+    says = f"{points} points in every group of touches"
+    return of_spheres(says, test, wrong, f"{points} points per group are required (fewer: {{}}).", origin)
 
 
 def spread_touches(test: SphereTest, points: int, origin: Origin) -> Requirement:
@@ -157,48 +155,66 @@ def sphere_positions(test: SphereTest, positions: int, origin: Origin) -> Requir
     return Requirement(says, *origin, lacking)
 
 
-def of_bars(says: str, check: Callable[[list[BarPositions], float | None], str], origin: Origin) -> Requirement:
-    """A requirement of the positions of bars, with the size of the measuring range (mm) where it is known."""
+class _Count(NamedTuple):
+    """A number that the positions of bars have, in a measuring range (mm) whose size may be unknown; ``{n}`` is the
+    one that is needed, ``{}`` the one that they have."""
+
+    says: str
+    sentence: str
+    count: Callable[[list[BarPositions], float | None], float]
+
+
+_DIRECTIONS = (
+    "directions of the bars in all three dimensions, 10 degrees out of any plane (RMS)",
+    "The directions must be horizontal, vertical and inclined, not in one plane.",
+)
+_COUNTS = {
+    "lengths": _Count(
+        "{n} different calibrated lengths",
+        "{n} different lengths are required ({} given).",
+        lambda bars, size: len(bars),
+    ),
+    "readings": _Count(
+        "{n} readings of each length in each position",
+        "{n} readings in each position are required (a position has {}).",
+        lambda bars, size: min((number for bar in bars for number in bar.readings), default=0),
+    ),
+    "positions": _Count(
+        "{n} positions of the bars, different by 10 degrees, or in place by 5 % of the range",
+        "{n} different positions are required ({} given).",
+        lambda bars, size: sum(len(bar.distinct(size).readings) for bar in bars),
+    ),
+    "positions of each": _Count(
+        "{n} positions of every length, different by 10 degrees, or in place by 5 % of the range",
+        "{n} different positions of every length are required (one has {}).",
+        lambda bars, size: min(len(bar.distinct(size).readings) for bar in bars),
+    ),
+    "directions": _Count(*_DIRECTIONS, lambda bars, size: all_bars(bars).in_all_directions),
+    "directions of each": _Count(*_DIRECTIONS, lambda bars, size: all(bar.in_all_directions for bar in bars)),
+}
+
+
+def _bars(measured: Measured) -> list[BarPositions]:
+    groups = values_by_artefact(distinct_lengths(measured.lengths))
+    return bar_positions(measured, [group.tolist() for group in groups])
+
+
+def of_bars(kind: str, needed: int, origin: Origin) -> Requirement:
+    """So many of a key of `_COUNTS`."""
+    says, sentence, count = _COUNTS[kind]
 
     def lacking(measured: Measured) -> str:
-        groups = values_by_artefact(distinct_lengths(measured.lengths))
-        return check(bar_positions(measured, [group.tolist() for group in groups]), size_of(measured))
+        number = count(_bars(measured), size_of(measured))
+        return "" if number >= needed else sentence.format(number, n=needed)
 
-    return Requirement(says, *origin, lacking)
-
-
-def different_positions(positions: int, every_bar: bool, origin: Origin) -> Requirement:
-    """So many different positions, of every bar or of all together."""
-
-    def check(bars: list[BarPositions], size: float | None) -> str:
-        counts = [len(bar.distinct(size).readings) for bar in bars]
-        if not every_bar:
-            enough = sum(counts) >= positions
-            return "" if enough else f"{positions} different positions are required ({sum(counts)} given)."
-        few = [f"{bar.length:.0f} mm: {n}" for bar, n in zip(bars, counts, strict=True) if n < positions]
-        return f"{positions} different positions of every length are required ({', '.join(few)})." if few else ""
-
-    what = "of every length" if every_bar else "of the bars"
-    says = f"{positions} positions {what}, different by 10 degrees, or in place by 5 % of the range"
-    return of_bars(says, check, origin)
-
-
-def all_directions(every_bar: bool, origin: Origin) -> Requirement:
-    """Bars in directions that are not all in one plane."""
-
-    def check(bars: list[BarPositions], size: float | None) -> str:
-        wrong = [bar for bar in (bars if every_bar else [all_bars(bars)]) if not bar.in_all_directions]
-        named = f" ({', '.join(f'{bar.length:.0f} mm' for bar in wrong)}: they are not)" if every_bar else ""
-        return f"The directions must be horizontal, vertical and inclined, not in one plane{named}." if wrong else ""
-
-    says = "directions of the bars in all three dimensions, 10 degrees out of any plane (RMS)"
-    return of_bars(says, check, origin)
+    return Requirement(says.format(n=needed), *origin, lacking)
 
 
 def spread_places(every_bar: bool, least: float, origin: Origin) -> Requirement:
     """Bars in places over the measuring volume; not judged where its size is unknown."""
 
-    def check(bars: list[BarPositions], size: float | None) -> str:
+    def lacking(measured: Measured) -> str:
+        bars, size = _bars(measured), size_of(measured)
         if size is None:
             return "The size of the measuring volume is unknown, so that the places of the bars cannot be judged."
         narrowest = min(bar.spread(size) for bar in (bars if every_bar else [all_bars(bars)]))
@@ -210,28 +226,7 @@ def spread_places(every_bar: bool, least: float, origin: Origin) -> Requirement:
         )
 
     says = f"places over the measuring volume: middles scatter by {100 * least:.0f} % of the range or more (RMS)"
-    return of_bars(says, check, origin)
-
-
-def lengths_given(count: int, origin: Origin) -> Requirement:
-    """So many different lengths."""
-
-    def check(bars: list[BarPositions], size: float | None) -> str:
-        return "" if len(bars) >= count else f"{count} different lengths are required ({len(bars)} given)."
-
-    return of_bars(f"{count} different calibrated lengths", check, origin)
-
-
-def readings_of_each(repeats: int, origin: Origin) -> Requirement:
-    """So many readings in each position."""
-
-    def check(bars: list[BarPositions], size: float | None) -> str:
-        few = min((number for bar in bars for number in bar.readings), default=0)
-        if few >= repeats:
-            return ""
-        return f"{repeats} readings in each position are required (one has {pluralise(few, 'reading')})."
-
-    return of_bars(f"{repeats} readings of each length in each position", check, origin)
+    return Requirement(says, *origin, lacking)
 
 
 def requirements_table(tests: Sequence[StandardTest]) -> str:

@@ -56,7 +56,7 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
         misfit = _Misfit.by(arm, capture)
         if misfit is None:
             return ""
-        given, size = misfit.rms(misfit.given), total_link_length(arm)
+        given, size = misfit.rms(_Tried("", np.asarray(misfit.observed.q))), total_link_length(arm)
         if given < _NOMINAL * size:
             return ""
         rms, cause, write = np.inf, "", ""
@@ -91,13 +91,10 @@ class _Misfit(NamedTuple):
         observed = Observed.of(Capture({}, (), part), None)
         return cls(arm, observed.moved(arm, np.asarray(observed.q)))
 
-    @property
-    def given(self) -> _Tried:
-        return _Tried("", np.asarray(self.observed.q))
-
     def corrections(self) -> Iterator[_Tried]:
         q, observations = np.asarray(self.observed.q), self.observed.observations
-        yield from _readings(q, self.arm)
+        for tried in _of_joints(q[:, : self.arm.joints], self.arm):  # the column of a thermometer stays
+            yield tried._replace(q=np.concatenate([tried.q, q[:, self.arm.joints :]], axis=1))
         concerned = [i for i, one in enumerate(observations) if _measured_field(one) is not None]
         alike: dict[tuple[str, str], list[int]] = {}
         for i in concerned:
@@ -150,12 +147,6 @@ def _evenly(number: int, most: int) -> np.ndarray:
 def _roots(shape: tuple[int, ...], lever: float) -> Float[np.ndarray, "m r r"]:
     rows, poses = shape
     return np.broadcast_to(np.diag([1.0] * min(rows, 3) + [lever] * (rows - 3)), (poses, rows, rows))
-
-
-def _readings(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[_Tried]:
-    """The columns of the joints corrected; that of a thermometer stays."""
-    for tried in _of_joints(q[:, : arm.joints], arm):
-        yield tried._replace(q=np.concatenate([tried.q, q[:, arm.joints :]], axis=1))
 
 
 def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[_Tried]:

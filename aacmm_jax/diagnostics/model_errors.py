@@ -222,11 +222,7 @@ def model_tests(
         >>> print(tests.warns, len(tests.terms))
         False 0
     """
-    return values_of_tests(case_of(result, capture, class_noise))
-
-
-def values_of_tests(case: Case) -> ModelTests:
-    """The tests of a case."""
+    case = case_of(result, capture, class_noise)
     return ModelTests(
         misfit=case.once(misfit_of),
         lengths=case.once(lengths_of),

@@ -96,18 +96,14 @@ class NoisyJoint(NamedTuple):
     probability: float
 
 
-class _Variances(NamedTuple):
-    readings: Float[np.ndarray, " n"]  # arcsec^2; of a prismatic joint, of what this is at 1 m
-    seat: float  # mm^2
-
-
 class _Equations(NamedTuple):
     """Equations whose rows are whitened by some variances."""
 
     rows: Sequence[Rows]
     relations: Sequence[Block]
     unit: Float[np.ndarray, " n"]  # of the readings' columns, for a standard deviation of 1 arcsec
-    variances: _Variances
+    # Of the readings, arcsec^2 (of a prismatic joint, of what this is at 1 m), and of the seat, mm^2.
+    variances: Float[np.ndarray, " n+1"]
 
     @classmethod
     def of(cls, record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> "_Equations":
@@ -115,7 +111,7 @@ class _Equations(NamedTuple):
         unit = np.broadcast_to(one_arcsec(kinds), (joints,))
         steps = np.where(np.zeros(joints, dtype=bool) if kinds is None else kinds.mask(), 1.0, 1e-3)
         stated = np.broadcast_to(to_numpy(record.noise.of_readings(kinds)), (joints,)) / unit
-        return cls(rows, relations, unit / steps, _Variances(stated**2, float(record.noise.seating) ** 2))
+        return cls(rows, relations, unit / steps, np.append(stated, float(record.noise.seating)) ** 2)
 
     def readings(self, rows: Rows) -> Float[np.ndarray, "m r n"]:
         """The columns z_j."""
@@ -124,12 +120,19 @@ class _Equations(NamedTuple):
     def left(self) -> Residuals:
         return Residuals.of([*(rows.block("") for rows in self.rows), *self.relations])
 
-    def weighted(self, new: _Variances) -> "_Equations":
-        """The same rows, whitened by other variances."""
-        weighted, more, seat = [], new.readings - self.variances.readings, new.seat - self.variances.seat
+    def columns(self, rows: Rows, group: Sequence[int]) -> Float[np.ndarray, "m r _"]:
+        """Those of a variance that some joints have in common, or of the seat, whose number is that of the joints."""
+        return rows.by_tip if len(self.unit) in group else self.readings(rows)[..., list(group)]
+
+    def weighted(self, groups: Sequence[Sequence[int]], variances: Float[np.ndarray, " k"]) -> "_Equations":
+        """The same rows, whitened by other variances of some groups."""
+        weighted, new = [], self.variances.copy()
+        for group, variance in zip(groups, variances, strict=True):
+            new[list(group)] = variance
+        more = new - self.variances
         for rows in self.rows:
             z, t = self.readings(rows), rows.by_tip
-            covariance = (z * more) @ z.swapaxes(1, 2) + seat * t @ t.swapaxes(1, 2)
+            covariance = (z * more[:-1]) @ z.swapaxes(1, 2) + more[-1] * t @ t.swapaxes(1, 2)
             # Some noise of its own: where nothing else errs, poses with fewer than three errors would be singular.
             covariance += (1 + 1e-9) * np.eye(z.shape[1])
             factor = np.linalg.cholesky(0.5 * (covariance + covariance.swapaxes(1, 2)))
@@ -147,25 +150,23 @@ class _Equations(NamedTuple):
             blocks.append(np.eye(columns.shape[1]) - columns @ columns.swapaxes(1, 2))
         return blocks
 
-    def estimated(self, groups: Sequence[Sequence[int]], seat: bool) -> tuple["_Equations", Float[np.ndarray, " k"]]:
-        """With variances of groups of joints, one for each group, and of the seat, by restricted maximum likelihood.
+    def estimated(self, groups: Sequence[Sequence[int]]) -> tuple["_Equations", Float[np.ndarray, " k"]]:
+        """With one variance for each group of joints, the seat being the last group, by restricted maximum likelihood.
 
         Returns:
             The equations whitened by them, and the standard uncertainty of the log of each variance.
         """
-        last = len(groups)
-        now, log, u = self, np.zeros(last + seat), np.zeros(last + seat)
-        for i, group in enumerate(groups):
-            log[i] = np.log(max(np.mean(self.variances.readings[list(group)]), 1e-6))
-        if seat:  # from nothing it would not rise
+        now, u = self, np.zeros(len(groups))
+        log = np.array([np.log(max(np.mean(self.variances[list(group)]), 1e-6)) for group in groups])
+        if len(self.unit) in groups[-1]:  # from nothing it would not rise
             left = self.left()
             projected = zip(self.rows, self.projectors(left), strict=True)
             trace = sum(float(np.sum(rows.by_tip * (block @ rows.by_tip))) for rows, block in projected)
-            log[last] = np.log(max(self.variances.seat, 0.05 * left.degrees_of_freedom / max(trace, 1e-300)))
-            now = self.weighted(_of_groups(self.variances, log, groups, seat))
+            log[-1] = np.log(max(self.variances[-1], 0.05 * left.degrees_of_freedom / max(trace, 1e-300)))
+            now = self.weighted(groups, np.exp(log))
         for _ in range(_ROUNDS):
             left = now.left()
-            slope, information, traces = now._scores(left, groups, seat)
+            slope, information, traces = now._scores(left, groups)
             variances = np.exp(log)
             # By the logarithms: d/d(log v) = v d/dv.
             slope, information = slope * variances, information * variances * variances[:, None]
@@ -176,20 +177,19 @@ class _Equations(NamedTuple):
             damped = information[np.ix_(moving, moving)] + 1e-9 * np.eye(int(moving.sum()))
             step[moving] = np.clip(np.linalg.solve(damped, slope[moving]), -_FACTOR, _FACTOR)
             log = log + step
-            now = self.weighted(_of_groups(self.variances, log, groups, seat))
+            now = self.weighted(groups, np.exp(log))
             if np.max(np.abs(step), initial=0.0) < _TOLERANCE:
                 break
         return now, u
 
     def _scores(
-        self, left: Residuals, groups: Sequence[Sequence[int]], seat: bool
+        self, left: Residuals, groups: Sequence[Sequence[int]]
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
         """Derivatives of the log likelihood by the variances, their information, and tr MK."""
-        count = len(groups) + seat
+        count = len(groups)
         slope, information, traces = np.zeros(count), np.zeros((count, count)), np.zeros(count)
         for rows, part, block in zip(self.rows, left.slices, self.projectors(left), strict=False):
-            r, z = left.values[part].reshape(rows.residual.shape), self.readings(rows)
-            columns = [*(z[..., list(group)] for group in groups), *([rows.by_tip] if seat else [])]
+            r, columns = left.values[part].reshape(rows.residual.shape), [self.columns(rows, group) for group in groups]
             projected = [block @ column for column in columns]
             for k, column in enumerate(columns):
                 trace = float(np.sum(column * projected[k]))
@@ -213,14 +213,14 @@ class _Equations(NamedTuple):
         trace_t, trace_tt = _traces(blocks, tips, tips)
         tests = []
         for joint in joints:
-            columns = [self.readings(rows)[..., joint, None] for rows in self.rows]
+            columns = [self.columns(rows, [joint]) for rows in self.rows]
             kernels = [column @ column.swapaxes(1, 2) for column in columns]
             trace, trace_both = _traces(blocks, kernels, tips)
             if trace <= 0:
                 continue
             ratio = _value(kernels, poses) * freedom / max(trace * cost, 1e-300)
             below = freedom * trace_tt - trace_t**2
-            seated = self.variances.seat * trace_t > _LEAST * freedom and below > 1e-9 * trace_t**2
+            seated = self.variances[-1] * trace_t > _LEAST * freedom and below > 1e-9 * trace_t**2
             c = (freedom * trace_both - trace * trace_t) / below if seated else 0.0
             kernels = [kernel - c * tip for kernel, tip in zip(kernels, tips, strict=True)]
             x = _value(kernels, poses) / max(cost, 1e-300)
@@ -244,13 +244,6 @@ def _traces(blocks: Sequence[np.ndarray], one: Sequence[np.ndarray], other: Sequ
     return first, sum(np.einsum("mab,mba->", left, right) for left, right in products)
 
 
-def _of_groups(before: _Variances, log: Float[np.ndarray, " k"], groups: Sequence[Sequence[int]], seat: bool):
-    readings = before.readings.copy()
-    for group, value in zip(groups, np.exp(log), strict=False):
-        readings[list(group)] = value
-    return _Variances(readings, float(np.exp(log[-1])) if seat else before.seat)
-
-
 def noisiest_joint(case: Case) -> NoisyJoint | None:
     """The joint in whose direction residuals are larger than in those of the others, with the terms that the model
     lacks taken into account; where even these do not explain the residuals, what they miss looks like noise."""
@@ -267,7 +260,7 @@ def _noisiest(record: CalibrationRecord, equations: _Equations) -> tuple[NoisyJo
         return noisiest, equations
     # The noise of the calibration comes from two moments; its seat is often 0, and then poses that hardly see the
     # encoders in some direction count too much there.
-    equations, _ = equations.estimated([list(joints)], seat=True)
+    equations, _ = equations.estimated([joints, [len(joints)]])
     return equations.noisiest(joints), equations
 
 
@@ -303,21 +296,22 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
         noisy.append(noisiest.joint - 1)
         probabilities.append(noisiest.probability)
         others = [joint for joint in range(joints) if joint not in noisy]
-        groups = [[joint] for joint in noisy] + ([] if given else [others])
-        now, u = equations.estimated(groups, seat=not given)
+        groups = [[joint] for joint in noisy] + ([] if given else [others, [joints]])
+        now, u = equations.estimated(groups)
         noisiest = now.noisiest(others)
-    stated = equations.variances.readings if given else np.full(joints, now.variances.readings[others[0]])
-    if np.any(now.variances.readings[noisy] <= stated[noisy]):
+    variances, seat = now.variances[:-1], now.variances[-1]
+    stated = equations.variances[:-1] if given else np.full(joints, variances[others[0]])
+    if np.any(variances[noisy] <= stated[noisy]):
         return None
     arm, q = record.calibrated.arm, np.asarray(record.recording.capture.readings)
     if any(term.probability < _CLEAR for term in found_terms(arm, q, now.rows, now.relations)):
         return None
     kinds = arm.geometry.kinds
     units = np.broadcast_to(one_arcsec(kinds), (joints,))
-    expected, sd = np.sqrt(stated) * units, np.sqrt(now.variances.readings) * units
+    expected, sd = np.sqrt(stated) * units, np.sqrt(variances) * units
     noise = Noise(
-        encoder_arcsec=np.sqrt(now.variances.readings),
-        seating=float(record.noise.seating) if given else np.sqrt(now.variances.seat),
+        encoder_arcsec=np.sqrt(variances),
+        seating=float(record.noise.seating) if given else np.sqrt(seat),
         linear_encoder=None if kinds is None else np.where(kinds.mask(), sd, 0.0),
     )
     encoders = [

@@ -127,14 +127,12 @@ def consistency(
     white = root @ np.concatenate(free, axis=1)
     sizes = np.linalg.norm(root @ relations.shared, axis=0).max(initial=0.0)
     opened = white[:, np.linalg.norm(white, axis=0) > _NULL * sizes]
-    basis = _orthonormal(opened) if opened.shape[1] else opened
-    weight = root.T @ (np.eye(len(root)) - basis @ basis.T) @ root
-    pulled, diagonal = weight @ residual, np.diag(weight)
-    tested = diagonal > _EXPLAINED * np.diag(root.T @ root)
-    shifts = np.where(tested, pulled / np.where(tested, diagonal, 1.0), 0.0)
-    return Consistency(
-        float(residual @ pulled), len(root) - basis.shape[1], shifts, shifts * np.where(tested, pulled, 0)
-    )
+    left = Residuals.of([Block("", None, root @ residual, opened, np.zeros((len(root), 0)))])
+    tests = score_tests(left, list(root.T[:, :, None]))  # an error of each, which explains all that it alone says
+    shifts, gains = (np.array([float(np.sum(x)) for x in part]) for part in zip(
+        *((test.coefficients, test.gain) for test in tests), strict=True
+    ))  # fmt: skip
+    return Consistency(left.cost, left.degrees_of_freedom, shifts, gains)
 
 
 class ScoreTest(NamedTuple):

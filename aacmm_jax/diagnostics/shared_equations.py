@@ -95,11 +95,11 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
     Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
     """
     record, rows = problem.record, problem.rows
-    blocks = [*(part.block("") for part in rows), *relations]
+    blocks, size = [*(part.block("") for part in rows), *relations], sum(part.residual.size for part in rows)
     values = np.array([float(length.value) for length in record.recording.capture.lengths])
     if lengths_in_solve(record) or not len(values):
         u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)
-        return problem._replace(left=_without_scale(Residuals.of(blocks), sum(map(_size, rows)), values / u))
+        return problem._replace(left=_without_scale(Residuals.of(blocks), size, values / u))
     related = lengths_of_sockets(record, rows)
     if related is None:
         return problem
@@ -112,12 +112,8 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
         of_rows, r = related.scale[0], problem.left.values[: len(related.scale[0])]
         of_rows = of_rows - r * (r @ of_rows) / max(float(r @ r), 1e-300)
         blocks = _with_column(blocks, of_rows, whitening @ related.scale[1])
-    left = _without_scale(Residuals.of(blocks), sum(map(_size, rows)), whitening @ values)
+    left = _without_scale(Residuals.of(blocks), size, whitening @ values)
     return problem._replace(left=left, lengths=whitening)
-
-
-def _size(rows: Rows) -> int:
-    return rows.residual.size
 
 
 def _without_scale(left: Residuals, first: int, by_scale: Float[np.ndarray, " l"]) -> Residuals:

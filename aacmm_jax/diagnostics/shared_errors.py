@@ -67,30 +67,28 @@ def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivi
         addition = _addition(case, sensitivities)
     if addition is None:
         return result
+    shared, added, variance = addition
     before = result.parameter_covariance
-    if PLACES in addition.shared.kinds:
+    if PLACES in shared.kinds:
         before = before.without(DISAGREEMENT)
     covariance = before._replace(
-        matrix=before.matrix + addition.added,
-        noise=jax.tree.map(lambda leaf: np.sqrt(addition.variance) * leaf, before.noise),
+        matrix=before.matrix + added,
+        noise=jax.tree.map(lambda leaf: np.sqrt(variance) * leaf, before.noise),
     )
     if not np.all(np.isfinite(covariance.matrix)):
         return result
     return eqx.tree_at(
         lambda r: (r.parameter_covariance, r.shared),
         result,
-        (covariance, addition.shared),
+        (covariance, shared),
         is_leaf=lambda x: x is None,
     )
 
 
-class _Addition(NamedTuple):
-    shared: SharedErrors
-    added: Float[np.ndarray, "p p"]
-    variance: float  # of independent errors, over that of all
-
-
-def _addition(case: Case, sensitivities: Callable[[], Sensitivities]) -> _Addition | None:
+def _addition(
+    case: Case, sensitivities: Callable[[], Sensitivities]
+) -> tuple[SharedErrors, Float[np.ndarray, "p p"], float] | None:
+    """The errors that were found, what they add, and the variance of independent errors, over that of all."""
     record, (rows, relations) = case.record, case.chunks
     rows = _trusted(record, rows)
     if not rows or residual_rms(rows) < EXACT:
@@ -135,7 +133,7 @@ def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
 
 def _summed(
     problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions | None", without: Effects, every: Effects
-) -> _Addition:
+) -> tuple[SharedErrors, Float[np.ndarray, "p p"], float]:
     """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
     learned = [(effect, effect.learned) for effect in tips if effect.learned is not None]
     kinds, units = [effect.kind for effect, _ in learned], ["mm" for _ in learned]
@@ -169,7 +167,7 @@ def _summed(
         by_group=moments.by_group,
         law=law,
     )
-    return _Addition(shared, added.sum(axis=0) + follow @ moments.matrix @ follow.T, every.variance)
+    return shared, added.sum(axis=0) + follow @ moments.matrix @ follow.T, every.variance
 
 
 class _Tips(NamedTuple):

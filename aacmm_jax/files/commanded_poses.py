@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..core.errors import InputError
-from ..core.rotations import rotation_matrix
 from ..core.text import csv_text
 from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
@@ -57,21 +56,22 @@ def read_commanded_poses(
     that of positions whose header states none, by default mm. Raises `InputError`.
     """
     table, joints = TextTable(path), arm.joints
-    orientation = _orientation(table)
-    picked = _reading_columns(path, table, joints, alone=orientation is None, wanted=columns)
+    position, orientation = position_columns(table), _orientation(table)
+    taken = position[0] if position else ()
+    picked = reading_columns(table, joints, taken, columns, line=_OPTION, required=orientation is None)
     header, linear = header_units(table, picked, arm, unit) if picked else (None, None)
     if linear not in (None, "mm"):
         raise InputError(f"{path} states {linear} for readings of prismatic joints; convert them to mm.")
     unit = _angle_unit(path, header, unit)
     if unit is None:
         raise InputError(f"{path} does not say the unit of joint readings; give --unit deg or --unit rad.")
-    if picked and near is not None:
-        raise InputError(f"{path} has joint readings in each row; leave out --near.")
-    if not picked and near is None:
-        raise InputError(f"{path} has no joint readings to begin with; add columns q_1 to q_{joints}, or give --near.")
+    if bool(picked) == (near is not None):
+        raise InputError(
+            f"{path} needs joint readings once: give columns q_1 to q_{joints} and leave out --near, or --near alone."
+        )
     if near is not None and len(near) != joints:
         raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
-    poses = None if orientation is None else _poses(path, table, _ANGLES[unit], length_unit)
+    poses = None if orientation is None else _poses(table, _ANGLES[unit], position, orientation, length_unit)
     readings = table.numbers(picked) if near is None else np.tile(near, (table.length, 1))
     temperature = table.numbers(table.pick([TEMPERATURE]))[:, 0] if table.has([TEMPERATURE]) else None
     q = np.array(by_joint(arm, _ANGLES[unit], 1.0)) * readings
@@ -102,13 +102,13 @@ def read_known_poses(path: str | os.PathLike, joints: int, *, unit: str | None =
     position, orientation = position_columns(table), _orientation(table)
     if not table.header and table.width in (joints, joints + 3):
         picked, after = list(range(joints)), list(range(joints, table.width))
-        position, orientation = (after, None) if after else None, None
+        position = (after, None) if after else None
     else:
-        picked = _reading_columns(path, table, joints, alone=True)
+        picked = reading_columns(table, joints, position[0] if position else (), line=_OPTION)
     header = _angle_unit(path, table.unit(picked, unit), unit)
     readings = table.numbers(picked)
     angle = header or ("deg" if np.abs(readings).max() > 2 * np.pi else "rad")
-    poses = None if position is None and orientation is None else _poses(path, table, _ANGLES[angle], None, position)
+    poses = None if position is None and orientation is None else _poses(table, _ANGLES[angle], position, orientation)
     named = bool(table.header) and table.has(["socket"])
     sockets = tuple(table.texts("socket")) if named else ("A",) * table.length
     return KnownPoses(
@@ -147,22 +147,6 @@ def _orientation(table: TextTable) -> Columns | None:
     return find_named(table, _QUATERNION) or find_named(table, _ROTATION, tuple(_ANGLES))
 
 
-def _reading_columns(
-    path: str | os.PathLike, table: TextTable, joints: int, alone: bool, wanted: Sequence[Column] | None = None
-) -> list[int]:
-    """Columns of joint readings, counted from 0; ``alone``: there are no poses, so there must be some."""
-    if wanted is not None:
-        picked = table.pick(wanted)
-        if len(picked) != joints:
-            raise InputError(
-                f"{path}: {len(picked)} columns are picked for the readings of {joints} joints; pick one for each."
-            )
-        return picked
-    position = position_columns(table)
-    taken = position[0] if position is not None else []
-    return reading_columns(table, joints, taken, _OPTION, required=alone)
-
-
 def _angle_unit(path: str | os.PathLike, header: str | None, stated: str | None) -> str | None:
     """The unit of joint readings: that of the header, or the one that is stated."""
     if header is not None and (header not in _ANGLES or stated not in (None, header)):
@@ -171,39 +155,31 @@ def _angle_unit(path: str | os.PathLike, header: str | None, stated: str | None)
 
 
 def _poses(
-    path: str | os.PathLike, table: TextTable, angle: float, length: str | None, position: Columns | None = None
+    table: TextTable, angle: float, position: Columns | None, orientation: Columns | None, length: str | None = None
 ) -> Float[np.ndarray, "N 4 4"]:
     """Positions, mm, and orientations, where there are some; ``angle`` and ``length``: units of a rotation vector and
-    of positions that the header does not state; ``position``: the columns of a table without names."""
-    position, orientation = position or position_columns(table), _orientation(table)
+    of positions that the header does not state."""
+    from scipy.spatial.transform import Rotation
+
     if position is None:
-        raise InputError(f"{path} has orientations, but no positions in columns x, y and z; add them.")
-    if length is not None and position[1] not in (None, length):
-        raise InputError(f"{path} states positions in {position[1]}; leave out --length-unit.")
+        raise InputError(f"{table.path} has orientations, but no positions in columns x, y and z; add them.")
     unit, (columns, rotation_unit) = position[1] or length or "mm", orientation or ([], None)
-    if unit not in LENGTH_UNITS or rotation_unit not in (None, *_ANGLES):
+    if unit not in LENGTH_UNITS or length not in (None, unit) or rotation_unit not in (None, *_ANGLES):
         raise InputError(
-            f"{path} states positions in {unit}; give one of {', '.join(LENGTH_UNITS)}, and angles in deg or rad."
+            f"{table.path} states positions in {unit}; give one of {', '.join(LENGTH_UNITS)}, angles in deg or rad, "
+            "and leave out --length-unit."
         )
     poses = np.tile(np.eye(4), (table.length, 1, 1))
     poses[:, :3, 3] = LENGTH_UNITS[unit] * table.numbers(position[0])
     if len(columns) == len(_QUATERNION):
-        poses[:, :3, :3] = _rotations(path, table.numbers(columns))
+        quaternions = table.numbers(columns)
+        wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1) > _ROUNDED)
+        if len(wrong):
+            raise InputError(
+                f"{table.path} row {wrong[0] + 1}: the quaternion is not of length 1; correct it, or its columns."
+            )
+        poses[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
     elif columns:
         vectors = (angle if rotation_unit is None else _ANGLES[rotation_unit]) * table.numbers(columns)
-        poses[:, :3, :3] = np.moveaxis(np.asarray(rotation_matrix(vectors.T)), -1, 0)
+        poses[:, :3, :3] = Rotation.from_rotvec(vectors).as_matrix()
     return poses
-
-
-def _rotations(path: str | os.PathLike, quaternions: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
-    """Rotation matrices of quaternions w, x, y, z, whose length may differ from 1 by rounding."""
-    from scipy.spatial.transform import Rotation
-
-    size = np.linalg.norm(quaternions, axis=1)
-    wrong = np.flatnonzero(np.abs(size - 1) > _ROUNDED)
-    if len(wrong):
-        raise InputError(
-            f"{path} row {wrong[0] + 1}: the quaternion has length {size[wrong[0]]:.6g} instead of 1; correct it, or "
-            "its columns."
-        )
-    return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()

@@ -14,9 +14,8 @@ from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm, by_joint
-from .column_names import Column
 from .manifest_tables import Picked, Wanted, as_list
-from .table_columns import TEMPERATURE, check_not_taken, reading_columns
+from .table_columns import TEMPERATURE, reading_columns
 from .text_table import TextTable
 from .toml import Strict
 
@@ -108,7 +107,7 @@ class Readings:
         stated = wanted.columns
         if stated is None and self._angles is not None and self._angles.columns is not None:
             stated = as_list(self._angles.columns)
-        picked = self._picked(text, stated, wanted)
+        picked = reading_columns(text, self._arm.joints, wanted.taken, stated)
         thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
         if set(thermometer) & set(picked):
             raise InputError(
@@ -131,20 +130,6 @@ class Readings:
                 f"{TEMPERATURE} in its table."
             )
         return readings
-
-    def _picked(self, text: TextTable, stated: Sequence[Column] | None, wanted: Wanted) -> list[int]:
-        joints = self._arm.joints
-        if stated is None:
-            return reading_columns(text, joints, wanted.taken)
-        picked = text.pick(stated)
-        check_not_taken(text, picked, wanted.taken)
-        if len(picked) != joints:
-            what = "angles.columns" if wanted.columns is None else "columns"
-            raise InputError(
-                f"{text.path}: {what} picks {len(picked)} columns for the readings, but the arm has {joints} joints; "
-                "pick one a joint."
-            )
-        return picked
 
     def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted) -> Angles:
         """How these readings are written: what the table states comes first, then [angles], the header, the preset.

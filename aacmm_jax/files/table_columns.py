@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import LENGTH_UNITS
-from .column_names import bare_name, stem_and_number
+from .column_names import Column, bare_name, stem_and_number
 from .text_table import TextTable
 
 # Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...
@@ -55,8 +55,7 @@ def _families(table: TextTable, joints: int) -> list[_Family]:
     return families
 
 
-def check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[int]) -> None:
-    """Refuse columns of readings, from 0, that hold something else, too."""
+def _check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[int]) -> None:
     both = next((i for i in columns if i in taken), None)
     if both is not None:
         name = f" {quoted(table.header[both])}" if table.header else ""
@@ -67,14 +66,29 @@ def check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[in
 
 
 def reading_columns(
-    table: TextTable, joints: int, taken: Sequence[int] = (), line: str = LINE, required: bool = True
+    table: TextTable,
+    joints: int,
+    taken: Sequence[int] = (),
+    stated: Sequence[Column] | None = None,
+    *,
+    line: str = LINE,
+    required: bool = True,
 ) -> list[int]:
-    """The columns of the joint readings, from 0: those with names of joints, or all that are not ``taken`` where these
-    are as many as the joints, and nothing in the header contradicts it.
+    """The columns of the joint readings, from 0: those ``stated``, else those with names of joints, or all that are not
+    ``taken`` where these are as many as the joints, and nothing in the header contradicts it.
 
     ``line`` is what states columns, for messages. Raises `InputError` with the line to add where several sets of
     columns have such names, their numbers do not ascend, or they are ``required`` and not clear.
     """
+    if stated is not None:
+        picked = table.pick(stated)
+        _check_not_taken(table, picked, taken)
+        if len(picked) != joints:
+            raise InputError(
+                f"{table.path}: {len(picked)} columns are picked for the readings, but the arm has {joints} joints; "
+                "pick one a joint."
+            )
+        return picked
     families = _families(table, joints)
     named = [family for family in families if family.of_joints and not set(family.columns) <= set(taken)]
     whole = [family.columns for family in named if family.whole]
@@ -84,7 +98,7 @@ def reading_columns(
     # Where none is whole, one of as many columns is there twice.
     for columns in whole or [family.columns for family in named if len(family.columns) == joints]:
         table.check_ascending(columns, line)
-        check_not_taken(table, columns, taken)
+        _check_not_taken(table, columns, taken)
     if whole or not required:
         return whole[0] if whole else []
     temperature = table.pick([TEMPERATURE]) if table.has([TEMPERATURE]) else []
@@ -104,7 +118,7 @@ def reading_columns(
     if not proposed:
         add = (
             "correct the header, or the delimiter where decimal commas are taken for it, or pick one column a joint "
-            f"with {line.format('...')}"
+            f"with {line.format('...')}, or name them q_1 to q_{joints}"
         )
     raise InputError(
         f"{table.path} has {table.shown()}, and it is not clear which of them are those of the arm's {joints} joints; "

@@ -39,7 +39,7 @@ class Marks(NamedTuple):
     y: Numbers
     # Points (dot, square, triangle, diamond, cross, ring); line, dashed, dotted; what is between low and high (band, or
     # thick vertical bars); boxes from the axis up to y, or about y; level and border: thin lines across at each y or x;
-    # words: text is centred, upright grows away from zero, beside is to the right of its place.
+    # text: its words, centred.
     symbol: str = "dot"
     tone: str = "main"  # "main", "accent", "soft", "ink", "page"; in figures any colour
     words: Sequence[str] = ()  # said of each mark under the pointer, or written
@@ -123,6 +123,13 @@ def level(*values: float) -> Marks:
 def borders(values: Numbers) -> Marks:
     """Thin dotted lines across at these abscissas."""
     return Marks("", values, (), "border", "soft")
+
+
+def histogram(counts: np.ndarray, edges: np.ndarray, name: str = "") -> Marks:
+    """Boxes of counts between equally spaced edges."""
+    width = float(edges[1] - edges[0])
+    words = [f"{low:+.3g} to {low + width:+.3g}: {count}" for low, count in zip(edges, counts, strict=False)]
+    return Marks(name, (edges[:-1] + edges[1:]) / 2, counts, "boxes", "soft", words, box=(width, 0.0))
 
 
 def ordinates(marks: Sequence[Marks]) -> list[Numbers]:

@@ -7,12 +7,12 @@ import numpy as np
 
 from ..drift.results import Drift, Trend, in_words
 from ..summaries.harmonics import listed_apart
-from .charts import SERIES, Axis, Marks, Plot, borders, linear, names
+from .charts import SERIES, Axis, Marks, Plot, histogram, linear, names
 from .figures import check_format, draw, new_figure, save_figure
 
 _CROWDED = 0.03  # calibrations nearer in time than this fraction of the whole are spaced evenly
 _FAR = 8.0  # changes beyond so many expanded uncertainties need an axis that shortens what is far out
-_APART = 0.055  # of the axis between the names of lines
+_RATIO = "change / expanded uncertainty"
 
 
 def save_drift_trend(trend: Trend, path: Path) -> None:
@@ -96,57 +96,42 @@ def _changes_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
     last = np.abs(np.nan_to_num(ratio[-1]))
     named = [i for i in np.argsort(-last) if last[i] > 1][: len(SERIES)]
     others = [i for i in range(len(trend.names)) if i not in named]
-    y = _ratio_axis(ratio)
-    marks = [_within(x), *(Marks("", positions, ratio[:, i], "line", "soft", size=3) for i in others)]
     beyond = [(positions[k], ratio[k, i]) for i in others for k in np.flatnonzero(np.abs(ratio[:, i]) > 1)]
     at, over = np.array(beyond).reshape(-1, 2).T
-    marks.append(Marks("", at, over, "ring", "soft", size=5))
-    ends = _spread(y, ratio[-1, named])
-    for i, end, style in zip(named, ends, SERIES, strict=False):
-        marks.append(Marks("", positions, ratio[:, i], joined=True, **style))
-        words = f"{trend.names[i]} {in_words(drift.units[i], float(drift.change[i]))}"
-        marks.append(Marks("", [x.high + 0.02 * (x.high - x.low)], [end], "beside", style["tone"], [words], size=8.5))
+    marks = [
+        _within(x),
+        *(Marks("", positions, ratio[:, i], "line", "soft", size=3) for i in others),
+        Marks("", at, over, "ring", "soft", size=5),
+    ]
+    for i, style in zip(named, SERIES, strict=False):
+        name = f"{trend.names[i]} {in_words(drift.units[i], float(drift.change[i]))}"
+        marks.append(Marks(name, positions, ratio[:, i], joined=True, **style))
     title = (
         f"Change of {len(trend.names)} parameters from the first calibration; band: expanded uncertainty "
         f"({100 * drift.level:g} %)\nnamed: beyond the band at the end (at most {len(SERIES)}); "
         "open circles: other values beyond it"
     )
-    return Plot(x, y, tuple(marks), title + _not_shown(drift))
-
-
-def _spread(axis: Axis, values: np.ndarray) -> np.ndarray:
-    """Ordinates at which names beside the values do not overlap."""
-    order = np.argsort(values)
-    wanted = axis.at(values[order])
-    heights = wanted.copy()
-    for i in range(1, len(heights)):
-        heights[i] = max(heights[i], heights[i - 1] + _APART)
-    heights += np.mean(wanted - heights) if len(heights) else 0.0
-    spread = np.empty(len(values))
-    spread[order] = axis.value(heights)
-    return spread
+    return Plot(x, _ratio_axis(ratio), tuple(marks), title + _not_shown(drift))
 
 
 def _lengths_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
     """Change of lengths over the volume from the first calibration, and what the uncertainties alone predict; um."""
     lengths = [drift.lengths for drift in trend.drifts]
-    rows: dict[str, tuple[list[float], dict[str, Any]]] = {
-        "largest": ([abs(length.largest) for length in lengths], {"symbol": "triangle", "tone": "soft"}),
-        "RMS": ([length.rms for length in lengths], {"symbol": "square", "tone": "main"}),
-        "RMS by the uncertainties alone": (
-            [length.rms_by_chance for length in lengths], {"symbol": "ring", "tone": "accent"}
-        ),
-    }  # fmt: skip
+    rows = (
+        ("largest", [abs(length.largest) for length in lengths], "triangle", "soft"),
+        ("RMS", [length.rms for length in lengths], "square", "main"),
+        ("RMS by the uncertainties alone", [length.rms_by_chance for length in lengths], "ring", "accent"),
+    )
     marks = tuple(
-        Marks(name, positions[1:], 1e3 * np.where(np.isfinite(values), values, np.nan), joined=True, **style)
-        for name, (values, style) in rows.items()
+        Marks(name, positions[1:], 1e3 * np.where(np.isfinite(values), values, np.nan), symbol, tone, joined=True)
+        for name, values, symbol, tone in rows
     )
     y = linear(f"change of {lengths[0].length:g} mm\nlengths [um]", *(part.y for part in marks), zero=True)
     return Plot(x, y, marks)
 
 
 def _changes_of_two(drift: Drift) -> Plot:
-    """Changes between two calibrations over their expanded uncertainty; those beyond it are filled and named.
+    """Changes between two calibrations over their expanded uncertainty; those beyond it are filled, with their value.
 
     Of hundreds of coefficients of harmonics, those beyond it are drawn.
     """
@@ -155,39 +140,40 @@ def _changes_of_two(drift: Drift) -> Plot:
         i for i, name in enumerate(drift.names) if not drift.reasons[i] and (name in listed or bool(drift.moved[i]))
     ]
     ratio, moved = _ratio(drift.change, drift.expanded)[chosen], drift.moved[chosen]
-    x, y = np.arange(len(chosen)), _ratio_axis(ratio, margin=0.45)
-    words = [in_words(drift.units[i], float(drift.change[i])) for i in np.array(chosen, dtype=int)[moved]]
-    at = y.value(y.at(ratio[moved]) + np.where(ratio[moved] > 0, 0.03, -0.03))
-    axis = names("", [drift.names[i] for i in chosen])
+    x = np.arange(len(chosen))
+    labels = [
+        drift.names[i] + (f" {in_words(drift.units[i], float(drift.change[i]))}" if drift.moved[i] else "")
+        for i in chosen
+    ]
+    axis = names("", labels)
     marks = (
         _within(axis),
         Marks("", x, ratio, "bars", low=np.minimum(ratio, 0), high=np.maximum(ratio, 0), size=2),
         Marks("", x[~moved], ratio[~moved], "ring", "ink", size=7),
         Marks("", x[moved], ratio[moved], "square", size=7),
-        Marks("", x[moved], at, "upright", words=words, size=8),
-    )  # fmt: skip
+    )
     title = (
         f"New less old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band, "
         f"their expanded uncertainty ({100 * drift.level:g} %)"
     )
-    return Plot(axis, y, marks, title + _not_shown(drift))
+    return Plot(axis, _ratio_axis(ratio), marks, title + _not_shown(drift))
 
 
 def _lengths_of_two(drift: Drift) -> Plot:
     """Histogram of the changes of lengths between two calibrations, and what the uncertainties alone predict."""
-    lengths, marks = drift.lengths, []
+    lengths = drift.lengths
     counts, edges = np.histogram(1e3 * lengths.change, bins=40)
-    for rms, symbol, tone, name in (
-        (lengths.rms_by_chance, "dashed", "accent", "RMS by the uncertainties alone"),
-        (lengths.rms, "line", "main", "RMS of the changes"),
+    marks = [histogram(counts, edges)]
+    for name, rms, symbol, tone in (
+        ("RMS by the uncertainties alone", lengths.rms_by_chance, "dashed", "accent"),
+        ("RMS of the changes", lengths.rms, "line", "main"),
     ):
-        for side in (-1, 1) if np.isfinite(rms) else ():
-            at = 1e3 * side * rms
-            marks.append(Marks(name if side > 0 else "", [at, at], [0, 1.1 * counts.max()], symbol, tone))
-    box = (float(edges[1] - edges[0]), 0.0)
-    histogram = Marks("", (edges[:-1] + edges[1:]) / 2, counts, "boxes", "soft", box=box)
-    x = linear(f"change of {lengths.length:g} mm lengths over the volume [um]", edges, *(part.x for part in marks))
-    return Plot(x, linear("lengths", counts, zero=True), (histogram, *marks, borders([0.0])))
+        if np.isfinite(rms):
+            # From one side to the other, interrupted between them.
+            x, height = 1e3 * rms * np.array([-1, -1, np.nan, 1, 1]), 1.1 * counts.max()
+            marks.append(Marks(name, x, [0, height, np.nan, height, 0], symbol, tone))
+    title = f"change of {lengths.length:g} mm lengths over the volume [um]"
+    return Plot(linear(title, edges, *(part.x for part in marks)), linear("lengths", counts, zero=True), tuple(marks))
 
 
 def _ratio(change: np.ndarray, expanded: np.ndarray) -> np.ndarray:
@@ -195,17 +181,17 @@ def _ratio(change: np.ndarray, expanded: np.ndarray) -> np.ndarray:
     return np.where(expanded > 0, change / np.where(expanded > 0, expanded, 1.0), np.nan)
 
 
-def _ratio_axis(ratio: np.ndarray, margin: float = 0.1) -> Axis:
+def _ratio_axis(ratio: np.ndarray) -> Axis:
     """The axis of changes over their expanded uncertainty: that of the inverse hyperbolic sine if any is far out."""
-    title, largest = "change / expanded uncertainty", np.nanmax(np.abs(ratio), initial=1.0)
-    axis = linear(title, ratio, [-1.0, 1.0], margin=margin)
+    largest = np.nanmax(np.abs(ratio), initial=1.0)
+    axis = linear(_RATIO, ratio, [-1.0, 1.0], margin=0.1)
     if largest <= _FAR:
         return axis
     steps = (2, 5, 10, 20) if largest < 40 else (10, 100, 1000, 10_000, 100_000)
     ticks = [tick for tick in steps if tick < 2 * largest]
     values = [-tick for tick in reversed(ticks)] + [-1, 0, 1] + ticks
-    low, high = (np.sinh(np.arcsinh(end) * (1 + margin)) for end in (axis.low, axis.high))
-    return Axis(title, float(low), float(high), tuple((float(at), f"{at:g}") for at in values), "asinh")
+    low, high = (np.sinh(1.1 * np.arcsinh(end)) for end in (axis.low, axis.high))
+    return Axis(_RATIO, float(low), float(high), tuple((float(at), f"{at:g}") for at in values), "asinh")
 
 
 def _within(x: Axis) -> Marks:
@@ -224,14 +210,10 @@ def _time_axis(trend: Trend) -> tuple[Axis, np.ndarray]:
     span, count = seconds[-1] - seconds[0], len(seconds)
     even = span <= 0 or np.min(np.diff(seconds)) < _CROWDED * span
     positions = np.arange(count, dtype=float) if even else (seconds - seconds[0]) / span * (count - 1)
-    date_format = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
     by_file = trend.dated_by_file or (False,) * count
-    mark = "*" if any(by_file) and not all(by_file) else ""
-    dates = [
-        f"{date:{date_format}}{mark if of_file else ''}" for date, of_file in zip(trend.dates, by_file, strict=True)
-    ]
+    form = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
+    dates = [f"{date:{form}}{'*' if file else ''}" for date, file in zip(trend.dates, by_file, strict=True)]
     label = "calibration" + (", evenly spaced" if even else "")
-    if any(by_file):
-        label += f" ({mark}{': ' if mark else ''}when its file was made; the manifest states no date)"
+    label += " (*: when its file was made; the manifest states no date)" if any(by_file) else ""
     ticks = tuple(zip(positions.tolist(), dates, strict=True))
     return linear(label, positions, margin=0.03)._replace(ticks=ticks, named=True), positions

@@ -42,15 +42,15 @@ def draw(plot: Plot, axes: Any = None, size: tuple[float, float] = (6.4, 4.2), *
     if not any(marks.box[1] for marks in plot.marks):
         axes.grid(True, which="major", alpha=0.3)
     axes.set_axisbelow(True)
-    if plot.title:
-        axes.set_title(plot.title, fontsize=9)
     if plot.square:
         axes.set_aspect("equal")
     handles, labels = axes.get_legend_handles_labels()
     if legend and labels:
-        of_shades = next((marks.name for marks in plot.marks if marks.limits), None)
-        style = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 9, "title": of_shades}
-        axes.legend(handles, labels, ncols=_columns(labels), frameon=False, **style)
+        title = "\n".join(filter(None, (plot.title, *(marks.name for marks in plot.marks if marks.limits))))
+        style = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 9, "title_fontsize": 9}
+        axes.legend(handles, labels, ncols=_columns(labels), frameon=False, title=title, **style)
+    elif plot.title:
+        axes.set_title(plot.title, fontsize=9)
     return axes
 
 
@@ -120,8 +120,9 @@ def _draw_marks(axes: Any, marks: Marks) -> None:
         style = {"color": "0.4", "linewidth": 0.8, "zorder": 0, "linestyle": "-" if marks.symbol == "level" else "--"}
         for value in y if marks.symbol == "level" else x:
             across(value, **style)
-    elif marks.symbol in ("text", "upright", "beside"):
-        _write(axes, marks, color)
+    elif marks.symbol == "text":
+        for place in zip(x, y, marks.words, strict=True):
+            axes.text(*place, ha="center", va="center", color=color, fontsize=marks.size)
     elif marks.symbol == "band":
         axes.fill_between(x, *span, color=color, alpha=0.2, linewidth=0, label=label)
     elif marks.symbol == "bars":
@@ -142,7 +143,8 @@ def _draw_points(axes: Any, marks: Marks, x: np.ndarray, y: np.ndarray, span: tu
         for i, color in enumerate(_SHADES):
             chosen = np.asarray(marks.shade) == i
             shaded = style | {"markersize": 0.7 * (marks.size + 1.6 * i), "markeredgecolor": "0.5"}
-            axes.plot(x[chosen], y[chosen], color=color, label=_of_shade(marks, i), markeredgewidth=0.4, **shaded)
+            label = marks.shade_names[i] if marks.limits else None
+            axes.plot(x[chosen], y[chosen], color=color, label=label, markeredgewidth=0.4, **shaded)
     elif span is not None:
         bars = {"yerr": [y - span[0], span[1] - y], "capsize": 3, "elinewidth": 1.0}
         axes.errorbar(x, y, color=TONES.get(marks.tone, marks.tone), label=marks.name or None, **bars, **style)
@@ -166,18 +168,3 @@ def _draw_boxes(axes: Any, marks: Marks, x: np.ndarray, y: np.ndarray, span: tup
     axes.add_collection(PatchCollection(boxes, facecolors=faces, edgecolors="white", linewidths=0.4))
     for i, name in enumerate(marks.shade_names):
         axes.plot([], [], "s", color=_SHADES[i], markersize=8, label=name)
-
-
-def _of_shade(marks: Marks, i: int) -> str | None:
-    return marks.shade_names[i] if marks.limits else None
-
-
-def _write(axes: Any, marks: Marks, color: str) -> None:
-    """Words at places; upright ones grow away from zero."""
-    for x, y, words in zip(marks.x, marks.y, marks.words, strict=True):
-        style: dict[str, Any] = {"ha": "center", "va": "center", "color": color, "fontsize": marks.size}
-        if marks.symbol == "upright":
-            style |= {"rotation": 90, "va": "bottom" if y > 0 else "top"}
-        elif marks.symbol == "beside":
-            style["ha"] = "left"
-        axes.text(x, y, words, **style)

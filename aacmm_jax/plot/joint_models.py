@@ -1,6 +1,6 @@
 """Models of the joints: how they compare, and what each joint does besides its reading."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from ..core.units import DEG
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.corrections.kind import Term
 from ..pipeline.model_ladder import ComparedModels
+from ..summaries.compared_models import compared_models_summary
 from ..summaries.tables import format_number
 from .charts import Chart, Marks, Plot, borders, level, linear, names
 from .figures import TONES, draw
@@ -22,22 +23,24 @@ _MRAD = 1e-3
 _WIDTH = 0.38  # of a bar
 
 
-def models_chart(
-    labels: Sequence[str], recommended: int, inside: np.ndarray, outside: np.ndarray, u_outside: np.ndarray
-) -> Chart:
+def models_chart(summary: Mapping[str, Any]) -> Chart:
     """RMS errors of models inside and outside what they were fitted to, with the standard error outside; mm."""
-    x = np.arange(len(labels))
+    labels = [row["model"] for row in summary["models"]]
+    inside, outside, u = (
+        np.array([row[key] for row in summary["models"]], dtype=float)
+        for key in ("rms_inside", "rms_outside", "u_outside")
+    )
     words = [
         f"{label}: inside {format_number(a)} mm, outside {format_number(b)} ± {format_number(c)} mm"
-        for label, a, b, c in zip(labels, inside.tolist(), outside.tolist(), u_outside.tolist(), strict=True)
+        for label, a, b, c in zip(labels, inside.tolist(), outside.tolist(), u.tolist(), strict=True)
     ]
-    low, high = outside - u_outside, outside + u_outside
-    left, right, box = x - _WIDTH / 2, x + _WIDTH / 2, (_WIDTH, 0.0)
+    left, box = np.arange(len(labels)) - _WIDTH / 2, (_WIDTH, 0.0)
+    low, high, right = outside - u, outside + u, left + _WIDTH
     marks = (
         Marks("poses that were fitted", left, inside, "boxes", "soft", words, box=box),
         Marks("regions left out, ± one standard error", right, outside, "boxes", "main", words, low, high, box=box),
     )
-    named = [f"{label} (recommended)" if i == recommended else label for i, label in enumerate(labels)]
+    named = [f"{label} (recommended)" if label == summary["recommended"] else label for label in labels]
     y = linear("RMS distance from the geometry [mm]", inside, outside, high, [0.0], zero=True)
     description = "The RMS distance of poses from their geometry, from the simplest model to the richest."
     return Chart("models", "Errors by model", description, (Plot(names("", named), y, marks, height=260),))
@@ -61,12 +64,7 @@ def model_comparison(compared: ComparedModels, axes: Any = None) -> Any:
         >>> print(len(axes.patches), "bars")
         4 bars
     """
-    models = compared.models
-    columns = (
-        np.array([getattr(model, key) for model in models]) for key in ("rms_inside", "rms_outside", "u_outside")
-    )
-    chart = models_chart([model.model for model in models], models.index(compared.recommended), *columns)
-    return draw(chart.plots[0], axes)
+    return draw(models_chart(compared_models_summary(compared, "")).plots[0], axes)
 
 
 def functions_chart(record: CalibrationRecord) -> Chart | None:

@@ -2,7 +2,7 @@
 speak."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from ..diagnostics.pose_residuals import (
 )
 from ..kinematics.arm import by_joint
 from ..summaries.tables import Cell, Table, by_columns, format_number, numbers
-from .charts import SERIES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, round_ticks, runs, thinned
+from .charts import SERIES, Chart, Marks, Plot, borders, histogram, level, linear, logarithmic, runs, thinned
 from .figures import draw, draw_all, save_figure
 from .parameters import error_plot
 
@@ -34,7 +34,14 @@ _LEAST = 1e-5  # a residual of zero on a logarithmic axis, mm
 _MOST_IN_A_ROW = 3  # panels of a figure
 _QUANTITIES = {"standard deviations": "residual", "deg": "angle between orientations"}
 Marked = tuple[str, Sequence[int] | np.ndarray]  # why poses are marked, and their indices
+_OF_ARMS: tuple[dict[str, Any], ...] = ({"symbol": "square", "tone": "soft"}, SERIES[0])  # nominal, calibrated
 _LITTLE_WEIGHT = "half of its weight or less"
+# Of residuals in each unit: identity and title of the chart, and the values.
+_UNITS: dict[str, tuple[str, str, Callable[[ObservationResiduals], Any]]] = {
+    "mm": ("residuals", "Residuals in mm", lambda part: part.distance),
+    "standard deviations": ("normalised", "Residuals in standard deviations", lambda part: part.normalised),
+    "deg": ("angles", "Residuals of orientations", lambda part: np.asarray(part.angle) / DEG),
+}
 _DRAWN = 400  # most poses in one plot of a pattern in a page
 _FEWEST = 12  # poses: fewer show no pattern
 _BINS = (4, 12)  # least and most of them; a band needs some 15 poses in each
@@ -105,39 +112,35 @@ def pose_chart(
     if not len(finite):
         return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", ())
     drawn = np.union1d(finite[thinned(len(finite), most or len(finite))], marked)
-    labels = [f"{groups.names[i]}, pose {n}" for i, n in zip(groups.owner, groups.numbers, strict=True)]
-
-    def series(name: str, of: str, values: np.ndarray, chosen: np.ndarray, style: Mapping[str, Any]) -> Marks:
-        words = [f"{labels[i]}: {format_number(float(values[i]))} {unit} ({of})" for i in chosen]
-        return Marks(name, chosen + 1, np.maximum(values[chosen], _LEAST), words=words, size=5, **style)
-
+    kind = np.asarray(groups.kinds)[groups.owner]
     if len(arms) > 1:
-        styles = ({"symbol": "square", "tone": "soft"}, SERIES[0])
-        names = [f"{arm}, RMS {format_number(rms(values[np.isfinite(values)]), 3)} {unit}"
-                 for arm, values in arms.items()]  # fmt: skip
-        marks = [series(name, arm, values, drawn[np.isfinite(values[drawn])], style)
-                 for (arm, values), name, style in zip(arms.items(), names, styles, strict=True)]  # fmt: skip
+        series = [(arm, f"{arm}, RMS {format_number(rms(values[np.isfinite(values)]), 3)} {unit}", values, drawn, style)
+                  for (arm, values), style in zip(arms.items(), _OF_ARMS, strict=True)]  # fmt: skip
     else:
-        kind = np.asarray(groups.kinds)[groups.owner]
-        marks = [series(name, name, last, drawn[kind[drawn] == name], SERIES[i % len(SERIES)])
-                 for i, name in enumerate(dict.fromkeys(groups.kinds))]  # fmt: skip
+        series = [(name, name, last, drawn[kind[drawn] == name], SERIES[i % len(SERIES)])
+                  for i, name in enumerate(dict.fromkeys(groups.kinds))]  # fmt: skip
+    marks = []
+    for said, name, values, chosen, style in series:
+        chosen = chosen[np.isfinite(values[chosen])]
+        words = [f"{groups.names[groups.owner[i]]}, pose {groups.numbers[i]}: {format_number(float(values[i]))} {unit} "
+                 f"({said})" for i in chosen]  # fmt: skip
+        marks.append(Marks(name, chosen + 1, np.maximum(values[chosen], _LEAST), words=words, size=5, **style))
     if len(marked):
         marks.append(Marks(far[0], marked + 1, np.maximum(last[marked], _LEAST), "ring", "accent", size=11))
     ticks, edges = groups.parts()
-    word, end = f"{groups.word} after {groups.word}", len(labels) + 1.0
-    x = Axis("pose" if len(groups.sizes) == 1 else f"pose, {word}", 0.0, end, ticks or round_ticks(0, end),
-             named=bool(ticks))  # fmt: skip
+    word = "pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}"
+    x = linear(word, [0.0, len(last) + 1.0], margin=0.0)
+    x = x._replace(ticks=ticks, named=True) if ticks else x
     centre = "geometry" if groups.word == "observation" else "socket's centroid"
-    quantity = _QUANTITIES.get(unit, f"distance from the {centre}")
     expected = [level(1.0)] if unit == "standard deviations" else []
-    y = logarithmic(f"{quantity} [{unit}]", *(mark.y for mark in marks), *(mark.y for mark in expected))
-    plot = Plot(x, y, (*marks, *expected, borders(edges)))
+    y = logarithmic(f"{_QUANTITIES.get(unit, f'distance from the {centre}')} [{unit}]",
+                    *(mark.y for mark in (*marks, *expected)))  # fmt: skip
     median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
-    description = f"Dotted lines separate the {groups.word}s. " if len(edges) else ""
-    description += f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
+    description = f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
     description += " The only pose of a socket has no distance." if len(finite) < len(last) else ""
     description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
-    return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
+    table = None if len(arms) > 1 else _pose_table(groups, last, unit, far)
+    return Chart(id, title, description, (Plot(x, y, (*marks, *expected, borders(edges))),), table)
 
 
 def _pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked) -> Table:
@@ -146,14 +149,13 @@ def _pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked) -
     if len(chosen) > _LISTED:
         chosen = np.argsort(-np.nan_to_num(residuals))[:_LISTED]
         caption = f"The {_LISTED} farthest of {len(residuals)} poses"
-    columns: dict[str, Any] = {
+    says, marked = Cell(far[0], None, "outlier"), np.isin(chosen, far[1])
+    columns = {
         groups.word: [groups.names[i] for i in groups.owner[chosen]],
         "pose": groups.numbers[chosen].tolist(),
         f"calibrated [{unit}]": numbers(residuals[chosen], 5),
+        "marked": [says if mark else "" for mark in marked],
     }
-    if far[0]:
-        says, marked = Cell(far[0], None, "outlier"), np.isin(chosen, far[1])
-        columns["marked"] = [says if mark else "" for mark in marked]
     return by_columns(caption, columns)
 
 
@@ -221,7 +223,7 @@ def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = N
         >>> print(axes.get_ylabel())
         distance from the socket's centroid [mm]
     """
-    if unit not in ("mm", *_QUANTITIES):
+    if unit not in _UNITS:
         raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
     chart = kinds_chart(record, unit)
     if chart is None:
@@ -238,21 +240,10 @@ def kinds_chart(
     if not parts:
         return None
     groups = Groups.of(record.recording.capture).only([i for i, _ in parts])
-    values = np.concatenate([_in_unit(part, unit) for _, part in parts])
+    values = np.concatenate([np.asarray(_UNITS[unit][2](part)) for _, part in parts])
     if far is None or unit == "deg":
         far = _LITTLE_WEIGHT, np.flatnonzero(np.concatenate([part.weight for _, part in parts]) <= 0.5)
-    id, title = {
-        "mm": ("residuals", "Residuals in mm"),
-        "deg": ("angles", "Residuals of orientations"),
-        "standard deviations": ("normalised", "Residuals in standard deviations"),
-    }[unit]
-    return pose_chart(id, title, groups, {"calibrated": values}, unit=unit, far=far, most=most)
-
-
-def _in_unit(part: ObservationResiduals, unit: str) -> np.ndarray:
-    if unit == "deg":
-        return np.asarray(part.angle) / DEG
-    return part.distance if unit == "mm" else part.normalised
+    return pose_chart(*_UNITS[unit][:2], groups, {"calibrated": values}, unit=unit, far=far, most=most)
 
 
 def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
@@ -319,30 +310,28 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
     q = np.asarray(record.recording.capture.readings)[residuals.poses]
     order = np.arange(1, len(residuals.poses) + 1)
     units = by_joint(record.calibrated.arm, (DEG, "deg"), (1.0, "mm"))
-    limit = _limit(residuals.along_joint)
-    by_reading = tuple(
-        _pattern(q[:, i] / unit, residuals.along_joint[:, i], f"reading of joint {i + 1} [{name}]", "", limit, most)
+    by_reading = [
+        (q[:, i] / unit, f"reading of joint {i + 1} [{name}]", residuals.along_joint[:, i], "")
         for i, (unit, name) in enumerate(units)
-    )
-    limit = _limit(residuals.vector)
-    by_order = tuple(
-        _pattern(order, residuals.vector[:, i], "pose, in the order of the capture", f"along {axis}", limit, most)
+    ]
+    by_order = [
+        (order, "pose, in the order of the capture", residuals.vector[:, i], f"along {axis}")
         for i, axis in enumerate("xyz")
-    )
+    ]
     return [
         Chart(
             "by-joint",
             "Residuals against the readings",
             "The component of each residual along which the joint would move the tip, mm, against its reading. A wave "
             "is an eccentric encoder or a bending link, a slope a wrong gear ratio or zero.",
-            by_reading,
+            _patterns(by_reading, most),
         ),
         Chart(
             "by-order",
             "Residuals along x, y and z",
             "The residual in the base frame, mm, pose after pose as the capture holds them. A step between sockets or "
             "placements, or a slope, is something that moved, warmed or wore meanwhile.",
-            by_order,
+            _patterns(by_order, most),
         ),
         Chart(
             "histogram",
@@ -355,41 +344,33 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
 
 def _histogram(values: np.ndarray) -> Plot:
     edges = np.linspace(-4.5, 4.5, 31)
-    width = edges[1] - edges[0]
     counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
     fine = np.linspace(edges[0], edges[-1], 121)
-    normal = len(values) * width * np.exp(-(fine**2) / 2) / math.sqrt(2 * math.pi)
-    words = [f"{a:+.1f} to {a + width:+.1f}: {count}" for a, count in zip(edges, counts, strict=False)]
-    marks = (
-        Marks("residuals", (edges[:-1] + edges[1:]) / 2, counts, "boxes", "soft", words, box=(width, 0.0)),
-        Marks("normal distribution", fine, normal, "line", "accent"),
-    )
+    normal = len(values) * (edges[1] - edges[0]) * np.exp(-(fine**2) / 2) / math.sqrt(2 * math.pi)
+    marks = histogram(counts, edges, "residuals"), Marks("normal distribution", fine, normal, "line", "accent")
     x = linear("residual [standard deviations]", edges, margin=0.0)
     return Plot(x, linear("coordinates", counts, normal, zero=True), marks, height=220)
 
 
-def _pattern(x: np.ndarray, y: np.ndarray, x_title: str, title: str, limit: float, most: int) -> Plot:
-    """Residuals, and the band of their means; the axis is symmetric, and what lies beyond it is drawn at its edge."""
-    finite = np.flatnonzero(np.isfinite(y))
-    drawn = finite[thinned(len(finite), most)] if len(finite) else finite
-    points = Marks("pose", x[drawn], np.clip(y[drawn], -limit, limit), "dot", "soft", size=3.5)
-    y_axis = linear("residual [mm]", [-limit, limit], margin=0.0)
-    marks = (level(0.0), points, *_mean_band(x[finite], y[finite]))
-    return Plot(linear(x_title, x, margin=0.02), y_axis, marks, title=title, height=150)
-
-
-def _mean_band(x: np.ndarray, y: np.ndarray) -> list[Marks]:
-    """The mean of neighbouring poses, and twice its standard error to both sides."""
-    bins = min(max(len(x) // 15, _BINS[0]), _BINS[1])
-    if len(x) < 3 * bins:
-        return []
-    parts = np.array_split(np.argsort(x, kind="stable"), bins)
-    middle, mean = (np.array([values[part].mean() for part in parts]) for values in (x, y))
-    twice = np.array([2 * y[part].std(ddof=1) / math.sqrt(len(part)) for part in parts])
-    name = "mean of neighbours, ± 2 of its u"
-    return [Marks(name, middle, mean, "band", low=mean - twice, high=mean + twice), Marks("", middle, mean, "line")]
-
-
-def _limit(values: np.ndarray) -> float:
-    finite = np.abs(values[np.isfinite(values)])
-    return 1.15 * float(np.quantile(finite, _INSIDE)) or 1.0
+def _patterns(panels: Sequence[tuple[np.ndarray, str, np.ndarray, str]], most: int) -> tuple[Plot, ...]:
+    """Residuals, and the band of the means of neighbouring poses with twice their standard errors, on symmetric axes of
+    equal length; what lies beyond is drawn at their edges. Panels: abscissas and their title, residuals, title."""
+    all_residuals = np.abs(np.concatenate([y for _, _, y, _ in panels]))
+    limit = 1.15 * float(np.quantile(all_residuals[np.isfinite(all_residuals)], _INSIDE)) or 1.0
+    plots = []
+    for x, x_title, y, title in panels:
+        finite = np.flatnonzero(np.isfinite(y))
+        drawn = finite[thinned(len(finite), most)] if len(finite) else finite
+        points = Marks("pose", x[drawn], np.clip(y[drawn], -limit, limit), "dot", "soft", size=3.5)
+        marks = [level(0.0), points]
+        bins = min(max(len(finite) // 15, _BINS[0]), _BINS[1])
+        if len(finite) >= 3 * bins:
+            parts = np.array_split(finite[np.argsort(x[finite], kind="stable")], bins)
+            middle, mean = (np.array([values[part].mean() for part in parts]) for values in (x, y))
+            twice = np.array([2 * y[part].std(ddof=1) / math.sqrt(len(part)) for part in parts])
+            name = "mean of neighbours, ± 2 of its u"
+            marks.append(Marks(name, middle, mean, "band", low=mean - twice, high=mean + twice))
+            marks.append(Marks("", middle, mean, "line"))
+        y_axis = linear("residual [mm]", [-limit, limit], margin=0.0)
+        plots.append(Plot(linear(x_title, x, margin=0.02), y_axis, tuple(marks), title=title, height=150))
+    return tuple(plots)

@@ -1,6 +1,6 @@
 """Figures of a Monte Carlo study; each takes its results."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -9,17 +9,19 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..study.results import Results
-from ..study.statistics import METRICS, correlation, factor_title, level_text, level_title, shown_unit
+from ..study.statistics import METRICS, correlation, factor_title, level_text, level_title, metric_title, shown_unit
 from ..summaries.tables import format_number
-from .charts import SERIES, Marks, Plot, level, linear, logarithmic, names, ordinates
+from .charts import SERIES, Marks, Plot, linear, logarithmic, names, thinned
 from .figures import draw, draw_all, save_figure
 from .uncertainty import correlation_plot
 
 _WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
 _SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
-_ENDS = (5, 50, 95)  # percentiles
 _MOST_PLOTS = 12  # of a metric, each with a combination of factors
 _WIDE = 20  # times: positive values over a wider range need a logarithmic axis
+_SCALE_ERROR = "error of the scale of stage 1 [parts in a million]"
+# A name, a metric, and the cells at each level of the factor, whose trials are pooled.
+_Series = tuple[str, str, Sequence[Sequence[int]]]
 
 
 def study_metric(results: Results, metric: str = "length_error", axes: Any = None) -> Any:
@@ -44,47 +46,49 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
     """
     if metric not in METRICS:
         raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")
-    return draw(metric_plots(results, metric, lambda cells: _percentiles(results, metric, cells), True)[0], axes)
+    return draw(metric_plots(results, metric, together=True)[0], axes)
 
 
-def metric_plots(
-    results: Results, metric: str, percentiles: Callable[[Sequence[int]], np.ndarray], together: bool = False
-) -> tuple[Plot, ...]:
-    """A metric against the factor with the most levels: medians of the converged trials, with bars from the 5th to the
-    95th percentile, which ``percentiles`` gives of each cell; for each combination of the other factors a plot, or all
-    ``together`` side by side."""
-    factors, (unit, _) = results.study.factors, metric_unit(metric)
-    along = max(factors, key=lambda name: len(factors[name])) if factors else None
-    most = len(SERIES) if together else _MOST_PLOTS
-    all_runs = {"": [0]} if along is None else _runs(results, along, most)
-    groups = [all_runs] if together else [{words: cells} for words, cells in all_runs.items()]
-    values = [[percentiles(cells) for cells in runs.values()] for runs in groups]
-    every = np.concatenate([part.ravel() for parts in values for part in parts])
-    every = every[np.isfinite(every)]
-    wide = bool(len(every)) and every.min() > 0 and every.max() > _WIDE * every.min()
-    y = (logarithmic if wide else linear)(METRICS[metric] + (f" [{unit}]" if unit else ""), every)
-    x_axis = names("", ["all trials"]) if along is None else names(factor_title(along), _levels(results, along))
-    plots = []
-    for runs, parts in zip(groups, values, strict=True):
-        marks = []
-        for i, ((words, cells), ends) in enumerate(zip(runs.items(), parts, strict=True)):
-            at = np.array([0 if along is None else _index(results, cell)[along] for cell in cells])
-            x = at + 0.6 * ((i + 0.5) / len(runs) - 0.5)  # side by side at each level
+def metric_plots(results: Results, metric: str, factor: str = "", *, together: bool = False) -> tuple[Plot, ...]:
+    """A metric against a factor, by default that with the most levels: a plot for each combination of the levels of
+    the others, or all ``together`` side by side."""
+    factors = results.study.factors
+    factor = factor or max(factors, key=lambda name: len(factors[name]), default="")
+    if together:
+        runs = _runs(results, factor, len(SERIES))
+        panels = {"": [(words if len(runs) > 1 else "", metric, cells) for words, cells in runs.items()]}
+    else:
+        panels = {words: [("", metric, cells)] for words, cells in _runs(results, factor, _MOST_PLOTS).items()}
+    return _plots(results, factor, panels)
+
+
+def _plots(results: Results, factor: str, panels: Mapping[str, Sequence[_Series]]) -> tuple[Plot, ...]:
+    """Plots by their titles, on the same axes: at each level of the factor the median of every series with a bar from
+    the 5th to the 95th percentile, side by side."""
+    levels = _levels(results, factor)
+    metrics = {metric for series in panels.values() for _, metric, _ in series}
+    title = _SCALE_ERROR if metrics == {"scale"} else metric_title(min(metrics, key=len))
+    if len(metrics) > 1:  # before and after
+        title = title.replace(" after the scale fix", "")
+    marks: dict[str, list[Marks]] = {words: [] for words in panels}
+    ends = np.zeros(0)
+    for words, series in panels.items():
+        for i, (name, quantity, cells) in enumerate(series):
+            low, middle, high = _percentiles(results, quantity, cells, (5, 50, 95))
             said = [
-                f"cell {cell + 1}: median {format_number(b)} {unit}, 5 % {format_number(a)}, 95 % {format_number(c)}"
-                for cell, (a, b, c) in zip(cells, ends.T.tolist(), strict=True)
+                f"{level}: median {format_number(b)}, 5 % {format_number(a)}, 95 % {format_number(c)}"
+                for level, a, b, c in zip(levels, low.tolist(), middle.tolist(), high.tolist(), strict=True)
             ]
-            name = words if len(runs) > 1 else ""
-            marks.append(Marks(name, x, ends[1], **SERIES[i], words=said, low=ends[0], high=ends[2]))
-        title = "" if len(runs) > 1 else next(iter(runs))
-        height = 280 if len(groups) == 1 else 200
-        plots.append(Plot(x_axis, y, tuple(marks), title=title[:1].upper() + title[1:], height=height))
-    return tuple(plots)
-
-
-def metric_unit(metric: str) -> tuple[str, float]:
-    """The unit in which a metric is drawn, and the factor to it."""
-    return ("parts in a million", 1e6) if metric == "scale_error" else shown_unit(metric)
+            ends = np.concatenate([ends, low[np.isfinite(low)], high[np.isfinite(high)]])
+            x = np.arange(len(levels)) + 0.6 * ((i + 0.5) / len(series) - 0.5)
+            marks[words].append(Marks(name, x, middle, **SERIES[i], words=said, low=low, high=high))
+    wide = len(ends) and ends.min() > 0 and ends.max() > _WIDE * ends.min()
+    axes = names(factor_title(factor) if factor else "", levels), (logarithmic if wide else linear)(title, ends)
+    height = 280 if len(panels) == 1 else 200
+    return tuple(
+        Plot(*axes, tuple(series), title=words[:1].upper() + words[1:], height=height)
+        for words, series in marks.items()
+    )
 
 
 def save_study_figures(results: Results, folder: Path) -> list[Path]:
@@ -147,20 +151,17 @@ def study_distributions(
     Example:
         >>> aj.plot.study_distributions(results, "bounds.length_mm").savefig("distributions.svg")
     """
-    index = [_index(results, cell)[factor] for cell in range(len(results.study.cells))]
-    cells = [[cell for cell, at in enumerate(index) if at == i] for i in range(len(results.study.factors[factor]))]
-    x, axis = np.arange(len(cells)), names(factor_title(factor), _levels(results, factor))
-    plots = []
-    for name in filter(None, (_available(results, metric) for metric in metrics)):
-        low, q25, median, q75, high = np.array([_quantiles(_values(results, name, level_cells), (5, 25, 50, 75, 95))
-                                                for level_cells in cells]).T  # fmt: skip
-        marks = (
-            Marks("", x, median, "bars", low=q25, high=q75, size=16),
-            Marks("", x, median, "square", low=low, high=high, size=5),
-        )
-        wide = np.nanmin(low, initial=np.inf) > 0 and np.nanmax(median) > _WIDE / 2 * np.nanmin(median)
-        plots.append(Plot(axis, (logarithmic if wide else linear)(_title(name), low, high), marks))
-    figure = draw_all(plots, len(plots), (4.3, 3.8))
+    index, plots = _index(results)[factor], []
+    cells = [np.flatnonzero(index == i).tolist() for i in range(len(results.study.factors[factor]))]
+    for metric in metrics:
+        for name in (metric, f"{metric}_stage1"):
+            low, high = _percentiles(results, name, cells, (25, 75)) if name in METRICS else np.full((2, 1), np.nan)
+            if np.any(np.isfinite(low)):
+                (plot,) = _plots(results, factor, {"": [("", name, cells)]})
+                box = Marks("", np.arange(len(cells)), low, "bars", low=low, high=high, size=16)
+                plots.append(plot._replace(marks=(box, *plot.marks)))
+                break
+    figure = draw_all(plots, len(plots), (4.3, 4.4))
     others = [factor_title(name) for name in results.study.factors if name != factor]
     pooled = f"\ntrials pooled over all levels of: {', '.join(others)}" if others else ""
     figure.suptitle(f"boxes: quartiles and median; whiskers: 5 % and 95 %{pooled}", fontsize=9)
@@ -175,38 +176,18 @@ def study_errors(results: Results, factor: str) -> Any:
         factor: ``"bounds.length_mm"`` or ``"bounds.angle_deg"``, varied in the study.
 
     Returns:
-        The figure, with medians and bands from the 5th to the 95th percentile.
+        The figure, with medians and bars from the 5th to the 95th percentile.
 
     Example:
         >>> aj.plot.study_errors(results, "bounds.length_mm").savefig("errors.svg")
     """
     kind = "length_error" if "length" in factor else "angle_error"
-    runs = _runs(results, factor, most=4)
-    x = _values_of_factor(results, factor, next(iter(runs.values())))
-    # Angles are the same after the fix: the line before it is wide enough to be seen below the other.
-    stages: dict[str, dict[str, Any]] = {
-        f"{kind}_stage1": {"name": "before the scale fix", "tone": "accent", "symbol": "triangle", "size": 15},
-        kind: {"name": "after", "tone": "main", "symbol": "square", "size": 6},
-    }
+    stages = {"before the scale fix": f"{kind}_stage1", "after": kind}
     panels = {
-        fill(words, 60): [
-            part for name, style in stages.items() for part in _curve(x, _percentiles(results, name, cells), **style)
-        ]
-        for words, cells in runs.items()
+        fill(words, 60): [(name, metric, cells) for name, metric in stages.items()]
+        for words, cells in _runs(results, factor, most=4).items()
     }
-    y = logarithmic(_title(kind), *(ends for marks in panels.values() for ends in ordinates(marks)))
-    x_axis = logarithmic(factor_title(factor), x)._replace(ticks=tuple((float(at), f"{at:g}") for at in x))
-    plots = [Plot(x_axis, y, tuple(marks), title=words) for words, marks in panels.items()]
-    return draw_all(plots, len(plots), (5, 3.9))
-
-
-def _curve(x: np.ndarray, ends: np.ndarray, *, band: bool = True, **style: Any) -> list[Marks]:
-    """Medians as joined points, with a band from the 5th to the 95th percentile; nothing where no trial converged."""
-    low, middle, high = ends
-    if not np.any(np.isfinite(middle)):
-        return []
-    curve = Marks(x=x, y=middle, joined=True, **style)
-    return [Marks("", x, middle, "band", style["tone"], low=low, high=high), curve] if band else [curve]
+    return draw_all(_plots(results, factor, panels), len(panels), (5, 3.9))
 
 
 def study_scale(results: Results, factor: str) -> Any:
@@ -217,20 +198,12 @@ def study_scale(results: Results, factor: str) -> Any:
         factor: ``"bounds.length_shift_mm"`` or ``"bounds.angle_shift_deg"``, varied in the study.
 
     Returns:
-        The figure, with medians and bands from the 5th to the 95th percentile.
+        The figure, with medians and bars from the 5th to the 95th percentile.
 
     Example:
         >>> aj.plot.study_scale(results, "bounds.length_shift_mm").savefig("scale.svg")
     """
-    runs = _runs(results, factor, most=len(SERIES))
-    marks = [level(0.0)]
-    for style, (words, cells) in zip(SERIES, runs.items(), strict=False):
-        ends, name = 1e6 * (_percentiles(results, "scale", cells) - 1), words if len(runs) > 1 else ""
-        x = _values_of_factor(results, factor, cells)
-        marks += _curve(x, ends, band=len(runs) <= 4, name=name, **style)
-    x_axis = linear(factor_title(factor), *(part.x for part in marks))
-    y = linear("error of the scale of stage 1 [parts in a million]", *ordinates(marks))
-    return draw_all([Plot(x_axis, y, tuple(marks))], 1, (6.4, 4.2 + 0.16 * len(runs)))
+    return draw_all(metric_plots(results, "scale", factor, together=True), 1, (6.4, 5.4))
 
 
 def study_correlation(results: Results, cell: int) -> Any:
@@ -271,96 +244,72 @@ def study_convergence(results: Results) -> Any:
     Example:
         >>> aj.plot.study_convergence(results).savefig("convergence.svg")
     """
-    factors = sorted(results.study.factors, key=lambda name: -len(results.study.factors[name]))[:2]
-    levels = [_levels(results, name) for name in factors] + [["all"]] * (2 - len(factors))
+    factors = sorted(results.study.factors, key=lambda name: -len(results.study.factors[name]))
+    factors = [*factors, "", ""][:2]
+    levels, count = [_levels(results, name) for name in factors], len(results.study.cells)
+    i, j = (_index(results).get(name, np.zeros(count, dtype=int)) for name in factors)
     total, good = np.zeros((2, len(levels[1]), len(levels[0])))
-    for cell in range(len(results.study.cells)):
-        index = _index(results, cell)
-        at = (index[factors[1]] if len(factors) > 1 else 0, index[factors[0]] if factors else 0)
+    for cell in range(count):
         converged = results.column("converged", cell)
-        total[at] += np.sum(converged >= 0)
-        good[at] += np.sum(converged == 1)
+        total[j[cell], i[cell]] += np.sum(converged >= 0)
+        good[j[cell], i[cell]] += np.sum(converged == 1)
     percentage = np.divide(100 * good, total, out=np.full_like(good, np.nan), where=total > 0).ravel()
     y, x = (part.ravel() for part in np.indices(total.shape))
     # The least is a middle shade, on which its number can be read.
     failed = 100 - np.nan_to_num(percentage, nan=100.0)
     shade = np.rint(2 * failed / max(failed.max(), 1.0)).astype(int)
-    words = ["-" if np.isnan(p) else f"{p:.0f}" if p in (0, 100) else f"{p:.1f}" for p in percentage]
     marks = (
         Marks("", x, y, "boxes", shade=shade, box=(1.0, 1.0)),
-        Marks("", x, y, "text", "ink", words, size=8),
-    )
-    titles = (
-        factor_title(factors[0]) if factors else "",
-        fill(factor_title(factors[1]), 14 + 8 * len(levels[1])) if len(factors) > 1 else "",
+        Marks("", x, y, "text", "ink", ["-" if np.isnan(p) else f"{p:.4g}" for p in percentage], size=8),
     )
     x_axis, y_axis = (
-        names(title, labels)._replace(low=-0.5, high=len(labels) - 0.5)
-        for title, labels in zip(titles, levels, strict=True)
+        names(fill(factor_title(name) if name else "", 14 + 8 * len(labels)), labels)._replace(
+            low=-0.5, high=len(labels) - 0.5
+        )
+        for name, labels in zip(factors, levels, strict=True)
     )
     size = 1.9 + 0.75 * max(len(levels[0]), 4), 1.9 + 0.5 * len(levels[1])
     return draw_all([Plot(x_axis, y_axis, marks, title="trials that converged [%]")], 1, size)
 
 
-def _available(results: Results, metric: str) -> str | None:
-    """The metric, or that of stage 1 where the study has no scale fix."""
-    cells = range(len(results.study.cells))
-    for name in (metric, f"{metric}_stage1"):
-        if name in METRICS and any(len(_values(results, name, [cell])) for cell in cells):
-            return name
-    return None
+def _percentiles(
+    results: Results, metric: str, levels: Sequence[Sequence[int]], percentiles: Sequence[int]
+) -> np.ndarray:
+    """Percentiles over the converged trials of the cells at each level, in the unit in which the metric is drawn; NaN
+    where there are none."""
+    columns = []
+    for cells in levels:
+        rows = [results.column(metric, cell)[results.column("converged", cell) == 1] for cell in cells]
+        values = np.concatenate(rows)
+        values = 1e6 * (values - 1) if metric == "scale" else shown_unit(metric)[1] * values
+        values = values[np.isfinite(values)]
+        columns.append(np.percentile(values if len(values) else [np.nan], percentiles))
+    return np.array(columns).T
 
 
-def _values(results: Results, metric: str, cells: Sequence[int]) -> np.ndarray:
-    """A metric of the converged trials of some cells, in the unit in which it is drawn."""
-    rows = [results.column(metric, cell)[results.column("converged", cell) == 1] for cell in cells]
-    values = metric_unit(metric)[1] * np.concatenate(rows)
-    return values[np.isfinite(values)]
+def _index(results: Results) -> dict[str, np.ndarray]:
+    """The number of the level of every factor in each cell."""
+    factors = results.study.factors
+    sizes = [len(levels) for levels in factors.values()]
+    chosen = np.unravel_index(np.arange(len(results.study.cells)), sizes) if sizes else ()
+    return dict(zip(factors, chosen, strict=True))
 
 
-def _quantiles(values: np.ndarray, percentiles: Sequence[int]) -> np.ndarray:
-    return np.percentile(values, percentiles) if len(values) else np.full(len(percentiles), np.nan)
-
-
-def _percentiles(results: Results, metric: str, cells: Sequence[int]) -> np.ndarray:
-    """5th, 50th and 95th percentile in each cell; NaN where no trial converged."""
-    return np.array([_quantiles(_values(results, metric, [cell]), _ENDS) for cell in cells]).T
-
-
-def _index(results: Results, cell: int) -> dict[str, int]:
-    """Which level of every factor a cell has."""
-    sizes = [len(levels) for levels in results.study.factors.values()]
-    chosen = np.unravel_index(cell, sizes) if sizes else ()
-    return {name: int(i) for name, i in zip(results.study.factors, chosen, strict=True)}
-
-
-def _values_of_factor(results: Results, factor: str, cells: Sequence[int]) -> np.ndarray:
-    levels = results.study.factors[factor]
-    return np.array([float(levels[_index(results, cell)[factor]]) for cell in cells])
-
-
-def _runs(results: Results, factor: str, most: int) -> dict[str, list[int]]:
-    """Runs of cells that differ in one factor only and in its order, by the levels of the other factors in words."""
-    runs: dict[str, list[int]] = {}
+def _runs(results: Results, factor: str, most: int) -> dict[str, list[list[int]]]:
+    """Runs of cells that differ in one factor only, in its order, by the levels of the other factors in words."""
+    runs: dict[str, list[list[int]]] = {}
     for cell in range(len(results.study.cells)):
-        runs.setdefault(_cell_label(results, cell, without=factor), []).append(cell)
-    for cells in runs.values():
-        cells.sort(key=lambda cell: results.study.factors[factor][_index(results, cell)[factor]])
-    if len(runs) > most:
-        chosen = np.unique(np.linspace(0, len(runs) - 1, most).round().astype(int))
-        runs = {words: cells for i, (words, cells) in enumerate(runs.items()) if i in chosen}
-    return runs
+        runs.setdefault(_cell_label(results, cell, without=factor), []).append([cell])
+    labels = list(runs)
+    return {labels[i]: runs[labels[i]] for i in thinned(len(labels), most).tolist()}
 
 
 def _cell_label(results: Results, cell: int, without: str = "") -> str:
     """The levels of a cell's factors in words."""
-    factors, index = results.study.factors, _index(results, cell)
-    return ", ".join(level_title(name, factors[name][i]) for name, i in index.items() if name != without)
+    factors = results.study.factors
+    levels = {name: factors[name][at[cell]] for name, at in _index(results).items() if name != without}
+    return ", ".join(level_title(name, level) for name, level in levels.items())
 
 
 def _levels(results: Results, factor: str) -> list[str]:
-    return [level_text(level) for level in results.study.factors[factor]]
-
-
-def _title(metric: str) -> str:
-    return f"{METRICS[metric].removesuffix(' after the scale fix')} [{metric_unit(metric)[0] or '1'}]"
+    return [level_text(level) for level in results.study.factors[factor]] if factor else ["all trials"]

@@ -26,13 +26,9 @@ def models_report(summary: dict[str, Any]) -> Report:
         summary: What `files.load_compared_models` returned.
     """
     models = summary["models"]
-    recommended = [row["model"] for row in models].index(summary["recommended"])
-    chosen = models[recommended]
+    chosen = next(row for row in models if row["model"] == summary["recommended"])
     doubtful = bool(summary["warnings"]) or not chosen["converged"]
-    columns = (np.array([row[key] for row in models], dtype=float)
-               for key in ("rms_inside", "rms_outside", "u_outside"))  # fmt: skip
     by_name, by_region = model_tables(summary)
-    by_model = models_chart([row["model"] for row in models], recommended, *columns)
     return Report(
         title=f"Models of the joints compared, {summary['arm'] or 'an arm'}",
         subtitle=f"{pluralise(len(models), 'model')} on {pluralise(summary['poses'], 'pose')}; "
@@ -46,7 +42,9 @@ def models_report(summary: dict[str, Any]) -> Report:
             ("(error / predicted standard deviation)², mean outside", number(chosen["ratio"], 2).text),
         ],
         sections=[
-            Section("models", "Errors inside and outside", [_INTRODUCTION, by_model, by_name, MODELS_MEANING]),
+            Section(
+                "models", "Errors inside and outside", [_INTRODUCTION, models_chart(summary), by_name, MODELS_MEANING]
+            ),
             Section("regions", "Errors by region", [_by_region(summary, by_region)]),
         ],
     )

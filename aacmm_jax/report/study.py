@@ -1,14 +1,11 @@
 """The report of a Monte Carlo study."""
 
-from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from ..plot.charts import Chart
-from ..plot.study import metric_plots, metric_unit
+from ..plot.study import metric_plots
 from ..study.results import Results
-from ..study.statistics import METRICS, factor_title, level_text, study_summary
+from ..study.statistics import factor_title, level_text, metric_title, study_summary
 from ..study.tables import cell_table, label, metric_table, parameter_table
 from .elements import Report, Section
 
@@ -71,17 +68,10 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
 
 def _metric_section(results: Results, summary: dict[str, Any], name: str) -> Section:
     """One metric in every cell: median and 5th to 95th percentile, with a table of its statistics."""
-    unit, factor = metric_unit(name)
-    title = METRICS[name] if name == "k" else f"{METRICS[name][0].upper()}{METRICS[name][1:]}"
-    heading = f"{title} [{unit}]" if unit else title
-    cells = metric_table(summary, name, heading)
-    plots = metric_plots(results, name, lambda chosen: factor * _ends(summary, name, chosen))
+    title = metric_title(name)
+    title = title if name == "k" else f"{title[0].upper()}{title[1:]}"
     description = "Marks are medians, bars reach from the 5th to the 95th percentile of the converged trials."
-    return Section(f"figure-{name}", title, [Chart(f"chart-{name}", heading, description, plots, cells)])
-
-
-def _ends(summary: dict[str, Any], name: str, cells: Sequence[int]) -> np.ndarray:
-    """5th, 50th and 95th percentile of a metric in each cell; NaN where no trial converged."""
-    figures = [summary["results"][cell]["figures"].get(name) or {} for cell in cells]
-    keys = ("p5", "p50", "p95")
-    return np.array([[(row.get(key) or {}).get("value") for row in figures] for key in keys], dtype=float)
+    table = metric_table(summary, name, title)
+    return Section(
+        f"figure-{name}", title, [Chart(f"chart-{name}", title, description, metric_plots(results, name), table)]
+    )

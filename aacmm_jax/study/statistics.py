@@ -47,6 +47,8 @@ _FACTORS = {
 
 def shown_unit(metric: str) -> tuple[str, float]:
     """The unit in which people read a metric, and the factor to it from mm and rad."""
+    if metric == "scale_error":
+        return "parts in a million", 1e6
     return {"1": ("", 1.0), "mm": ("mm", 1.0), "rad": ("arcsec", 1 / ARCSEC)}[unit_of(metric)]
 
 

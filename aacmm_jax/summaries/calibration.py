@@ -15,7 +15,7 @@ from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
 from ..diagnostics.determined import determined
 from ..diagnostics.findings import case_of, finding_rows, findings_of, sentences
-from ..diagnostics.model_errors import rows_of_tests, values_of_tests
+from ..diagnostics.model_errors import model_tests, rows_of_tests
 from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.tried_poses import tried_poses
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
@@ -175,7 +175,7 @@ def calibration_summary(
     """
     case, findings = case_of(record), findings_of(record)
     observability = case.once(determined)
-    tests = None if record.implausible_residual or not record.plausible_scale else rows_of_tests(values_of_tests(case))
+    tests = None if record.implausible_residual or not record.plausible_scale else rows_of_tests(model_tests(record))
     evaluations, vectors = record.evaluations(), record.vectors()
     uncertainty, u = uncertainty_of(record), np.sqrt(np.diag(record.covariance))
     expanded = uncertainty.factor() * u

@@ -223,7 +223,7 @@ BROKEN = [
     ("iso", ISO[2], without_length("bar1"), "5 different lengths"),
     ("iso", ISO[2], without_length("bar2/07"), "7 different positions of every length"),
     ("iso", ISO[2], repeated, "7 different positions of every length"),
-    ("iso", ISO[2], fewer_readings, "3 readings in each position are required (one has 2"),
+    ("iso", ISO[2], fewer_readings, "3 readings in each position are required (a position has 2"),
     ("iso", ISO[2], lambda m: bars(m, along(lambda n: (1, 0, 0)), one_bar), "not in one plane"),
     ("iso", ISO[2], lambda m: bars(m, along(lambda n: (math.cos(n), math.sin(n), 0)), one_bar), "not in one plane"),
     ("iso", ISO[2], lambda m: bars(m, to_one_place, one_bar), "scatter by 0.0 %"),

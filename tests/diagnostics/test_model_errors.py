@@ -17,7 +17,7 @@ from aacmm_jax.diagnostics import (
     noisy_encoders,
 )
 from aacmm_jax.diagnostics.findings import case_of, sentences
-from aacmm_jax.diagnostics.model_errors import rows_of_tests, values_of_tests
+from aacmm_jax.diagnostics.model_errors import rows_of_tests
 
 MODULES = (missing_terms, model_errors, noisy_encoders, length_consistency)
 ARCSEC = aj.units.ARCSEC
@@ -71,8 +71,10 @@ def calibrated(arm, capture, given, **options):
 
 def checked(arm, capture, given, **options):
     """The tests, and the sentences of their findings."""
-    case = case_of(calibrated(arm, capture, given, replace_noise=False), capture, **options)
-    return values_of_tests(case), sentences(finding for module in MODULES for finding in module.test(case))
+    result = calibrated(arm, capture, given, replace_noise=False)
+    case = case_of(result, capture, **options)
+    tests = model_errors.model_tests(result, capture, **options)
+    return tests, sentences(finding for module in MODULES for finding in module.test(case))
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -296,7 +296,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL.replace('"rad"', '"rad"\noffset = [1, 2]'), ["angles.offset has 2 values", "give one, or one a joint"]),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3]'),
-            ["angles.columns picks 3", "6 joints", "pick one a joint"],
+            ["3 columns are picked", "6 joints", "pick one a joint"],
         ),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3, 4, 5, 9]'),

@@ -172,8 +172,11 @@ def test_what_cannot_be_drawn_is_refused(record, call, said):
     assert_refused(lambda: call(record), said)
 
 
-def test_what_the_scale_fix_does_not_change_is_seen_below_what_it_left(made):
-    panel = aj.plot.study_errors(made["study_metric"][0], "noise.encoder_arcsec").axes[0]
-    before, after = panel.lines
-    assert before.get_linewidth() > 2 * after.get_linewidth()
-    assert before.get_markersize() > 2 * after.get_markersize()
+def test_errors_before_and_after_the_scale_fix_stand_side_by_side(made):
+    results = made["study_metric"][0]
+    panel = aj.plot.study_errors(results, "noise.encoder_arcsec").axes[0]
+    before, after = (container.lines[0] for container in panel.containers)
+    assert np.all(before.get_xdata() < after.get_xdata())
+    medians = [1e6 * (np.median(results.column("scale", cell)) - 1) for cell in (0, 1)]
+    scale = aj.plot.study_scale(results, "noise.encoder_arcsec").axes[0]
+    np.testing.assert_allclose(scale.containers[0].lines[0].get_ydata(), medians, rtol=1e-6)
