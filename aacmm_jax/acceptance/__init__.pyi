@@ -2,14 +2,15 @@ from .all_tests import measured_by as measured_by
 from .all_tests import requirements_table as requirements_table
 from .all_tests import run as run
 from .asme_b89_4_22 import spat as spat
-from .decision import RULES as RULES
-from .decision import Limit as Limit
-from .decision import decide as decide
-from .influences import Expansion as Expansion
-from .influences import Influences as Influences
 from .iso_10360_12 import articulated_location as articulated_location
 from .iso_10360_12 import form_error as form_error
 from .jjf_1408 import half_range as half_range
+from .judgement import RULES as RULES
+from .judgement import SYMBOLS as SYMBOLS
+from .judgement import Expansion as Expansion
+from .judgement import Influences as Influences
+from .judgement import Limit as Limit
+from .judgement import decide as decide
 from .lengths import two_rms as two_rms
 from .procedure import Procedure as Procedure
 from .procedure import plan_procedure as plan_procedure
@@ -24,4 +25,3 @@ from .results import Metric as Metric
 from .spheres import enclosing_sphere as enclosing_sphere
 from .spheres import fit_sphere as fit_sphere
 from .spheres import size_error as size_error
-from .standards import SYMBOLS as SYMBOLS

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
 from ..data.capture import ReferenceLength
-from .influences import Influences
+from .judgement import Influences
 from .results import Measured, Metric, MetricValue, metric_value
 
 _SAME_ARTEFACT = 0.01  # lengths that differ by less (relative) belong to one artefact

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
-from .decision import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
-from .standards import EDITIONS, SYMBOLS
+from .judgement import COVERAGE_FACTOR, DECISIONS, EDITIONS, SYMBOLS, Decision, Rule, worst
 
 # Metrics by name: what each of them is.
 #
@@ -100,7 +99,7 @@ class AcceptanceTest(NamedTuple):
         ['based on JJF 1408-2013', 'based on ASME B89.4.22-2004']
     """
 
-    standard: str  # a key of `acceptance.standards.EDITIONS`
+    standard: str  # a key of `acceptance.judgement.EDITIONS`
     title: str
     metrics: tuple[Metric, ...]
     missing: tuple[str, ...]  # sentences

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from xml.etree.ElementTree import Element
 
-from ..acceptance.decision import COVERAGE_FACTOR, RULES, Decision, worst
+from ..acceptance.judgement import COVERAGE_FACTOR, RULES, Decision, worst
 from ..acceptance.record import EvaluationRecord
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from .xml_elements import MILLIMETRE, element, english, equipment_quantity, method, named, real, software, text

@@ -83,8 +83,7 @@ def evaluate(
     Errors on data that the calibration has not used are printed next to those that its uncertainty predicts. A manifest
     of points is tested without a calibration.
     """
-    from ..acceptance.decision import limit_of_text, read_limits
-    from ..acceptance.influences import Influences, read_expansions
+    from ..acceptance.judgement import Influences, limit_of_text, read_expansions, read_limits
     from ..acceptance.results import METRICS
     from . import evaluation_views
 
@@ -156,8 +155,8 @@ def _evaluated_points(
     of_test: dict[str, Any],
 ) -> dict[str, Any]:
     """Run the acceptance tests of a manifest of points; the summary."""
+    from ..acceptance.judgement import STANDARDS, checked_standards
     from ..acceptance.record import PointsRecord
-    from ..acceptance.standards import STANDARDS, checked_standards
     from ..files.evaluations import save_points
     from ..files.points import read_points
     from ..summaries.evaluation import points_summary

@@ -11,9 +11,9 @@ from ..core.errors import InputError
 from ..core.text import csv_text
 from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .column_names import Column
 from .manifest_angles import header_units
 from .table_columns import TEMPERATURE, find_named, position_columns, reading_columns
+from .text_lines import Column
 from .text_table import TextTable
 
 Columns = tuple[list[int], str | None]  # columns of a quantity, from 0, and the unit that the header states

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..acceptance.all_tests import checked_limits
-from ..acceptance.decision import Limit, checked_rule
-from ..acceptance.influences import Expansion, Influences, checked_influences
+from ..acceptance.judgement import Expansion, Influences, Limit, Rule, checked_influences
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
 from ..acceptance.results import Measured
+from ..core.arguments import checked
 from ..kinematics.arm import parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -138,8 +138,7 @@ def _judged(table: StoredTable, cls: type, fields: schema.Fields) -> dict[str, A
     values["influences"] = checked_influences(Influences(u, u_relative, *expansions))
     values["limits"] = checked_limits({name: Limit(*limit) for name, limit in values["limits"].items()})
     check_sense(table.path, {"the uncertainty of the test is not finite": not math.isfinite(values["u_test"])})
-    if values["rule"] is not None:
-        checked_rule(values["rule"])
+    checked(values["rule"], Rule | None, "rule")
     return values
 
 

@@ -15,10 +15,10 @@ from ..core.text import quoted, shorten
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
-from .column_names import Column
 from .inputs import InputFile
 from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, Wanted, as_list
 from .patterns import check_name, fields_of, fill
+from .text_lines import Column
 from .text_table import TextTable
 
 

@@ -18,7 +18,7 @@ from pydantic import (
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
 from ..data.observations.socket import Socket
-from .column_names import Column
+from .text_lines import Column
 from .toml import Strict, each_once
 
 NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}

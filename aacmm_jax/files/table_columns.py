@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import LENGTH_UNITS
-from .column_names import Column, bare_name, stem_and_number
+from .text_lines import Column, bare_name, stem_and_number
 from .text_table import TextTable
 
 # Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...

@@ -10,12 +10,14 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.text import is_number, number, quoted, shorten
-from .column_names import (
+from .text_lines import (
     AMBIGUOUS,
     Column,
     Line,
     along_axes,
     are_numbered,
+    cells_of,
+    delimiter_of,
     has_number,
     header_cells,
     is_row,
@@ -24,10 +26,10 @@ from .column_names import (
     plain_name,
     stem_and_number,
     stripped,
+    table_lines,
     trimmed,
     unit_in,
 )
-from .text_lines import cells_of, delimiter_of, table_lines
 
 _LARGEST = 1e15  # encoder counts reach 1e10; beyond it squares lose what is measured
 _PLAIN = frozenset("0123456789+-eE \t")  # and the decimal mark: float takes these as people read them, or not at all

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.decision import COVERAGE_FACTOR
+from ..acceptance.judgement import COVERAGE_FACTOR
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import AcceptanceTest
 from ..calibration.evaluation import Evaluation, evaluate

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.decision import RULES
-from ..acceptance.influences import Influences
+from ..acceptance.judgement import RULES, Influences
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.evaluation import Evaluation, evaluate

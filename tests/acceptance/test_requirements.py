@@ -348,7 +348,7 @@ def test_the_certified_form_and_its_uncertainty_count_in_the_form_error():
 
 @pytest.mark.parametrize("text", ["bar=11.5,1,20,0", "artefact=11.5,1,20", "artefact=a,1,20,0", "arm"])
 def test_expansions_that_cannot_be_read_are_refused(text):
-    from aacmm_jax.acceptance.influences import read_expansions
+    from aacmm_jax.acceptance.judgement import read_expansions
     from tests.refusals import assert_refused
 
     assert_refused(lambda: read_expansions([text]), "--expansion", "artefact=11.5,1,20.8,0.2")
