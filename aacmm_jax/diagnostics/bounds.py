@@ -22,22 +22,21 @@ def test(case: Case) -> list[Finding]:
         if not names:
             continue
         texts = shorten([f"{name} ({sides[name]})" for name in names])
-        costs = (
-            "The width of the bounds is part of their uncertainties."
-            if weak
-            else "Every uncertainty, that of k too, takes these values as exact."
-        )
-        findings.append(
+        finding = (
             Finding(
                 code,
-                f"On a bound{' because the data hardly determine them' if weak else ''}: {texts}.",
-                costs,
-                "Fix one parameter of each combination named below (--held), and do not widen the bounds."
-                if weak
-                else "Widen the bounds unless they are known limits.",
-                severity="doubt",
-                doubt=f"on a bound: {shorten(sorted(names), 3)}",
-                concerns=tuple(names),
+                f"On a bound because the data hardly determine them: {texts}.",
+                "The width of the bounds is part of their uncertainties.",
+                "Fix one parameter of each combination named below (--held), and do not widen the bounds.",
+            )
+            if weak
+            else Finding(
+                code,
+                f"On a bound: {texts}.",
+                "Every uncertainty, that of k too, takes these values as exact.",
+                "Widen the bounds unless they are known limits.",
             )
         )
+        doubt = f"on a bound: {shorten(sorted(names), 3)}"
+        findings.append(finding._replace(severity="doubt", doubt=doubt, concerns=tuple(names)))
     return findings

@@ -137,29 +137,27 @@ def lengths_in_solve(record: CalibrationRecord) -> bool:
     return record.final_method == "joint" and bool(record.recording.capture.lengths)
 
 
-def _kept(record: CalibrationRecord) -> str | None:
-    """The length that the equations keep: none where anything but repeatability says what the scale is."""
-    if lengths_in_solve(record):
-        return None
-    scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)
-    return record.hold if scaled else scale_anchor_of(record)
-
-
 def _rows_and_relations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple[list[Rows], list[Block]]:
-    anchor = _kept(record)
+    in_solve = lengths_in_solve(record)
+    # The length that the equations keep: none where anything but repeatability says what the scale is.
+    scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)
+    anchor = None if in_solve else record.hold if scaled else scale_anchor_of(record)
     names = tuple(name for name in record.names if name != anchor)
     every = (*names, *(name for name in extra if name not in names))
-    linear = linearisation_of(record, every, noise=record.noise, lengths=lengths_in_solve(record))
+    linear = linearisation_of(record, every, noise=record.noise, lengths=in_solve)
     observed, p, free = linear.observed, len(every), len(names)
     steps, columns = np.asarray(linear.steps), np.array([every.index(name) for name in extra])
-    common = _common(observed)
+    # The geometry that several observations, reference lengths or certified values depend on.
+    related = {end for ends in observed.ends for end in ends} | observed.certified().keys()
+    private = [observed.positions[part] for part in observed.blocks if part in related]
+    common = np.unique(np.concatenate([np.arange(observed.layout.shared), *private]).astype(int))
     rows = []
     parts = zip(linear.parts(), linear.white(), linear.by_head(), linear.by_private(), linear.private(), strict=True)
-    for part, white, head, private, index in parts:
+    for part, white, head, by_own, index in parts:
         weight = np.sqrt(np.asarray(part.weight))
         root = weight[:, None, None] * np.asarray(part.root)
         by = np.moveaxis(np.asarray(head) * weight, (0, 1, 2), (2, 1, 0)) * steps[: linear.height]
-        own = np.moveaxis(np.asarray(private) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + index]
+        own = np.moveaxis(np.asarray(by_own) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + index]
         among = np.isin(index, common)
         shared = np.zeros((*by.shape[:2], free + len(common)))
         shared[..., :free] = by[..., :free]
@@ -177,18 +175,14 @@ def _rows_and_relations(record: CalibrationRecord, extra: tuple[str, ...]) -> tu
                 np.arange(part.poses.start, part.poses.stop),
             )
         )
-    rows = [part for part in rows if not _only_pose(record, part)]
+    # A socket with one pose shows no scatter; only lengths in the solve need it.
+    rows = [part for part in rows if in_solve or len(part.poses) > 1 or part.own.shape[2] != 3]
     derivatives, residual, u = linear.relations()
     u = np.maximum(u, LEAST_U)
     chosen = np.concatenate([np.arange(free), p + common])
     block = Block("", None, residual / u, (derivatives * steps)[:, chosen] / u[:, None], np.zeros((len(u), 0)))
     prior = _of_prior(record, np.asarray(linear.z), steps[:free], len(chosen))
     return rows, [*([block] if len(u) else []), *prior]
-
-
-def _only_pose(record: CalibrationRecord, rows: Rows) -> bool:
-    """Whether it is a socket with one pose, which shows no scatter, and which no length in the solve needs."""
-    return len(rows.poses) == 1 and rows.own.shape[2] == 3 and not lengths_in_solve(record)
 
 
 def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, shared: int) -> list[Block]:
@@ -201,14 +195,6 @@ def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, share
     residual = weight[with_prior] * (z[: len(steps)] - mean)[with_prior]
     derivatives = np.eye(shared)[with_prior] * (weight * steps)[with_prior][:, None]
     return [Block(PRIOR, None, residual, derivatives, np.zeros((len(with_prior), 0)))]
-
-
-def _common(observed: Observed) -> np.ndarray:
-    """Indices of the geometry that several observations, reference lengths or certified values depend on."""
-    related = {end for ends in observed.ends for end in ends} | observed.certified().keys()
-    private = [observed.positions[part] for part in observed.blocks if part in related]
-    own = np.concatenate(private) if private else np.zeros(0, dtype=int)
-    return np.union1d(np.arange(observed.layout.shared), own)
 
 
 def scale_anchor_of(record: CalibrationRecord) -> str | None:

@@ -110,7 +110,10 @@ class _Misfit(NamedTuple):
                     changed[i] = dict(of).get(cause, observations[i])
                 names = shorten([observations[i].name for i in several], 3)
                 field = _measured_field(observations[several[0]])
-                yield _Tried(f"{cause} ({names})", q, tuple(changed), _line(cause, field))
+                unit = length_unit(_UNITS.get(cause, 0.0))
+                write = f' In its table of the manifest write units = {{ {field} = "{unit}" }}.'
+                write = write if unit in ("m", "inch") else ""
+                yield _Tried(f"{cause} ({names})", q, tuple(changed), write)
 
     def rms(self, tried: _Tried) -> float:
         """RMS distance of the tips from the geometry that fits them, mm; an angle counts as the arm's lever makes it.
@@ -127,7 +130,11 @@ class _Misfit(NamedTuple):
             z = np.concatenate([vector, *(start[name] for name in observed.blocks)])
             for _ in range(_ROUNDS):
                 point = rows_at(space, observed, z)
-                roots = tuple(_roots(rows.values.shape, lever) for rows in point.rows)
+                sizes = [rows.values.shape for rows in point.rows]
+                roots = [np.diag([1.0] * min(size, 3) + [lever] * (size - 3)) for size, _ in sizes]
+                roots = tuple(
+                    np.broadcast_to(root, (m, *root.shape)) for root, (_, m) in zip(roots, sizes, strict=True)
+                )
                 whitening = Whitening(roots, np.zeros(0), {name: 0 * value for name, value in certified.items()})
                 linear = Linearisation.of(observed, space, z, point, [], whitening, None)
                 squares = sum(float(np.sum(white**2)) for white in linear.white())
@@ -142,11 +149,6 @@ class _Misfit(NamedTuple):
 
 def _evenly(number: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, number - 1, min(number, most)).astype(int))
-
-
-def _roots(shape: tuple[int, ...], lever: float) -> Float[np.ndarray, "m r r"]:
-    rows, poses = shape
-    return np.broadcast_to(np.diag([1.0] * min(rows, 3) + [lever] * (rows - 3)), (poses, rows, rows))
 
 
 def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[_Tried]:
@@ -184,12 +186,6 @@ def _measured_field(observation: AbstractObservation) -> str | None:
     return None
 
 
-def _line(cause: str, field: str | None) -> str:
-    """What to write in the manifest where a unit is the cause."""
-    unit = length_unit(_UNITS.get(cause, 0.0))
-    return f' In its table of the manifest write units = {{ {field} = "{unit}" }}.' if unit in ("m", "inch") else ""
-
-
 def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractObservation]]:
     """Corrections of what one observation measured."""
     name = _measured_field(observation)
@@ -209,17 +205,11 @@ def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractO
         rotations = np.asarray(observation.rotations)
         for order in itertools.permutations(range(3)):
             for signs in itertools.product((1, -1), repeat=3) if order == (0, 1, 2) else ((1, 1, 1),):
-                if (order, signs) != ((0, 1, 2), (1, 1, 1)):
-                    yield _order_says(order, signs), changed(values[:, order] * signs)
+                read = " ".join(("-" if signs[i] < 0 else "") + "xyz"[i] for i in np.argsort(order))
+                if read != "x y z":
+                    yield f"the columns of positions are {read}", changed(values[:, order] * signs)
         for cause, corrected in _rotations(rotations):
             yield cause, changed(corrected, "rotations")
-
-
-def _order_says(order: tuple[int, ...], signs: tuple[int, ...]) -> str:
-    if order == (0, 1, 2):
-        wrong = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
-        return f"the signs of measured positions are wrong in {' and '.join(wrong)}"
-    return f"the columns of positions are in the order {' '.join('xyz'[i] for i in np.argsort(order))}"
 
 
 def _rotations(rotations: Float[np.ndarray, "m 3 3"]) -> Iterator[tuple[str, Float[np.ndarray, "m 3 3"]]]:

@@ -14,7 +14,7 @@ information tr MKMK / 2, of which the blocks of single poses are taken: enough f
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -46,9 +46,29 @@ Result = TypeVar("Result", Calibration, Identification)
 def test(case: Case) -> list[Finding]:
     """Encoders whose noise was replaced, and one that seems noisier than it was taken to be."""
     record, findings = case.record, []
-    if record.noisy_encoders:
-        slides, given = record.calibrated.arm.prismatic, record.given_noise is not None
-        findings.append(_replaced(record.noisy_encoders, slides, given))
+    slides, given = record.calibrated.arm.prismatic, record.given_noise is not None
+    texts = []
+    for encoder in record.noisy_encoders:
+        # Of the others nothing may be left beside the noise of the tip, and what is given may be 0.
+        comparable = encoder.found < _FAR_MORE * encoder.expected
+        times = f"{encoder.found / encoder.expected:.2g} times as much as" if comparable else "far more than"
+        scatter, u = (reading_text(value, encoder.joint in slides) for value in (encoder.found, encoder.u))
+        texts.append(
+            f"joint {encoder.joint} scatter by {scatter} (u = {u.split(' ')[0]}), {times} "
+            f"{'given' if given else 'those of the others'} ({chance_text(encoder.probability)})"
+        )
+    if texts:
+        findings.append(
+            Finding(
+                "noisy-encoders-replaced",
+                f"Readings of {shorten(texts, 3)}.",
+                "Their noise was re-estimated; weights and uncertainties use the estimate (--keep-noise: "
+                f"{'the noise as given' if given else 'one noise for all encoders'}).",
+                "Check the encoder, and the joint for play.",
+                probability=max(encoder.probability for encoder in record.noisy_encoders),
+                concerns=tuple(f"joint {encoder.joint}" for encoder in record.noisy_encoders),
+            )
+        )
     noisiest = None if record.implausible_residual else case.once(noisiest_joint)
     if noisiest is not None and noisiest.probability < LEVEL:
         findings.append(
@@ -63,29 +83,6 @@ def test(case: Case) -> list[Finding]:
             )
         )
     return findings
-
-
-def _replaced(encoders: Sequence[NoisyEncoder], slides: Collection[int], given: bool) -> Finding:
-    """That the noise of some encoders was replaced; ``slides`` are the numbers of prismatic joints."""
-    texts = []
-    for encoder in encoders:
-        # Of the others nothing may be left beside the noise of the tip, and what is given may be 0.
-        comparable = encoder.found < _FAR_MORE * encoder.expected
-        times = f"{encoder.found / encoder.expected:.2g} times as much as" if comparable else "far more than"
-        scatter, u = (reading_text(value, encoder.joint in slides) for value in (encoder.found, encoder.u))
-        texts.append(
-            f"joint {encoder.joint} scatter by {scatter} (u = {u.split(' ')[0]}), {times} "
-            f"{'given' if given else 'those of the others'} ({chance_text(encoder.probability)})"
-        )
-    return Finding(
-        "noisy-encoders-replaced",
-        f"Readings of {shorten(texts, 3)}.",
-        "Their noise was re-estimated; weights and uncertainties use the estimate (--keep-noise: "
-        f"{'the noise as given' if given else 'one noise for all encoders'}).",
-        "Check the encoder, and the joint for play.",
-        probability=max(encoder.probability for encoder in encoders),
-        concerns=tuple(f"joint {encoder.joint}" for encoder in encoders),
-    )
 
 
 class NoisyJoint(NamedTuple):

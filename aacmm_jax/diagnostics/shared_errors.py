@@ -32,9 +32,20 @@ from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import EXACT, PRIOR, Rows, lengths_in_solve, residual_rms
 from .findings import Case
-from .random_effects import NULL, Effects, Moments, OneVariance, group_deviations, one_variance, second_moments
+from .random_effects import (
+    NULL,
+    Effects,
+    Moments,
+    OneVariance,
+    SharedProblem,
+    group_deviations,
+    one_variance,
+    problem_of_poses,
+    scale_of_lengths,
+    second_moments,
+    with_lengths,
+)
 from .residual_tests import alike, form_test, in_succession, score_tests
-from .shared_equations import SharedProblem, problem_of_poses, scale_of_lengths, with_lengths
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
 # Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as

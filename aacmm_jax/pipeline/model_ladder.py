@@ -36,8 +36,8 @@ from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds
 from ..kinematics.priors import default_prior
+from .cross_validation import UnseenRegion, regions_of, unseen_regions
 from .single import calibrate
-from .unseen_regions import UnseenRegion, regions_of, unseen_regions
 
 _LEVEL = 0.05  # of the test by regions
 _EXPECTED_VARIANCE = 9.0  # of a log variance that is expected

@@ -81,8 +81,8 @@ MISTAKES = [
     ("points", "q", lambda q: q * [-1, 1, 1, 1, 1, 1], "joint 1 read with the wrong sign"),
     ("points", "q", lambda q: q[:, [1, 0, 2, 3, 4, 5]], "the columns of joints 1 and 2 are exchanged"),
     ("points", "q", np.deg2rad, "readings in radians are taken for degrees"),
-    ("transforms", "points", lambda x: x[:, [1, 2, 0]], "the columns of positions are in the order y z x (six)"),
-    ("transforms", "points", lambda x: x * [-1, 1, 1], "the signs of measured positions are wrong in x (six)"),
+    ("transforms", "points", lambda x: x[:, [1, 2, 0]], "the columns of positions are y z x (six)"),
+    ("transforms", "points", lambda x: x * [-1, 1, 1], "the columns of positions are -x y z (six)"),
     (
         *("transforms", "rotations", requaternioned("wxyz", "xyzw")),
         "quaternions in the order x y z w are taken for w x y z (six)",

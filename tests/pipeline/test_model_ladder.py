@@ -14,6 +14,7 @@ from aacmm_jax.data.recording import Recording
 from aacmm_jax.diagnostics.equations import equations_of
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.parameters import ArmSpecification
+from aacmm_jax.pipeline.cross_validation import Region, UnseenRegion, _dense, regions_of, unseen_regions
 from aacmm_jax.pipeline.model_ladder import (
     DEFAULT_MODELS,
     ComparedModel,
@@ -22,7 +23,6 @@ from aacmm_jax.pipeline.model_ladder import (
     default_models,
     log_evidence,
 )
-from aacmm_jax.pipeline.unseen_regions import Region, UnseenRegion, _dense, regions_of, unseen_regions
 
 NOISE = aj.Noise(encoder_arcsec=10, seating=0.02)
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)
