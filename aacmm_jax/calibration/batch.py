@@ -68,8 +68,7 @@ class BatchOptions(NamedTuple):
     @property
     def solving(self) -> Solving:
         """How each problem is solved."""
-        own = self._asdict()
-        return Solving(**{name: own[name] for name in Solving._fields if name in own})
+        return Solving(**{name: value for name, value in self._asdict().items() if name in Solving._fields})
 
 
 @checked_arguments
@@ -120,8 +119,8 @@ def identify_many(
         [0.0124 0.0124 0.0124] [ True  True  True]
     """
     given = BatchOptions(**options)
-    batch = _Batch.of("identify", arm, capture, lower, upper, start, given, with_lengths=False)
-    return batch.identify()
+    bounds, space = _checked_box("identify", arm, capture, lower, upper, start, given)
+    return _batch_of(arm, capture, bounds, start, space, given, with_lengths=False).identify()
 
 
 @checked_arguments
@@ -157,14 +156,14 @@ def calibrate_many(
         [0.99924 0.99922] [ True  True]
     """
     given = BatchOptions(**options)
-    _, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
+    bounds, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
     method, at_once = method_of(arm, capture, space, given.solving, method, given.covariance)
     if at_once:
         given = given._replace(hold=None)
-        many = _Batch.of("calibrate", arm, capture, lower, upper, start, given, with_lengths=True).identify()
+        many = _batch_of(arm, capture, bounds, start, space, given, with_lengths=True).identify()
         return _of_joint(many, many, None)
     given = given._replace(covariance=False)
-    batch = _Batch.of("calibrate", arm, capture, lower, upper, start, given, with_lengths=False)
+    batch = _batch_of(arm, capture, bounds, start, space, given, with_lengths=False)
     return _in_two_stages(batch, batch.identify(), method)
 
 
@@ -248,38 +247,18 @@ class _Batch(NamedTuple):
     space: Parameters
     options: BatchOptions
 
-    @classmethod
-    def of(
-        cls,
-        single: str,
-        arm: Arm,
-        capture: Capture,
-        lower: Bounds | Numbers,
-        upper: Numbers | None,
-        start: Numbers | None,
-        options: BatchOptions,
-        *,
-        with_lengths: bool,
-    ) -> "_Batch":
-        """Everything checked and laid out; ``single`` is the function that solves one problem. Reference lengths take
-        part in the least squares ``with_lengths``."""
-        bounds, space = _checked_box(single, arm, capture, lower, upper, start, options)
-        check_finite(noise=options.noise)
-        check_columns(arm, capture.columns)
-        box, size = _lay_out(arm, capture, bounds, start, space)
-        space = based_on(space, arm)
-        arm, capture = to_numpy((space.base, capture))
-        problems = Problems(arm, capture, *box, near=None)
-        return cls(problems, _form(problems, space, options, with_lengths), size, space, options)
-
     def identify(self) -> ManyIdentifications:
         """All problems."""
         options = self.options
         devices = jax.local_devices() if options.devices is None else items_of(options.devices, "devices")
         if not devices:
             raise InputError("devices is empty; name at least one, or leave it out.")
-        slots = options.slots or _default_slots(devices, len(self.form.pose))
-        workers = options.workers or _default_workers(devices)
+        slots, workers = _SLOTS_ELSEWHERE, len(devices)
+        if devices[0].platform == "cpu":
+            slots = min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / len(self.form.pose))), 0))
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            workers = max(workers, cores)
+        slots, workers = options.slots or slots, options.workers or workers
         chunks = _chunks(self.size, slots, workers, options.chunk)
         # Whole rounds of the slots, their number a power of two: each size is compiled once, so there should be few.
         capacity = slots * 2 ** math.ceil(math.log2(-(-max(map(len, chunks)) // slots)))
@@ -309,6 +288,25 @@ class _Batch(NamedTuple):
         part = selected(self.problems, self.form.axes, rows)._replace(near=near)
         form = _form(part, self.space, self.options._replace(hold=None), with_lengths=True)
         return self._replace(problems=part, form=form, size=len(rows)).identify()
+
+
+def _batch_of(
+    arm: Arm,
+    capture: Capture,
+    bounds: tuple[Numbers, Numbers],
+    start: Numbers | None,
+    space: Parameters,
+    options: BatchOptions,
+    *,
+    with_lengths: bool,
+) -> _Batch:
+    """Everything checked and laid out; reference lengths take part in the least squares ``with_lengths``."""
+    check_finite(noise=options.noise)
+    check_columns(arm, capture.columns)
+    box, size = _lay_out(arm, capture, bounds, start, space)
+    space = based_on(space, arm)
+    problems = Problems(*to_numpy((space.base, capture)), *box, near=None)
+    return _Batch(problems, _form(problems, space, options, with_lengths), size, space, options)
 
 
 def _form(problems: Problems, space: Parameters, options: BatchOptions, with_lengths: bool) -> Form:
@@ -341,18 +339,6 @@ def _form(problems: Problems, space: Parameters, options: BatchOptions, with_len
     )
 
 
-def _default_slots(devices: Sequence[Any], poses: int) -> int:
-    if devices[0].platform != "cpu":
-        return _SLOTS_ELSEWHERE
-    return min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / poses)), 0))
-
-
-def _default_workers(devices: Sequence[Any]) -> int:
-    """Chunks in work at the same time: one for each device; on a CPU, one for each core."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return len(devices) if devices[0].platform != "cpu" else max(len(devices), cores)
-
-
 def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
     """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at the end of
     each."""
@@ -364,11 +350,8 @@ def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[rang
 
 
 def _run(run: Callable, chunks: Sequence[range], devices: Sequence[Any], workers: int) -> list:
-    """Results of all chunks in their order, computed by threads: XLA releases the interpreter's lock while it computes.
-
-    A single chunk needs no thread, which takes a millisecond to start.
-    """
-    if len(chunks) == 1:
+    """Results of all chunks in their order, computed by threads: XLA releases the interpreter's lock meanwhile."""
+    if len(chunks) == 1:  # needs no thread, which takes a millisecond to start
         return [run(chunks[0], devices[0])]
     failed = threading.Event()
 

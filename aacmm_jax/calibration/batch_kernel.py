@@ -108,10 +108,6 @@ class _Chunk(NamedTuple):
             prior=self.prior,
         )
 
-    def first(self) -> Task:
-        """The task of the first problem, for what is the same for all."""
-        return self.task(*self.selected(jnp.asarray(0)))
-
     def selected(self, index: Any) -> tuple[Problems, Observed]:
         """The problems of an index."""
         problems = selected(self.problems, self.form.axes, index)
@@ -151,7 +147,7 @@ def _pick(tree: Any, axis: Any, index: Any) -> Any:
 
 
 def selected(problems: Problems, axes: Problems, index: Any) -> Problems:
-    """The problems of an index; what all share stays as it is."""
+    """The problems of an index."""
     return Problems(*(_pick(tree, axis, index) for tree, axis in zip(problems, axes, strict=True)))
 
 
@@ -161,7 +157,7 @@ def solve_chunk(
 ) -> dict[str, Any]:
     """Solve the first ``count`` of the problems of a chunk: the fields of `ManyIdentifications`."""
     chunk = _Chunk(form, problems, *_prepared(form, problems), noise, prior)
-    first = chunk.first()
+    first = chunk.task(*chunk.selected(jnp.asarray(0)))  # for what is the same for all
     losses = losses_of(first)
     # With a prior the last least squares is part of what follows the loop (`_fields`).
     solves = losses if prior_of(first) is None else losses[:-1]
@@ -180,14 +176,9 @@ def _again(
     losses: list[Loss | None], problem: Problems, task: Task, ended: _Ended
 ) -> tuple[Float[AnyArray, " z"], Whitening]:
     """Where the next least squares begins, and its weights; of the losses, the last and the next."""
-    z, state = _state_after(task, ended, losses[0])
-    return z, weights(task, begin(task), state, losses[1])
-
-
-def _state_after(task: Task, ended: _Ended, loss: Loss | None) -> tuple[AnyArray, State]:
-    """All unknowns after a least squares that is not the last, and the state there."""
-    z, point = ended.unknowns(task, loss)
-    return z, state_after(task, begin(task), z, point, False)
+    z, point = ended.unknowns(task, losses[0])
+    begun = begin(task)
+    return z, weights(task, begun, state_after(task, begun, z, point, False), losses[1])
 
 
 def _prepared(form: Form, problems: Problems) -> tuple[Observed, Any]:
@@ -226,8 +217,8 @@ def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task
     """The fields of one problem after its last least squares; that with a prior is still to come."""
     begun, prior, of_prior = begin(task), prior_of(task), None
     if prior is not None:
-        z, state = _state_after(task, ended, losses[-2])
-        z, state, last, of_prior = fitted_with_prior(task, prior, begun, state, z)
+        z, point = ended.unknowns(task, losses[-2])
+        z, state, last, of_prior = fitted_with_prior(task, prior, begun, state_after(task, begun, z, point, False), z)
         last = last._replace(steps=ended.steps + last.steps)
     else:
         tips_alone = task.needs_no_weights and not form.covariance
@@ -287,7 +278,8 @@ def _solve_all(
             return work(task, args._replace(batch=True), z[:size], *extra)
 
         function = chunk.by_slot(one, 2 + extra)
-        return lambda index, *extra: function(index, begun.z[index], _at(begun.whitening, index), *extra)
+        begins = begun.z, begun.whitening
+        return lambda index, *extra: function(index, *jax.tree.map(lambda leaf: leaf[index], begins), *extra)
 
     def start_and_box(task: Task, _: Any, first: AnyArray) -> tuple[AnyArray, Box]:
         return first, Box(*(side[: first.shape[0]] for side in box_of(task)))
@@ -325,7 +317,3 @@ def _solve_all(
     )
     start = (progress, slot, jnp.asarray(slots), empty)
     return jax.lax.while_loop(lambda carry: jnp.any(carry[1] < count), once, start)[3]
-
-
-def _at(tree: Any, index: Any) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], tree)

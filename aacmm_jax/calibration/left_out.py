@@ -31,29 +31,31 @@ class LeftOut(NamedTuple):
     noise_degrees_of_freedom: float = math.inf
 
     @property
-    def degrees_of_freedom(self) -> tuple[float, float]:
-        """Degrees of freedom of the poses and of the lengths."""
-        poses, lengths = self.rms_degrees_of_freedom, self.length_degrees_of_freedom
-        return (
-            poses if math.isfinite(poses) else 3.0 * self.poses,
-            lengths if math.isfinite(lengths) else float(_predicted(self).sum()),
-        )
+    def predicted_lengths(self) -> np.ndarray:
+        """Which errors of lengths the other groups can predict."""
+        return np.isfinite(self.length_u) & (self.length_u > 0)
 
     @property
     def length_ratio(self) -> float:
         """Root mean square error of the lengths in their own standard uncertainties; NaN where there is none."""
-        predicted = _predicted(self)
+        predicted = self.predicted_lengths
         normalised = self.length_error[predicted] / self.length_u[predicted]
         return float(np.sqrt(np.mean(normalised**2))) if predicted.any() else math.nan
 
     @property
-    def probabilities(self) -> tuple[float, float]:
-        """Of such errors of poses, and of lengths, by chance where the predictions are right; NaN where unknown."""
-        poses, lengths = self.degrees_of_freedom
+    def comparisons(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Of the poses, then of the lengths: how many, found and predicted root mean squares, degrees of freedom."""
+        poses, lengths = self.rms_degrees_of_freedom, self.length_degrees_of_freedom
+        count = float(self.predicted_lengths.sum())
         return (
-            chance(self.rms, self.rms_predicted, poses, self.noise_degrees_of_freedom),
-            chance(self.length_ratio, 1.0, lengths, self.noise_degrees_of_freedom),
+            (self.poses, self.rms, self.rms_predicted, poses if math.isfinite(poses) else 3.0 * self.poses),
+            (count, self.length_ratio, 1.0, lengths if math.isfinite(lengths) else count),
         )
+
+    @property
+    def probabilities(self) -> list[float]:
+        """Of such errors of poses, and of lengths, by chance where the predictions are right; NaN where unknown."""
+        return [chance(*parts[1:], self.noise_degrees_of_freedom) for parts in self.comparisons]
 
 
 class CrossValidation(NamedTuple):
@@ -77,18 +79,17 @@ class CrossValidation(NamedTuple):
     @property
     def rms(self) -> float:
         """Root mean square distance from the socket's centroid over the poses of all groups, mm."""
-        return self._pooled([group.rms for group in self.groups])
+        return self._pooled("rms")
 
     @property
     def rms_predicted(self) -> float:
         """What the uncertainties of the calibrations without them predicted, mm."""
-        return self._pooled([group.rms_predicted for group in self.groups])
+        return self._pooled("rms_predicted")
 
-    def _pooled(self, values: list[float]) -> float:
-        pairs = zip(self.groups, values, strict=True)
-        counted = [(group.poses, value) for group, value in pairs if group.poses and np.isfinite(group.rms_predicted)]
-        total = sum(poses for poses, _ in counted)
-        return math.sqrt(sum(poses * value**2 for poses, value in counted) / total) if total else math.nan
+    def _pooled(self, name: str) -> float:
+        counted = [group for group in self.groups if group.poses and np.isfinite(group.rms_predicted)]
+        squares = sum(group.poses * getattr(group, name) ** 2 for group in counted)
+        return math.sqrt(squares / sum(group.poses for group in counted)) if counted else math.nan
 
     @property
     def length_rms(self) -> float:
@@ -109,15 +110,11 @@ class CrossValidation(NamedTuple):
         """How many groups the others cannot predict, because without them something is not determined."""
         return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
 
-    def ratios(self) -> list[float]:
-        """Found over predicted, of poses and of lengths, where they are known."""
-        pairs = [(self.rms, self.rms_predicted), (self.length_rms, self.length_u)]
-        return [rms / predicted for rms, predicted in pairs if predicted > 0 and np.isfinite(rms)]
-
     @property
     def excess(self) -> float:
-        """Errors over their prediction, the larger of both ratios: about 1 where the uncertainty is right."""
-        return max(self.ratios(), default=float("nan"))
+        """Errors over their prediction, of poses or of lengths, the larger: about 1 where the uncertainty is right."""
+        pairs = [(self.rms, self.rms_predicted), (self.length_rms, self.length_u)]
+        return max((rms / expected for rms, expected in pairs if expected > 0 and np.isfinite(rms)), default=math.nan)
 
     @property
     def disagreeing(self) -> tuple[int, ...]:
@@ -132,29 +129,16 @@ class CrossValidation(NamedTuple):
     def surprising(self) -> bool:
         """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance does
         in one case of a hundred."""
-        pooled = self._pooled_probabilities()
-        return bool(self.disagreeing) or any(probability < _HALF / len(pooled) for probability in pooled)
-
-    def _pooled_probabilities(self) -> list[float]:
-        """Of the errors of all poses, and of all lengths. A sum of squares of independent parts with means T and
-        degrees of freedom f has (sum T)^2 / sum (T^2 / f) of them (Satterthwaite)."""
-        poses = [(group.poses, group.rms, group.rms_predicted, group.degrees_of_freedom[0]) for group in self.groups]
-        lengths = [
-            (int(_predicted(group).sum()), group.length_ratio, 1.0, group.degrees_of_freedom[1])
-            for group in self.groups
-        ]
-        probabilities, of_noise = [], min(group.noise_degrees_of_freedom for group in self.groups)
-        for parts in (poses, lengths):
+        pooled, of_noise = [], min(group.noise_degrees_of_freedom for group in self.groups)
+        for parts in zip(*(group.comparisons for group in self.groups), strict=True):
             usable = [part for part in parts if part[0] and part[3] > 0 and 0 < part[2] < math.inf]
             if usable:
+                # A sum of squares of independent parts with means T and degrees of freedom f has
+                # (sum T)^2 / sum (T^2 / f) of them (Satterthwaite).
                 count, rms, predicted, freedom = np.array(usable).T
                 means = count * predicted**2
                 ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
-                pooled = float(means.sum() ** 2 / np.sum(means**2 / freedom))
-                probabilities.append(chance(ratio, 1.0, pooled, of_noise))
-        return [probability for probability in probabilities if math.isfinite(probability)]
-
-
-def _predicted(group: LeftOut) -> np.ndarray:
-    """Which errors of lengths the other groups can predict."""
-    return np.isfinite(group.length_u) & (group.length_u > 0)
+                of_sum = float(means.sum() ** 2 / np.sum(means**2 / freedom))
+                pooled.append(chance(ratio, 1.0, of_sum, of_noise))
+        known = [probability for probability in pooled if math.isfinite(probability)]
+        return bool(self.disagreeing) or any(probability < _HALF / len(known) for probability in known)

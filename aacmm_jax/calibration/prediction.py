@@ -20,7 +20,7 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.copies import visits_of
 from ..data.observations.socket import position_of
-from ..model.elimination import followed
+from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import LEVEL, Law, coverage_factor, degrees_of_freedom
@@ -196,12 +196,12 @@ class _Unseen(NamedTuple):
         of_shared, of_parameters = (
             [np.asarray(r)[part] for r in influence.rows] for part in (slice(p, None), slice(p))
         )
-        values, vectors = np.linalg.eigh(sum(_flat(rows) @ _flat(rows).T for rows in of_shared))
+        values, vectors = np.linalg.eigh(sum(flat(rows) @ flat(rows).T for rows in of_shared))
         large = values > _NULL * values.max(initial=0.0)
         basis = vectors[:, large] / np.sqrt(values[large])
         of_shared = [np.einsum("sb,srm->brm", basis, rows) for rows in of_shared]
         of_parameters = [rows / scale for rows in of_parameters]
-        along = np.sum([_flat(b) @ _flat(a).T for b, a in zip(of_shared, of_parameters, strict=True)], axis=0)
+        along = np.sum([flat(b) @ flat(a).T for b, a in zip(of_shared, of_parameters, strict=True)], axis=0)
         joined = [
             np.concatenate([b, a - np.einsum("bp,brm->prm", along, b)])
             for b, a in zip(of_shared[:groups], of_parameters[:groups], strict=True)
@@ -225,10 +225,6 @@ def _own_basis(influence: Influence, number: int) -> Float[np.ndarray, "k r m"]:
     values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
     roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
     return np.asarray(followed(np.asarray(rows), np.swapaxes(roots, 1, 2), block.sizes))
-
-
-def _flat(rows: Float[np.ndarray, "k r m"]) -> Float[np.ndarray, "k _"]:
-    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
@@ -261,13 +257,10 @@ def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
 def _of_lengths(
     problem: _Unseen, capture: Capture
 ) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, "l l"], Float[np.ndarray, "l c"], Law]:
-    """Errors of the reference lengths, their covariance, and its parts."""
+    """Errors of the reference lengths, their covariance, and its parts, mm and mm^2."""
     linear, influence, uncertainty = problem.linear, problem.influence, problem.uncertainty
     observed, p, count = linear.observed, len(linear.space.names), len(capture.lengths)
     u = np.array([float(length.u) for length in capture.lengths])
-    if not count:
-        none = np.zeros((0, 0))
-        return np.zeros(0), none, *_parts_of_lengths(uncertainty, np.zeros((0, p)), none, u, u)
     measured, by_geometry = observed.distances(np.asarray(linear.z)[p:], ends_of(capture))
     places = np.zeros((count, count))
     for name, variance in zip(capture.names, _variances_in_places(uncertainty.shared, capture), strict=True):
@@ -282,24 +275,13 @@ def _of_lengths(
     scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, own, part) for part, own in pairs], axis=0)
     covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
     error = np.asarray(measured) - np.array([float(length.value) for length in capture.lengths])
-    return error, covariance, *_parts_of_lengths(uncertainty, along, covariance, u**2, np.diagonal(places))
-
-
-def _parts_of_lengths(
-    uncertainty: Uncertainty,
-    slopes: Float[np.ndarray, "l p"],
-    covariance: Float[np.ndarray, "l l"],
-    stated: Float[np.ndarray, " l"],
-    in_places: Float[np.ndarray, " l"],
-) -> tuple[Float[np.ndarray, "l c"], Law]:
-    """Variances of errors of lengths by what they rest on, mm^2: the parts of the calibration's uncertainty, of which
-    the first contains the scatter of the poses at the ends, errors of places there, and what is stated of lengths."""
+    # What they rest on: the parts of the calibration's uncertainty, of which the first contains the scatter of the
+    # poses at the ends, errors of places there, and what is stated of lengths.
     law = uncertainty.law.joined(Law.of(np.array([np.inf])))
-    others = np.column_stack([uncertainty.parts(slopes)[:, 1:], stated])
+    others = np.column_stack([uncertainty.parts(along)[:, 1:], u**2])
     if PLACES in (names := () if uncertainty.components is None else uncertainty.components.names):
-        others[:, names.index(PLACES)] += in_places
-    whole = np.diagonal(covariance)
-    return np.column_stack([whole - others.sum(axis=1), others]), law
+        others[:, names.index(PLACES)] += np.diagonal(places)
+    return error, covariance, np.column_stack([np.diagonal(covariance) - others.sum(axis=1), others]), law
 
 
 def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> Float[np.ndarray, " s"]:

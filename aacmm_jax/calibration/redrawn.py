@@ -143,7 +143,6 @@ def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M 
 
 
 def _square_roots(covariances: Float[np.ndarray, "*m r r"]) -> Float[np.ndarray, "*m r r"]:
-    """Of positive semidefinite matrices, which may be 0."""
     values, vectors = np.linalg.eigh(covariances)
     return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
 
@@ -153,24 +152,20 @@ class Trials(NamedTuple):
 
     size: int  # numbers in one of them
     # So many of them, by random numbers, with a level (t, 1, 1) that multiplies the noise of readings and seat; and the
-    # coefficients of functions that the model lacks.
-    drawn: Callable[[int, np.random.Generator, Any], tuple[Capture, Float[np.ndarray, "t k"]]]
+    # coefficients of functions that the model lacks, where errors that poses share were found.
+    drawn: Callable[[int, np.random.Generator, Any], tuple[Capture, Float[np.ndarray, "t k"] | None]]
 
 
 def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.ndarray, " l"]) -> Trials:
     """Of a calibration; ``u`` are those of its reference lengths, mm."""
     shared, arm = to_numpy(result.shared), result.arm
 
-    def alike(count: int, random: np.random.Generator) -> tuple[DrawnErrors | None, Float[np.ndarray, "t k"]]:
-        errors = draw_shared(shared, arm, capture, count, random)
-        return errors, np.zeros((count, 0)) if errors is None else errors.coefficients
-
     if result.method == "joint":
         truth = truth_of(result, capture)
 
         def drawn_observations(count: int, random: np.random.Generator, level: Any) -> Any:
-            errors, coefficients = alike(count, random)
-            return truth.drawn(count, noise, random, level, errors), coefficients
+            errors = draw_shared(shared, arm, capture, count, random)
+            return truth.drawn(count, noise, random, level, errors), errors and errors.coefficients
 
         return Trials(truth.size, drawn_observations)
     # Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move.
@@ -183,13 +178,15 @@ def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.n
 
     def drawn(count: int, random: np.random.Generator, level: Any) -> Any:
         seats = float(noise.seating) * level * random.normal(size=(count, len(exact), 3))
-        errors, coefficients = alike(count, random)
+        errors = draw_shared(shared, arm, capture, count, random)
         seats = seats if errors is None else seats + errors.tips
         read = noise.of_columns(arm.geometry.kinds, arm.joints, exact.shape[1])
         readings = exact + read * level * random.normal(size=(count, *exact.shape))
         readings[..., : arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
         readings += 0.0 if errors is None else errors.joints
-        return batch_of_captures(capture, readings, _around(true_lengths, u, count, random)), coefficients
+        return batch_of_captures(
+            capture, readings, _around(true_lengths, u, count, random)
+        ), errors and errors.coefficients
 
     return Trials(exact.size, drawn)
 
@@ -309,7 +306,15 @@ class ObservedTruth(NamedTuple):
         observations = []
         for part in self.parts:
             observation, none = part.observation, np.zeros((count, *part.values.shape))
-            rows = _rows_with_replacement(observation, count, random)
+            if np.bincount(observation.places).max() < 2:
+                raise InputError(
+                    f"observation '{observation.name}' has one pose in each point, so none can be drawn in the place "
+                    "of another; record several, or use monte_carlo."
+                )
+            rows = np.empty((count, observation.q.shape[0]), dtype=int)
+            for place in range(observation.places.max() + 1):
+                group = np.flatnonzero(observation.places == place)
+                rows[:, group] = group[random.integers(len(group), size=(count, len(group)))]
             fields = [field for field in observation.by_pose if not isinstance(getattr(observation, field), tuple)]
             chosen = [np.asarray(getattr(observation, field))[rows] for field in fields]
             batch = eqx.tree_at(
@@ -349,41 +354,22 @@ def _repeated(observation: AbstractObservation, count: int) -> AbstractObservati
     return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *np.shape(leaf))), observation)
 
 
-def _rows_with_replacement(
-    observation: AbstractObservation, count: int, random: np.random.Generator
-) -> Int[np.ndarray, "t m"]:
-    places = observation.places
-    if np.bincount(places).max() < 2:
-        raise InputError(
-            f"observation '{observation.name}' has one pose in each point, so none can be drawn in the place of "
-            "another; record several, or use monte_carlo."
-        )
-    rows = np.empty((count, observation.q.shape[0]), dtype=int)
-    for place in range(places.max() + 1):
-        group = np.flatnonzero(places == place)
-        rows[:, group] = group[random.integers(len(group), size=(count, len(group)))]
-    return rows
-
-
 def batch_of_observations(
     observations: list[AbstractObservation], ends: list[tuple[str, str]], lengths: DrawnLengths
 ) -> Capture:
     """A batch of captures, as `identify_many` takes it; ``ends`` are names of the positions at the lengths' ends."""
     count, _, joints = observations[0].q.shape
     template = Capture({}, (), [jax.tree.map(lambda leaf: leaf[0], batch) for batch in observations])
-    references = tuple(
-        eqx.tree_at(lambda length: (length.value, length.u), ReferenceLength(_socket(a), _socket(b), 1.0), (value, u))
-        for (a, b), value, u in zip(ends, lengths.value.T, lengths.u.T, strict=True)
-    )
+    references = []
+    for pair, value, u in zip(ends, lengths.value.T, lengths.u.T, strict=True):
+        start, end = (position.removeprefix("position of ") for position in pair)
+        length = ReferenceLength(start, end, 1.0)
+        references.append(eqx.tree_at(lambda length: (length.value, length.u), length, (value, u)))
     return eqx.tree_at(
         lambda capture: (capture.q, capture.lengths, capture.observations),
         template,
-        (np.zeros((count, 0, joints)), references, tuple(observations)),
+        (np.zeros((count, 0, joints)), tuple(references), tuple(observations)),
     )
-
-
-def _socket(position: str) -> str:
-    return position.removeprefix("position of ")
 
 
 def batch_of_captures(capture: Capture, q: Numbers, values: Numbers, u: Numbers | None = None) -> Capture:

@@ -20,7 +20,6 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
-from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
 from .record import uncertainty_of
@@ -80,19 +79,17 @@ class Sampled(NamedTuple):
         if self.failed:
             sentences.append(f"{self.failed} of {self.trials} trials did not converge and are left out.")
         apart = [name for name, good in zip(self.quantities, self.agrees, strict=True) if not good]
-        percent = f"{100 * self.level:g} %"
+        says = (
+            f"agree with those of {self.trials} Monte Carlo trials within the tolerance of JCGM 101, for every "
+            f"parameter{', k,' if 'k' in self.quantities else ''} and lengths over the volume."
+        )
         if apart:
-            return [
-                *sentences,
-                f"The linear {percent} intervals differ from the Monte Carlo ones by more than the tolerance of JCGM "
-                f"101 for {len(apart)} of {len(self.quantities)} quantities: {', '.join(apart[:8])}"
-                f"{' ...' if len(apart) > 8 else ''}; use the Monte Carlo ones.",
-            ]
-        return [
-            *sentences,
-            f"The linear {percent} intervals agree with those of {self.trials} Monte Carlo trials within the tolerance "
-            f"of JCGM 101, for every parameter{', k,' if 'k' in self.quantities else ''} and lengths over the volume.",
-        ]
+            says = (
+                "differ from the Monte Carlo ones by more than the tolerance of JCGM 101 for "
+                f"{len(apart)} of {len(self.quantities)} quantities: {', '.join(apart[:8])}"
+                f"{' ...' if len(apart) > 8 else ''}; use the Monte Carlo ones."
+            )
+        return [*sentences, f"The linear {100 * self.level:g} % intervals {says}"]
 
 
 @checked_arguments
@@ -155,7 +152,9 @@ def monte_carlo(
     while sum(map(len, values)) + failed < most and not stable:
         random = np.random.default_rng([seed, len(values)])
         parts = []
-        for count in _slices(block, trials.size):
+        # So many at a time that the readings of each take 200 MB at most.
+        slices = max(int(2.5e7 / trials.size), 1)
+        for count in (min(slices, block - first) for first in range(0, block, slices)):
             # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives
             # Student's t (JCGM 101, 6.4.9).
             scale = 1.0 if math.isinf(freedom) else np.sqrt(freedom / random.chisquare(freedom, size=(count, 1, 1)))
@@ -234,22 +233,6 @@ def _check_some(values: np.ndarray, trials: int, what: str, remedy: str) -> None
         raise InputError(f"{len(values)} of {trials} {what} trials converged; {remedy}.")
 
 
-def _check_loss(result: Calibration, capture: Capture, robust: LossName | None) -> None:
-    """Refuse trials that would be solved with another loss than the calibration, or of another capture."""
-    if result.method == "two-stage":
-        if capture.observations or robust is not None:
-            raise InputError(
-                "the calibration is of sockets and lengths without a robust loss; give its own capture and loss."
-            )
-        return
-    lost = any(bool(np.any(np.asarray(weights) < 1)) for weights in result.observed.weights)
-    if lost and robust is None:
-        raise InputError(
-            "a robust loss took weight from poses of this calibration; name it for the bootstrap (robust='huber'), "
-            "which keeps such poses, or calibrate without it."
-        )
-
-
 def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
     """delta = 10^l / 2, where u = c 10^l with an integer c of so many digits (JCGM 101, 7.9.2)."""
     safe = np.where(u > 0, u, 1.0)
@@ -259,17 +242,10 @@ def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.nda
     return np.where(u > 0, 0.5 * 10**exponent, 0.0)
 
 
-def _slices(block: int, numbers: int) -> list[int]:
-    """Sizes of the parts of a block of trials, so that the readings of each take 200 MB at most."""
-    most = max(int(2.5e7 / numbers), 1)
-    return [min(most, block - first) for first in range(0, block, most)]
-
-
 class _RepeatedTask(NamedTuple):
     """What is the same in all trials."""
 
     result: Calibration
-    capture: Capture
     start: Float[np.ndarray, "v n"]
     end: Float[np.ndarray, "v n"]
     u: Float[np.ndarray, " l"]
@@ -283,7 +259,18 @@ class _RepeatedTask(NamedTuple):
         lengths: tuple[np.ndarray, np.ndarray] | None,
         robust: LossName | None = None,
     ) -> "_RepeatedTask":
-        _check_loss(result, capture, robust)
+        """Refuses trials that would be solved with another loss than the calibration, or of another capture."""
+        joint = result.method == "joint"
+        if not joint and (capture.observations or robust is not None):
+            raise InputError(
+                "the calibration is of sockets and lengths without a robust loss; give its own capture and loss."
+            )
+        lost = any(bool(np.any(np.asarray(weights) < 1)) for weights in result.observed.weights)
+        if joint and lost and robust is None:
+            raise InputError(
+                "a robust loss took weight from poses of this calibration; name it for the bootstrap (robust='huber'), "
+                "which keeps such poses, or calibrate without it."
+            )
         two = isinstance(lengths, tuple | list) and len(lengths) == 2
         shapes = [np.shape(poses) for poses in lengths] if lengths is not None and two else []
         if lengths is not None and (not two or len(shapes[0]) != 2 or shapes[0] != shapes[1]):
@@ -292,7 +279,7 @@ class _RepeatedTask(NamedTuple):
             )
         start, end = lengths or sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
         u = np.array([float(length.u) for length in capture.lengths])
-        return cls(result, capture, np.asarray(start), np.asarray(end), u, robust)
+        return cls(result, np.asarray(start), np.asarray(end), u, robust)
 
     def in_order(self, values: Float[np.ndarray, " q"], others: Numbers) -> Float[np.ndarray, " p"]:
         """Numbers of the parameters of a prior in the order of all, with others for those that it leaves out."""
@@ -319,13 +306,13 @@ class _RepeatedTask(NamedTuple):
         options: dict[str, Any] = {"noise": result.weighting_noise, "robust": self.robust, "method": result.method}
         if result.method == "two-stage":
             return calibrate_many(stage1.arm, captures, bounds, start=stage1.parameters, hold=result.hold, **options)
-        if means is None:
-            return calibrate_many(result.arm, captures, bounds, start=result.parameters, **options)
-        assert result.prior is not None
-        arms = Parameters(result.arm, result.space.names).arm(means)
-        weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
-        prior = Prior({name: 1 / weight for name, weight in weights if weight > 0})
-        return calibrate_many(arms, captures, bounds, start=result.parameters, prior=prior, **options)
+        arm = result.arm
+        if means is not None:
+            assert result.prior is not None
+            arm = Parameters(result.arm, result.space.names).arm(means)
+            weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
+            options["prior"] = Prior({name: 1 / weight for name, weight in weights if weight > 0})
+        return calibrate_many(arm, captures, bounds, start=result.parameters, **options)
 
     def solved(
         self,
@@ -343,18 +330,16 @@ class _RepeatedTask(NamedTuple):
         lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
         shared = result.shared
         if coefficients is not None and shared is not None and shared.names:
-            lengths = np.asarray(lengths) + coefficients @ self._by_functions(shared).T
+            # Derivatives of the lengths by the coefficients of functions that the model lacks.
+            whole = uncertainty_of(result).complete
+            by_tips = [np.asarray(whole.derivatives(q))[..., -len(shared.names) :] for q in (self.start, self.end)]
+            between = np.subtract(*(np.asarray(whole.arm.position(q)) for q in (self.end, self.start)))
+            direction = between / np.linalg.norm(between, axis=1, keepdims=True)
+            by_functions = np.einsum("vc,vck->vk", direction, by_tips[1] - by_tips[0])
+            lengths = np.asarray(lengths) + coefficients @ by_functions.T
         scale = [] if many.k is None else [many.k[:, None]]
         values = np.hstack([many.parameters, *scale, np.asarray(lengths)])
         return values[many.converged], int(np.sum(~many.converged))
-
-    def _by_functions(self, shared: SharedErrors) -> Float[np.ndarray, "v k"]:
-        """Derivatives of the lengths by the coefficients of functions that the model lacks."""
-        whole = uncertainty_of(self.result).complete
-        by_tips = [np.asarray(whole.derivatives(q))[..., -len(shared.names) :] for q in (self.start, self.end)]
-        between = np.subtract(*(np.asarray(whole.arm.position(q)) for q in (self.end, self.start)))
-        direction = between / np.linalg.norm(between, axis=1, keepdims=True)
-        return np.einsum("vc,vck->vk", direction, by_tips[1] - by_tips[0])
 
     def sampled(self, values: np.ndarray, failed: int, level: float, digits: int, stable: bool = True) -> Sampled:
         """The trials' distribution, with the linear result to compare it with."""

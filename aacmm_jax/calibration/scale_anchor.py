@@ -98,16 +98,28 @@ def scale_anchor(
     hold = _checked_hold(hold, space, lengths, concrete)
     fixed, slides = fixed_lengths(arm, space), tuple(f"q_{i}" for i in arm.prismatic)
     partners = None if fixed or slides else ((), ())
-    longest = _longest_link(lengths, arm if concrete else None)
+    longest = _longest_link(lengths, arm) if concrete else None
     set_by, without_anchor = (), False
     if concrete and (fixed or slides):
-        single = _first(arm)
+        with jax.ensure_compile_time_eval():
+            single = arm if is_single(arm) else jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1])[0], arm)
         if longest is not None and hold in (None, "longest"):
             poses = _known_poses(single, capture) if slides else None
-            scaling = _of_lengths(single, space, fixed) if poses is None else _of_slides(single, space, longest, poses)
+            if poses is None:
+                # How the free parameters, and a common relative change of the fixed lengths, move the tips, mm.
+                values, split, steps = [value_of(single, name) for name in fixed], len(space.names), space.scale
+                both = _columns_of_both(single, space, fixed)
+                scaling = [(rows[:, :split] * np.asarray(steps), rows[:, split:] @ np.array(values)) for rows in both]
+            else:
+                scaling = _of_slides(single, space, longest, poses)
             least = min(_left_of_scaling(*part) for part in scaling)
-            u = _scatter(single, noise) / (math.sqrt(_EQUATIONS) * max(least, 1e-300))
-            moving = () if poses is None else tuple(name for name in slides if _slides(poses, name))
+            # Of a tip coordinate, mm, as the noise has it for a tip at half of the arm's reach.
+            scatter = _SCATTER
+            if noise is not None and is_concrete(noise.encoder, noise.seating):
+                scatter = math.hypot(*at_tip(noise, single, total_link_length(single) / 2))
+            u = scatter / (math.sqrt(_EQUATIONS) * max(least, 1e-300))
+            travels = np.zeros(arm.joints) if poses is None else np.ptp(np.asarray(poses.q), axis=0)
+            moving = tuple(name for name in slides if travels[int(name[2:]) - 1] > 1.0)  # mm
             set_by = (moving or fixed) if u <= _LARGEST_UNCERTAINTY else ()
             without_anchor = bool(slides) and u <= _LARGEST_OF_SLIDES
         if not slides:
@@ -118,7 +130,7 @@ def scale_anchor(
 
 
 def _checked_hold(hold: object, space: Parameters, lengths: list[str], concrete: bool) -> str | None:
-    """The length to hold, "longest", or None, as where no length is free."""
+    """A length, "longest", or None, as where no length is free."""
     if not isinstance(hold, str | None):
         raise InputError(f"hold is {shown(hold)}; give the name of a length, 'longest' or None.")
     if hold not in (None, "longest", *lengths):
@@ -182,21 +194,13 @@ def fixed_lengths(arm: Arm, space: Parameters) -> tuple[str, ...]:
     return tuple(name for name in names if np.any(value_of(arm, name) != 0))
 
 
-def _longest_link(lengths: list[str], arm: Arm | None) -> str | None:
+def _longest_link(lengths: list[str], arm: Arm) -> str | None:
     links = [name for name in lengths if not name.startswith("probe") and name != "d_1"] or lengths
-    if not links or arm is None:
-        return links[0] if links else None
+    if not links:
+        return None
     sizes = {name: float(np.abs(value_of(arm, name)).max()) for name in lengths}
     # The links of a gantry are slides, and all that scales with the wrist may be the probe.
     return max(links if any(sizes[name] for name in links) else lengths, key=sizes.__getitem__)
-
-
-def _first(arm: Arm) -> Arm:
-    """The first arm of a batch, which may be a batch in some of its parameters only."""
-    if is_single(arm):
-        return arm
-    with jax.ensure_compile_time_eval():
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1])[0], arm)
 
 
 def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[Float[np.ndarray, "rows k"]]:
@@ -209,14 +213,6 @@ def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> lis
             columns = jacobian_at(variant, q, names)
             matrices.append((columns - columns.mean(axis=0)).reshape(-1, len(names)))
     return matrices
-
-
-def _of_lengths(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """How the free parameters, and a common relative change of the fixed lengths, move the tips: rows of both, mm, at
-    the nominal arm and at a neighbouring one."""
-    values, split = np.array([value_of(arm, name) for name in fixed]), len(space.names)
-    steps = natural_steps(space.names)
-    return [(rows[:, :split] * steps, rows[:, split:] @ values) for rows in _columns_of_both(arm, space, fixed)]
 
 
 def _of_slides(arm: Arm, space: Parameters, longest: str, poses: SocketPoses) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -243,11 +239,6 @@ def _known_poses(arm: Arm, capture: SocketPoses | None) -> SocketPoses:
         return generic_poses(arm)
 
 
-def _slides(poses: SocketPoses, name: str) -> bool:
-    """Whether the readings of a prismatic joint, ``q_i``, differ by more than 1 mm."""
-    return float(np.ptp(np.asarray(poses.q)[:, int(name[2:]) - 1])) > 1.0
-
-
 def _left_of_scaling(free: Float[np.ndarray, "rows k"], scaling: Float[np.ndarray, " rows"]) -> float:
     """What repeatability sees of the scale, mm RMS for a relative change of 1.
 
@@ -257,13 +248,6 @@ def _left_of_scaling(free: Float[np.ndarray, "rows k"], scaling: Float[np.ndarra
     """
     residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
     return float(np.sqrt(np.mean(residual**2)))
-
-
-def _scatter(arm: Arm, noise: Noise | None) -> float:
-    """Standard deviation of a tip coordinate, mm, as the noise has it for a tip at half of the arm's reach."""
-    if noise is None or not is_concrete(noise.encoder, noise.seating):
-        return _SCATTER
-    return math.hypot(*at_tip(noise, arm, total_link_length(arm) / 2))
 
 
 def _partners(arm: Arm, columns: list[np.ndarray], space: Parameters, fixed: tuple[str, ...]) -> Partners | None:

@@ -21,7 +21,7 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..kinematics.arm import Arm, check_columns, is_single
-from ..kinematics.chain import ForwardPass, forward_pass
+from ..kinematics.chain import forward_pass
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
@@ -103,8 +103,14 @@ def task_of(arm: Arm, capture: Capture, bounds: Bounds, solving: Solving) -> Tas
     observed = Observed.of(capture, space.base)
     if is_concrete(*jax.tree.leaves((arm, capture, vector))):
         check_data(capture, observed, *to_numpy((space, vector)), anchor, solving)
-    if prior is not None and is_concrete(*jax.tree.leaves((prior, bounds))):
-        _check_means(prior, bounds)
+    stated = prior and prior.of(space.names, space.vector())
+    if stated is not None and is_concrete(*jax.tree.leaves((prior, bounds))):
+        mean, low, high = (np.asarray(side)[stated.index] for side in (stated.mean, bounds.lower, bounds.upper))
+        for i in np.flatnonzero(~((low <= mean) & (mean <= high))):
+            raise InputError(
+                f"the prior's mean of {space.names[stated.index[i]]} is {mean[i]:g}, outside its bounds {low[i]:g} to "
+                f"{high[i]:g} (mm or rad); correct the mean or widen the bounds."
+            )
     return Task(
         observed=observed,
         bounds=bounds,
@@ -158,13 +164,9 @@ def method_of(
 
 def check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None:
     """Raise `InputError` where an arm, a capture or bounds are a batch; ``many`` is the function that takes batches."""
-    is_batch = {
-        "arm": not is_single(arm),
-        "capture": capture.q.ndim > 2,
-        "bounds": max(bounds.lower.ndim, bounds.upper.ndim) > 1,
-    }
-    batches = [what for what, batch in is_batch.items() if batch]
-    if batches:
+    wide = max(bounds.lower.ndim, bounds.upper.ndim) > 1
+    is_batch = {"arm": not is_single(arm), "capture": capture.q.ndim > 2, "bounds": wide}
+    if batches := [what for what, batch in is_batch.items() if batch]:
         raise InputError(
             f"the {' and the '.join(batches)} given are a batch, but one problem is solved here; use {many}."
         )
@@ -183,20 +185,6 @@ def _check_start(bounds: Bounds, vector: AnyArray, what: str) -> None:
         raise InputError(
             f"{what} is outside the bounds: {bounds.space.names[i]} is {values[i]:g}, not within {lower[i]:g} to "
             f"{upper[i]:g}; move the start or widen the bounds."
-        )
-
-
-def _check_means(prior: Prior, bounds: Bounds) -> None:
-    """Raise `InputError` where the mean of a prior is outside the bounds: one of both is wrong."""
-    names = bounds.space.names
-    stated = prior.of(names, np.asarray(bounds.space.vector()))
-    if stated is None:
-        return
-    mean, low, high = (np.asarray(values)[stated.index] for values in (stated.mean, bounds.lower, bounds.upper))
-    for i in np.flatnonzero(~((low <= mean) & (mean <= high))):
-        raise InputError(
-            f"the prior's mean of {names[stated.index[i]]} is {mean[i]:g}, outside its bounds {low[i]:g} to "
-            f"{high[i]:g} (mm or rad); correct the mean or widen the bounds."
         )
 
 
@@ -263,24 +251,12 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
     for observation, rows in zip(observed.observations, observed.slices, strict=True):
         # Through the class: a bound method of Equinox is a module made anew.
         type(observation).check_determined(observation, np.asarray(forward.tip[:, rows]))
-    _check_targets(observed, forward)
-    geometry = len(observed.steps)
-    if observed.equations < count + geometry:
-        raise InputError(
-            f"the observations give {observed.equations} equations, but {count + geometry} numbers are unknown "
-            f"({count} parameters and {geometry} of the unknown geometry); record more poses, fix more parameters, or "
-            "give a prior of them together with the noise."
-        )
-
-
-def _check_targets(observed: Observed, forward: ForwardPass) -> None:
-    """Refuse a target whose place cannot be told from that of the station, because the last frame never turns."""
+    # A target at t in the last frame (x, y, z) is seen at F (p + R t): where R is one matrix, t and the translation of
+    # the station's frame F cannot be told apart.
     poses: dict[str, list[np.ndarray]] = {}
     for observation, part in zip(observed.observations, observed.slices, strict=True):
         if observation.target:
             poses.setdefault(observation.target, []).append(np.arange(part.start, part.stop))
-    # A target at t in the last frame (x, y, z) is seen at F (p + R t): where R is one matrix, t and the translation of
-    # the station's frame F cannot be told apart.
     for target, parts in poses.items():
         axes = [np.asarray(forward.frame[i])[:, np.concatenate(parts)] for i in (0, 2)]
         if max(np.ptp(axis, axis=1).max() for axis in axes) < _LEAST_TURN:
@@ -288,6 +264,13 @@ def _check_targets(observed: Observed, forward: ForwardPass) -> None:
                 f"target '{target}' was seen from one orientation of the last frame, in which its place cannot be told "
                 "from that of the instrument; take poses with the wrist turned."
             )
+    geometry = len(observed.steps)
+    if observed.equations < count + geometry:
+        raise InputError(
+            f"the observations give {observed.equations} equations, but {count + geometry} numbers are unknown "
+            f"({count} parameters and {geometry} of the unknown geometry); record more poses, fix more parameters, or "
+            "give a prior of them together with the noise."
+        )
 
 
 def check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, strict: bool) -> None:

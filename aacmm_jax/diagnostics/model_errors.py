@@ -19,7 +19,6 @@ from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..uncertainty.shared_kinds import SUCCESSIVE, VISITS
-from .equations import equations_of, in_chunks
 from .findings import Case, Finding, case_of, chance_text
 from .length_consistency import Lengths, lengths_of
 from .missing_terms import FoundTerm, explained, missing
@@ -127,8 +126,7 @@ def misfit_of(case: Case) -> Misfit | None:
     usual = case.usual
     if usual is None:
         return None
-    rows, relations = in_chunks(equations_of(case.record._replace(noise=usual.noise)))
-    left = Residuals.of([*(part.block("") for part in rows), *relations])
+    left = Case(case.record._replace(noise=usual.noise)).left
     freedom, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
     probability = f_tail(ratio, freedom, CLASS_DEGREES_OF_FREEDOM)
     return Misfit(float(np.sqrt(ratio)), freedom, probability, usual.source or usual.arm_class)

@@ -72,7 +72,7 @@ def sums_by_component(
         left, right = (_by_component(part, count) for part in (first, second))
         return left @ xp.swapaxes(right, -1, -2)
     if sum(sizes) >= _LONG * count:
-        return xp.stack([_flat(first[..., poses]) @ _flat(second[..., poses]).T for poses in _slices(sizes)])
+        return xp.stack([flat(first[..., poses]) @ flat(second[..., poses]).T for poses in _slices(sizes)])
     products: Any = sum(first[:, None, r] * second[None, :, r] for r in range(first.shape[1]))
     return xp.moveaxis(_summed(products, sizes), -1, 0)
 
@@ -106,7 +106,7 @@ def followed(
     if sum(sizes) >= _LONG * len(sizes):
         shapes = [(matrices.shape[-1], r, size) for size in sizes]
         parts = zip(matrices, _slices(sizes), shapes, strict=True)
-        pieces = [(matrix.T @ _flat(by_own[..., poses])).reshape(shape) for matrix, poses, shape in parts]
+        pieces = [(matrix.T @ flat(by_own[..., poses])).reshape(shape) for matrix, poses, shape in parts]
         return pieces[0] if len(pieces) == 1 else xp.concatenate(pieces, axis=-1)
     owner = owner_of(sizes)
     total: Any = 0.0
@@ -116,7 +116,8 @@ def followed(
     return total
 
 
-def _flat(rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k _"]:
+def flat(rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k _"]:
+    """A row for each unknown, over all rows of all poses."""
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
@@ -169,7 +170,7 @@ def arrow_of(
     ``height`` is the number of unknowns of the head.
     """
     xp = namespace([block.white for block in blocks])
-    heads = [_flat(block.by_head) for block in blocks if block.by_head is not None]
+    heads = [flat(block.by_head) for block in blocks if block.by_head is not None]
     whole = heads[0] if len(heads) == 1 else xp.concatenate(heads, axis=1)
     head = whole @ whole.T  # A A^T, over the rows of all blocks
     if prior is not None:
@@ -260,7 +261,7 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
     xp = namespace(arrow)
     # Residuals of components without unknowns are at right angles to these.
     slope: Any = sum(
-        (_flat(block.by_head) @ block.white.reshape(-1) for block in blocks if block.by_head is not None),
+        (flat(block.by_head) @ block.white.reshape(-1) for block in blocks if block.by_head is not None),
         xp.zeros(p + layout.shared),
     )
     if prior is not None:

@@ -24,6 +24,7 @@ from ..kinematics.jacobian import (
     stacked_jacobian_columns,
 )
 from ..kinematics.parameters import Parameters
+from ..solver.arrow import split
 from .layout import Group, Layout
 from .observed import Observed, tips_of
 from .socket_sums import to_poses
@@ -182,66 +183,44 @@ def _by_own(by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, size: int) -
     return whole
 
 
-class _Relations(NamedTuple):
-    """Where the relations of one class, or of the shared geometry, stand."""
-
-    rows: np.ndarray  # their numbers: lengths, then numbers of certified parts; component by component
-    numbers: np.ndarray  # of their derivatives, as `_relations` lists these
-    columns: np.ndarray  # where each of these stands, within the component or among the shared numbers
-    of_row: np.ndarray  # place of its row among ``rows``
-    sizes: tuple[int, ...]
-
-
 def _relations(observed: Observed, geometry: Float[AnyArray, " g"], whitening: Whitening, p: int) -> list[RowBlock]:
     """Rows of lengths and of certified values: of each class of components, and of the shared geometry."""
-    certified = observed.certified()
+    certified, positions, layout = observed.certified(), observed.positions, observed.layout
     if not observed.ends and not certified:
         return []
-    xp, layout, positions = namespace(geometry, whitening), observed.layout, observed.positions
-    index = np.array([[positions[end] for end in pair] for pair in observed.ends], dtype=int).reshape(-1, 2, 3)
-    vectors = geometry[index[:, 1]] - geometry[index[:, 0]]
-    size = xp.sqrt(xp.sum(vectors**2, axis=1))
-    lengths = whitening.lengths * (size - observed.nominal)
-    pairs = certified.items()
-    values = [whitening.certified[name] * (geometry[positions[name]] - value) for name, (value, _) in pairs]
-    white = xp.concatenate([lengths, *values])
-    slopes = vectors * (whitening.lengths / size)[:, None]
-    # Derivatives as a list of numbers, in the order in which `_places` lists where they stand.
-    numbers = xp.concatenate([(-slopes).ravel(), slopes.ravel(), *(whitening.certified[name] for name in certified)])
+    sizes, pull = observed.distances(geometry, observed.ends)
+    errors, slopes, weights = [sizes - observed.nominal], [pull], [whitening.lengths]
+    for name, (value, _) in certified.items():
+        errors.append(geometry[positions[name]] - value)
+        slopes.append((positions[name][:, None] == np.arange(len(geometry))).astype(float))
+        weights.append(whitening.certified[name])
+    xp = namespace(geometry, whitening)
+    weight, slope, error = map(xp.concatenate, (weights, slopes, errors))
+    white, (head, components) = weight * error, split(weight[:, None] * slope, layout.shared, layout.classes)
+    # All numbers of a relation belong to one component, or all of them are shared.
+    first = [int(positions[pair[0]][0]) for pair in observed.ends]
+    first += [int(index) for name in certified for index in positions[name]]
     blocks = []
-    for of, places in _places(observed.layout, observed.ends, tuple(certified)).items():
-        height = p + layout.shared if of < 0 else layout.classes[of][1]
-        whole = xp.zeros((height, len(places.rows)))
-        at = places.columns + (p if of < 0 else 0), places.of_row
-        whole = set_at(whole, at, numbers[places.numbers])[:, None]
-        by = (whole, None) if of < 0 else (None, whole)
-        blocks.append(RowBlock(white[places.rows][None], *by, of, places.sizes))
+    for of, (rows, owner) in _relations_by_class(layout, tuple(first)).items():
+        if of < 0:
+            by_head = xp.concatenate([xp.zeros((p, len(rows))), head[rows].T])[:, None]
+            blocks.append(RowBlock(white[rows][None], by_head, None, of, ()))
+        else:
+            poses = tuple(np.bincount(owner, minlength=layout.classes[of][0]).tolist())
+            blocks.append(RowBlock(white[rows][None], None, components[of][rows, owner].T[:, None], of, poses))
     return blocks
 
 
 @lru_cache(maxsize=32)
-def _places(layout: Layout, ends: tuple[tuple[str, str], ...], certified: tuple[str, ...]) -> dict[int, _Relations]:
-    """Of the relations of each class: their rows sorted by component, and where their derivatives stand."""
-    positions, count = layout.positions, len(ends)
-    starts, stops = ([positions[pair[i]] for pair in ends] for i in (0, 1))
-    own = [positions[name] for name in certified]
-    index = np.concatenate([*starts, *stops, *own]).astype(int)
-    of_length = np.repeat(np.arange(count), 3)
-    row = np.concatenate([of_length, of_length, count + np.arange(sum(map(len, own)))]).astype(int)
-    located = [layout.component_of(int(i)) for i in index]
+def _relations_by_class(layout: Layout, first: tuple[int, ...]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Numbers of the relations of each class and their components, which they are sorted by; of ``first`` numbers."""
+    located = [layout.component_of(index)[:2] for index in first]
     by_class = {}
     for of in dict.fromkeys(place[0] for place in located):
-        mine = np.array([i for i, place in enumerate(located) if place[0] == of])
-        component = {int(row[i]): located[i][1] for i in mine}
-        rows = sorted(component, key=lambda number: (component[number], number))
-        sizes = np.bincount([component[n] for n in rows], minlength=0 if of < 0 else layout.classes[of][0])
-        by_class[of] = _Relations(
-            rows=np.array(rows),
-            numbers=mine,
-            columns=np.array([located[i][2] for i in mine]),
-            of_row=np.array([rows.index(number) for number in row[mine].tolist()]),
-            sizes=() if of < 0 else tuple(int(size) for size in sizes),
-        )
+        rows = np.array([row for row, place in enumerate(located) if place[0] == of])
+        owner = np.array([located[row][1] for row in rows])
+        order = np.argsort(owner, kind="stable")
+        by_class[of] = rows[order], owner[order]
     return by_class
 
 
