@@ -243,7 +243,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         (ALL.replace('"x"', '"xx"'), ["a.csv has no column 'xx'; it has the columns 1 'q1', 2 'q2'"]),
         (ALL.replace('"x"', "20"), ["a.csv has no column '20'; it has"]),
         (ALL.replace('"x"', '"y"'), ["one column is picked twice"]),
-        (ALL.replace('"q?"', '"q[1-3]"'), ["picks 3 columns for the readings", "6 joints"]),
+        (ALL.replace('"q?"', '"q[1-3]"'), ["3 columns are picked for the readings", "6 joints"]),
         (ALL.replace("points =", "point ="), ["no 'point'", "did you mean 'points'?"]),
         (ALL.replace(', "z"]', "]"), ["points is in 3 columns, but 2 are picked"]),
         ('columns = { q = "q?" }', ["no 'points' (measured point)", "pick its columns"]),
