@@ -61,7 +61,20 @@ def test(case: Case) -> list[Finding]:
     findings = [] if misfit is None or misfit.probability >= LEVEL else [_misfit(misfit)]
     successive = case.once(successive_of)
     if successive is not None and successive.probability < LEVEL:
-        findings.append(_successive(successive, case.record))
+        shared = set() if case.record.shared is None else set(case.record.shared.kinds)
+        findings.append(
+            Finding(
+                "successive-poses",
+                f"Residuals of successive poses are autocorrelated (correlation {successive.correlation:.2f}, "
+                f"{chance_text(successive.probability)}): a seat that shifts at each visit, or errors that the model "
+                "lacks.",
+                "The stated uncertainties include what they share, as estimated from the residuals."
+                if shared & {VISITS, SUCCESSIVE}
+                else "Such poses count as independent, so every stated uncertainty is too small.",
+                severity="doubt",
+                probability=successive.probability,
+            )
+        )
     noisy = case.once(noisy_observations)
     if noisy:
         texts = [f"{part.name} ({math.sqrt(max(part.test.ratio, 0)):.2g} times)" for part in noisy]
@@ -76,20 +89,6 @@ def test(case: Case) -> list[Finding]:
             )
         )
     return findings
-
-
-def _successive(successive: Successive, record: CalibrationRecord) -> Finding:
-    shared = set() if record.shared is None else set(record.shared.kinds)
-    return Finding(
-        "successive-poses",
-        f"Residuals of successive poses are autocorrelated (correlation {successive.correlation:.2f}, "
-        f"{chance_text(successive.probability)}): a seat that shifts at each visit, or errors that the model lacks.",
-        "The stated uncertainties include what they share, as estimated from the residuals."
-        if shared & {VISITS, SUCCESSIVE}
-        else "Such poses count as independent, so every stated uncertainty is too small.",
-        severity="doubt",
-        probability=successive.probability,
-    )
 
 
 def _misfit(misfit: Misfit) -> Finding:
