@@ -247,16 +247,19 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         (ALL.replace("points =", "point ="), ["no 'point'", "did you mean 'points'?"]),
         (ALL.replace(', "z"]', "]"), ["points is in 3 columns, but 2 are picked"]),
         ('columns = { q = "q?" }', ["no 'points' (measured point)", "pick its columns"]),
-        (ALL + 'units = { points = "cm" }', ["units.points is 'cm'", "mm, m, um, inch"]),
+        (ALL + 'units = { points = "cm" }', ["the points are in 'cm'", "mm, m, um, inch"]),
         # Mixed units: in one header, or in header and manifest.
         (
             ALL.replace('"x", "y"', '"x [m]", "y [mm]"'),
             ["mixes units: 'x [m]' is in m, 'y [mm]' is in mm", "convert one of them"],
         ),
-        (ALL.replace('"x", "y"', '"y", "y_mm"') + 'units = { points = "inch" }', ["units.points is 'inch'", "says mm"]),
-        (ALL.replace('"x", "y", "z"', '"a", "b", "c"'), ["the header of points says 'cm'", "one of mm, m, um, inch"]),
+        (
+            ALL.replace('"x", "y"', '"y", "y_mm"') + 'units = { points = "inch" }',
+            ["the header of the points says mm, but the manifest inch"],
+        ),
+        (ALL.replace('"x", "y", "z"', '"a", "b", "c"'), ["the points are in 'cm'", "one of mm, m, um, inch"]),
         (ALL.replace('"q?"', '"p?"'), ["the header of the readings says deg, but the manifest rad"]),
-        (ALL + 'units = { q = "degrees" }', ["units.q is 'degrees'", "rad, deg"]),
+        (ALL + 'units = { q = "degrees" }', ["the readings are in 'degrees'", "rad, deg"]),
         (ALL + "u = 0.1", ["u is given and also in columns"]),
         (ALL + 'readings = "short.csv"', ["5 rows of 'points'", "2 readings"]),
         (ALL + 'files = ["a.csv"]', ["needs either file or files"]),
