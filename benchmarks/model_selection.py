@@ -51,7 +51,7 @@ KINDS = ("expansion", "gear", "gravity", "harmonics=1")
 MODELS = ("dh", *KINDS, *(",".join(kind for kind in KINDS if kind != out) for out in KINDS[::-1]), ",".join(KINDS))
 # Codes of findings that only state how a capture is made.
 STATEMENTS = (
-    "one-reference-length", "little-redundancy", "determined-together", "hardly-determined", "undetermined",
+    "one-reference-length", "little-redundancy", "hardly-determined", "undetermined",
 )  # fmt: skip
 NEW, LENGTH = 20, 300.0  # lengths whose coverage is asked, mm
 

@@ -37,7 +37,7 @@ FINDINGS = {
 }
 # Those that only state how a capture is made.
 STATEMENTS = (
-    "one-reference-length", "little-redundancy", "determined-together", "hardly-determined", "undetermined",
+    "one-reference-length", "little-redundancy", "hardly-determined", "undetermined",
     "outside-limits",
 )  # fmt: skip
 POSE_SETS = 8

@@ -111,14 +111,11 @@ class BarPositions(NamedTuple):
     readings: tuple[int, ...]
 
     @property
-    def across(self) -> float:
-        """Mean square of the directions' components along the axis that they have least of; 1/3 for all directions."""
-        return float(np.linalg.eigvalsh(self.directions.T @ self.directions / len(self.directions))[0])
-
-    @property
     def in_all_directions(self) -> bool:
         """Whether the directions are not all in one plane or parallel, with a margin of about 10 degrees."""
-        return self.across >= _LEAST_ACROSS
+        # Mean square of their components along the axis that they have least of; 1/3 for all directions.
+        across = np.linalg.eigvalsh(self.directions.T @ self.directions / len(self.directions))[0]
+        return bool(across >= _LEAST_ACROSS)
 
     def spread(self, size: float) -> float:
         """RMS distance of the middles from their mean, relative to a size."""

@@ -99,12 +99,9 @@ class EvaluationRecord(NamedTuple):
 
     def acceptance(self) -> dict[str, list[AcceptanceTest]]:
         """The tests of ``standards``, and those with a limit, as far as the capture allows; of both arms."""
-        arms = self.arms() if self.standards or self.limits else {}
-        tests = {
-            stage: run(self.measured(arm.arm), self.limits, self.u_test, influences=self.influences, rule=self.rule)
-            for stage, arm in arms.items()
-        }
-        return {stage: _chosen(tests.get(stage, []), self.standards, self.limits) for stage in self.arms()}
+        if not (self.standards or self.limits):
+            return {stage: [] for stage in self.arms()}
+        return {stage: _tests(self, self.measured(arm.arm)) for stage, arm in self.arms().items()}
 
 
 class PointsRecord(NamedTuple):
@@ -126,15 +123,13 @@ class PointsRecord(NamedTuple):
 
     def acceptance(self) -> list[AcceptanceTest]:
         """The tests of ``standards``, and those with a limit, as far as the points allow."""
-        tests = run(self.measured, self.limits, self.u_test, influences=self.influences, rule=self.rule)
-        return _chosen(tests, self.standards, self.limits)
+        return _tests(self, self.measured)
 
 
-def _chosen(
-    tests: list[AcceptanceTest], standards: Collection[str], limits: Mapping[str, Limit | float]
-) -> list[AcceptanceTest]:
-    names = {STANDARDS[name] for name in standards if name in STANDARDS}
-    return [test for test in tests if test.standard in names or any(metric.name in limits for metric in test.metrics)]
+def _tests(record: EvaluationRecord | PointsRecord, measured: Measured) -> list[AcceptanceTest]:
+    tests = run(measured, record.limits, record.u_test, influences=record.influences, rule=record.rule)
+    wanted = {STANDARDS[name] for name in record.standards if name in STANDARDS}
+    return [test for test in tests if test.standard in wanted or {m.name for m in test.metrics} & record.limits.keys()]
 
 
 def evaluation_of(

@@ -23,10 +23,10 @@ def option(metavar: str | None, help: str, *names: str, default: Any = None, **l
     return typer.Option(default, *names, metavar=metavar, help=help, callback=_finite, **limits)
 
 
-def _finite(ctx: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
+def _finite(context: Any, parameter: Any, value: Any) -> Any:  # by their order, as Click passes them
     """Refuse numbers that are not finite, which limits do not."""
     if isinstance(value, float) and not math.isfinite(value):
-        raise InputError(f"{param.opts[0]} '{value}' is not a finite number; write plain decimal digits.")
+        raise InputError(f"{parameter.opts[0]} '{value}' is not a finite number; write plain decimal digits.")
     return value
 
 

@@ -10,7 +10,7 @@ from ..calibration.record import CalibrationRecord, Removed, record_of
 from ..calibration.results import Calibration, Identification
 from ..core.errors import InputError
 from ..core.units import DEG
-from ..data.capture import Capture, part_of
+from ..data.capture import Capture, names_in, part_of
 from ..data.observations.socket import Socket
 from .equations import PROBE, Equations, Rows
 from .findings import Case, Finding, case_of, chance_text
@@ -129,7 +129,7 @@ def _as_if(cause: Cause | None, group: str) -> str:
 
 def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
     """Kinds of groups, the largest ones first -> sockets and observations with their group of this kind."""
-    names = [*capture.names, *(observation.name for observation in capture.observations)]
+    names = names_in(capture)
     divisions: dict[str, dict[str, str | None]] = {}
     if capture.sessions:
         divisions["session"] = {name: capture.session_of(name) for name in names}
@@ -313,38 +313,27 @@ def remove_contradicting(
             break
         (suspect,) = clear[0].suspects
         capture = record.recording.capture
-        kept = tuple(
-            name
-            for name in (*capture.names, *(observation.name for observation in capture.observations))
-            if name not in suspect.members
-        )
+        kept = tuple(name for name in names_in(capture) if name not in suspect.members)
         try:
             rest = part_of(capture, kept)
             again = record_of(solve(rest), record.recording._replace(capture=rest), robust=record.robust)
         except InputError:  # what is left does not determine the arm, so nothing can be said without this group
             break
-        record = again._replace(
-            others=record.others, removed=(*record.removed, _removed(record, again, clear[0].kind, suspect))
+        changed = np.abs(again.vectors()["calibrated"] - record.vectors()["calibrated"])
+        u = np.sqrt(np.diag(record.covariance))
+        changes = np.where(u > 0, changed / np.where(u > 0, u, 1.0), 0.0)
+        worst, rows = int(np.argmax(changes)), case_of(again).equations.rows
+        removed = Removed(
+            kind=clear[0].kind,
+            group=suspect.group,
+            members=suspect.members,
+            ratio=suspect.test.ratio,
+            degrees_of_freedom=suspect.test.degrees_of_freedom,
+            probability=suspect.test.probability,
+            rms_with=suspect.rms_others[0],
+            rms_without=rms_of(rows, np.zeros(rows[0].shared.shape[2])),
+            changed_most=again.names[worst],
+            change=float(changes[worst]),
         )
+        record = again._replace(others=record.others, removed=(*record.removed, removed))
     return record
-
-
-def _removed(before: CalibrationRecord, after: CalibrationRecord, kind: str, suspect: Suspect) -> Removed:
-    equations = case_of(after).equations
-    changed = np.abs(after.vectors()["calibrated"] - before.vectors()["calibrated"])
-    u = np.sqrt(np.diag(before.covariance))
-    changes = np.where(u > 0, changed / np.where(u > 0, u, 1.0), 0.0)
-    worst = int(np.argmax(changes))
-    still = np.zeros(equations.rows[0].shared.shape[2])
-    return Removed(
-        kind=kind,
-        group=suspect.group,
-        members=suspect.members,
-        ratio=suspect.test.ratio,
-        degrees_of_freedom=suspect.test.degrees_of_freedom,
-        probability=suspect.test.probability,
-        rms_with=suspect.rms_others[0],
-        rms_without=rms_of(equations.rows, still),
-        changed_most=after.names[worst],
-        change=float(changes[worst]),
-    )

@@ -1,18 +1,34 @@
-"""What the data of a calibration determine, and what nothing checks: few equations, and a single reference length."""
+"""What the data of a calibration determine, and what nothing checks: parameters that are on a bound or hardly known,
+few equations, and a single reference length."""
+
+from collections.abc import Iterator
 
 import numpy as np
 
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
-from ..data.noise import tip_covariances
-from ..kinematics.chain import joint_motion
+from ..kinematics.near_degeneracy import SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds, Parameters
-from ..uncertainty.identifiability import Observability, observability
+from ..uncertainty.identifiability import Observability, observability, rms_of_noise
 from .findings import Case, Finding
+from .usability import is_anchored, many_on_bounds, on_bounds
 
-ORDER, NEEDS = 95, "fit"
+ORDER, NEEDS = 85, "fit"
 _TOGETHER = 1e-3  # part of an undetermined direction, from which a parameter belongs to it
+# Of those that the data hardly determine apart from others, and of the others, which wider bounds help.
+_ON_BOUNDS = {
+    "weak-on-bounds": (
+        "On a bound because the data hardly determine them: {names}.",
+        "The width of the bounds is part of their uncertainties.",
+        "Fix one parameter of each combination named below (--held), and do not widen the bounds.",
+    ),
+    "on-bounds": (
+        "On a bound: {names}.",
+        "Every uncertainty, that of k too, takes these values as exact.",
+        "Widen the bounds unless they are known limits.",
+    ),
+}
 
 
 def determined(case: Case) -> Observability:
@@ -21,72 +37,68 @@ def determined(case: Case) -> Observability:
     arm, capture = record.calibrated.arm, record.recording.capture
     space = Parameters(arm, record.names)
     geometry, noise = to_numpy((arm.geometry, record.noise))
-    covariances = tip_covariances(geometry, joint_motion(geometry, np.asarray(capture.readings)), noise)
-    sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
+    sigma = rms_of_noise(geometry, np.asarray(capture.readings), noise)
     known = () if record.prior is None else record.prior.known
     bounds = Bounds(space, record.lower, record.upper)
     return observability(arm, capture, space, sigma=sigma, bounds=bounds, known=known)
 
 
 def test(case: Case) -> list[Finding]:
-    """Little redundancy, undetermined combinations, and parameters that are hardly known."""
+    """Parameters on bounds, little redundancy, undetermined combinations, and parameters that are hardly known."""
     record, seen = case.record, case.once(determined)
-    findings = [] if record.recording.capture.observations else _redundancy(record)
+    traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
+    findings = [*_on_bounds(record, traded), *_redundancy(record)]
     findings += [Finding("undetermined", sentence) for sentence in seen.sentences()]
-    weak = [name for name, single in zip(record.names, record.determined, strict=True) if not single]
     # Named above are those that the same capture could not determine without noise either, and near-degenerate ones.
-    named = {record.names[i] for i in np.flatnonzero(np.abs(seen.null).max(axis=1, initial=0.0) > _TOGETHER)}
-    named |= {name for trade_off in seen.trade_offs for name in trade_off.names}
-    weak = [name for name in weak if name not in named]
-    if weak:
-        findings.append(
-            Finding(
-                "determined-together",
-                f"Strongly correlated, individually almost undetermined: {shorten(weak, 12)}.",
-                "Tip and length uncertainties remain valid.",
-                "Hold some of them constant (--held).",
-                concerns=tuple(weak),
-            )
-        )
-    u, width = np.sqrt(np.diag(record.covariance)), (record.upper - record.lower) / 2
-    most = np.where(np.isfinite(width), 0.5 * width, np.inf)
-    loose = [
-        name
-        for name, single, own_u, largest in zip(record.names, record.determined, u, most, strict=True)
-        if single and name not in named and own_u > largest
-    ]
-    if loose:
+    open_parts = np.flatnonzero(np.abs(seen.null).max(axis=1, initial=0.0) > _TOGETHER)
+    named = traded | {record.names[i] for i in open_parts}
+    half_width = (record.upper - record.lower) / 2
+    most = np.where(np.isfinite(half_width), SHARE_OF_BOUNDS * half_width, np.inf)
+    loose = ~np.asarray(record.determined) | (np.sqrt(np.diag(record.covariance)) > most)
+    names = [name for name, is_loose in zip(record.names, loose, strict=True) if is_loose and name not in named]
+    if names:
         findings.append(
             Finding(
                 "hardly-determined",
-                f"Hardly determined, with a standard uncertainty over half of what the bounds allow: {shorten(loose)}.",
-                advice="Fix some (--held), or record poses that separate them.",
-                concerns=tuple(loose),
+                "Hardly determined one by one, as they are strongly correlated or have a standard uncertainty over "
+                f"half of what the bounds allow: {shorten(names, 12)}.",
+                "Tip and length uncertainties remain valid.",
+                "Fix some (--held), or record poses that separate them.",
+                concerns=tuple(names),
             )
         )
     return findings
 
 
-def _redundancy(record: CalibrationRecord) -> list[Finding]:
-    capture, unknown, findings = record.recording.capture, len(record.names) - 1, []
+def _on_bounds(record: CalibrationRecord, traded: set[str]) -> Iterator[Finding]:
+    # Without an anchor all lengths slide to bounds in stage 1, which the scale fix undoes.
+    sides = on_bounds(record, final=True) | (on_bounds(record) if is_anchored(record) else {})
+    if many_on_bounds(record):
+        return
+    for code, (says, costs, advice) in _ON_BOUNDS.items():
+        names = [name for name in sides if (name in traded) == (code == "weak-on-bounds")]
+        says = says.format(names=shorten([f"{name} ({sides[name]})" for name in names]))
+        doubt = f"on a bound: {shorten(sorted(names), 3)}"
+        if names:
+            yield Finding(code, says, costs, advice, severity="doubt", doubt=doubt, concerns=tuple(names))
+
+
+def _redundancy(record: CalibrationRecord) -> Iterator[Finding]:
+    capture, unknown = record.recording.capture, len(record.names) - 1
+    if capture.observations:
+        return
     redundancy = 3 * sum(size - 1 for size in capture.sizes) - unknown
     if redundancy < unknown / 2:
-        findings.append(
-            Finding(
-                "little-redundancy",
-                f"Only {redundancy} more equations than unknowns, which makes the residuals small whatever the errors "
-                "are.",
-                advice="Record more poses.",
-            )
+        yield Finding(
+            "little-redundancy",
+            f"Only {redundancy} more equations than unknowns, which makes the residuals small whatever the errors are.",
+            advice="Record more poses.",
         )
     if len(capture.lengths) == 1 and record.method != REPEATABILITY and not record.scale_set_by:
         (length,) = capture.lengths
-        findings.append(
-            Finding(
-                "one-reference-length",
-                "With a single reference length its residual is zero by construction.",
-                advice="Hold a second one out as a check.",
-                concerns=(f"{length.start} - {length.end}",),
-            )
+        yield Finding(
+            "one-reference-length",
+            "With a single reference length its residual is zero by construction.",
+            advice="Hold a second one out as a check.",
+            concerns=(f"{length.start} - {length.end}",),
         )
-    return findings

@@ -32,6 +32,13 @@ class GroupTest(NamedTuple):
     variance: float  # of the others without it, in units of what was expected
     step: Float[np.ndarray, " p"]  # from the given parameters to those of the others alone
 
+    @classmethod
+    def of(cls, group: Hashable, added: int, gain: float, cost: float, freedom: int, step: np.ndarray) -> "GroupTest":
+        """By the sum of squares that ``added`` equations or unknowns account for, and that of the rest."""
+        variance = max(cost / freedom, 1e-300)
+        ratio = max(gain, 0.0) / added / variance
+        return cls(group, ratio, (added, freedom), f_tail(ratio, added, freedom), variance, step)
+
 
 class Block(NamedTuple):
     """Equations of one fixture and one group: residuals in standard deviations, and their derivatives.
@@ -152,11 +159,8 @@ def different_groups(blocks: Sequence[Block]) -> list[GroupTest]:
         again = sum(block.residual.size for block in blocks if block.group is None)
         added = whole.degrees_of_freedom + again - freedom
         if added > 0 and min(own.degrees_of_freedom, others.degrees_of_freedom) > 0:
-            variance = max((own.cost + others.cost) / freedom, 1e-300)
-            ratio = max(whole.cost - own.cost - others.cost, 0.0) / added / variance
-            tests.append(
-                GroupTest(group, ratio, (added, freedom), f_tail(ratio, added, freedom), variance, others.step)
-            )
+            apart = own.cost + others.cost
+            tests.append(GroupTest.of(group, added, whole.cost - apart, apart, freedom, others.step))
     return sorted(tests, key=lambda test: -test.ratio)
 
 
@@ -207,8 +211,6 @@ class _Parts(NamedTuple):
             others = Fit.of(rest, diagonal)
             added, freedom = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom
             if added > 0 and freedom > 0:
-                variance = max(others.cost / freedom, 1e-300)
-                ratio = max(everything.cost - others.cost, 0.0) / added / variance
-                probability = f_tail(ratio, added, freedom)
-                tests.append(GroupTest(group, ratio, (added, freedom), probability, variance, others.step))
+                gain = everything.cost - others.cost
+                tests.append(GroupTest.of(group, added, gain, others.cost, freedom, others.step))
         return tests

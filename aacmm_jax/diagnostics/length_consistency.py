@@ -163,7 +163,7 @@ def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations:
     # What a prior says counts as the poses do: lengths are compared with all else.
     poses, (related,), scale = [part.block("") for part in rows], lengths, None
     poses += [block for block in relations if block.fixture == PRIOR]
-    measured = any(one.fixes_scale and not one.certified for one in capture.observations)
+    measured = any(o.fixes_scale and not o.certified for o in capture.observations)
     if anchor is not None and (record.hold is None or lengths_in_solve(record)) and not measured:
         column = record.names.index(anchor)
         scale = np.concatenate([block.shared[:, column] for block in poses]), related.shared[:, column]

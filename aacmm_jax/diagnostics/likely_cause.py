@@ -86,7 +86,7 @@ class _Misfit(NamedTuple):
         if not scattering:
             return None
         chosen = [scattering[i] for i in _evenly(len(scattering), _OBSERVATIONS)]
-        part = [one.select(_evenly(one.q.shape[0], _POSES)) for one in chosen]
+        part = [observation.select(_evenly(observation.q.shape[0], _POSES)) for observation in chosen]
         # Without the arm: its readings may be in any unit.
         observed = Observed.of(Capture({}, (), part), None)
         return cls(arm, observed.moved(arm, np.asarray(observed.q)))

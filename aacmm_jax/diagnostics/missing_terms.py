@@ -81,7 +81,17 @@ def missing(case: Case) -> "tuple[FoundTerm, ...]":
 
 def explained(case: Case) -> tuple[list[Rows], list[Block]]:
     """The equations of a calibration, with these terms as further unknowns."""
-    return with_terms(*case.chunks, case.once(missing), case.record.calibrated.arm.joints)
+    (rows, relations), terms = case.chunks, case.once(missing)
+    if not terms:
+        return rows, relations
+    joints = case.record.calibrated.arm.joints
+    columns = np.concatenate(columns_of([term.term for term in terms], rows, joints), axis=1)
+    parts = np.split(columns, np.cumsum([part.residual.size for part in rows])[:-1])
+    extended = [
+        part._replace(shared=np.concatenate([part.shared, added.reshape(*part.residual.shape, -1)], axis=2))
+        for part, added in zip(rows, parts, strict=True)
+    ]
+    return extended, wider(relations, columns.shape[1])
 
 
 def _words(name: str) -> tuple[str, str]:
@@ -228,21 +238,6 @@ def found_terms(
         )
         for (i, test, probability, others), coefficient in zip(chosen, coefficients, strict=True)
     )
-
-
-def with_terms(
-    rows: Sequence[Rows], relations: Sequence[Block], terms: Sequence[FoundTerm], joints: int
-) -> tuple[list[Rows], list[Block]]:
-    """The equations with these terms as further unknowns."""
-    if not terms:
-        return list(rows), list(relations)
-    columns = np.concatenate(columns_of([term.term for term in terms], rows, joints), axis=1)
-    parts = np.split(columns, np.cumsum([part.residual.size for part in rows])[:-1])
-    extended = [
-        part._replace(shared=np.concatenate([part.shared, added.reshape(*part.residual.shape, -1)], axis=2))
-        for part, added in zip(rows, parts, strict=True)
-    ]
-    return extended, wider(relations, columns.shape[1])
 
 
 def _criterion(left: Residuals, test: ScoreTest) -> float:

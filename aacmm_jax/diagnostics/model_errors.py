@@ -19,7 +19,6 @@ from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..uncertainty.shared_kinds import SUCCESSIVE, VISITS
-from .equations import equations_of, in_chunks
 from .findings import Case, Finding, case_of, chance_text
 from .length_consistency import Lengths, lengths_of
 from .missing_terms import FoundTerm, explained, missing
@@ -62,7 +61,20 @@ def test(case: Case) -> list[Finding]:
     findings = [] if misfit is None or misfit.probability >= LEVEL else [_misfit(misfit)]
     successive = case.once(successive_of)
     if successive is not None and successive.probability < LEVEL:
-        findings.append(_successive(successive, case.record))
+        shared = set() if case.record.shared is None else set(case.record.shared.kinds)
+        findings.append(
+            Finding(
+                "successive-poses",
+                f"Residuals of successive poses are autocorrelated (correlation {successive.correlation:.2f}, "
+                f"{chance_text(successive.probability)}): a seat that shifts at each visit, or errors that the model "
+                "lacks.",
+                "The stated uncertainties include what they share, as estimated from the residuals."
+                if shared & {VISITS, SUCCESSIVE}
+                else "Such poses count as independent, so every stated uncertainty is too small.",
+                severity="doubt",
+                probability=successive.probability,
+            )
+        )
     noisy = case.once(noisy_observations)
     if noisy:
         texts = [f"{part.name} ({math.sqrt(max(part.test.ratio, 0)):.2g} times)" for part in noisy]
@@ -77,20 +89,6 @@ def test(case: Case) -> list[Finding]:
             )
         )
     return findings
-
-
-def _successive(successive: Successive, record: CalibrationRecord) -> Finding:
-    shared = set() if record.shared is None else set(record.shared.kinds)
-    return Finding(
-        "successive-poses",
-        f"Residuals of successive poses are autocorrelated (correlation {successive.correlation:.2f}, "
-        f"{chance_text(successive.probability)}): a seat that shifts at each visit, or errors that the model lacks.",
-        "The stated uncertainties include what they share, as estimated from the residuals."
-        if shared & {VISITS, SUCCESSIVE}
-        else "Such poses count as independent, so every stated uncertainty is too small.",
-        severity="doubt",
-        probability=successive.probability,
-    )
 
 
 def _misfit(misfit: Misfit) -> Finding:
@@ -127,8 +125,7 @@ def misfit_of(case: Case) -> Misfit | None:
     usual = case.usual
     if usual is None:
         return None
-    rows, relations = in_chunks(equations_of(case.record._replace(noise=usual.noise)))
-    left = Residuals.of([*(part.block("") for part in rows), *relations])
+    left = Case(case.record._replace(noise=usual.noise)).left
     freedom, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
     probability = f_tail(ratio, freedom, CLASS_DEGREES_OF_FREEDOM)
     return Misfit(float(np.sqrt(ratio)), freedom, probability, usual.source or usual.arm_class)

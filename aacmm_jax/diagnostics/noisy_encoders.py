@@ -261,19 +261,6 @@ def _noisiest(record: CalibrationRecord, equations: _Equations) -> tuple[NoisyJo
     return equations.noisiest(joints), equations
 
 
-def _noisy_within_observations(equations: _Equations, joint: int) -> bool:
-    """Whether a joint (from 1) is noisy even where its zero may differ from one observation to the next.
-
-    A zero that is off in some of them, as after a slip, moves all of their poses alike: these contradict the others,
-    and that is what has to be said.
-    """
-    rows = [
-        part._replace(own=np.concatenate([part.own, part.extra[..., [joint - 1]]], axis=2)) for part in equations.rows
-    ]
-    noisiest = equations._replace(rows=rows).noisiest([joint - 1])
-    return noisiest is not None and noisiest.probability < LEVEL
-
-
 def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     """The noise of a calibration with that of noisy encoders as the residuals show it; None where there are none.
 
@@ -287,7 +274,14 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     given, joints = record.given_noise is not None, len(equations.unit)
     noisy, probabilities, u = [], [], np.zeros(0)
     noisiest, now = _noisiest(record, equations)
-    if noisiest is None or noisiest.probability >= LEVEL or not _noisy_within_observations(now, noisiest.joint):
+    if noisiest is None or noisiest.probability >= LEVEL:
+        return None
+    # A zero that is off in some observations, as after a slip, moves all of their poses alike: these contradict the
+    # others, and that is what has to be said. So the joint must be noisy where its zero may differ between them.
+    j = noisiest.joint - 1
+    loose = [part._replace(own=np.concatenate([part.own, part.extra[..., [j]]], axis=2)) for part in now.rows]
+    within = now._replace(rows=loose).noisiest([j])
+    if within is None or within.probability >= LEVEL:
         return None
     while noisiest is not None and noisiest.probability < LEVEL and len(noisy) < joints - 1:
         noisy.append(noisiest.joint - 1)

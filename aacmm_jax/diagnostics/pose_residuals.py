@@ -10,7 +10,6 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
-from ..uncertainty.linearisation import ObservationRows
 from .equations import equations_of, linearisation_of
 
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
@@ -44,28 +43,27 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
     Returns:
         One for each observation.
     """
-    linear = linearisation_of(record, record.names, noise=record.given_noise)
-    return tuple(_residuals(part) for part in linear.parts())
-
-
-def _residuals(part: ObservationRows) -> ObservationResiduals:
-    values = np.asarray(part.values)
-    moved = np.asarray(part.by_readings)[:_POSITION_ROWS]
-    lever = np.linalg.norm(moved, axis=0)
-    white = np.einsum("mab,bm->am", part.root, values)
-    variances = np.diagonal(np.asarray(part.measured), axis1=1, axis2=2)
-    turned = values.shape[0] > _POSITION_ROWS
-    return ObservationResiduals(
-        observation=part.observation,
-        distance=np.linalg.norm(values[:_POSITION_ROWS], axis=0),
-        angle=np.linalg.norm(values[_POSITION_ROWS:], axis=0) if turned else None,
-        normalised=np.sqrt(np.mean(white**2, axis=0)),
-        weight=np.asarray(part.weight),
-        u=float(np.sqrt(np.mean(variances[:, :_POSITION_ROWS]))),
-        u_angle=float(np.sqrt(np.mean(variances[:, _POSITION_ROWS:]))) if turned else None,
-        by_joint=-np.einsum("rm,rnm->nm", values[:_POSITION_ROWS], moved) / np.maximum(lever, _LEAST_LEVER) ** 2,
-        lever=lever,
-    )
+    residuals = []
+    for part in linearisation_of(record, record.names, noise=record.given_noise).parts():
+        values, moved = np.asarray(part.values), np.asarray(part.by_readings)[:_POSITION_ROWS]
+        position, angles = values[:_POSITION_ROWS], values[_POSITION_ROWS:]
+        lever = np.linalg.norm(moved, axis=0)
+        white = np.einsum("mab,bm->am", part.root, values)
+        variances = np.diagonal(np.asarray(part.measured), axis1=1, axis2=2)
+        residuals.append(
+            ObservationResiduals(
+                observation=part.observation,
+                distance=np.linalg.norm(position, axis=0),
+                angle=np.linalg.norm(angles, axis=0) if len(angles) else None,
+                normalised=np.sqrt(np.mean(white**2, axis=0)),
+                weight=np.asarray(part.weight),
+                u=float(np.sqrt(np.mean(variances[:, :_POSITION_ROWS]))),
+                u_angle=float(np.sqrt(np.mean(variances[:, _POSITION_ROWS:]))) if len(angles) else None,
+                by_joint=-np.einsum("rm,rnm->nm", position, moved) / np.maximum(lever, _LEAST_LEVER) ** 2,
+                lever=lever,
+            )
+        )
+    return tuple(residuals)
 
 
 def distances_of(capture: Capture, evaluation: Evaluation) -> tuple[Float[np.ndarray, " m"], ...]:

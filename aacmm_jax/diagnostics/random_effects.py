@@ -154,22 +154,11 @@ def group_deviations(
     return np.exp(0.5 * logs), 2 / np.where(spread > 0, spread, 1e-9)
 
 
-class Moments(NamedTuple):
-    """Second moments about 0 of the coefficients of an effect, and their derivatives by log variances of groups."""
-
-    matrix: Float[np.ndarray, "k k"]
-    by_group: Float[np.ndarray, "g k k"]
-
-    def in_units(self, steps: Float[np.ndarray, " k"]) -> "Moments":
-        """Of coefficients in units of their own, of those in ``steps``."""
-        both = steps[:, None] * steps
-        return Moments(self.matrix * both, self.by_group * both)
-
-
 def second_moments(
     effects: Effects, columns: Float[np.ndarray, "R k"], sd: Float[np.ndarray, " g"], members: Float[np.ndarray, "g k"]
-) -> Moments:
-    """Second moments of the coefficients of groups, given the residuals and the groups' standard deviations.
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "g k k"]]:
+    """Second moments about 0 of the coefficients of groups, given the residuals and the groups' standard deviations;
+    and their derivatives by the groups' log variances.
 
     A calibration without the effect has the error that these coefficients make, whose mean square is this.
     """
@@ -180,8 +169,8 @@ def second_moments(
     mean = covariance @ effects.product(columns, r) / variance
     grown = [covariance @ (weight[:, None] * covariance) for weight in weights]
     moved = [covariance @ (weight[:, None] * mean) for weight in weights]
-    by_group = [one + step @ mean.T + mean @ step.T for one, step in zip(grown, moved, strict=True)]
-    return Moments(covariance + mean @ mean.T, np.array(by_group))
+    by_group = [spread + step @ mean.T + mean @ step.T for spread, step in zip(grown, moved, strict=True)]
+    return covariance + mean @ mean.T, np.array(by_group)
 
 
 class SharedProblem(NamedTuple):

@@ -78,32 +78,26 @@ def _outside_limits(recording: Recording) -> Iterator[Finding]:
 
 def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     """Of standard uncertainties that nothing which measures arms has: most likely of another unit than mm."""
-    small, large = [], []
-    for where, values in _uncertainties(capture):
-        positive = values[values > 0]
-        if len(positive) and positive.min() < _SMALLEST_U:
-            small.append(f"{where} (u = {positive.min() / UM:.3g} um)")
-        if len(positive) and positive.max() > _LARGEST_U:
-            large.append(f"{where} (u = {positive.max() / UM:,.0f} um)")
-    findings = []
-    for code, texts, says, unit in (
-        ("small-u", small, "u < 0.1 um is implausibly small", "m"),
-        ("large-u", large, "u > 1 mm is implausibly large", "um"),
-    ):
-        if texts:
-            advice = f"u is in mm; was it given in {unit}?"
-            findings.append(Finding(code, f"{says}: {shorten(texts)}.", advice=advice, concerns=tuple(texts)))
-    return findings
-
-
-def _uncertainties(capture: Capture) -> Iterator[tuple[str, np.ndarray]]:
-    """What has standard uncertainties of lengths or coordinates, by its table in a manifest, and these, mm."""
-    for length in capture.lengths:
-        yield f"[[length]] {length.start} - {length.end}", np.atleast_1d(np.asarray(length.u, dtype=float))
+    stated = [(f"[[length]] {length.start} - {length.end}", length.u) for length in capture.lengths]
     for observation in capture.observations:
         stored = observation.stored()
-        values = stored.get("u")
+        u = stored.get("u")
         if stored.get("covariance") is not None:
-            values = np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1))
-        if values is not None:
-            yield f"[[{observation.table}]] {observation.name}", np.atleast_1d(np.asarray(values, dtype=float)).ravel()
+            u = np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1))
+        if u is not None:
+            stated.append((f"[[{observation.table}]] {observation.name}", u))
+    positive = [(where, values[values > 0]) for where, u in stated for values in [np.asarray(u, dtype=float).ravel()]]
+    least = [(where, values.min() / UM) for where, values in positive if len(values) and values.min() < _SMALLEST_U]
+    most = [(where, values.max() / UM) for where, values in positive if len(values) and values.max() > _LARGEST_U]
+    small = [f"{where} (u = {u:.3g} um)" for where, u in least]
+    large = [f"{where} (u = {u:,.0f} um)" for where, u in most]
+    return [
+        Finding(
+            code, f"{says}: {shorten(texts)}.", advice=f"u is in mm; was it given in {unit}?", concerns=tuple(texts)
+        )
+        for code, texts, says, unit in (
+            ("small-u", small, "u < 0.1 um is implausibly small", "m"),
+            ("large-u", large, "u > 1 mm is implausibly large", "um"),
+        )
+        if texts
+    ]

@@ -8,7 +8,7 @@ where three lengths or more compare them, as far as these leave them possible. A
 weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,7 +16,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.record import CalibrationRecord
 from ..calibration.redrawn import functions_of, places_of
 from ..calibration.results import Calibration
 from ..calibration.stages import Sensitivities
@@ -35,7 +34,6 @@ from .findings import Case
 from .random_effects import (
     NULL,
     Effects,
-    Moments,
     OneVariance,
     SharedProblem,
     group_deviations,
@@ -101,7 +99,10 @@ def _addition(
 ) -> tuple[SharedErrors, Float[np.ndarray, "p p"], float] | None:
     """The errors that were found, what they add, and the variance of independent errors, over that of all."""
     record, (rows, relations) = case.record, case.chunks
-    rows = _trusted(record, rows)
+    # What is left of poses that lost most of their weight to a robust loss is no noise.
+    weights = np.concatenate([np.asarray(part) for part in record.observed.weights])
+    trusted = [part.at(weights[part.poses] > _TRUSTED) for part in rows]
+    rows = [part for part in trusted if len(part.poses)]
     if not rows or residual_rms(rows) < EXACT:
         return None
     prior = [block for block in relations if block.fixture == PRIOR]
@@ -135,13 +136,6 @@ def _addition(
     return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
 
 
-def _trusted(record: CalibrationRecord, rows: Sequence[Rows]) -> list[Rows]:
-    """Without poses that lost most of their weight to a robust loss: what is left of their errors is no noise."""
-    weights = np.concatenate([np.asarray(part) for part in record.observed.weights])
-    trusted = [part.at(weights[part.poses] > _TRUSTED) for part in rows]
-    return [part for part in trusted if len(part.poses)]
-
-
 def _summed(
     problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions | None", without: Effects, every: Effects
 ) -> tuple[SharedErrors, Float[np.ndarray, "p p"], float]:
@@ -156,11 +150,12 @@ def _summed(
     law = Law(
         np.full(len(laws), np.inf), np.array([law.ratios for law in laws]), np.array([law.weights for law in laws])
     )
-    follow, moments, names = np.zeros((p, 0)), Moments(np.zeros((0, 0)), np.zeros((0, 0, 0))), ()
+    follow, moments, by_group, names = np.zeros((p, 0)), np.zeros((0, 0)), np.zeros((0, 0, 0)), ()
     if functions is not None:
         names, follow, steps = functions.names, functions.follow, functions.steps
-        moments = second_moments(without, problem.turned(*functions.turned), functions.sd, functions.members)
-        moments = moments.in_units(steps)
+        columns = problem.turned(*functions.turned)
+        moments, by_group = second_moments(without, columns, functions.sd, functions.members)
+        moments, by_group = (part * steps[:, None] * steps for part in (moments, by_group))
         kinds, units = [*kinds, *functions.kinds], [*units, *functions.units]
         sds += [sd * steps[np.argmax(group)] for sd, group in zip(functions.sd, functions.members, strict=True)]
         of_functions = Law.of(functions.degrees_of_freedom)
@@ -171,14 +166,14 @@ def _summed(
         units=tuple(units),
         names=names,
         sd=np.array(sds),
-        moments=moments.matrix,
+        moments=moments,
         follow=follow,
         correlation_length=np.asarray(lengths[0] if lengths else np.nan),
         added=added,
-        by_group=moments.by_group,
+        by_group=by_group,
         law=law,
     )
-    return shared, added.sum(axis=0) + follow @ moments.matrix @ follow.T, every.variance
+    return shared, added.sum(axis=0) + follow @ moments @ follow.T, every.variance
 
 
 class _Tips(NamedTuple):

@@ -23,7 +23,24 @@ def test(case: Case) -> list[Finding]:
     if not record.converged and (record.plausible_scale or not record.reason.startswith("Converged")):
         findings.append(Finding("not-converged", record.reason, severity="unusable"))
     if record.implausible_residual:
-        findings.append(_implausible(case))
+        if record.recording.capture.observations:
+            worst = int(np.argmax(record.observed.rms_after))
+            names, rms = (record.observed.names[worst],), record.observed.rms_after[worst]
+            subject = f"Poses of {names[0]} are {rms:.3g} mm RMS from their geometry"
+        else:
+            names, rms = (), float(record.evaluations()["calibrated"].repeatability.rms)
+            subject = f"The poses of a socket disagree by {rms:.3g} mm RMS"
+        findings.append(
+            Finding(
+                "implausible-residuals",
+                f"{subject}, more than the {record.largest_plausible_residual:.2g} mm that are plausible for this arm, "
+                "so data and arm do not belong together.",
+                advice=f"Check columns, units, signs, sockets and the arm. {case.once(cause_or_check)}",
+                severity="unusable",
+                doubt="data and arm do not belong together",
+                concerns=names,
+            )
+        )
     elif record.plausible_scale and many_on_bounds(record):
         sides = on_bounds(record)
         findings.append(
@@ -37,29 +54,6 @@ def test(case: Case) -> list[Finding]:
             )
         )
     return findings
-
-
-def _implausible(case: Case) -> Finding:
-    """The solve ended at a minimum, but of data that do not belong to this arm."""
-    record = case.record
-    most = f"more than the {record.largest_plausible_residual:.2g} mm that are plausible for this arm"
-    if record.recording.capture.observations:
-        worst = int(np.argmax(record.observed.rms_after))
-        names, rms = (record.observed.names[worst],), record.observed.rms_after[worst]
-        subject = f"Poses of {names[0]} are {rms:.3g} mm RMS from their geometry"
-        check = "Check columns, units, signs and the arm."
-    else:
-        names, rms = (), float(record.evaluations()["calibrated"].repeatability.rms)
-        subject = f"The poses of a socket disagree by {rms:.3g} mm RMS"
-        check = "Check the files, their columns and unit, the sockets and the arm."
-    return Finding(
-        "implausible-residuals",
-        f"{subject}, {most}, so data and arm do not belong together.",
-        advice=f"{check} {case.once(cause_or_check)}",
-        severity="unusable",
-        doubt="data and arm do not belong together",
-        concerns=names,
-    )
 
 
 def cause_or_check(case: Case) -> str:

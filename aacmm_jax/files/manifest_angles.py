@@ -14,7 +14,7 @@ from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import check_revolutions
 from ..kinematics.arm import Arm, by_joint
-from .manifest_tables import Picked, Wanted, as_list
+from .manifest_tables import Picked, Wanted, as_list, checked_unit
 from .table_columns import TEMPERATURE, reading_columns
 from .text_table import TextTable
 from .toml import Strict
@@ -143,32 +143,24 @@ class Readings:
             raise InputError(
                 f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'
             )
-        unit = unit or angular or wanted.usual_unit
+        known = (*ANGLE_UNITS, "counts") if angles is not None and angles.unit == "counts" else ANGLE_UNITS
+        unit = checked_unit(text.path, "readings", angular, unit, wanted.usual_unit, known)
         if unit is None:
             raise InputError(
                 "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" "
                 'or "rad", or state it in the header of the table, as J1 [deg].'
             )
-        if unit not in ANGLE_UNITS and (angles is None or unit != angles.unit):  # which may be counts
-            raise InputError(f"units.q is '{unit}'; it must be one of {', '.join(ANGLE_UNITS)}.")
         stated = {} if angles is None else angles.model_dump(exclude_unset=True)
         if angles is None or unit != angles.unit:
-            stated = {key: value for key, value in stated.items() if key != "counts_per_turn"}
-        if angular is not None and angular != unit:
-            raise _contradiction(text, "readings", angular, unit)
-        if linear is not None and linear != stated.setdefault("linear_unit", linear):
-            raise _contradiction(text, "prismatic joints", linear, stated["linear_unit"])
+            stated.pop("counts_per_turn", None)
+        if linear is not None:
+            units = (*LENGTH_UNITS, "counts")
+            checked_unit(text.path, "prismatic joints", linear, stated.setdefault("linear_unit", linear), None, units)
         if linear == "counts" and "counts_per_mm" not in stated:
             raise InputError(
                 f'{text.path} has readings in counts; add linear_unit = "counts" and counts_per_mm = [...].'
             )
         return Angles(**{**stated, "unit": unit})
-
-
-def _contradiction(text: TextTable, what: str, header: str, stated: str) -> InputError:
-    return InputError(
-        f"{text.path}: the header of the {what} says {header}, but the manifest {stated}; correct one of them."
-    )
 
 
 def with_temperature(

@@ -16,7 +16,7 @@ from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
 from .inputs import InputFile
-from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, Wanted, as_list
+from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, Wanted, as_list, checked_unit
 from .patterns import check_name, fields_of, fill
 from .text_lines import Column
 from .text_table import TextTable
@@ -218,21 +218,12 @@ class _Reader:
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
         units = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
-        unit = self._table.units.get(entry.name)
-        if unit is not None and header is not None and unit != header:
-            raise InputError(
-                f"{self._where}: units.{entry.name} is '{unit}', but the header of its columns says {header}; correct "
-                "one of them."
-            )
+        name, usual = entry.name, self._preset.units.get(entry.name)
+        unit = checked_unit(self._where, name, header, self._table.units.get(name), usual, units)
+        if unit is None and entry.unit == "1":
+            raise InputError(f"{self._where} has angles without a unit; give units = {{ {name} = 'deg' }}.")
         if unit is None:
-            unit = header or self._preset.units.get(entry.name)
-        if unit is None:
-            if entry.unit == "1":
-                raise InputError(f"{self._where} has angles without a unit; give units = {{ {entry.name} = 'deg' }}.")
             return 1.0
-        if unit not in units:
-            what = f"units.{entry.name} is" if unit != header else f"the header of {entry.name} says"
-            raise InputError(f"{self._where}: {what} '{unit}'; it must be one of {', '.join(units)}.")
         return units[unit] ** (2 if entry.unit == "mm^2" else 1)
 
     def _rotations(self, entry: Entry, numbers: np.ndarray, header: str | None) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The tables of a manifest that name files: one a kind, made of what the kind declares."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import (
@@ -15,6 +15,8 @@ from pydantic import (
     model_validator,
 )
 
+from ..core.errors import InputError
+from ..core.text import quoted
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
 from ..data.observations.socket import Socket
@@ -180,3 +182,19 @@ class Wanted(NamedTuple):
     usual_unit: str | None  # of the preset, where neither the manifest nor the header states one
     taken: Sequence[int]  # columns, from 0, that hold something else
     temperature: float | None
+
+
+def checked_unit(
+    where: object, what: str, header: str | None, stated: str | None, usual: str | None, units: Iterable[str]
+) -> str | None:
+    """The unit that the manifest states, or the header, or the preset. Raises `InputError` where the first two differ,
+    or it is none of ``units``."""
+    if header is not None and stated not in (None, header):
+        raise InputError(
+            f"{where}: the header of the {what} says {quoted(header)[1:-1]}, but the manifest {stated}; correct one of "
+            "them."
+        )
+    unit = stated or header or usual
+    if unit is not None and unit not in units:
+        raise InputError(f"{where}: the {what} are in {quoted(unit)}; give one of {', '.join(units)}.")
+    return unit

@@ -6,13 +6,12 @@ import numpy as np
 
 from ..acceptance.results import Measured
 from ..core.errors import InputError, naming, nearest
-from ..core.text import quoted
 from ..core.units import LENGTH_UNITS
 from ..kinematics.workspace import Reach
 from .inputs import InputFile, InputFiles
 from .manifest import PointsManifest, read_recorded
 from .manifest_observations import Source
-from .manifest_tables import Wanted, as_list
+from .manifest_tables import Wanted, as_list, checked_unit
 from .outputs import as_path
 from .table_columns import LINE, position_columns, proposed_columns
 from .text_lines import TABLE_SHARE
@@ -100,14 +99,7 @@ def _points(text: TextTable, wanted: Wanted, model: PointsManifest) -> np.ndarra
             "three."
         )
     header = text.unit(picked, key="points") if named is None else named[1]
-    stated = wanted.unit or model.points.unit or header or wanted.usual_unit
-    if stated is None:
+    unit = checked_unit(text.path, "points", header, wanted.unit or model.points.unit, wanted.usual_unit, LENGTH_UNITS)
+    if unit is None:
         raise InputError(f'{text.path} does not say the unit of its points; add unit = "mm" to [points].')
-    if header not in (None, stated):
-        raise InputError(
-            f"{text.path}: the header of the points says {quoted(header)[1:-1]}, but the manifest {stated}; correct "
-            "one of them."
-        )
-    if stated not in LENGTH_UNITS:
-        raise InputError(f"{text.path}: points are in {quoted(stated)}; give one of {', '.join(LENGTH_UNITS)}.")
-    return text.numbers(picked, measured=True, stated=columns is not None) * LENGTH_UNITS[stated]
+    return text.numbers(picked, measured=True, stated=columns is not None) * LENGTH_UNITS[unit]

@@ -201,11 +201,9 @@ class TextTable:
                 "out if it is a comment, else write its first cell without #."
             )
         self._check_end(picked)
-        if measured:
-            self._check_first(picked)
         table = np.stack([self._column(i) for i in picked], axis=1)
-        if measured and not stated:
-            self._check_twice(picked, table)
+        if measured:
+            self._check_measured(picked, table, stated)
         return table
 
     def _column(self, index: int) -> np.ndarray:
@@ -250,16 +248,22 @@ class TextTable:
         self._hashes = self._hashes or index == 0  # "#2" is a text
         return np.array([row[index].strip(" \t").strip("\"'") for row in self._rows])
 
-    def _check_first(self, picked: Sequence[int]) -> None:
-        """Refuse numbers of columns as the first row."""
+    def _check_measured(self, picked: Sequence[int], table: np.ndarray, stated: bool) -> None:
+        """Refuse numbers of columns as the first row, and a column that is there twice."""
         cells = [self._rows[0][i].strip(" \t") for i in picked]
         count = len(cells)
         if count > 1 and any(sorted(cells) == sorted(map(str, range(i, i + count))) for i in (0, 1)):
-            order = ", ".join(str(i + 1) for i in sorted(picked, key=lambda i: int(self._rows[0][i])))
+            order = ", ".join(str(picked[i] + 1) for i in np.argsort(table[0]))
             raise InputError(
                 f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; add "
                 f"skip = {self._lines[0]} and columns = [{order}], or write it with decimal points if it was measured."
             )
+        for (i, one), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
+            if not stated and self.length >= _FEW and np.ptp(one) > 0 and np.array_equal(one, other):
+                raise InputError(
+                    f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
+                    f"columns = [{', '.join(str(column + 1) for column in picked)}] if these are right."
+                )
 
     def _check_end(self, picked: Sequence[int]) -> None:
         """Refuse a last number with fewer decimals than all others of its column, in a file without a last line's end,
@@ -271,14 +275,3 @@ class TextTable:
                 "than all above it and no end of the line after it, so the file may be cut; copy it again, or end that "
                 "line if it is complete."
             )
-
-    def _check_twice(self, picked: Sequence[int], table: np.ndarray) -> None:
-        """Refuse a column that is there twice."""
-        if self.length < _FEW:
-            return
-        for (i, one), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
-            if np.ptp(one) > 0 and np.array_equal(one, other):
-                raise InputError(
-                    f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
-                    f"columns = [{', '.join(str(column + 1) for column in picked)}] if these are right."
-                )

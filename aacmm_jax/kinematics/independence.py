@@ -206,8 +206,8 @@ def _independent(arm: Arm, order: list[str], rows: Float[np.ndarray, "r p"]) -> 
 def _order(arm: Arm, parallel: list[int]) -> list[str]:
     n = arm.joints
     values = {kind: np.asarray(getattr(arm, kind)) for kind in ("a", "d")}
-    lengths = [(f"{kind}_{i}", values[kind][i - 1]) for i in range(1, n) for kind in ("a", "d")]
-    lengths = [(name, value) for name, value in lengths if not (name[0] == "d" and int(name[2:]) in parallel)]
+    pairs = [(kind, i) for i in range(1, n) for kind in ("a", "d") if kind == "a" or i not in parallel]
+    lengths = [(f"{kind}_{i}", values[kind][i - 1]) for kind, i in pairs]
     late = {name for i in arm.prismatic for name in (f"a_{i}", f"d_{i + 1}")}
     late |= {f"theta_{i}" for i in arm.prismatic if {i - 1, i} & set(parallel)}
     nonzero = [name for name, value in lengths if value != 0 and name not in late]

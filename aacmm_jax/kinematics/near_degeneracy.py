@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..core.text import listed
 from .arm import is_length
 from .corrections.kinds import unit_of_coefficient
 
@@ -48,18 +49,16 @@ class TradeOff(NamedTuple):
     @property
     def text(self) -> str:
         """The trade-off in words."""
-        first, *others = self.names
-        text = f"one {_step(first)} of {first} changes the tips by {1e3 * self.movement:.2g} um"
+        (first, *others), movement = self.names, f"{1e3 * self.movement:.2g} um"
+        step = _step(first)
+        text = f"one {step} of {first} changes the tips by {movement}"
         if others:
-            pairs = zip(self.amounts[1 : 1 + _PARTNERS_NAMED], others[:_PARTNERS_NAMED], strict=False)
-            imitation = _listed([f"{amount:.2g} {_step(name)} of {name}" for amount, name in pairs])
-            text = (
-                f"{_listed([first, others[0]])} trade off: 1 {_step(first)} of {first} is imitated by {imitation} "
-                f"to within {1e3 * self.movement:.2g} um"
-            )
-        if np.isfinite(self.u):
-            text += f" (u = {self.u:.3g} {_step(first)}"
-            text += f", bounds +-{self.half_width:.3g} {_step(first)})" if np.isfinite(self.half_width) else ")"
+            pairs = list(zip(self.amounts[1:], others, strict=True))[:_PARTNERS_NAMED]
+            imitation = listed(f"{amount:.2g} {_step(name)} of {name}" for amount, name in pairs)
+            text = f"{first} and {others[0]} trade off: 1 {step} of {first} is imitated by {imitation}"
+            text += f" to within {movement}"
+        if np.isfinite(self.u):  # half-widths are known where the noise is
+            text += f" (u = {self.u:.3g} {step}, bounds +-{self.half_width:.3g} {step})"
         return text
 
 
@@ -131,7 +130,3 @@ def _step(name: str) -> str:
     """The natural step of a parameter; 0.001 in the unit of a coefficient of a joint correction."""
     unit = unit_of_coefficient(name)
     return "mm" if is_length(name) else "per mille" if unit == "1" else unit.replace("rad", "mrad") or "mrad"
-
-
-def _listed(items: list[str]) -> str:
-    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)

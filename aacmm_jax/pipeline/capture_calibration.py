@@ -118,7 +118,12 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     def solved(capture: Capture) -> Calibration | Identification:
         if chosen.scale == "measured":
             return calibrate(bounds.space.base, capture, bounds, **solving._asdict())
-        _check_stage1(capture, solving)
+        if chosen.method is not None or chosen.strict:
+            raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")
+        if any(observation.fixes_scale for observation in capture.observations):
+            raise InputError(
+                "--scale nominal is for captures without a scale, but these observations fix it; leave it out."
+            )
         return identify(bounds.space.base, capture, bounds, **solving.of_stage1)
 
     with warnings.catch_warnings():
@@ -145,16 +150,6 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             sampled = chosen.stage("Drawing trials", lambda: monte_carlo(result, record.recording.capture))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
     return record
-
-
-def _check_stage1(capture: Capture, solving: CalibrationOptions) -> None:
-    """Raise `InputError` where the scale need not be that of the nominal arm, or an option is not of stage 1."""
-    if solving.method is not None or solving.undetermined == "raise":
-        raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")
-    if any(observation.fixes_scale for observation in capture.observations):
-        raise InputError(
-            "--scale nominal is for captures without a scale, but these observations fix it; leave it out."
-        )
 
 
 def _to_cross_validate(recording: Recording, solving: CalibrationOptions, chosen: CaptureOptions) -> bool:

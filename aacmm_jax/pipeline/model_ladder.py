@@ -31,7 +31,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..diagnostics.equations import PRIOR, Equations, Rows, equations_of
+from ..diagnostics.equations import PRIOR, Equations, equations_of
 from ..kinematics.arm import DOWN, Arm, without_corrections
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds
@@ -229,11 +229,21 @@ def log_evidence(equations: Equations, prior: PriorMetrics, expected: Mapping[st
     models of a capture have in common are left out: of the geometry, which has no prior, and of reference lengths and
     certified values.
     """
-    logarithm = -_cost_of_scales(prior, expected)
-    information, squares, eliminated = 0.0, 0.0, 0.0
+    logarithm, information, squares, eliminated = 0.0, 0.0, 0.0, 0.0
+    # What learned scales cost: being away from what is expected, and having been chosen by the data, of which each
+    # parameter that they determine adds 1/2 to the curvature by the log variance.
+    for group, sd, effective, learned in zip(prior.groups, prior.sd, prior.effective, prior.learned, strict=True):
+        if learned:
+            away = 2 * float(np.log(sd / expected[group]))
+            logarithm -= 0.5 * (away**2 / _EXPECTED_VARIANCE + np.log1p(0.5 * float(effective) * _EXPECTED_VARIANCE))
     for rows in equations.rows:
-        shared, determinant = _without_geometry(rows)
-        information, eliminated = information + shared.T @ shared, eliminated + determinant
+        # The geometry of this observation is eliminated.
+        shared, own = (part.reshape(rows.residual.size, part.shape[2]) for part in (rows.shared, rows.own))
+        basis, sizes, _ = np.linalg.svd(own, full_matrices=False)
+        determined = sizes > _SMALL * sizes.max(initial=1e-300)
+        shared = shared - basis[:, determined] @ (basis[:, determined].T @ shared)
+        information = information + shared.T @ shared
+        eliminated += float(2 * np.sum(np.log(sizes[determined])))
         squares += float(np.sum(rows.residual**2))
         # The product of the standard deviations of the rows, by what one of them is in mm.
         sizes = np.linalg.svd(rows.in_mm, compute_uv=False)
@@ -244,24 +254,3 @@ def log_evidence(equations: Equations, prior: PriorMetrics, expected: Mapping[st
         if block.fixture == PRIOR:
             logarithm += float(np.sum(np.log(np.linalg.norm(block.shared, axis=1))))
     return logarithm - 0.5 * (squares + eliminated + float(np.linalg.slogdet(information)[1]))
-
-
-def _without_geometry(rows: Rows) -> tuple[Float[np.ndarray, "R s"], float]:
-    """Derivatives by what observations share, with the geometry of this one eliminated; log determinant of what is
-    eliminated."""
-    shared, own = (part.reshape(rows.residual.size, part.shape[2]) for part in (rows.shared, rows.own))
-    basis, sizes, _ = np.linalg.svd(own, full_matrices=False)
-    determined = sizes > _SMALL * sizes.max(initial=1e-300)
-    basis = basis[:, determined]
-    return shared - basis @ (basis.T @ shared), float(2 * np.sum(np.log(sizes[determined])))
-
-
-def _cost_of_scales(prior: PriorMetrics, expected: Mapping[str, float]) -> float:
-    """What learned scales cost: being away from what is expected, and having been chosen by the data."""
-    cost, groups = 0.0, zip(prior.groups, np.asarray(prior.sd), np.asarray(prior.effective), prior.learned, strict=True)
-    for group, sd, effective, learned in groups:
-        if learned:
-            away = 2 * np.log(sd / expected[group])
-            # Each parameter that the data determine adds 1/2 to the curvature by the log variance.
-            cost += 0.5 * (away**2 / _EXPECTED_VARIANCE + np.log1p(0.5 * effective * _EXPECTED_VARIANCE))
-    return float(cost)

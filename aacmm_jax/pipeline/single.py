@@ -67,8 +67,7 @@ class CalibrationOptions(NamedTuple):
     @property
     def solving(self) -> Solving:
         """Those of a single solve."""
-        own = self._asdict()
-        return Solving(**{name: own[name] for name in Solving._fields})
+        return Solving(**{name: getattr(self, name) for name in Solving._fields})
 
     @property
     def may_replace_noise(self) -> bool:

@@ -26,13 +26,11 @@ from ..planning.first_capture import (
     first_capture,
     still_joints,
 )
-from ..uncertainty.correction_limits import is_vertical
 from .calibration import arm_summary
 
 _SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
 _SHOWN = (15, 30, 60, 120)  # poses
-_VERTICAL = "The axis of joint {joint} is vertical, so gravity has no moment about it: {names} left out."
-_ON_AXIS = "What loads {names} lies on the axis of joint {joint}, so it has no moment: left out."
+_NO_MOMENT = "Gravity has no moment about joint {joint}, whose axis is vertical or meets the load: left out {names}."
 _OTHERS = "Left out as constant, or as combinations of other functions of their joint: {names}."
 
 
@@ -130,7 +128,7 @@ def _left_out(arm: Arm, model: str | None) -> list[str]:
     values = function_values(arm.corrections.nominal, gone, q, np.asarray(arm.gravity))
     why: dict[tuple[int, str], list[str]] = {}
     for term, row in zip(gone, values, strict=True):
-        reason = _OTHERS if np.abs(row).max() > 1e-9 else _VERTICAL if is_vertical(arm, q, term.joint) else _ON_AXIS
+        reason = _OTHERS if np.abs(row).max() > 1e-9 else _NO_MOMENT
         why.setdefault((0 if reason == _OTHERS else term.joint, reason), []).append(term.name)
     return [reason.format(joint=joint, names=shorten(names)) for (joint, reason), names in why.items()]
 

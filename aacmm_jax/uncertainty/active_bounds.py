@@ -28,11 +28,8 @@ def of_active_bounds(
 ) -> Float[AnyArray, "p p"]:
     """What is added to a covariance for the widths of those active bounds that end a near-degenerate direction.
 
-    Args:
-        linear: Everything that ties the parameters down, linear at the result.
-        active: Which parameters are on a bound (not 0).
-        bounds: The bounds of the parameters of ``linear``.
-        sigma: Standard deviation of a tip coordinate, mm.
+    ``linear`` is all that ties the parameters down, at the result; ``active`` is not 0 of parameters on a bound;
+    ``sigma`` is the standard deviation of a tip coordinate, mm.
     """
     xp, p = namespace(linear.z, active), len(linear.space.names)
     if xp is np and not np.any(active):

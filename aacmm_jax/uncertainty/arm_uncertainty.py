@@ -1,5 +1,7 @@
 """The uncertainty of a calibrated arm: of its parameters, of a tip, of a length."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
@@ -69,18 +71,14 @@ class Uncertainty(eqx.Module):
         if self.components is not None:
             wider = xp.pad(self.components.matrices, ((0, 0), (0, k), (0, k)))
             parts = Components(self.components.names, wider, self.components.law).joined(parts)
-        return Uncertainty(
+        return replace(
+            self,
             arm=to_numpy(arm) if xp is np else arm,
             covariance=xp.concatenate([above, below]),
             open=xp.asarray(np.pad(np.asarray(self.open), (0, k))),
-            noise=self.noise,
-            u_k=self.u_k,
             shared=shared.without_functions(),
             components=parts,
-            surplus_k=self.surplus_k,
             names=(*self.names, *shared.names),
-            scatter_degrees_of_freedom=self.scatter_degrees_of_freedom,
-            lengths=self.lengths,
         )
 
     @property
@@ -96,8 +94,7 @@ class Uncertainty(eqx.Module):
         0 on a bound, unless the data hardly determine the direction that it ends (`active_bounds`).
         """
         xp = namespace(self)
-        alone = xp.sqrt(xp.diagonal(self.covariance))
-        return xp.where(xp.diagonal(self.open) > 1e-6, np.inf, alone)
+        return xp.where(xp.diagonal(self.open) > 1e-6, np.inf, xp.sqrt(xp.diagonal(self.covariance)))
 
     @property
     @numpy_if_known
@@ -154,8 +151,7 @@ class Uncertainty(eqx.Module):
         """Expanded uncertainty of functions of the free parameters with these derivatives."""
         whole = to_numpy(self).complete
         wider = np.pad(derivatives, [*((0, 0),) * (derivatives.ndim - 1), (0, len(whole.names) - len(self.names))])
-        parts = np.asarray(whole.parts(wider))
-        return whole.expanded_by_parts(parts, level)
+        return whole.expanded_by_parts(np.asarray(whole.parts(wider)), level)
 
     @property
     def degrees_of_freedom(self) -> Float[np.ndarray, " p"]:
@@ -193,12 +189,14 @@ class Uncertainty(eqx.Module):
         q = self._checked(q)
         whole = self.complete
         covariance = whole.covariance_of_functions(whole.derivatives(q))
-        return covariance + self._reading(q) if reading else covariance
+        if reading:
+            xp = namespace(self, q)
+            covariance = covariance + self._noise(q) + self.in_one_place**2 * xp.asarray(np.eye(3))
+        return covariance
 
     def expanded_tip(self, q: Numbers, *, level: float = LEVEL, reading: bool = False) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the tip at joint angles ``(..., n)``, along its most uncertain direction, mm."""
-        parts = np.asarray(self.tip_parts(q, reading=reading))
-        return self.expanded_by_parts(parts, level)
+        return self.expanded_by_parts(np.asarray(self.tip_parts(q, reading=reading)), level)
 
     @numpy_if_known
     def tip_parts(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
@@ -234,8 +232,7 @@ class Uncertainty(eqx.Module):
         self, start: Numbers, end: Numbers, *, level: float = LEVEL, reading: bool = False
     ) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
-        parts = np.asarray(self.length_parts(start, end, reading=reading))
-        return self.expanded_by_parts(parts, level)
+        return self.expanded_by_parts(np.asarray(self.length_parts(start, end, reading=reading)), level)
 
     @numpy_if_known
     def length_parts(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
@@ -282,10 +279,6 @@ class Uncertainty(eqx.Module):
         if is_concrete(q) and not np.all(np.isfinite(np.asarray(q))):
             raise InputError("a joint angle is not finite; give angles in rad.")
         return q
-
-    def _reading(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 3"]:
-        xp = namespace(self, q)
-        return self._noise(q) + self.in_one_place**2 * xp.asarray(np.eye(3))
 
     def _noise(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 3"]:
         xp = namespace(self, q)

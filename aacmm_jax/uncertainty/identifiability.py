@@ -1,28 +1,39 @@
 """What a capture determines: rank, undetermined and near-degenerate directions, observability indices."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.arguments import check_finite, checked_arguments, items_of
 from ..core.numpy_or_jax import to_numpy
+from ..core.text import listed
 from ..data.capture import Capture, ReferenceLength, check_one_capture
 from ..data.noise import Noise, tip_covariances
-from ..kinematics.arm import Arm, check_columns, correction_names, joint_limits, neighbouring_arm, with_arrays
-from ..kinematics.chain import joint_motion
-from ..kinematics.independence import generic_poses, nearly_parallel, tip_movements
+from ..kinematics.arm import (
+    Arm,
+    check_columns,
+    correction_names,
+    jacobian_at,
+    joint_limits,
+    neighbouring_arm,
+    with_arrays,
+)
+from ..kinematics.chain import Geometry, joint_motion
+from ..kinematics.independence import generic_poses, nearly_parallel, rigid_motions, tip_movements
 from ..kinematics.inverse_kinematics import project_to_targets
-from ..kinematics.near_degeneracy import TradeOff, trade_offs
+from ..kinematics.near_degeneracy import TradeOff, reduced_echelon, trade_offs
 from ..kinematics.parameters import Bounds, Parameters
-from .correction_limits import by_more_sockets, why_undetermined
-from .null_space import complement, named_directions, structural
+from .correction_limits import why_undetermined
 from .observed_identifiability import Agreeing
 
 _RANK = 1e-8  # singular values below this, of the largest, are zero
-_NAMED = 4
+_NAMED, _PARAMETERS_NAMED, _PARTS_NAMED = 4, 6, 3  # directions in a sentence, and parts of one
 _FOLLOWS = 1e-3  # part of a direction, above which a parameter belongs to it
+_PRESENT = 1e-4  # of a direction's largest component: smaller ones are left out of its name
+_MOVED = 1e-4  # of the same: parts of the geometry that change less do not follow
+_CONFIGURATIONS = 100
 
 
 class Observability(NamedTuple):
@@ -56,7 +67,7 @@ class Observability(NamedTuple):
     @property
     def rank(self) -> int:
         """Number of independent directions that the data determine."""
-        return _rank(self.singular)
+        return int(np.sum(self.singular > _RANK * max(self.singular[0], 1e-300)))
 
     @property
     def indices(self) -> dict[str, float]:
@@ -79,32 +90,24 @@ class Observability(NamedTuple):
 
     def sentences(self) -> list[str]:
         """What a user should know, one sentence each: directions that are not or hardly determined, and what to do."""
-        sentences = []
         always = [text for text, never in zip(self.undetermined, self.structural, strict=True) if never]
         now = [text for text, never in zip(self.undetermined, self.structural, strict=True) if not never]
+        sentences = []
         if always:
             sentences.append(
                 f"No measurement of this kind can separate: {'; '.join(always)}. Fix one of each (--held)."
             )
         if now:
             remedy = f" {self.remedy}" if self.remedy else " Fix one of each (--held)."
-            count = f"{len(now)} combinations of {len(self.names)} parameters"
-            sentences.append(
-                f"Not determined by these data: {'; '.join(now) if len(now) <= _NAMED else count}.{remedy}"
-            )
+            sentences.append(f"Not determined by these data: {_first(now)}.{remedy}")
         if self.by_prior:
-            texts = list(self.by_prior[:_NAMED])
-            if len(self.by_prior) > _NAMED:
-                texts.append(f"{len(self.by_prior) - _NAMED} more combinations")
-            sentences.append(f"Determined by the prior and not, or hardly, by these data: {'; '.join(texts)}.")
+            sentences.append(f"Determined by the prior and not, or hardly, by these data: {_first(self.by_prior)}.")
         if self.trade_offs:
-            texts = [trade_off.text for trade_off in self.trade_offs[:_NAMED]]
-            if len(self.trade_offs) > _NAMED:
-                texts.append(f"{len(self.trade_offs) - _NAMED} more combinations")
+            texts = _first([trade_off.text for trade_off in self.trade_offs])
             first = ", ".join(trade_off.names[0] for trade_off in self.trade_offs)
             sentences.append(
-                f"Hardly determined by these data: {'; '.join(texts)}. Fix one of each, such as {first} (--held); "
-                "wider bounds do not help."
+                f"Hardly determined by these data: {texts}. Fix one of each, such as {first} (--held); wider bounds do "
+                "not help."
             )
         sentences += self.corrections
         for i in self.parallel:
@@ -160,104 +163,148 @@ def observability(
     check_finite(arm=arm, capture=capture, noise=noise)
     check_columns(space.base, capture.columns)
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
+    q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
     if noise is not None:
         noise.check(arm.joints)
-        q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
-        covariances = tip_covariances(arm.geometry, joint_motion(arm.geometry, q), noise)
-        sigma = float(np.sqrt(np.trace(np.asarray(covariances)).mean() / 3))
+        sigma = rms_of_noise(arm.geometry, q, noise)
     # Fixed values are those of the arm, not of the space's base.
     base = with_arrays(arm, beta=np.zeros_like(arm.alpha)) if arm.beta is None and space.base.beta is not None else arm
     space = Parameters(base, space.names)
-    spectrum = _spectrum(base, base, capture, space, noise)
-    if spectrum.rank < len(space.names):
+    spectrum = _Spectrum.of(base, capture, space, noise)
+    if spectrum.null.shape[1]:
         # A nominal arm may have an exact alignment (a probe on the last axis) that the real one does not share.
         neighbour = neighbouring_arm(base, space.names)
-        other = _spectrum(neighbour, base, capture, space, noise)
-        if other.rank > spectrum.rank:
+        other = _Spectrum.of(neighbour, capture, space, noise, targets_of=base)
+        if other.null.shape[1] < spectrum.null.shape[1]:
             base, spectrum = neighbour, other
-    rank, p = spectrum.rank, len(space.names)
-    known = items_of(known, "known")
-    open_directions, of_prior = _without_known(complement(spectrum.vectors[:rank], p), space, known)
-    null, undetermined = named_directions(open_directions, base, space)
-    always = tuple(bool(x) for x in structural(null, base, space))
-    undetermined = spectrum.agreeing.named(undetermined, null)
+    names, known = space.names, set(items_of(known, "known"))
+    functions = set(correction_names(base))
+    # Undetermined directions that concern no known parameter, and the others.
+    null = spectrum.null
+    _, sizes, turned = np.linalg.svd(null[[name in known for name in names]])
+    split = int(np.sum(sizes > 1e-6))
+    null, of_prior = null @ turned[split:].T, null @ turned[:split].T
+    of_prior = of_prior[:, ~np.any(np.abs(of_prior[[name in functions & known for name in names]]) > _FOLLOWS, axis=0)]
+    null, undetermined = spectrum.named(null, base, space)
+    structural = _structural(null, base, space)
     weak = _trade_offs(spectrum, space, sigma, bounds)
-    q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
-    sockets = 0 if capture.observations else len(capture.names)
-    unknown = [(_chief(one, space, 0.5), _chief(one, space, _FOLLOWS)) for one in np.abs(null.T)]
+    weak_by_prior = [trade_off for trade_off in weak if known.intersection(trade_off.names)]
+    weak = tuple(trade_off for trade_off in weak if not known.intersection(trade_off.names))
+    chief = [
+        [tuple(np.array(names)[direction > share * direction.max()].tolist()) for share in (0.5, _FOLLOWS)]
+        for direction in np.abs(null.T)
+    ]
     # Of a trade-off, the parameter to fix, or its strongest partner where that is no coefficient.
-    leads = [one for one in weak if not set(one.names) & set(known)]
-    unknown += [(one.names[: 1 + (one.names[0] not in correction_names(base))], one.names) for one in leads]
-    reasons, others = why_undetermined(base, q, unknown, sockets)
-    functions = set(correction_names(base)) & set(known)
-    rows = [name in functions for name in space.names]
-    by_prior = named_directions(of_prior[:, ~np.any(np.abs(of_prior[rows]) > _FOLLOWS, axis=0)], base, space)[1]
+    groups = [(main, every) for main, every in chief]
+    groups += [(trade_off.names[: 1 + (trade_off.names[0] not in functions)], trade_off.names) for trade_off in weak]
+    reasons, unexplained = why_undetermined(base, q, groups)
     return Observability(
-        names=space.names,
-        poses=sum(capture.sizes) + sum(observation.q.shape[0] for observation in capture.observations),
+        names=names,
+        poses=len(q),
         singular=spectrum.singular,
         condition=spectrum.condition,
         null=null,
         undetermined=undetermined,
-        structural=always,
-        remedy="" if all(always) or not null.shape[1] else _remedy(base, capture, space, p - sum(always)),
-        parallel=tuple(i for i in nearly_parallel(arm) if _lacks_beta(space, i)),
-        trade_offs=tuple(one for one in weak if not set(one.names) & set(known)),
+        structural=tuple(structural.tolist()),
+        remedy="" if structural.all() else _remedy(base, capture, space, int(structural.sum())),
+        # Whether the angle between nearly parallel axes is identified without Hayati's beta.
+        parallel=tuple(i for i in nearly_parallel(arm) if f"beta_{i}" not in names and f"alpha_{i}" in names),
+        trade_offs=weak,
         by_prior=(
-            *by_prior,
-            *(one.text for one in weak if set(one.names) & set(known) and not set(one.names) & functions),
+            *spectrum.named(of_prior, base, space)[1],
+            *(trade_off.text for trade_off in weak_by_prior if not known & functions & set(trade_off.names)),
         ),
-        corrections=reasons + _by_more_sockets(base, capture, space, others),
+        corrections=reasons + _by_more_sockets(base, capture, space, unexplained),
     )
 
 
-def _without_known(
-    null: Float[np.ndarray, "p nullity"], space: Parameters, known: Iterable[str]
-) -> tuple[Float[np.ndarray, "p open"], Float[np.ndarray, "p by_prior"]]:
-    """Undetermined directions that concern no known parameter, and the others."""
-    rows = null[[name in known for name in space.names]]
-    if not rows.size:
-        return null, null[:, :0]
-    _, sizes, directions = np.linalg.svd(rows)
-    rank = int(np.sum(sizes > 1e-6))
-    return null @ directions[rank:].T, null @ directions[:rank].T
+def rms_of_noise(geometry: Geometry, q: Float[np.ndarray, "N n"], noise: Noise) -> float:
+    """RMS standard deviation of a tip coordinate by the noise of readings and seat, mm."""
+    covariances = np.asarray(tip_covariances(geometry, joint_motion(geometry, q), noise))
+    return float(np.sqrt(np.trace(covariances).mean() / 3))
+
+
+def _first(texts: Sequence[str]) -> str:
+    more = [f"{len(texts) - _NAMED} more combinations"] if len(texts) > _NAMED else []
+    return "; ".join([*texts[:_NAMED], *more])
 
 
 class _Spectrum(NamedTuple):
-    rows: Float[np.ndarray, "w p"]  # of everything, natural steps; whitened where the noise is known
-    movements: Float[np.ndarray, "m p"]  # rows whose sum of squares is the mean square movement of the tips, mm
-    singular: Float[np.ndarray, " p"]
-    vectors: Float[np.ndarray, "r p"]
-    rank: int
-    condition: float
+    """Singular values of the derivatives of all that was observed, by the parameters in natural steps."""
+
     agreeing: Agreeing
+    movements: Float[np.ndarray, "m p"]  # rows whose sum of squares is the mean square movement of the tips, mm
+    geometry: Float[np.ndarray, "g p"]  # how the unknown geometry follows
+    singular: Float[np.ndarray, " p"]
+    null: Float[np.ndarray, "p nullity"]
+    condition: float
+
+    @classmethod
+    def of(
+        cls, arm: Arm, capture: Capture, space: Parameters, noise: Noise | None = None, targets_of: Arm | None = None
+    ) -> "_Spectrum":
+        agreeing = Agreeing.of(capture, Parameters(arm, space.names), targets_of)
+        plain = agreeing.eliminated()
+        whitened = plain if noise is None else agreeing.eliminated(noise)
+        # Each pose has as many rows on average: only their number of poses counts.
+        poses = plain.poses * np.sqrt(len(plain.poses) / len(agreeing.observed.q))
+        # With as many rows of zeros as there are parameters all singular values and vectors are there.
+        p = len(space.names)
+        rows = np.concatenate([whitened.poses, whitened.relations, np.zeros((p, p))])
+        _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
+        rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
+        norms = np.linalg.norm(rows, axis=0)
+        scale = np.where(norms > _RANK * norms.max(), norms, 1.0)  # others are rounding
+        equal = np.linalg.svd(rows / scale, compute_uv=False)[:rank]
+        condition = float(equal[0] / equal[-1]) if rank else np.inf
+        movements = tip_movements(poses[:, None], plain.relations)
+        return cls(agreeing, movements, plain.geometry, singular, vectors[rank:].T, condition)
+
+    def named(
+        self, null: Float[np.ndarray, "p k"], arm: Arm, space: Parameters
+    ) -> tuple[Float[np.ndarray, "p k"], tuple[str, ...]]:
+        """Part of the null space by directions of few parameters, and their names, with the parts of the geometry that
+        follow them; the scale is a direction of its own."""
+        if not null.shape[1]:
+            return null, ()
+        rest, texts, directions = null, [], []
+        values = np.asarray(space.vector(arm)) * space.lengths
+        scale = np.where([name == "d_1" for name in space.names], 0.0, values)
+        size = np.linalg.norm(scale)
+        if size > 0 and np.linalg.norm(scale - null @ (null.T @ scale)) < 1e-6 * size:
+            texts.append("all lengths together: the scale")
+            directions.append(scale / size)
+            # The other directions are named without the longest link, the largest component of the scale.
+            pivot = int(np.argmax(np.abs(scale)))
+            rest = null - np.outer(scale, null[pivot] / scale[pivot])
+            rest = np.linalg.svd(rest, full_matrices=False)[0][:, : null.shape[1] - 1]
+        for direction in reduced_echelon(rest)[0].T:
+            size, followers = np.abs(direction).max(), self.geometry @ direction
+            names = [name for name, x in zip(space.names, np.abs(direction), strict=True) if x > _PRESENT * size]
+            parts = [name for name, at in self.agreeing.parts if np.abs(followers[at]).max() > _MOVED * size]
+            items = _some(names, _PARAMETERS_NAMED, "more")
+            items += _some(parts, _PARTS_NAMED, "more parts of the geometry")
+            alone = f"{items[0]} (changes nothing that is measured)"
+            texts.append(f"{listed(items)} trade off" if len(items) > 1 else alone)
+            directions.append(direction / np.linalg.norm(direction))
+        return np.stack(directions, axis=1), tuple(texts)
 
 
-def _spectrum(arm: Arm, targets_of: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> _Spectrum:
-    agreeing = Agreeing.of(capture, Parameters(arm, space.names), targets_of)
-    plain = agreeing.eliminated()
-    rows = plain if noise is None else agreeing.eliminated(noise)
-    # Each pose has as many rows on average: only their number of poses counts.
-    poses = plain.poses * np.sqrt(len(plain.poses) / len(agreeing.observed.q))
-    return _decomposed(
-        np.concatenate([rows.poses, rows.relations]), tip_movements(poses[:, None], plain.relations), agreeing
-    )
+def _some(items: list[str], most: int, more: str) -> list[str]:
+    return items if len(items) <= most else [*items[: most - 1], f"{len(items) - most + 1} {more}"]
 
 
-def _decomposed(rows: Float[np.ndarray, "w p"], movements: Float[np.ndarray, "m p"], agreeing: Agreeing) -> _Spectrum:
-    p = rows.shape[1]
-    _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
-    singular = np.concatenate([singular, np.zeros(p - len(singular))])
-    rank = _rank(singular)
-    norms = np.linalg.norm(rows, axis=0)
-    scale = np.where(norms > _RANK * norms.max(), norms, 1.0)  # others are rounding
-    equal = np.linalg.svd(rows / scale, compute_uv=False)[:rank]
-    condition = float(equal[0] / equal[-1]) if rank else np.inf
-    return _Spectrum(rows, movements, singular, vectors, rank, condition, agreeing)
-
-
-def _rank(singular: Float[np.ndarray, " p"]) -> int:
-    return int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
+def _structural(null: Float[np.ndarray, "p k"], arm: Arm, space: Parameters) -> Bool[np.ndarray, " k"]:
+    """Which directions move the tip, in any pose, only as a rigid motion of the whole arm, which no capture shows."""
+    random = np.random.default_rng(0)
+    q = random.uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints))
+    if arm.thermometer:
+        q = np.concatenate([q, random.uniform(10.0, 30.0, (_CONFIGURATIONS, 1))], axis=1)
+    rows = 3 * _CONFIGURATIONS
+    movements = (jacobian_at(arm, q, space.names) * np.asarray(space.scale) @ null).reshape(rows, -1)
+    rigid = rigid_motions(np.asarray(arm.position(q))).reshape(rows, 6)
+    remaining = movements - rigid @ np.linalg.lstsq(rigid, movements, rcond=None)[0]
+    return np.linalg.norm(remaining, axis=0) < 1e-6 * np.sqrt(rows)
 
 
 def _trade_offs(
@@ -265,86 +312,71 @@ def _trade_offs(
 ) -> tuple[TradeOff, ...]:
     if sigma is None or not sigma > 0:
         return trade_offs(spectrum.movements, space.names)
-    rows = spectrum.agreeing.eliminated(sigma=sigma)
-    whitened = np.concatenate([rows.poses, rows.relations])
-    default = np.where(space.lengths, 10.0, 17.5)
-    half = default
+    rows = spectrum.agreeing.eliminated(sigma)
+    half = default = np.where(space.lengths, 10.0, 17.5)
     if bounds is not None:
         half = np.asarray(bounds.upper - bounds.lower) / 2 / np.asarray(space.scale)
         half = np.where(np.isfinite(half), half, default)
+    whitened = np.concatenate([rows.poses, rows.relations])
     return trade_offs(spectrum.movements, space.names, whitened=whitened, half_widths=half)
 
 
-def _lacks_beta(space: Parameters, i: int) -> bool:
-    """Whether the angle between the nearly parallel axes i and i + 1 is identified without Hayati's beta."""
-    return f"beta_{i}" not in space.names and f"alpha_{i}" in space.names
-
-
-def _chief(direction: Float[np.ndarray, " p"], space: Parameters, share: float) -> tuple[str, ...]:
-    """Parameters with at least this share of the largest component of a direction."""
-    return tuple(space.names[i] for i in np.flatnonzero(direction > share * direction.max()))
+def _with_more(
+    arm: Arm,
+    capture: Capture,
+    space: Parameters,
+    sockets: dict[str, Float[np.ndarray, "_ _"]],
+    lengths: Sequence[ReferenceLength] = (),
+) -> _Spectrum:
+    """With invented sockets, which have the first pose's temperature where they have none."""
+    temperature = np.asarray(capture.readings)[:1, arm.joints :]
+    more = dict(capture.sockets)
+    for name, q in sockets.items():
+        more[name] = np.concatenate([q, np.repeat(temperature, len(q), axis=0)], axis=1)[:, : capture.columns]
+    return _Spectrum.of(arm, Capture(more, [*capture.lengths, *lengths], capture.observations), space)
 
 
 def _by_more_sockets(arm: Arm, capture: Capture, space: Parameters, names: tuple[str, ...]) -> tuple[str, ...]:
     """A sentence on which of these coefficients poses in more sockets would determine, where some do."""
     if not names or capture.observations:
         return ()
-    # The zero byte keeps the invented sockets apart from those of the capture.
     generic = generic_poses(arm)
     parts = np.split(np.asarray(generic.q), np.cumsum(generic.sizes)[:-1])
-    others = {f"\0{i}": q for i, q in enumerate(parts)}
-    more = Capture({**capture.sockets, **others}, capture.lengths)
-    spectrum = _spectrum(arm, arm, more, space, None)
-    lost = complement(spectrum.vectors[: spectrum.rank], len(space.names))
-    left = {space.names[i] for i in np.flatnonzero(np.any(np.abs(lost) > _FOLLOWS, axis=1))}
+    spectrum = _with_more(arm, capture, space, {f"\0{i}": q for i, q in enumerate(parts)})
+    left = {name for name, row in zip(space.names, np.abs(spectrum.null), strict=True) if np.any(row > _FOLLOWS)}
     left |= {trade_off.names[0] for trade_off in _trade_offs(spectrum, space, None, None)}
     determined = [name for name in names if name not in left]
-    return (by_more_sockets(determined),) if determined else ()
+    if not determined:
+        return ()
+    return (f"Poses in more sockets, over all of the workspace, would determine {listed(determined)}.",)
 
 
-def _remedy(arm: Arm, capture: Capture, space: Parameters, rank: int) -> str:
-    """Which further data would give that rank: tried one after the other, the least effort first."""
+def _remedy(arm: Arm, capture: Capture, space: Parameters, left: int) -> str:
+    """Which further data would leave so many directions open: tried one after the other, the least effort first."""
     random = np.random.default_rng(0)
-    limits = np.asarray(joint_limits(arm, None))
+    low, high = np.asarray(joint_limits(arm, None)).T
     # The zero byte keeps the invented sockets apart from those of the capture.
-    q = random.uniform(limits[:, 0], limits[:, 1], (4, arm.joints))
-    temperature = np.asarray(capture.readings)[: len(q), arm.joints :][:1]
-    q = np.concatenate([q, np.repeat(temperature, len(q), axis=0)], axis=1)
-    more_sockets = {f"\0{i}": row[None] for i, row in enumerate(q)}
-    one_length = [ReferenceLength("\0000", "\0001", 1.0)]
-    two_lengths = [*one_length, ReferenceLength("\0002", "\0003", 1.0)]
-    more_poses = {}
-    for first, readings in list(capture.sockets.items())[:1]:
-        more_poses = {f"\0 {first}": _other_configurations(arm, np.asarray(readings)[0], random)}
-    warmer = {}
-    if capture.columns > arm.joints:
-        warmer = {f"\0 {name}": _warmer_too(np.asarray(readings)) for name, readings in capture.sockets.items()}
+    more_sockets = {f"\0{i}": row[None] for i, row in enumerate(random.uniform(low, high, (4, arm.joints)))}
+    lengths = [ReferenceLength("\0000", "\0001", 1.0), ReferenceLength("\0002", "\0003", 1.0)]
+    more_poses, warmer = {}, {}
+    for name, q in capture.sockets.items():
+        first = np.tile(np.asarray(q)[:1], (60, 1))
+        if not more_poses:  # other configurations with the tip in the same place
+            starts = first.copy()
+            starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
+            moved, reached = project_to_targets(arm, starts, np.asarray(arm.position(first)))
+            more_poses[f"\0 {name}"] = moved[reached] if reached.any() else first[:1]
+        if capture.columns > arm.joints:
+            shift = 10.0 * (np.arange(capture.columns) == capture.columns - 1)  # K
+            warmer[f"\0 {name}"] = np.concatenate([q, q + shift])
     length = "a second position of the reference length" if capture.lengths else "a reference length"
-    for text, sockets, lengths in (
-        ("Poses in the same sockets at other temperatures would determine them.", warmer, []),
-        (f"{length[0].upper()}{length[1:]} would determine them.", more_sockets, one_length),
-        ("Reference lengths at two more positions would determine them.", more_sockets, two_lengths),
-        ("More poses in a socket, as different as possible, would determine them.", more_poses, []),
-        (f"More poses in a socket, and {length}, would determine them.", more_poses | more_sockets, one_length),
+    for text, sockets, added in (
+        ("Poses in the same sockets at other temperatures", warmer, []),
+        (f"{length[0].upper()}{length[1:]}", more_sockets, lengths[:1]),
+        ("Reference lengths at two more positions", more_sockets, lengths),
+        ("More poses in a socket, as different as possible,", more_poses, []),
+        (f"More poses in a socket, and {length},", more_poses | more_sockets, lengths[:1]),
     ):
-        if not sockets:
-            continue
-        more = Capture({**capture.sockets, **sockets}, [*capture.lengths, *lengths], capture.observations)
-        if _spectrum(arm, arm, more, space, None).rank >= rank:
-            return text
+        if sockets and _with_more(arm, capture, space, sockets, added).null.shape[1] <= left:
+            return f"{text} would determine them."
     return ""
-
-
-def _warmer_too(q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "2*m n"]:
-    """The same configurations, and once more 10 K warmer."""
-    warmer = q.copy()
-    warmer[:, -1] += 10.0
-    return np.concatenate([q, warmer])
-
-
-def _other_configurations(arm: Arm, q: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Other configurations with the tip where ``q`` has it."""
-    starts = np.tile(q, (60, 1))
-    starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
-    configurations, reached = project_to_targets(arm, starts, np.tile(np.asarray(arm.position(q)), (60, 1)))
-    return configurations[reached] if reached.any() else q[None]

@@ -6,13 +6,12 @@ such as sockets, are moved, a few milliradians at most, to where the tips agree 
 joints cannot be moved to agree with a measured transform.)
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
-from ..core.numpy_or_jax import AnyArray
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.socket import position_of
@@ -20,7 +19,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
 from ..model.elimination import followed, pseudo_inverse, sums_by_component
-from ..model.observed import Observed
+from ..model.observed import Observed, ends_of
 from ..model.rows import PointRows, Whitening, rows_at, whitening_of
 from ..solver.arrow import joined, split
 from .linear_propagation import Influence
@@ -34,8 +33,6 @@ _AGREES = 1e-9  # mm or rad
 _LEAST_U = 1e-6  # mm: an exact certified value would be a row of infinite weight
 _NULL = 1e-10  # singular values of the shared geometry below this, of the largest, are zero
 _MOST = 0.5  # of the poses: where fewer agree, all count
-_MOVED = 1e-4  # of the largest change: parts of the geometry that change less do not follow
-_NAMED = 2
 
 
 class Eliminated(NamedTuple):
@@ -70,8 +67,9 @@ class Agreeing(NamedTuple):
         z = np.asarray(source.vector())
         z = np.concatenate([z, np.asarray(observed.start(source, z))])
         for _ in range(_ROUNDS):
-            point, errors = _at(source, observed, z)
-            whitening = _whitening(observed, point, [covariance_of_sigma(error, np.ones(())) for error in errors])
+            point = rows_at(source, observed, z)
+            errors = arm_errors(point, observed)
+            whitening = _whitening(observed, point.rows, errors)
             # What is certified does not count: the fit in mm.
             alone = whitening._replace(certified={name: 0 * weight for name, weight in whitening.certified.items()})
             new = Linearisation.of(observed, source, z, point, errors, alone, None).fitted(fixed)
@@ -81,22 +79,17 @@ class Agreeing(NamedTuple):
         z = np.concatenate([np.asarray(space.vector()), z[p:]])
         observed = observed.measured_without_errors(space, z[:p], z[p:])
         for _ in range(_ROUNDS):
-            point, errors = _at(space, observed, z)
+            point = rows_at(space, observed, z)
+            errors = arm_errors(point, observed)
             if max(np.abs(rows.values).max() for rows in point.rows) < _AGREES:
                 break
             observed = _moved(observed, arm, point, errors)
-        ends = tuple((position_of(length.start), position_of(length.end)) for length in capture.lengths)
         u = np.array([float(length.u) for length in capture.lengths])
-        return cls(observed, space, z, point, errors, ends, u)
+        return cls(observed, space, z, point, errors, ends_of(capture), u)
 
-    def eliminated(self, noise: Noise | None = None, sigma: float | None = None) -> Eliminated:
+    def eliminated(self, weigh: Noise | float | None = None) -> Eliminated:
         """In standard deviations by the noise, or by that of a tip coordinate; else in mm."""
-        measured = noise is not None or sigma is not None
-        if noise is not None:
-            of_arm = [covariance_of_noise(error, noise) for error in self.errors]
-        else:
-            of_arm = [covariance_of_sigma(error, np.asarray(1.0 if sigma is None else sigma)) for error in self.errors]
-        whitening = _whitening(self.observed, self.point, of_arm, measured)
+        whitening = _whitening(self.observed, self.point.rows, self.errors, weigh)
         # Poses that this arm cannot take, next to a singularity, would look like information.
         agree = [np.abs(rows.values).max(axis=0) < _AGREES for rows in self.point.rows]
         if np.mean(np.concatenate(agree)) < _MOST:  # another arm's: what is left of it says as little
@@ -118,7 +111,7 @@ class Agreeing(NamedTuple):
         whole = np.concatenate([np.eye(p), shared])
         followers = (-np.moveaxis(np.asarray(by_head) @ whole, -1, 0) for by_head in influence.follow)
         geometry = np.asarray(joined(shared.T, *followers)).T
-        lengths = self._lengths(influence, inverse, geometry, measured)
+        lengths = self._lengths(influence, inverse, geometry, weigh is not None)
         return Eliminated(rest[:count], np.concatenate([rest[count:], lengths]), geometry)
 
     def _lengths(
@@ -149,44 +142,25 @@ class Agreeing(NamedTuple):
         covariance += by_shared @ by_shared.T
         return np.asarray(inverse_cholesky(covariance)) @ (pull @ geometry)
 
-    def named(self, texts: tuple[str, ...], null: Float[np.ndarray, "p nullity"]) -> tuple[str, ...]:
-        """Names of undetermined directions with the parts of the geometry that follow them, but for sockets, which
-        follow every arm."""
-        if not texts:
-            return ()
-        follow = self.eliminated().geometry @ null
-        sockets = {
-            position_of(observation.name) for observation in self.observed.observations if observation.kind == "socket"
-        }
-        positions, names = self.observed.positions, []
-        for text, change, direction in zip(texts, follow.T, null.T, strict=True):
-            least = _MOVED * np.abs(direction).max()
-            parts = [name for name in self.observed.names if np.abs(change[positions[name]]).max() > least]
-            parts = [name for name in parts if name not in sockets]
-            names.append(text if not parts or "the scale" in text else _with_parts(text, parts))
-        return tuple(names)
-
-
-def _with_parts(text: str, parts: list[str]) -> str:
-    names = text.removesuffix(" trade off").split(" (changes nothing")[0].replace(" and ", ", ")
-    if len(parts) > _NAMED + 1:
-        parts = [*parts[:_NAMED], f"{len(parts) - _NAMED} more parts of the geometry"]
-    *first, last = [*names.split(", "), *parts]
-    return f"{', '.join(first)} and {last} trade off"
-
-
-def _at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"]) -> tuple[PointRows, list[ArmErrors]]:
-    point = rows_at(space, observed, z)
-    return point, arm_errors(point, observed)
+    @property
+    def parts(self) -> list[tuple[str, np.ndarray]]:
+        """The parts of the geometry with their indices, but for sockets, which follow every arm."""
+        sockets = {position_of(part.name) for part in self.observed.observations if part.kind == "socket"}
+        return [(name, self.observed.positions[name]) for name in self.observed.names if name not in sockets]
 
 
 def _whitening(
-    observed: Observed, point: PointRows, of_arm: list[Float[AnyArray, "_ _ _"]], measured: bool = False
+    observed: Observed, rows: list[Any], errors: list[ArmErrors], weigh: Noise | float | None = None
 ) -> Whitening:
-    """Rows in mm, whatever the uncertainty of what was measured, unless it is to count."""
-    if measured:
-        return whitening_of(point.rows, observed, of_arm, np.asarray(_LEAST_U))
-    rows = [part._replace(measured=np.zeros_like(part.measured)) for part in point.rows]
+    """By the noise, or the standard deviation of a tip coordinate; else rows in mm, whatever the uncertainty of what
+    was measured."""
+    if isinstance(weigh, Noise):
+        of_arm = [covariance_of_noise(error, weigh) for error in errors]
+    else:
+        of_arm = [covariance_of_sigma(error, np.asarray(1.0 if weigh is None else weigh)) for error in errors]
+    if weigh is not None:
+        return whitening_of(rows, observed, of_arm, np.asarray(_LEAST_U))
+    rows = [part._replace(measured=np.zeros_like(part.measured)) for part in rows]
     whitening = whitening_of(rows, observed, of_arm, np.asarray(_LEAST_U))
     return whitening._replace(certified={name: np.ones_like(weight) for name, weight in whitening.certified.items()})
 

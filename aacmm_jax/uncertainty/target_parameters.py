@@ -26,26 +26,18 @@ def determined_parameters(arm: Arm, capture: Capture | None = None) -> Parameter
     """Parameters that are free where nothing is said: `Parameters.independent`, or of targets alone those that these
     determine; with temperatures that vary, the thermal expansion of an arm that has it.
 
-    Args:
-        arm: The nominal arm.
-        capture: What was observed; by default tips in sockets.
-
-    Raises:
-        InputError: The arm has one configuration for each position of the tip, as with one or two joints.
+    Raises `InputError` for an arm that has one configuration for each position of the tip, as with one or two joints.
     """
     if capture is None:
         return Parameters.independent(arm)
     space = independent_of_targets(arm, capture) if only_targets(capture) else Parameters.independent(arm)
     coefficient = Expansion.words[0]
-    if coefficient not in correction_names(arm) or not _temperatures_vary(arm, capture):
+    temperature = np.asarray(capture.readings)[:, arm.joints :]
+    varies = temperature.size > 0 and float(np.ptp(temperature)) >= _VARIES
+    if coefficient not in correction_names(arm) or not varies:
         return space
     names = (*space.names, coefficient)
     return Parameters(space.base, tuple(name for name in parameter_names(space.base) if name in names))
-
-
-def _temperatures_vary(arm: Arm, capture: Capture) -> bool:
-    temperature = np.asarray(capture.readings)[:, arm.joints :]
-    return temperature.size > 0 and float(np.ptp(temperature)) >= _VARIES
 
 
 def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
@@ -54,10 +46,6 @@ def independent_of_targets(arm: Arm, capture: Capture) -> Parameters:
     The unknown places of the targets take the part of the probe, and of the link after the last joint, so that these
     are fixed. What else is determined depends on how far the target is from the last axis, where the nominal arm finds
     it.
-
-    Args:
-        arm: The nominal arm.
-        capture: At least one observation, each of a target.
     """
     # NumPy compiles nothing.
     observed, space = to_numpy((Observed.of(capture, arm), Parameters(arm, ("probe_x",))))

@@ -45,22 +45,19 @@ class VolumetricUncertainty(NamedTuple):
     def summary(self) -> dict[str, float]:
         """Median, 95th percentile and largest uncertainty, standard and expanded to 95 %, mm; the smallest and the
         largest coverage factor."""
-        numbers = {"length_mm": self.length}
-        pairs = [np.stack([u, expanded]) for u, expanded in zip(self[5:8], self[8:], strict=True)]
-        u, expanded = np.concatenate(pairs, axis=1)
+        u, expanded = np.concatenate(self[5:8]), np.concatenate(self[8:])
         usable = np.isfinite(u) & (u > 0)
         factors = expanded[usable] / u[usable]
-        numbers |= {"coverage_factor_least": float(factors.min(initial=np.inf))}
-        numbers |= {"coverage_factor_largest": float(factors.max(initial=-np.inf))}
-        for name in self._fields[5:]:
-            values = getattr(self, name)
-            numbers |= {
-                f"{name}_median_mm": float(np.median(values)),
-                f"{name}_95_mm": float(
-                    np.quantile(values, 0.95, method="higher")
-                ),  # no sum, so infinite ones are allowed
-                f"{name}_largest_mm": float(np.max(values)),
-            }
+        numbers = {
+            "length_mm": self.length,
+            "coverage_factor_least": float(factors.min(initial=np.inf)),
+            "coverage_factor_largest": float(factors.max(initial=-np.inf)),
+        }
+        for name, values in zip(self._fields[5:], self[5:], strict=True):
+            numbers[f"{name}_median_mm"] = float(np.median(values))
+            # No sum, so infinite ones are allowed.
+            numbers[f"{name}_95_mm"] = float(np.quantile(values, 0.95, method="higher"))
+            numbers[f"{name}_largest_mm"] = float(np.max(values))
         return numbers
 
 
@@ -139,14 +136,15 @@ def sample_lengths(
         raise InputError(f"a length of {length:g} mm does not fit into the volume of this arm; give a shorter one.")
     if count < 1:
         raise InputError(f"points is {count}; give at least one.")
-    random, allowed = (
-        random_generator(seed),
-        np.asarray(joint_limits(arm, None if limits is None else np.asarray(limits).tolist())),
-    )
-    draw = lambda m: random.uniform(allowed[:, 0], allowed[:, 1], (m, arm.joints))  # noqa: E731
+    random = random_generator(seed)
+    allowed = np.asarray(joint_limits(arm, None if limits is None else np.asarray(limits).tolist()))
+
+    def draw(m: int) -> Float[np.ndarray, "m n"]:
+        return random.uniform(allowed[:, 0], allowed[:, 1], (m, arm.joints))
+
     if length is None:
         return draw(count), draw(count)
-    starts, ends, count_reached = [], [], 0
+    starts, ends = [], []
     for _ in range(60):
         q = draw(2 * count)
         direction = random.normal(size=(2 * count, 3))
@@ -156,8 +154,7 @@ def sample_lengths(
         other, arrived = project_to_targets(arm, draw(2 * count)[near], targets[near], allowed)
         starts.append(q[near][arrived])
         ends.append(other[arrived])
-        count_reached += int(arrived.sum())
-        if count_reached >= count:
+        if sum(map(len, starts)) >= count:
             return np.concatenate(starts)[:count], np.concatenate(ends)[:count]
     raise InputError(
         f"lengths of {length:g} mm cannot be reached by this arm within its joint limits; give a shorter one."

@@ -342,7 +342,7 @@ def test_headers_that_are_not_ignored(tmp_path, content, stated, parts):
         ("z_mm,y_mm,x_mm", 'columns = { points = "[xyz]_mm" }', "pick them as a list, [9, 8, 7], in that of the axes"),
         ("z_mm,y_mm,x_mm", 'preset = "csv"', None),
         ("z_mm,y_mm,x_mm", 'preset = "ipa"', None),
-        ("z_cm,y_cm,x_cm", 'columns = { points = ["x_cm", "y_cm", "z_cm"] }', "header of points says 'cm'"),
+        ("z_cm,y_cm,x_cm", 'columns = { points = ["x_cm", "y_cm", "z_cm"] }', "the points are in 'cm'"),
         ("z_inches,y_inches,x_inches", 'columns = { points = [9, 8, 7] }', None),
     ],
 )  # fmt: skip

@@ -156,7 +156,7 @@ def test_lengths_of_measured_sockets_weigh_as_their_poses_scatter(paper_arm):
     many, less = (aj.observability(paper_arm, one, space, sigma=0.01) for one in (capture, few))
     assert many.rank == less.rank == 4  # d_1 moves the whole arm
     agreeing = Agreeing.of(*to_numpy((capture, space)))
-    by_sigma = agreeing.eliminated(sigma=0.01).relations
+    by_sigma = agreeing.eliminated(0.01).relations
     np.testing.assert_allclose(by_sigma, agreeing.eliminated().relations / (0.01 * np.sqrt(2 / 20)), rtol=1e-6)
 
 

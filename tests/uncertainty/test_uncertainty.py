@@ -287,7 +287,7 @@ def test_projected_poses_meet_in_their_sockets(paper_arm, capture):
 
 REFUSED = {
     "negative": (lambda arm, capture, bounds: aj.Noise(encoder_arcsec=-1), "zero or positive"),
-    "not finite": (lambda arm, capture, bounds: aj.Noise(seating=np.inf), "not finite"),
+    "not finite": (lambda arm, capture, bounds: aj.Noise(seating=np.inf), "finite numbers"),
     "nothing": (
         lambda arm, capture, bounds: aj.calibrate(arm, capture, bounds, noise=aj.Noise()),
         "noise is zero everywhere",
