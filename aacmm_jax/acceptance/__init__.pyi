@@ -6,7 +6,6 @@ from .iso_10360_12 import articulated_location as articulated_location
 from .iso_10360_12 import form_error as form_error
 from .jjf_1408 import half_range as half_range
 from .judgement import RULES as RULES
-from .judgement import SYMBOLS as SYMBOLS
 from .judgement import Expansion as Expansion
 from .judgement import Influences as Influences
 from .judgement import Limit as Limit
@@ -25,3 +24,4 @@ from .results import Metric as Metric
 from .spheres import enclosing_sphere as enclosing_sphere
 from .spheres import fit_sphere as fit_sphere
 from .spheres import size_error as size_error
+from .standards import SYMBOLS as SYMBOLS

@@ -20,21 +20,12 @@ from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
 from . import asme_b89_4_22, iso_10360_12, jjf_1408
 from .geometry import postures_of
-from .judgement import (
-    DEFAULT_RULES,
-    MOST,
-    Influences,
-    Limit,
-    Rule,
-    checked_influences,
-    checked_limit,
-    decide,
-    without_test,
-)
+from .judgement import MOST, Influences, Limit, Rule, checked_influences, checked_limit, decide, without_test
 from .requirements import StandardTest
 from .requirements import requirements_table as table_of
 from .results import METRICS, AcceptanceTest, Measured, Metric
 from .spheres import points_of
+from .standards import DEFAULT_RULES
 
 TESTS: tuple[StandardTest, ...] = (*jjf_1408.TESTS, *asme_b89_4_22.TESTS, *iso_10360_12.TESTS)
 NO_INFLUENCES = Influences()

@@ -13,7 +13,7 @@ from ..core.errors import InputError, naming
 from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
 from .geometry import LEAST_SPREAD, LEFT_OR_RIGHT, elbow_sides, least_turn
-from .judgement import ASME_B89_4_22, Influences
+from .judgement import Influences
 from .lengths import deviation_metrics, distinct_lengths, length_readings, values_by_artefact
 from .procedure_items import (
     OutOfReach,
@@ -45,6 +45,7 @@ from .requirements import (
 )
 from .results import Measured, Metric, metric_value, percent
 from .spheres import points_of, size_error
+from .standards import ASME_B89_4_22
 
 ZONES = {"near": (0.0, 0.2), "middle": (0.2, 0.8), "far": (0.8, 1.0)}  # fractions of the reach
 BARS = ((0.5, 0.75), (1.2, 1.5))  # fractions of the reach

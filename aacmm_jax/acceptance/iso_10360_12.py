@@ -12,7 +12,7 @@ import numpy as np
 from ..core.arrays import Numbers
 from ..core.errors import naming
 from .geometry import LEAST_SPREAD, unit_rows
-from .judgement import ISO_10360_12, Influences
+from .judgement import Influences
 from .lengths import length_readings
 from .procedure_items import PlannedItems, PlannedSphere, ProcedureRegion, bar_items, socket_in_zone, touch_item
 from .requirements import (
@@ -32,6 +32,7 @@ from .requirements import (
 )
 from .results import Measured, Metric, metric_value
 from .spheres import EXACT_POINTS, enclosing_sphere, fit_sphere, size_error
+from .standards import ISO_10360_12
 
 _PROBING_POINTS, _ORIENTATIONS, _ORIENTATION_POINTS = 25, 5, 5
 _LENGTHS, _POSITIONS, _REPEATS = 5, 7, 3

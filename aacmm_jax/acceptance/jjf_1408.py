@@ -3,11 +3,12 @@
 import numpy as np
 
 from ..core.arrays import Numbers
-from .judgement import JJF_1408, Influences
+from .judgement import Influences
 from .lengths import deviation_metrics, length_readings
 from .requirements import CALIBRATED, CONDITIONS, Requirement, StandardTest, of_bars
 from .results import Measured, Metric, metric_value
 from .spheres import points_of
+from .standards import JJF_1408
 
 _SOCKET_POSES = 10  # of one socket, for a complete test
 _LENGTH_POSITIONS = 30  # of a length: Cheng et al. 2018, section 4.4

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from statistics import NormalDist
 from typing import Annotated, Literal, NamedTuple, get_args
 
@@ -142,39 +142,6 @@ def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
             raise InputError(f"--mpe gives {name} two limits; give it one.")
         limits[name] = limit_of_text(value, f"--mpe {name}={value}")
     return limits
-
-
-JJF_1408, ASME_B89_4_22, ISO_10360_12 = "JJF 1408", "ASME B89.4.22", "ISO 10360-12"
-EDITIONS = {JJF_1408: "JJF 1408-2013", ASME_B89_4_22: "ASME B89.4.22-2004", ISO_10360_12: "ISO 10360-12:2016"}
-Planned = Literal["asme", "iso"]  # standards whose procedure can be planned, as arguments name them
-PLANNED: dict[Planned, str] = {"asme": ASME_B89_4_22, "iso": ISO_10360_12}
-Standard = Literal["jjf", "asme", "iso"]
-STANDARDS: dict[Standard, str] = {"jjf": JJF_1408, "asme": ASME_B89_4_22, "iso": ISO_10360_12}  # as options name them
-# The standard that a sphere was touched for, by its test.
-OF_SPHERES = {"effective-diameter": "asme", "probing": "iso", "articulation": "iso"}
-# Symbols of ISO 10360-12:2016 by metric, as a maker's public explanation of its data sheets prints them (Kreon, at
-# digitalscan3d.com/iso-10360-12-standard-for-measuring-arms and oberon3d.com, of 2020); not compared with the text.
-#
-# >>> print(aj.acceptance.SYMBOLS["E_Uni"])
-# E_Uni:0:Tact.AArm
-SYMBOLS = {
-    "P_Size": "P_Size.Sph.1x25::Tact.AArm",
-    "P_Form": "P_Form.Sph.1x25::Tact.AArm",
-    "L_Dia": "L_Dia.5x5:Art:Tact.AArm",
-    "E_Uni": "E_Uni:0:Tact.AArm",
-}
-# Decision rules where none is asked for. ISO 10360 names ISO 14253-1 as its default (public forewords of ISO 10360-8);
-# for JJF 1408 it is our choice. That ASME B89.4.22 is judged by simple acceptance is background knowledge.
-DEFAULT_RULES: dict[str, Rule] = {JJF_1408: "iso-2017", ASME_B89_4_22: "simple", ISO_10360_12: "iso-2017"}
-
-
-def checked_standards(names: Iterable[str]) -> tuple[Standard, ...]:
-    """Standards in the order of `STANDARDS`, or `InputError` for a name that is none of them."""
-    given = tuple(names)
-    for name in given:
-        if name not in STANDARDS:
-            raise InputError(f"acceptance is {name!r}; it must be one of {', '.join(STANDARDS)}.")
-    return tuple(name for name in STANDARDS if name in given)
 
 
 REFERENCE_TEMPERATURE = 20.0  # C (ISO 1)

@@ -18,8 +18,8 @@ from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach, arm_reach, search_region
 from . import asme_b89_4_22, iso_10360_12
-from .judgement import Planned
 from .procedure_items import PlannedSphere, ProcedureItem, ProcedureRegion
+from .standards import Planned
 
 # The tests of touched spheres: as an item names them, and as a manifest does.
 TOUCHED: dict[str, SphereTest] = {

@@ -27,7 +27,8 @@ from .all_tests import (
     measured_by,
     run,
 )
-from .judgement import OF_SPHERES, STANDARDS, Influences, Limit, Rule, Standard, checked_standards
+from .judgement import Influences, Limit, Rule
+from .standards import OF_SPHERES, STANDARDS, Standard, checked_standards
 
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
 _ROUNDING = 1e-7  # relative error up to which a length has the error zero by construction

@@ -11,10 +11,11 @@ import numpy as np
 
 from ..data.sphere import ProbedSphere, SphereTest
 from .geometry import BarPositions, all_bars, bar_positions, covers_hemisphere, separate_places, size_of
-from .judgement import EDITIONS, Influences
+from .judgement import Influences
 from .lengths import distinct_lengths, values_by_artefact
 from .results import AcceptanceTest, Measured, Metric
 from .spheres import EXACT_POINTS, fit_sphere
+from .standards import EDITIONS
 
 Confidence = Literal["public source", "secondary source", "background", "own reading"]
 Origin = tuple[str, Confidence]  # the source, and how certain it is

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from ..data.capture import ReferenceLength
 from ..data.sphere import ProbedSphere
 from ..kinematics.workspace import Reach
-from .judgement import COVERAGE_FACTOR, DECISIONS, EDITIONS, SYMBOLS, Decision, Rule, worst
+from .judgement import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
+from .standards import EDITIONS, SYMBOLS
 
 # Metrics by name: what each of them is.
 #

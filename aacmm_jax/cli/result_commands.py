@@ -155,8 +155,8 @@ def _evaluated_points(
     of_test: dict[str, Any],
 ) -> dict[str, Any]:
     """Run the acceptance tests of a manifest of points; the summary."""
-    from ..acceptance.judgement import STANDARDS, checked_standards
     from ..acceptance.record import PointsRecord
+    from ..acceptance.standards import STANDARDS, checked_standards
     from ..files.evaluations import save_points
     from ..files.points import read_points
     from ..summaries.evaluation import points_summary

@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..acceptance.judgement import Standard
+from ..acceptance.standards import Standard
 from ..core.errors import InputError, naming
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings

@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..acceptance.judgement import PLANNED
 from ..acceptance.procedure import TOUCHED, Procedure
 from ..acceptance.procedure_items import ProcedureItem
+from ..acceptance.standards import PLANNED
 from ..core.text import csv_text
 from ..core.units import DEG
 from ..data.observations.declared import Entry

@@ -3,7 +3,7 @@
 Nothing here needs JAX, so that ``aacmm show`` checks a file and prints the summary in it quickly.
 """
 
-from ..acceptance.judgement import STANDARDS
+from ..acceptance.standards import STANDARDS
 from .records import Field, Fields, count, mapping, number, part, text, truth
 
 _BOTH = "see unit"

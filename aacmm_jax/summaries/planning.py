@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import PLANNED
 from ..acceptance.procedure import Procedure
+from ..acceptance.standards import PLANNED
 from ..data.noise import linear_encoder_mm
 from ..kinematics.collisions import Cell
 from ..planning.design import Plan
