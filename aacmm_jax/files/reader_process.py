@@ -162,8 +162,10 @@ def _after_fork() -> None:
         process.returncode = 0
         for pipe in (process.stdin, process.stdout):
             os.close(pipe.fileno())  # and not `close`, which would send what the parent's thread has begun to send
+        _of_parents.append(process)  # else Python would warn that its pipes are not closed
 
 
+_of_parents: list[Any] = []
 _reader = _Reader()
 atexit.register(lambda: _reader.stop())
 if hasattr(os, "register_at_fork"):

@@ -53,8 +53,8 @@ class Plan(NamedTuple):
 
     Example:
         >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)
-        >>> print(planned.q.shape, planned.owner[:4], sorted(planned.sockets))
-        (12, 6) [0 0 1 1] ['A', 'B', 'C', 'D']
+        >>> print(planned.q.shape, planned.owner.shape, sorted(planned.sockets))
+        (12, 6) (12,) ['A', 'B', 'C', 'D']
     """
 
     arm: Arm
