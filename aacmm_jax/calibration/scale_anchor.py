@@ -107,9 +107,13 @@ def scale_anchor(
             poses = _known_poses(single, capture) if slides else None
             if poses is None:
                 # How the free parameters, and a common relative change of the fixed lengths, move the tips, mm.
-                values, split, steps = [value_of(single, name) for name in fixed], len(space.names), space.scale
+                values, split, steps = (
+                    [value_of(single, name) for name in fixed],
+                    len(space.names),
+                    natural_steps(space.names),
+                )
                 both = _columns_of_both(single, space, fixed)
-                scaling = [(rows[:, :split] * np.asarray(steps), rows[:, split:] @ np.array(values)) for rows in both]
+                scaling = [(rows[:, :split] * steps, rows[:, split:] @ np.array(values)) for rows in both]
             else:
                 scaling = _of_slides(single, space, longest, poses)
             least = min(_left_of_scaling(*part) for part in scaling)
