@@ -112,7 +112,7 @@ class CrossValidation(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """Errors over their prediction, of poses or of lengths, the larger: about 1 where the uncertainty is right."""
+        """The larger of two ratios of errors to their prediction, of the poses and of the lengths; about 1 is right."""
         pairs = [(self.rms, self.rms_predicted), (self.length_rms, self.length_u)]
         return max((rms / expected for rms, expected in pairs if expected > 0 and np.isfinite(rms)), default=math.nan)
 
