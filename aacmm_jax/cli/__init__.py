@@ -1,6 +1,7 @@
 """The command line, ``aacmm``."""
 
 import contextlib
+import errno
 import gc
 import io
 import os
@@ -45,7 +46,7 @@ def main() -> None:
     try:
         from ..core.errors import InputError
         from ..files.outputs import asking
-        from .app import Stopped, app, prepare_jax
+        from .app import Stopped, app, check_numbers, prepare_jax
 
         for family in _FAMILIES:
             import_module(f".{family}", __name__)
@@ -56,6 +57,7 @@ def main() -> None:
     except KeyboardInterrupt:
         _interrupted()
     try:
+        check_numbers(sys.argv[1:])
         if sys.argv[1:2] != ["show"] and not {"--help", "--version"} & set(sys.argv):  # which rarely compute
             prepare_jax()
         with contextlib.nullcontext() if overwrite else asking():
@@ -80,8 +82,9 @@ def main() -> None:
         if debug:
             raise
         _fail_without_jax()
-        if isinstance(error, OSError):  # standard output cannot be written
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             _discard_output()
+            _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
         _fail(f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.", 1)
     finally:
         gc.freeze()

@@ -1,16 +1,75 @@
 """What all commands share: the application, and how results are printed."""
 
+import contextlib
+import inspect
 import json
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import typer
+import typer.core
 
 from ..core.backend import prepare_command
-from ..core.text import printable
+from ..core.errors import InputError
+from ..core.text import in_short, is_number, printable, quoted
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands; what typer says of wrong options is printable and no longer than people read."""
+
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        with _said_in_short():
+            return super().make_context(*arguments, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        with _said_in_short():
+            return super().invoke(ctx)
+
+
+@contextlib.contextmanager
+def _said_in_short() -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        message = getattr(error, "message", "")  # of typer's exceptions; that of several lines is the help
+        if isinstance(message, str) and "\n" not in message:
+            error.message = printable(in_short(message))  # pyright: ignore[reportAttributeAccessIssue]
+        raise
+
+
+def check_numbers(arguments: Sequence[str]) -> None:
+    """Refuse values of numeric options that only Python takes for numbers (1_0, digits of other scripts), and NaN."""
+    callbacks: list[Any] = [info.callback for info in app.registered_commands if arguments[:1] == [_name(info)]]
+    numeric = set()
+    for callback in callbacks:
+        parameters = inspect.signature(callback).parameters
+        for name, hint in get_type_hints(callback).items():
+            if {int, float} & {hint, *get_args(hint)}:
+                numeric |= set(parameters[name].default.param_decls or [f"--{name.replace('_', '-')}"])
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        option, equals, value = argument.partition("=")
+        value = value if equals else following
+        plain = is_number(value) and math.isfinite(float(value))
+        if option in numeric and _is_pythons(value) and not plain:
+            raise InputError(f"{option} {quoted(value)} is not a finite number; write plain decimal digits.")
+
+
+def _name(info: Any) -> str:
+    return info.name or info.callback.__name__.replace("_", "-")
+
+
+def _is_pythons(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
 
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,

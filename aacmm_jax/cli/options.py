@@ -20,14 +20,7 @@ def argument(metavar: str, help: str, default: Any = ...) -> Any:
 def option(metavar: str | None, help: str, *names: str, default: Any = None, **limits: Any) -> Any:
     """An option of a command: the word for its value (None: its choices), what it does, and its names if they are not
     the parameter's."""
-    return typer.Option(default, *names, metavar=metavar, help=help, callback=_finite, **limits)
-
-
-def _finite(context: Any, parameter: Any, value: Any) -> Any:  # by their order, as Click passes them
-    """Refuse numbers that are not finite, which limits do not."""
-    if isinstance(value, float) and not math.isfinite(value):
-        raise InputError(f"{parameter.opts[0]} '{value}' is not a finite number; write plain decimal digits.")
-    return value
+    return typer.Option(default, *names, metavar=metavar, help=help, **limits)
 
 
 def flag(name: str, help: str) -> Any:

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import typer
 
 from ..core.errors import InputError
+from ..core.text import shorten
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
@@ -141,10 +142,28 @@ def _evaluated(
         warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
         evaluation = evaluation_of(record, recording, **of_test)._replace(calibration_warnings=tuple(warnings))
         summary = with_spinner("Evaluating", lambda: evaluation_summary(evaluation))
+        if not summary["acceptance"]:
+            _refuse_options_of_tests(of_test, measuring_range)
         if output is not None:
             save_evaluation(output, evaluation, summary)
             summary["written"] = str(output)
     return summary
+
+
+def _refuse_options_of_tests(of_test: dict[str, Any], measuring_range: float | None) -> None:
+    """Raise `InputError` where options are given that only acceptance tests have, and none was made."""
+    influences = of_test["influences"]
+    given = {
+        "--rule": of_test["rule"] is not None,
+        "--test-u-mm": of_test["u_test"] > 0 or influences.u_relative > 0,
+        "--expansion": influences.artefact is not None or influences.arm is not None,
+        "--range-mm": measuring_range is not None,
+    }
+    if any(given.values()):
+        raise InputError(
+            f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only; this "
+            "capture supports none, or none was requested: name them with --acceptance, or leave the option out."
+        )
 
 
 def _evaluated_points(

@@ -169,13 +169,7 @@ def test_a_process_of_its_own(aacmm_process, cache, tmp_path, monkeypatch):
         ("show panda", "| true", "utf-8", 141, ""),
         pytest.param("show panda --json", "| true", "utf-8", 141, "", marks=pytest.mark.slow),
         pytest.param(
-            *(
-                "show panda",
-                "> /dev/full",
-                "utf-8",
-                1,
-                "Error: aacmm failed unexpectedly (OSError: [Errno 28] No space left",
-            ),
+            *("show panda", "> /dev/full", "utf-8", 1, "Error: standard output cannot be written: no space left"),
             marks=pytest.mark.slow,
         ),
         pytest.param("show named.toml", "> out.txt", "ascii", 0, "", marks=pytest.mark.slow),
@@ -297,6 +291,15 @@ def panda_files(tmp_path_factory):
     command_line(folder, "simulate", "panda", "-o", "p.h5", *SOCKETS, "--length", "A,B")
     command_line(folder, "calibrate", "p.h5", "-o", "c.h5", "--no-cross-validate")
     return folder
+
+
+@pytest.mark.parametrize("option", [("--rule", "simple"), ("--test-u-mm", "0.001"), ("--range-mm", "800")])
+def test_options_without_an_acceptance_test_are_refused(aacmm, panda_files, tmp_path, option):
+    shutil.copytree(panda_files, tmp_path, dirs_exist_ok=True)
+    chosen = ("--only", "A", "--acceptance", "iso")  # one socket, which is too little for any test
+    said = aacmm("evaluate", "c.h5", "p.h5", "-o", "e.h5", *chosen, *option, expect=2).stderr
+    assert f"{option[0]} applies to acceptance tests only" in said
+    assert not (tmp_path / "e.h5").exists()
 
 
 def test_the_stored_summary_is_what_is_computed(aacmm, panda_files, tmp_path):

@@ -41,9 +41,12 @@ def test_what_is_printed(text, shown):
 @pytest.mark.parametrize(
     ("options", "part"),
     [
-        (("--seating-mm", "nan"), "Invalid value for '--seating-mm'"),
+        (("--seed", "1_0"), "--seed '1_0' is not a finite number; write plain decimal digits."),
+        (("--seed=\u0663",), "--seed '\u0663' is not a finite number"),
+        (("--seating-mm", "nan"), "--seating-mm 'nan' is not a finite number"),
         (("--encoder-arcsec", "inf"), "--encoder-arcsec 'inf' is not a finite number"),
         (("--seed", "12345678901234567890"), "should be less than or equal to"),
+        (("--poses", "99999999"), "socket 'A' is given 99,999,999 poses, more than 100,000; give fewer."),
         (("--poses", "9" * 5001), "is not of the form N"),
         (("--poses", "\u0663"), "--poses '\u0663' is not of the form N"),
         (("--socket", "B=1_0,2,3"), "is not of the form NAME=X,Y,Z"),
@@ -62,7 +65,7 @@ def test_options(aacmm, tmp_path, options, part):
         (("plan", "cheng2018-simulation", "-o", "p.csv", "--poses", "99999999"), "should be less than or equal to"),
         (("plan", "cheng2018-simulation", "-o", "p.csv", "--region", "z=0:8_0"), "is not of the form AXIS=LOW:HIGH"),
         (("show", "x" * 300), "is neither a file nor an arm"),
-        (("evaluate", "x.toml", "--max-rms-mm", "nan"), "Invalid value for '--max-rms-mm'"),
+        (("evaluate", "x.toml", "--max-rms-mm", "nan"), "--max-rms-mm 'nan' is not a finite number"),
         (("study", "noise", "-o", "s.h5", "--seed", "12345678901234567890"), "'seed' must be less than"),
         (("study", "noise", "-o", "s.h5", "--trials", "32000", "--chunk", "1"), "more than 10,000 blocks"),
     ],
@@ -70,6 +73,26 @@ def test_options(aacmm, tmp_path, options, part):
 def test_other_commands(aacmm, tmp_path, command, part):
     assert part in " ".join(aacmm(*command, expect=2).stderr.split())
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("text", [10_000 * "n", 5_000 * "n ", "\x1b[2J"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("{}",),
+        ("show", "{}"),
+        ("show", "c.h5", "{}"),
+        ("import", "{}", "-o", "c.h5"),
+        (*SIMULATE, "--acceptance", "{}"),
+        (*SIMULATE, "--true-arm", "{}"),
+        (*SIMULATE, "--length", "{}"),
+        (*SIMULATE, "--{}"),
+    ],
+)
+def test_long_arguments(aacmm, command, text):
+    said = aacmm(*(word.format(text) for word in command), expect=2).stderr
+    assert len(said) < 1300  # with the usage
+    assert "\x1b" not in said
 
 
 def test_names_from_a_file_do_not_reach_the_terminal_raw(aacmm, tmp_path, paper_capture):
