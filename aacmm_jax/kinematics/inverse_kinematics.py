@@ -37,11 +37,14 @@ EXACT = 1e-7  # mm: one more step closes a gap of this size to rounding
 SocketPoses = Any
 
 
-def repeated(step: Callable[..., tuple[Any, Any]], q: Any, rows: Sequence[Any], steps: int) -> Any:
+def repeated(
+    step: Callable[..., tuple[Any, Any]], q: Any, rows: Sequence[Any], steps: int, *, together: bool = False
+) -> Any:
     """``q, more = step(q, *rows)`` at most so many times, each configuration (last axis) until it needs no more.
 
-    NumPy leaves out those that are done, most of them after a dozen steps; in JAX they stay as they are. So the result
-    of one does not depend on the others.
+    NumPy leaves out those that are done, most of them after a dozen steps. In JAX they stay as they are, so that the
+    result of one does not depend on the others; or they go on ``together`` until all are done, which brings those near
+    a singularity closer and is what the random configurations of studies have been drawn by.
     """
     if namespace(q, rows) is np:
         q, under_way = q.copy(), np.arange(q.shape[-1])
@@ -55,7 +58,7 @@ def repeated(step: Callable[..., tuple[Any, Any]], q: Any, rows: Sequence[Any], 
     def body(state: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
         count, q, under_way = state
         new, more = step(q, *rows)
-        return count + 1, jnp.where(under_way, new, q), under_way & more
+        return (count + 1, new, more) if together else (count + 1, jnp.where(under_way, new, q), under_way & more)
 
     start = (jnp.zeros((), dtype=np.int32), q, jnp.ones(q.shape[-1:], dtype=bool))
     return jax.lax.while_loop(lambda state: (state[0] < steps) & jnp.any(state[2]), body, start)[1]
@@ -71,7 +74,8 @@ def solve_to_targets(
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
     """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
-    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). A row does not depend on the other rows.
+    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). In NumPy a row does not depend on the others; in
+    JAX by rounding, since all go on until the last has arrived.
 
     Args:
         geometry: The arm's ``geometry``.
@@ -101,7 +105,7 @@ def solve_to_targets(
         return xp.clip(q + xp.clip(change, -largest, largest), low, high), xp.any(xp.abs(gap) > EXACT, axis=0)
 
     # The step after the gap was seen to be closed takes what Newton's method leaves to rounding.
-    q = repeated(step, q.T[:, None, :], [targets.T], steps)
+    q = repeated(step, q.T[:, None, :], [targets.T], steps, together=True)
     tip = forward_pass(geometry, joint_motion_of_rows(geometry, q)).tip
     return q[:, 0].T, xp.linalg.norm(targets.T - tip, axis=0)
 

@@ -38,8 +38,8 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
 
     Example:
         >>> data = aj.study.open_study("study.h5")
-        >>> print(data.de_stage1.mean("trial").values.round(3), "mm")
-        [0.009 0.01  0.009 0.009] mm
+        >>> print(data.de_stage1.mean("trial").values.round(4), "mm")
+        [0.009  0.0098 0.0091 0.0091] mm
     """
     require("data", "open_study")
     import xarray
