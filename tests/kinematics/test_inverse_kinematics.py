@@ -10,7 +10,7 @@ import aacmm_jax as aj
 def test_in_jax_all_go_on_until_the_last_has_arrived():
     """Those near a singularity come closer by it, and seeds of studies rest on which of them count as arrived."""
     arm, random = aj.load_arm("cheng2018-ra7125"), np.random.default_rng(0)
-    targets = random.uniform(-600, 600, (256, 3)) + [0, 0, 300]
+    targets = random.uniform(-600, 600, (256, 3)) + np.array([0.0, 0.0, 300.0])
     start, limits = random.uniform(-np.pi, np.pi, (256, 6)), np.array([(-np.pi, np.pi)] * 6)
     distance = {}
     for name, array in (("numpy", np.asarray), ("jax", jnp.asarray)):
