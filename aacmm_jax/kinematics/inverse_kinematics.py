@@ -74,8 +74,8 @@ def solve_to_targets(
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
     """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
-    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). In NumPy a row does not depend on the others; in
-    JAX by rounding, since all go on until the last has arrived.
+    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). In NumPy a row does not depend on the others;
+    in JAX all go on until the last has arrived.
 
     Args:
         geometry: The arm's ``geometry``.
