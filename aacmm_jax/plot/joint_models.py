@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.joint_model import function_of_joint
-from ..calibration.record import CalibrationRecord
+from ..calibration.record import CalibrationRecord, function_of_joint
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..diagnostics.pose_residuals import observation_residuals

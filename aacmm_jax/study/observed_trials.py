@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy.special import erf
 
 from ..calibration.evaluation import fit_geometry
-from ..calibration.redrawn import DrawnLengths, ObservedTruth, batch_of_observations, shifted
+from ..calibration.redrawn import ObservedTruth, shifted
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..kinematics.arm import Arm, by_joint
@@ -67,7 +67,7 @@ def draw_observed(
         for i, (observation, poses) in enumerate(zip(truth.observed.observations, truth.observed.slices, strict=True))
     ]
     u = np.broadcast_to(np.asarray(truth.observed.u), value.shape)
-    captures = batch_of_observations(observations, truth.ends, DrawnLengths(value, u))
+    captures = truth.batch(observations, value)
     lower, upper = study.cell_values.lower[cells], study.cell_values.upper[cells]
     return DrawnTrials(readings, np.stack(true), lower, upper, np.stack(start), value, u), captures
 
@@ -91,7 +91,7 @@ def _trial(
     errors = truth.errors_of_rows(1, float(values.seating), random)
     shifts = [error[0] - rows for error, rows in zip(errors, left, strict=True)]
     certified = {name: drawn[0] for name, drawn in truth.values(1, random).items()}
-    return true, start, read, shifts, certified, truth.lengths(1, random).value[0]
+    return true, start, read, shifts, certified, truth.lengths(1, random)[0]
 
 
 def _taken(
