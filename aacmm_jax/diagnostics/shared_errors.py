@@ -184,7 +184,8 @@ def _addition(
     if not tips and lacking is None:
         return None
     shared = _summed(problem, tips, lacking, without)
-    return shared, shared.added.sum(axis=0) + shared.follow @ shared.moments @ shared.follow.T, every.variance
+    added = np.asarray(shared.added.sum(axis=0) + shared.follow @ shared.moments @ shared.follow.T)
+    return shared, added, every.variance
 
 
 def _summed(problem: SharedProblem, tips: list[_Tips], functions: _Functions | None, without: Effects) -> SharedErrors:
