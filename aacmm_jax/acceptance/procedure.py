@@ -145,8 +145,18 @@ def plan_procedure(
         left_out += planner.plan_asme(lengths)
     else:
         planner.plan_iso(lengths)
-    parts = map(tuple, (planner.sockets, planner.touches, planner.lengths, planner.spheres, left_out))
-    return Procedure(arm, standard, reach, size, measuring_range is not None, *parts)
+    return Procedure(
+        arm,
+        standard,
+        reach,
+        measuring_range=size,
+        range_stated=measuring_range is not None,
+        sockets=tuple(planner.sockets),
+        touches=tuple(planner.touches),
+        lengths=tuple(planner.lengths),
+        spheres=tuple(planner.spheres),
+        left_out=tuple(left_out),
+    )
 
 
 def _unsuitable_bars(standard: Planned, size: float, lengths: Sequence[float]) -> list[str]:
@@ -265,7 +275,7 @@ class _Planner:
         ends = np.concatenate([tip[chosen] for tip in tips])
         others, owner = configurations_at(search, ends, _STARTS if repeats > 1 else 0)
         for number in range(positions):
-            labels = [f"{name}/{number + 1:02d}/{side}" for side in "ab"]
+            labels = f"{name}/{number + 1:02d}/a", f"{name}/{number + 1:02d}/b"
             for index, (label, q) in enumerate(zip(labels, (start, end), strict=True)):
                 at = index * positions + number
                 poses = np.concatenate([q[chosen[number]][None], others[owner == at]])

@@ -252,7 +252,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | None]]] = {
     "readings": (
         "{1} readings of each length in each position",
         "{1} readings in each position are required (a position has {0}).",
-        lambda m, needed: _fewer(needed, min(bar_positions(m).readings, default=0)),
+        lambda m, needed: _fewer(needed, min(bar_positions(m).readings.tolist(), default=0)),
     ),
     "positions": (
         "{1} positions of the bars, different by 10 degrees, or in place by 5 % of the range",
