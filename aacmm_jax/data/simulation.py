@@ -16,7 +16,7 @@ from ..core.random_keys import random_generator, random_key, random_numbers
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.chain import length_scale
-from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise

@@ -27,7 +27,7 @@ from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
-from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, InputFiles
 from .manifest_angles import Angles, Readings
