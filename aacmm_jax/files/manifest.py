@@ -23,11 +23,11 @@ from ..core.errors import InputError, naming
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings
 from ..data.joined_captures import join_sessions
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
-from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, InputFiles
 from .manifest_angles import Angles, Readings

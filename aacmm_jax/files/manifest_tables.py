@@ -18,8 +18,8 @@ from pydantic import (
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..data.observations.declared import Entry
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation, kinds
-from ..data.observations.socket import Socket
 from .text_lines import Column
 from .toml import Strict, each_once
 

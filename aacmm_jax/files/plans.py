@@ -7,14 +7,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..acceptance.procedure import TOUCHED, Procedure
-from ..acceptance.procedure_items import ProcedureItem
+from ..acceptance.procedure import TOUCHED, Procedure, ProcedureItem
 from ..acceptance.standards import PLANNED
 from ..core.text import csv_text
 from ..core.units import DEG
 from ..data.observations.declared import Entry
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan
