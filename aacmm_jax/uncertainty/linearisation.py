@@ -131,7 +131,8 @@ class Linearisation(NamedTuple):
             weight = xp.ones(block.white.shape[1]) if weight is None else weight
             roles = [role for role in group.roles if role.private]
             size, first = sum(role.size for role in roles), 0
-            assert block.by_head is not None and root is not None  # as rows of poses have them
+            assert block.by_head is not None
+            assert root is not None
             for i, (number, count) in enumerate(zip(group.members, group.counts, strict=True)):
                 at, first = slice(first, first + count), first + count
                 by_private, private = xp.zeros((0, *block.white[:, at].shape)), np.zeros(0, dtype=int)
