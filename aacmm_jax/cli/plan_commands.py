@@ -217,7 +217,7 @@ def _specification(arm: str, links: Mapping[str, Any], held: str | None, model: 
         specification = specification._replace(held=fixed, free=free)
     if model is None:
         return specification
-    from ..files.joint_models import with_model
+    from ..files.joint_options import with_model
 
     return with_model(specification, model)
 

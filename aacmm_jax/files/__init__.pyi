@@ -20,9 +20,7 @@ from .controllers import python_program as python_program
 from .controllers import zero_offsets as zero_offsets
 from .controllers import zero_offsets_csv as zero_offsets_csv
 from .evaluations import load_evaluation as load_evaluation
-from .evaluations import load_points as load_points
 from .evaluations import save_evaluation as save_evaluation
-from .evaluations import save_points as save_points
 from .kits import read_kit as read_kit
 from .manifest import read_manifest as read_manifest
 from .plans import save_plan as save_plan

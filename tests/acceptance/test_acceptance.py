@@ -642,7 +642,7 @@ def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
 
 
 def test_an_evaluation_of_points_is_stored_whole(tmp_path):
-    from aacmm_jax.files.evaluations import load_points, save_points
+    from aacmm_jax.files.evaluations import load_evaluation, save_evaluation
 
     spheres = (aj.data.ProbedSphere("S", "probing", (PLACE + 15.5 * AXES,), 31.0, 0.001, 0.0, 0.0002, 0.0001),)
     measured = lengths_of((0.01, 0.001, 100.0))._replace(
@@ -650,8 +650,8 @@ def test_an_evaluation_of_points_is_stored_whole(tmp_path):
     )
     cold = acceptance.Influences(arm=acceptance.Expansion(23e-6, 0.0, 15.0))
     record = acceptance.PointsRecord(measured, {"E_Uni": Limit(0.02, 49)}, 0.001, influences=cold)
-    save_points(tmp_path / "points.h5", record)
-    again = load_points(tmp_path / "points.h5")
+    save_evaluation(tmp_path / "points.h5", record)
+    again = load_evaluation(tmp_path / "points.h5")
     assert again.acceptance() == record.acceptance()
     assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
     written = aj.report.write_report(tmp_path / "points.h5", tmp_path / "points.html")
