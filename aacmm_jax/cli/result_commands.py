@@ -177,7 +177,7 @@ def _evaluated_points(
     from ..acceptance.record import PointsRecord
     from ..acceptance.standards import STANDARDS, checked_standards
     from ..files.evaluations import save_evaluation
-    from ..files.points import read_points
+    from ..files.manifest import read_points
     from ..summaries.evaluation import points_summary
 
     if manifest.suffix != ".toml":

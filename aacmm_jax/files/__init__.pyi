@@ -23,8 +23,8 @@ from .evaluations import load_evaluation as load_evaluation
 from .evaluations import save_evaluation as save_evaluation
 from .kits import read_kit as read_kit
 from .manifest import read_manifest as read_manifest
+from .manifest import read_points as read_points
 from .plans import save_plan as save_plan
-from .points import read_points as read_points
 from .ur_kinematics import ur_kinematics_yaml as ur_kinematics_yaml
 from .urdf import link_masses as link_masses
 from .urdf import save_urdf as save_urdf

@@ -19,7 +19,7 @@ from aacmm_jax.acceptance.all_tests import checked_limits
 from aacmm_jax.acceptance.judgement import read_limits
 from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
 from aacmm_jax.acceptance.standards import EDITIONS, STANDARDS
-from aacmm_jax.files.plans import procedure_csv, procedure_manifest
+from aacmm_jax.files.plans import plan_csv, plan_manifest
 from aacmm_jax.kinematics.workspace import Reach
 from tests.refusals import assert_refused
 
@@ -468,9 +468,9 @@ def test_a_limit_without_data_is_refused():
 
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(procedure, recorded, cheng, tmp_path):
     """As in a laboratory: plan, record a file for each socket and group of touches, import."""
-    (tmp_path / "acceptance.toml").write_text(procedure_manifest(procedure, "cheng2018-simulation"))
+    (tmp_path / "acceptance.toml").write_text(plan_manifest(procedure, "cheng2018-simulation"))
     files: dict[str, list[str]] = {}
-    for row in csv.DictReader(procedure_csv(procedure).splitlines()):
+    for row in csv.DictReader(plan_csv(procedure).splitlines()):
         files.setdefault(row["file"], []).append(" ".join(row[f"q_{i}_deg"] for i in range(1, 7)))
     for name, rows in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
