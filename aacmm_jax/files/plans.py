@@ -8,8 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..acceptance.procedure import TOUCHED, Procedure
-from ..acceptance.procedure_items import ProcedureItem
+from ..acceptance.procedure import TOUCHED, Procedure, ProcedureItem
 from ..acceptance.standards import PLANNED
 from ..core.text import csv_text
 from ..core.units import DEG
