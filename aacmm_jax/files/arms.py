@@ -3,6 +3,7 @@
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -83,7 +84,7 @@ def load_specification(
 
     A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
     `Parameters.independent`, and the default bounds. ``source`` is, like all arguments that are not named here, that of
-    `load_arm`.
+    `load_arm`; ``probe`` is in mm.
 
     Args:
         capture: What was observed, where it is known.
@@ -227,7 +228,9 @@ def _arm_of_rows(model: ArmFile) -> Arm:
         a=[length * a for _, a in links],
         d=[length * row.d for row in rows],
         theta=[angle * row.theta for row in rows],
-        beta=None if all(row.beta is None for row in rows) else [angle * (row.beta or 0.0) for row in rows],
+        beta=None
+        if all(row.beta is None for row in rows)
+        else [0.0 if row.beta is None else angle * row.beta for row in rows],
         probe=[length * x for x in model.probe],
         limits=None if rows[0].limits is None else limits,
         prismatic=model.prismatic,
@@ -326,7 +329,7 @@ def _corrections(arm: Arm) -> dict[str, object]:
     )
 
 
-def _given(**entries: object) -> dict[str, object]:
+def _given(**entries: Any) -> dict[str, Any]:
     """Entries that are not None; arrays as lists."""
     listed = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in entries.items()}
     return {key: value for key, value in listed.items() if value is not None}

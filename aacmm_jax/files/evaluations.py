@@ -47,13 +47,13 @@ def save_evaluation(
         >>> print(aj.files.load_evaluation("evaluation.h5").recording.capture.names)
         ('A', 'B', 'C', 'D')
     """
-    judged = record._replace(limits=checked_limits(record.limits))
-    if isinstance(judged, PointsRecord):
-        root = {"of": "points"} | dict(table_of(judged.measured, schema.POINTS).attributes)
-        write_tables(path, "evaluation", _points_tables(judged), root, summary=summary)
+    record = record._replace(limits=checked_limits(record.limits))
+    if isinstance(record, PointsRecord):
+        root = {"of": "points"} | dict(table_of(record.measured, schema.POINTS).attributes)
+        write_tables(path, "evaluation", _points_tables(record), root, summary=summary)
         return
     tables = captures.recording_tables(record.recording) | {"calibrated_arm": captures.arm_table(record.calibrated)}
-    tables["evaluation"] = table_of(judged, schema.EVALUATION)
+    tables["evaluation"] = table_of(record, schema.EVALUATION)
     rows = [
         (stage, test.standard, metric.name, metric.value, metric.decision or "", metric.worst)
         for stage, tests in record.acceptance().items()
