@@ -118,7 +118,7 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
     from ..data.reference_length import check_temperatures
     from ..files.manifest_rows import with_temperature
     from ..kinematics.arm import correction_names
-    from ..kinematics.corrections.expansion import Expansion
+    from ..kinematics.corrections import Expansion
 
     if Expansion.words[0] not in correction_names(calibrated):
         if temperature is not None:

@@ -77,7 +77,7 @@ def _of_capture(specification: Any, path: Path) -> dict[str, Any]:
 
 def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
     from ..data.capture import Capture
-    from ..data.observations.measured_points import MeasuredPoints
+    from ..data.observations.measured import MeasuredPoints
     from ..diagnostics.joint_travel import standing_rows
     from ..diagnostics.reading_check import check_readings
     from ..files.commanded_poses import read_known_poses

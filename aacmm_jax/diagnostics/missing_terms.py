@@ -19,8 +19,7 @@ from ..core.units import ARCSEC
 from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections.kind import Term
-from ..kinematics.corrections.kinds import all_sought, model_of, model_with, terms_of
+from ..kinematics.corrections import Term, all_sought, model_of, model_with, terms_of
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import Rows, wider
 from .findings import Case, Finding, chance_text, rounded

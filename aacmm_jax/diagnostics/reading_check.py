@@ -19,7 +19,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.units import DEG, INCH, M
 from ..data.capture import Capture
-from ..data.observations.measured_points import AbstractMeasured
+from ..data.observations.measured import AbstractMeasured
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.jacobian import tip_position
 from ..kinematics.workspace import total_link_length

@@ -23,7 +23,7 @@ from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
-from ..kinematics.corrections.kinds import coefficient_of, shared_model
+from ..kinematics.corrections import coefficient_of, shared_model
 from ..kinematics.priors import default_prior
 from ..uncertainty.covariance import DISAGREEMENT
 from ..uncertainty.degrees_of_freedom import Law

@@ -15,8 +15,8 @@ from ..core.errors import InputError, naming, nearest
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings
 from ..data.joined_captures import join_sessions
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
 from ..kinematics.workspace import Reach

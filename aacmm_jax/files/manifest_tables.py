@@ -26,11 +26,11 @@ from ..core.errors import InputError
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
 from ..data.observations.declared import Entry
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation, kinds
-from ..data.observations.socket import Socket
 from ..data.sphere import SphereTest
 from ..kinematics.arm import Arm, by_joint
-from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from .text_lines import Column
 from .toml import Point, Strict, each_once
 

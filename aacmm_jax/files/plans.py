@@ -13,8 +13,8 @@ from ..acceptance.standards import PLANNED
 from ..core.text import csv_text
 from ..core.units import DEG
 from ..data.observations.declared import Entry
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
 from ..kinematics.arm import by_joint
 from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan

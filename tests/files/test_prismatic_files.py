@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.data.observations.socket import Socket
+from aacmm_jax.data.observations.held import Socket
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files import controllers, plans
 from aacmm_jax.files.captures import load_capture, save_capture
