@@ -10,7 +10,7 @@ from ..calibration.record import CalibrationRecord, function_of_joint
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..diagnostics.pose_residuals import observation_residuals
-from ..kinematics.corrections.kind import Term
+from ..kinematics.corrections import Term
 from ..pipeline.model_ladder import ComparedModels
 from ..summaries.compared_models import compared_models_summary
 from ..summaries.tables import format_number
