@@ -94,7 +94,7 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
             return points_report(load_points(source))
         return evaluation_report(load_evaluation(source))
     if kind == "study":
-        from ..study.results import Results
+        from ..study.store import Results
         from .study import study_report
 
         return study_report(Results.of(source))
