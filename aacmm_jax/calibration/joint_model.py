@@ -12,7 +12,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
 from ..kinematics.arm import DOWN, Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.corrected_arm import function_values, with_corrections
-from ..kinematics.corrections.kind import Term
+from ..kinematics.corrections import Term
 from ..kinematics.parameters import Bounds, Parameters, based_on
 from ..kinematics.priors import Prior, default_prior
 from ..uncertainty.target_parameters import determined_parameters

@@ -22,7 +22,7 @@ from ..data.observations.observation import AbstractObservation
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.chain import JointKinds, reading_units
 from ..kinematics.corrected_arm import function_values, with_further_corrections
-from ..kinematics.corrections.kinds import term_of
+from ..kinematics.corrections import term_of
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed

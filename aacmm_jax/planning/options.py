@@ -17,7 +17,7 @@ from ..data.simulation import socket_point
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.collisions import Cell, HalfSpace
 from ..kinematics.cones import TOOL_AXIS, Cone, Cones, cones_of
-from ..kinematics.corrections.expansion import Expansion
+from ..kinematics.corrections import Expansion
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import SearchRegion, arm_reach, search_region, total_link_length
 from ..uncertainty.volume import default_length

@@ -11,7 +11,7 @@ from ..calibration.record import CalibrationRecord
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..diagnostics.pose_residuals import observation_residuals
-from ..kinematics.corrections.kind import Term
+from ..kinematics.corrections import Term
 from ..pipeline.model_ladder import ComparedModels
 from ..summaries.compared_models import compared_models_summary
 from ..summaries.tables import format_number

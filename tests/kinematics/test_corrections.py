@@ -12,7 +12,7 @@ from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.chain import forward_pass, joint_motion, joints_first
 from aacmm_jax.kinematics.corrected_arm import function_values
-from aacmm_jax.kinematics.corrections.kinds import terms_of
+from aacmm_jax.kinematics.corrections import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
 from aacmm_jax.kinematics.joint_functions import KnownFunctions
 
@@ -179,7 +179,7 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         (["expansion_1"], "is of the whole arm and has no number"),
         (["cos1"], "is of a joint from 1 to 7"),
         ("coupled=2", "names no joints"),
-        ("coupled=2-9", "names joint 9 of 7"),
+        ("coupled=2-9", "is of a joint from 1 to 7"),
         (["cos1_9"], "is of a joint from 1 to 7"),
         (["compliance1_2"], "is of a link from 2 to 7"),
         (["d_3"], "'d_3' is not the name of a coefficient"),
