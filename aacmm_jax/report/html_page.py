@@ -93,7 +93,7 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
         of_points = attributes.get("of") == "points"
         return (points_report if of_points else evaluation_report)(load_evaluation(source))
     if kind == "study":
-        from ..study.results import Results
+        from ..study.store import Results
         from .study import study_report
 
         return study_report(Results.of(source))
