@@ -21,7 +21,7 @@ from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
-from ..data.observations.socket import position_of
+from ..data.observations.held import position_of
 from ..kinematics.arm import Arm, check_columns
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.metrics import Repeatability, no_repeatability, repeatability

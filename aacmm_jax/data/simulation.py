@@ -21,8 +21,7 @@ from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
 from .observations.declared import MOST_POSES
-from .observations.observation import AbstractObservation
-from .observations.simulated import AbstractSimulated
+from .observations.observation import AbstractObservation, AbstractSimulated
 from .reference_length import check_temperatures
 
 

@@ -4,9 +4,9 @@ from typing import Any
 
 from ..plot.charts import Chart
 from ..plot.study import metric_plots
-from ..study.results import Results
-from ..study.statistics import factor_title, level_text, metric_title, study_summary
-from ..study.tables import cell_table, label, metric_table, parameter_table
+from ..study.results import study_summary
+from ..study.store import Results
+from ..study.tables import cell_table, factor_title, label, level_text, metric_table, metric_title, parameter_table
 from .elements import Report, Section
 
 _SHOWN = (
