@@ -112,7 +112,7 @@ def concluded(
         covariances = propagation.row_covariances(linear.point.rows, linear.errors, whitening, noise)
         rows = [influence.weighted_rows(number) for number in range(len(groups))]
         shared = propagation.of_shared_readings(rows, linear.errors, whitening, noise, reading)
-    by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales.added(influence.inverse)
+    by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales(influence.inverse)
     unknowns = propagation.propagated(influence, covariances, shared, by_scales)
     spent = p + count if of_prior is None else of_prior.effective
     metrics = _metrics(task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent)

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.left_out import CrossValidation, LeftOut
-from ..calibration.prediction import Agreement
+from ..calibration.prediction import Agreement, CrossValidation, LeftOut
 
 
 def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
