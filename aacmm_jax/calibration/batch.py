@@ -31,17 +31,9 @@ from ..model.robust import Loss
 from ..solver.reason import numbers_of, reasons
 from .batch_kernel import Form, Problems, selected, solve_chunk
 from .results import ManyCalibrations, ManyIdentifications
-from .scale_anchor import Method
+from .scale_anchor import Method, method_of
 from .stages import divided
-from .task import (
-    Solving,
-    anchor_of,
-    check_data,
-    checked_noise_model,
-    configurations,
-    method_of,
-    without_lengths,
-)
+from .task import Solving, anchor_of, check_data, checked_noise_model, configurations, without_lengths
 
 # Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
 # 7,000 poses: five times slower where they do not); a GPU needs thousands.
@@ -157,7 +149,8 @@ def calibrate_many(
     """
     given = BatchOptions(**options)
     problems, space, size = _laid_out("calibrate", arm, capture, lower, upper, start, given)
-    method, at_once = method_of(arm, capture, space, given.solving, method, given.covariance)
+    at_once = given.covariance or given.solving.all_at_once
+    method, at_once = method_of(arm, capture, space, given.noise, method, at_once)
     given = given._replace(hold=None) if at_once else given._replace(covariance=False)
     batch = _Batch(problems, _form(problems, space, given, at_once), size, space, given)
     stage1 = batch.identify()

@@ -9,7 +9,7 @@ with n degrees of freedom, the ratio of found to predicted has the F distributio
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -63,7 +63,7 @@ class _Part(NamedTuple):
     """Sums of squares of one observation: found, and of what the trace of V, and that of its square, consist."""
 
     poses: int  # 0 for the only pose of a socket, which shows no scatter
-    found: float  # mm^2
+    squares: float  # mm^2
     turned: int  # poses with an orientation
     angles: float  # rad^2
     normalised: float  # of the residuals in standard deviations
@@ -90,7 +90,7 @@ class UnseenErrors(NamedTuple):
         return np.sqrt(np.diagonal(self.length_covariance))
 
     def expanded(self, level: float = 0.95) -> Float[np.ndarray, " l"]:
-        """Expanded uncertainty of the error of every reference length, mm."""
+        """Its expanded uncertainty, mm."""
         return coverage_factor(level, self.length_parts, self.law) * self.length_u
 
     def of(self, names: Iterable[str]) -> Agreement:
@@ -98,13 +98,14 @@ class UnseenErrors(NamedTuple):
         parts = [self.parts[name] for name in names if self.parts[name].poses]
         if not parts:
             return NOTHING
-        whole, effective = _Part(*map(sum, zip(*parts, strict=True))), math.nan
+        sums: list[Any] = [sum(column) for column in zip(*parts, strict=True)]
+        whole, effective = _Part(*sums), math.nan
         if 0 < whole.trace < math.inf:
             both = whole.shared @ self.common
             effective = whole.trace**2 / (whole.square + float(np.sum(both * both.T)))
         return Agreement(
             count=whole.poses,
-            rms=math.sqrt(whole.found / whole.poses),
+            rms=math.sqrt(whole.squares / whole.poses),
             predicted=math.sqrt(whole.trace / whole.poses),
             degrees_of_freedom=effective,
             noise_degrees_of_freedom=self.noise_degrees_of_freedom,
@@ -169,7 +170,7 @@ class _Unseen(NamedTuple):
     linear: Linearisation
     influence: Influence
     parts: list[ObservationRows]
-    own: Sequence[Float[AnyArray, "_ _ _"]]  # U of each observation's own geometry
+    private: Sequence[Float[AnyArray, "_ _ _"]]  # U of each observation's own geometry
     joined: Sequence[Float[AnyArray, "w _ _"]]  # W but for these: of the shared geometry, and K A
     common: Float[np.ndarray, "w w"]  # S for these
     basis: Float[np.ndarray, "s b"]  # of the shared geometry's numbers, with which its columns are orthonormal
@@ -197,46 +198,46 @@ class _Unseen(NamedTuple):
         pairs = list(zip(of_shared, of_parameters, strict=True))
         along = np.sum([flat(b) @ flat(a).T for b, a in pairs], axis=0)
         joined = [np.concatenate([b, a - np.einsum("bp,brm->prm", along, b)]) for b, a in pairs[:groups]]
-        count, own = len(basis.T), []
+        count, private = len(basis.T), []
         common = np.zeros((count + p,) * 2)
         common[:count, :count], common[count:, count:] = -np.eye(count), uncertainty.covariance
         for number, block in enumerate(influence.blocks[:groups]):
             rows = influence.own_rows(number)
             if rows is None:
-                own.append(np.zeros((0, *block.white.shape)))
+                private.append(np.zeros((0, *block.white.shape)))
                 continue
             values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
             roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
-            own.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
-        split = (observed.by_observation(rows) for rows in (own, joined))
-        return cls(uncertainty, linear, influence, linear.parts(), *split, common, basis, along)
+            private.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
+        private, joined = observed.by_observation(private), observed.by_observation(joined)
+        return cls(uncertainty, linear, influence, linear.parts(), private, joined, common, basis, along)
 
 
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
     values = np.asarray(part.values)
     r, m = values.shape
-    own, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.own, problem.joined))  # (m, w, r)
+    private, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.private, problem.joined))
     to_mm = np.linalg.inv(np.asarray(part.root))[:, :POSITION_ROWS]
     weights = np.einsum("mca,mcb->mab", to_mm, to_mm)
     common, p = problem.common, len(problem.uncertainty.space.names)
     by_common = np.einsum("mwa,wv->mva", joined, common)
-    errors = np.einsum("mva,mvb->mab", by_common, joined) - np.einsum("mka,mkb->mab", own, own)
+    errors = np.einsum("mva,mvb->mab", by_common, joined) - np.einsum("mka,mkb->mab", private, private)
     along = np.swapaxes(joined[:, joined.shape[1] - p :], 1, 2)
     is_open = not np.all(np.isfinite(problem.uncertainty.covariance_of_functions(to_mm @ along)))
-    weighted, of_own = joined @ weights, own @ weights
-    alone, crossed = np.einsum("mka,mla->kl", of_own, own), np.einsum("mka,mwa->kw", of_own, joined)
+    of_private = private @ weights
+    alone, crossed = np.einsum("mka,mla->kl", of_private, private), np.einsum("mka,mwa->kw", of_private, joined)
     square = np.sum(weights**2) + 2 * np.einsum("mab,mbc,mca->", weights, weights, errors)
     square = square + np.sum(alone * alone.T) - 2 * np.sum((crossed @ common) * crossed)
     return _Part(
         poses=0 if part.observation.kind == "socket" and m == 1 else m,
-        found=float(np.sum(values[:POSITION_ROWS] ** 2)),
+        squares=float(np.sum(values[:POSITION_ROWS] ** 2)),
         turned=m if r > POSITION_ROWS else 0,
         angles=float(np.sum(values[POSITION_ROWS:] ** 2)),
         normalised=float(np.sum(np.asarray(part.white) ** 2)),
         rows=r * m,
         trace=math.inf if is_open else float(np.einsum("maa->", weights) + np.sum(weights * errors)),
         square=float(square),
-        shared=np.einsum("mwa,mva->wv", weighted, joined),
+        shared=np.einsum("mwa,mva->wv", joined @ weights, joined),
     )
 
 
@@ -258,7 +259,7 @@ def _of_lengths(
     pull = by_head[:, p:] @ problem.basis
     along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
     pairs = zip(components, influence.own, strict=True)
-    scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, own, part) for part, own in pairs], axis=0)
+    scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, inverse, part) for part, inverse in pairs], axis=0)
     covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
     error = np.asarray(measured) - np.array([float(length.value) for length in capture.lengths])
     # What they rest on: the parts of the calibration's uncertainty, of which the first contains the scatter of the

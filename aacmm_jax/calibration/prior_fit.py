@@ -106,7 +106,7 @@ class PriorProblem(NamedTuple):
     def first_scales(self) -> Float[AnyArray, " s"]:
         """The scales before anything is learned; those that are given keep these values."""
         xp, prior = namespace(self.reference.sigma, self.prior), self.prior
-        first = np.array([own[0] for own in prior.members])
+        first = np.array([members[0] for members in prior.members])
         variances = 2 * xp.log(xp.maximum((prior.sd / self.begun.steps[: prior.sd.shape[0]])[first], _LEAST_GIVEN))
         return xp.concatenate([_log_sigma(self.reference.sigma), variances])
 
@@ -207,13 +207,13 @@ class PriorProblem(NamedTuple):
     def metrics(self, scales: Float[AnyArray, " s"], effective: Float[AnyArray, " k"]) -> PriorMetrics:
         """What the result says of the prior."""
         xp, prior = namespace(scales, effective), self.prior
-        first = np.array([own[0] for own in prior.members])
+        first = np.array([members[0] for members in prior.members])
         in_units, of_groups = np.array([unit != MIXED for unit in prior.units]), xp.exp(0.5 * scales[1:])
         return PriorMetrics(
             groups=prior.groups,
             learned=prior.learned,
             units=prior.units,
-            parameters=tuple(len(own) for own in prior.members),
+            parameters=tuple(len(members) for members in prior.members),
             sd=xp.where(in_units, of_groups * self.begun.steps[first], of_groups),
             effective=xp.asarray(prior.membership) @ effective,
             supported=~xp.asarray(self.learned) | self.moving(scales),
