@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 from ..core.arguments import Count, checked
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
-from ..core.x64 import check_x64
+from ..core.jax_setup import check_x64
 from .active_set import Box, Flat, QuadraticModel, expand
 from .adjoint import BoundedAdjoint, box_of
 from .levenberg_marquardt import Progress, Rules, advance, begin
