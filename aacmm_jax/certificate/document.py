@@ -32,7 +32,10 @@ def dcc_xml(
 ) -> str:
     """Make the Digital Calibration Certificate of a calibration.
 
-    The same input gives the same text: without a stated number, the unique identifier is a UUID of the content.
+    The same input gives the same text: without a stated number, the unique identifier is a UUID of the content. Returns
+    the text of an XML file in UTF-8. `InputError` if the calibration did not converge, its scale is impossible or the
+    nominal arm's, a name has characters that XML does not allow, the dates are out of order, the evaluation is of
+    another arm, or a conformity is stated that no result supports.
 
     Args:
         record: The calibration.
@@ -42,14 +45,6 @@ def dcc_xml(
         command: The command that computed it.
         evaluation: An evaluation of the same calibration, whose acceptance tests are added. A statement of conformity
             rests on them, and is refused without them.
-
-    Returns:
-        The text of an XML file in UTF-8.
-
-    Raises:
-        InputError: If the calibration did not converge, its scale is impossible or the nominal arm's, a name has
-            characters that XML does not allow, the dates are out of order, the evaluation is of another arm, or a
-            conformity is stated that no result supports.
 
     Example:
         >>> data = aj.files.AdministrativeData(laboratory={"name": "Metrology Laboratory"})

@@ -30,15 +30,12 @@ class CertifiedValue(NamedTuple):
 def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
     """Read the single values (``si:real``) among the results of a Digital Calibration Certificate.
 
+    Returns the values by the names of measurement result, result, list and quantity, such as ``("Calibrated
+    parameters", "Denavit-Hartenberg parameters", "a_2")``; of several with the same names, the last. `InputError` if
+    the text is no XML, no DCC, or has a document type, whose entities could name other files.
+
     Args:
         text: The XML of the certificate.
-
-    Returns:
-        The values by the names of measurement result, result, list and quantity, such as
-        ``("Calibrated parameters", "Denavit-Hartenberg parameters", "a_2")``; of several with the same names, the last.
-
-    Raises:
-        InputError: If the text is no XML, no DCC, or has a document type, whose entities could name other files.
 
     Example:
         >>> text = aj.certificate.dcc_xml(record, aj.files.AdministrativeData(), created="2026-01-31T12:00:00Z")

@@ -35,7 +35,7 @@ def view_of_arm(
         geometry: The parts of the unknown geometry, mm and rad, of a capture with observations besides sockets.
     """
     groups, q = Groups.of(capture), np.asarray(capture.readings)
-    owner, numbers, chosen = groups.owner, groups.numbers, thinned(len(q), _MOST)
+    owner, labels, chosen = groups.owner, groups.labels, thinned(len(q), _MOST)
     tips = np.asarray(arm.position(capture.q))
     marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
     lines = skeleton(arm, q[chosen])
@@ -52,7 +52,7 @@ def view_of_arm(
         "from": "geometry" if capture.observations else "socket's centroid",
         "poses": [
             {
-                "label": f"{groups.names[owner[i]]}, pose {numbers[i]}",
+                "label": labels[i],
                 "points": np.round(line, 1).tolist(),
                 "distance": float(f"{distances[i]:.4g}") if np.isfinite(distances[i]) else None,
             }

@@ -30,17 +30,13 @@ def write_report(
 ) -> dict[str, Any]:
     """Write the report of a calibration, an evaluation, a study or compared models as one HTML file.
 
+    Returns title, verdict, warnings and size of the report. `InputError` if the source cannot be read or the target not
+    written, the administrative data state a conformity that the source contradicts, or Jinja is not installed.
+
     Args:
         source: The HDF5 file of the calibration, the evaluation, the study or the compared models.
         target: The HTML file to write, whole or not at all.
         administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
-
-    Returns:
-        Title, verdict, warnings and size of the report.
-
-    Raises:
-        InputError: If the source cannot be read or the target not written, the administrative data state a conformity
-            that the source contradicts, or Jinja is not installed.
 
     Example:
         >>> aj.files.save_calibration("calibration.h5", record)

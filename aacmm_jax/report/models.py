@@ -6,7 +6,7 @@ import numpy as np
 
 from ..core.text import pluralise
 from ..plot.charts import Chart, Marks, Plot, linear, names
-from ..plot.joint_models import models_chart
+from ..plot.parameters import models_chart
 from ..summaries.result_tables import MODELS_MEANING, model_tables
 from ..summaries.tables import Table, format_number, number
 from .elements import Report, Section

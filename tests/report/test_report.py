@@ -14,7 +14,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.plot import charts, svg
-from aacmm_jax.plot.uncertainty import tried_shades
+from aacmm_jax.plot.lengths import tried_shades
 from aacmm_jax.report import elements, write_report
 from aacmm_jax.report.html_page import _origin
 from aacmm_jax.summaries.tables import Table, decimals_for, format_number, number
