@@ -34,9 +34,7 @@ from ..summaries.tables import (
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
-from .arm_view import view_of_arm
-from .elements import Block, Section
-from .tables import DRAWN, residual_chart, socket_table
+from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_of_arm
 
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
