@@ -6,6 +6,7 @@ dots keep their size; text stands at percentages. Colours are those of the page'
 
 import html
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def points(plot: Plot) -> list[list]:
     return said
 
 
-def _positions(plot: Plot, x: object, y: object) -> tuple[np.ndarray, np.ndarray]:
+def _positions(plot: Plot, x: object, y: object) -> tuple[Any, Any]:
     return 1000 * plot.x.at(x), 1000 * (1 - plot.y.at(y))
 
 
