@@ -55,7 +55,7 @@ def _summary(specification: Any, check: Any, unit: str | None, positions: str, m
 
     best = check.best
     summary = reading_check_summary(check, specification.name, unit=unit, positions=positions)
-    angles = check.explained and (best.hypothesis.changes or best.angle != 1)
+    angles = check.explained and best.hypothesis._replace(length=1.0).changes
     summary["angles"] = angles_toml(best, unit, manifest) if angles else None
     summary["units"] = units_toml(best, positions) if check.explained else None
     return summary | {"standing": [], "reading_sets": [], "reading_sets_sentence": ""}
@@ -77,7 +77,7 @@ def _of_capture(specification: Any, path: Path) -> dict[str, Any]:
 
 def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
     from ..data.capture import Capture
-    from ..data.observations.measured_points import MeasuredPoints
+    from ..data.observations.measured import MeasuredPoints
     from ..diagnostics.joint_travel import standing_rows
     from ..diagnostics.reading_check import check_readings
     from ..files.commanded_poses import read_known_poses

@@ -14,7 +14,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.text import pluralise
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise, tip_covariances
-from ..data.observations.measured_points import MeasuredPoints
+from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm, joint_limits, parameter_names
 from ..kinematics.chain import joint_motion
 from ..kinematics.independence import generic_poses

@@ -5,13 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.joint_model import function_of_joint
-from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..calibration.record import CalibrationRecord, function_of_joint, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import DEG, people_read
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import is_length, parameter_unit
-from ..kinematics.corrections.kind import Term
+from ..kinematics.corrections import Term
 from ..pipeline.model_ladder import ComparedModels
 from ..summaries.compared_models import compared_models_summary
 from ..summaries.harmonics import listed_apart

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..study.results import Results
-from ..study.statistics import METRICS, correlation, factor_title, level_text, level_title, metric_title, shown_unit
+from ..study.blocks import METRICS
+from ..study.results import correlation
+from ..study.store import Results
+from ..study.tables import factor_title, level_text, level_title, metric_title, shown_unit
 from ..summaries.tables import format_number
 from .charts import SERIES, Marks, Plot, linear, logarithmic, names, thinned
 from .figures import draw, draw_all, save_figure
@@ -29,7 +31,7 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
 
     Args:
         results: The study.
-        metric: Name of the metric, a key of `study.statistics.METRICS`.
+        metric: Name of the metric, a key of `study.blocks.METRICS`.
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:

@@ -103,14 +103,13 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
 
         return calibration_report(load_calibration(source))
     if kind == "evaluation":
-        from ..files.evaluations import load_evaluation, load_points
+        from ..files.evaluations import load_evaluation
         from .evaluation import evaluation_report, points_report
 
-        if attributes.get("of") == "points":
-            return points_report(load_points(source))
-        return evaluation_report(load_evaluation(source))
+        of_points = attributes.get("of") == "points"
+        return (points_report if of_points else evaluation_report)(load_evaluation(source))
     if kind == "study":
-        from ..study.results import Results
+        from ..study.store import Results
         from .studies import study_report
 
         return study_report(Results.of(source))

@@ -8,9 +8,9 @@ from ..core.text import pluralise
 from ..plot.charts import Chart, Marks, Plot, linear, names
 from ..plot.parameters import models_chart
 from ..plot.study import metric_plots
-from ..study.results import Results
-from ..study.statistics import factor_title, level_text, metric_title, study_summary
-from ..study.tables import cell_table, label, metric_table, parameter_table
+from ..study.results import study_summary
+from ..study.store import Results
+from ..study.tables import cell_table, factor_title, label, level_text, metric_table, metric_title, parameter_table
 from ..summaries.result_tables import MODELS_MEANING, model_tables
 from ..summaries.tables import format_number, number
 from .elements import Report, Section

@@ -19,7 +19,7 @@ from ..diagnostics.model_errors import model_tests, rows_of_tests
 from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.tried_poses import tried_poses
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
-from ..kinematics.corrections.kinds import coefficient_of
+from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability

@@ -13,7 +13,7 @@ from ..core.errors import InputError
 from ..core.text import common_labels
 from ..data.capture import Capture, names_in, part_of
 from ..data.noise import Noise
-from ..data.observations.socket import Socket
+from ..data.observations.held import Socket
 from ..diagnostics.findings import sentences
 from ..diagnostics.held_out import no_better, surprise
 from ..kinematics.arm import Arm

@@ -398,7 +398,7 @@ decision_rule = "a rule"
 
 def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
     from aacmm_jax.acceptance.record import PointsRecord
-    from aacmm_jax.files.evaluations import save_points
+    from aacmm_jax.files.evaluations import save_evaluation
 
     (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
     stated = aj.files.read_administrative_data(tmp_path / "pass.toml")
@@ -407,9 +407,9 @@ def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
             lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated"
         )
     measured = aj.acceptance.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
-    save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
+    save_evaluation(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
     assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
-    save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
+    save_evaluation(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
     write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
     assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
     assert_refused(lambda: aj.certificate.dcc_xml(written.record, stated, created="2026-01-31T00:00:00"), "simulated")
