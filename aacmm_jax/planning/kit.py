@@ -15,8 +15,7 @@ from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
-from ..kinematics.cones import Cone, cones_of
-from ..kinematics.workspace import reached
+from ..kinematics.workspace import Cone, cones_of, reached
 from ..uncertainty.identifiability import observability
 from .kit_placement import KitItem, Thing, candidates_of_kit, least_poses, place, set_up
 from .motion import Motion, ordered_motion
@@ -200,10 +199,10 @@ def _in_order(
         seat, q = thing.seat(problem.region), np.asarray(poses.q)
         assert seat.cones is not None
         normals = np.tile(seat.cones.normals, (len(q), 1))
-        retract = problem.options.retract if thing.has_cone else 0.0
+        retract = problem.options.retract if thing.item.has_cone else 0.0
         order, motion = ordered_motion(seat, q, poses.places, normals, retract)
         ordered.append(poses.select(order))
-        motions.append(motion if thing.has_cone else motion._replace(tilt=np.full(len(q), np.nan)))
+        motions.append(motion if thing.item.has_cone else motion._replace(tilt=np.full(len(q), np.nan)))
     return ordered, tuple(motions)
 
 

@@ -18,8 +18,7 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.rotations import rotation_vector
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
-from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
-from ..kinematics.workspace import SearchRegion, reached, total_link_length
+from ..kinematics.workspace import TOOL_AXIS, Cone, SearchRegion, cones_of, reached, total_link_length
 from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation
 from .designs import Candidates, best_layout, relaxed_value
@@ -57,6 +56,11 @@ class KitItem(NamedTuple):
     # Out of its seats: in an artefact's own frame, for everything else in the base frame.
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
+    @property
+    def has_cone(self) -> bool:
+        """Whether it can be approached from some directions only."""
+        return self.half_angle < math.pi
+
 
 class Thing(NamedTuple):
     """An item in one of its places."""
@@ -64,11 +68,6 @@ class Thing(NamedTuple):
     item: KitItem
     simulated: AbstractSimulated
     frame: Frame | None = None  # None of what stands where it is
-
-    @property
-    def has_cone(self) -> bool:
-        """Whether it can be approached from some directions only."""
-        return self.item.half_angle < math.pi
 
     def at(self, frame: Frame) -> "Thing":
         """The same thing elsewhere."""
@@ -85,7 +84,7 @@ class Thing(NamedTuple):
 
     def approachable(self, seat: SearchRegion, q: Float[np.ndarray, "c n"], retract: float) -> Bool[np.ndarray, " c"]:
         """Which poses can be taken by way of their approach points; all where it has none."""
-        if not (retract and self.has_cone and seat.cones is not None):
+        if not (retract and self.item.has_cone and seat.cones is not None):
             return np.ones(len(q), dtype=bool)
         return approaches(seat, q, np.tile(seat.cones.normals, (len(q), 1)), retract).possible
 

@@ -15,10 +15,18 @@ from ..data.noise import Noise
 from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
 from ..kinematics.chain import reading_units
 from ..kinematics.collisions import Cell, HalfSpace
-from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
 from ..kinematics.corrections import Expansion
 from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import Reach, SearchRegion, arm_reach, search_region, total_link_length
+from ..kinematics.workspace import (
+    TOOL_AXIS,
+    Cone,
+    Reach,
+    SearchRegion,
+    arm_reach,
+    cones_of,
+    search_region,
+    total_link_length,
+)
 from ..uncertainty.volume import default_length, sample_lengths
 from .designs import Candidates, Kind, Objective, covariance_of, exchange
 

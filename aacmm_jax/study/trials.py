@@ -15,7 +15,7 @@ from scipy.special import erf
 
 from ..calibration.batch import calibrate_many, identify_many
 from ..calibration.evaluation import fit_geometry
-from ..calibration.redrawn import DrawnLengths, ObservedTruth, batch_of_captures, batch_of_observations, shifted
+from ..calibration.redrawn import ObservedTruth, batch_of_captures, shifted
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
@@ -201,7 +201,7 @@ def _draw_observed(
         for i, (observation, poses) in enumerate(zip(truth.observed.observations, truth.observed.slices, strict=True))
     ]
     u = np.broadcast_to(np.asarray(truth.observed.u), value.shape)
-    captures = batch_of_observations(observations, truth.ends, DrawnLengths(value, u))
+    captures = truth.batch(observations, value)
     lower, upper = study.cell_values.lower[cells], study.cell_values.upper[cells]
     return DrawnTrials(readings, np.stack(true), lower, upper, np.stack(start), value, u), captures
 
@@ -225,7 +225,7 @@ def _trial(
     errors = truth.errors_of_rows(1, float(values.seating), random)
     shifts = [error[0] - rows for error, rows in zip(errors, left, strict=True)]
     certified = {name: drawn[0] for name, drawn in truth.values(1, random).items()}
-    return true, start, read, shifts, certified, truth.lengths(1, random).value[0]
+    return true, start, read, shifts, certified, truth.lengths(1, random)[0]
 
 
 def _taken(
