@@ -9,8 +9,7 @@ from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeFloat, Posit
 
 from ..core.errors import InputError
 from ..core.units import DEG
-from ..data.arm_classes import CLASSES, SEATING, ArmNoise, class_noise, noise_of_repeatability
-from ..data.noise import Noise
+from ..data.noise import CLASSES, SEATING, ArmNoise, Noise, class_noise, noise_of_repeatability
 from ..kinematics.arm import Arm
 from .corrections import CorrectionsTable
 from .priors import PriorTable

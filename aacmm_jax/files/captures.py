@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import naming
-from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
-from ..data.copies import UNKNOWN, Repeated
-from ..data.recording import Recording
-from ..data.sphere import ProbedSphere, checked_sphere
+from ..data.capture_data import UNKNOWN, Repeated
+from ..data.noise import ArmNoise
+from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.arm import Arm, readings_unit
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior

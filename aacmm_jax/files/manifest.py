@@ -21,12 +21,10 @@ from pydantic import (
 from ..acceptance.standards import Standard
 from ..core.errors import InputError, naming
 from ..core.text import shorten
-from ..data.capture import Capture, ReferenceLength, check_readings
-from ..data.joined_captures import join_sessions
+from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.recording import Recording
-from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
+from ..data.recording import ProbedSphere, Recording, SphereTest, checked_sphere
 from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile, InputFiles

@@ -12,7 +12,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
-from ..data.capture import check_revolutions
+from ..data.capture_data import check_revolutions
 from ..kinematics.arm import Arm, by_joint
 from .manifest_tables import Picked, Wanted, as_list, checked_unit
 from .table_columns import TEMPERATURE, reading_columns

@@ -37,7 +37,7 @@ def _table(observation: AbstractObservation, joints: int, unit: str) -> Table:
 
 
 def _field(entry: Entry) -> Field:
-    content = "number" if entry.content == "points" else entry.content
+    content: Any = "number" if entry.content == "points" else entry.content
     return Field(entry.says, entry.unit, entry.dimensions, content)
 
 

@@ -11,8 +11,7 @@ from ..core.arguments import Count, Range, checked_fields
 from ..core.arrays import Numbers
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import to_numpy
-from ..data.arm_classes import CLASSES, ArmNoise, small_arm_noise
-from ..data.noise import Noise
+from ..data.noise import CLASSES, ArmNoise, Noise, small_arm_noise
 from ..data.simulation import socket_point
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.collisions import Cell, HalfSpace

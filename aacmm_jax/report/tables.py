@@ -9,7 +9,7 @@ from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..data.capture import Capture
 from ..diagnostics.pose_residuals import distances_of, observation_residuals
-from ..model.metrics import pose_outliers
+from ..model.sockets import pose_outliers
 from ..plot.charts import Chart
 from ..plot.residuals import Groups, distances_in, pose_chart
 from ..summaries.observations import capture_observations

@@ -11,7 +11,7 @@ import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import trials_of
 from aacmm_jax.calibration.sampling import _RepeatedTask
 from aacmm_jax.core.distributions import student_quantile
-from aacmm_jax.data.arm_classes import ArmNoise
+from aacmm_jax.data.noise import ArmNoise
 from aacmm_jax.diagnostics.findings import amendable
 from aacmm_jax.diagnostics.group_test import Block
 from aacmm_jax.diagnostics.random_effects import Effects, one_variance
