@@ -7,6 +7,12 @@ from .judgement import Expansion as Expansion
 from .judgement import Influences as Influences
 from .judgement import Limit as Limit
 from .judgement import decide as decide
+from .metrics import articulated_location as articulated_location
+from .metrics import form_error as form_error
+from .metrics import half_range as half_range
+from .metrics import size_error as size_error
+from .metrics import spat as spat
+from .metrics import two_rms as two_rms
 from .procedure import Procedure as Procedure
 from .procedure import plan_procedure as plan_procedure
 from .procedure import simulate_procedure as simulate_procedure
@@ -18,10 +24,4 @@ from .results import METRICS as METRICS
 from .results import AcceptanceTest as AcceptanceTest
 from .results import Measured as Measured
 from .results import Metric as Metric
-from .sockets import articulated_location as articulated_location
-from .sockets import form_error as form_error
-from .sockets import half_range as half_range
-from .sockets import size_error as size_error
-from .sockets import spat as spat
-from .sockets import two_rms as two_rms
 from .standards import SYMBOLS as SYMBOLS

@@ -18,9 +18,9 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach, SearchRegion, arm_reach, configurations_at, lowest_point, search_region
 from ..uncertainty.volume import sample_lengths
 from .geometry import LEFT_OR_RIGHT, elbow_sides, touch_directions, unit_rows
+from .metrics import SPAT_POSES, ZONES
 from .requirements import BARS, LONGEST, bar_range
 from .results import percent
-from .sockets import SPAT_POSES, ZONES
 from .standards import Planned
 
 # The tests of touched spheres: as an item names them, and as a manifest does.

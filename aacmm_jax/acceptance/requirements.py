@@ -25,8 +25,8 @@ from .geometry import (
     unit_rows,
 )
 from .judgement import Influences
+from .metrics import SPAT_POSES, ZONES, articulated, spheres_for, zone_of
 from .results import AcceptanceTest, Measured, Metric, percent
-from .sockets import SPAT_POSES, ZONES, articulated, spheres_for, zone_of
 from .standards import ASME_B89_4_22, EDITIONS, ISO_10360_12, JJF_1408
 
 Confidence = Literal[

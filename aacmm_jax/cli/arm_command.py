@@ -87,7 +87,7 @@ def arm(
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
     if model is not None:
-        from ..files.joint_models import with_model
+        from ..files.joint_options import with_model
 
         specification = with_model(specification, model)
     with together(figure):

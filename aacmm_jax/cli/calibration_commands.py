@@ -114,7 +114,7 @@ def calibrate(
     """
     from ..diagnostics.usability import does_not_fit
     from ..files.calibrations import save_calibration
-    from ..files.joint_models import with_model
+    from ..files.joint_options import with_model
     from ..pipeline.capture_calibration import CaptureOptions, calibrate_capture
     from ..summaries.calibration import calibration_summary
 
@@ -216,7 +216,7 @@ def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
         return default_prior(nominal.arm)
     if text is None:
         return nominal.prior
-    from ..files.priors import prior_of_text
+    from ..files.joint_options import prior_of_text
 
     return prior_of_text(text, nominal.arm)
 
@@ -272,7 +272,7 @@ def compare_models(
     from ..files.captures import load_capture
     from ..files.compared_models import save_compared_models
     from ..files.inputs import InputFile, fingerprint
-    from ..files.joint_models import masses_of
+    from ..files.joint_options import masses_of
     from ..pipeline.model_ladder import compare_models as run
     from ..summaries.compared_models import compared_models_summary
 

@@ -159,6 +159,7 @@ def _urdf(record: Any, specification: Any) -> Exported:
 
 def _certificate(calibration: InputFile, record: Any, about: Path | None, evaluation: Path | None) -> str:
     """The text of a certificate, with the acceptance tests of an evaluation where one is named."""
+    from ..acceptance.record import EvaluationRecord
     from ..certificate import dcc_xml
     from ..files.administrative_data import AdministrativeData, read_administrative_data
     from ..files.evaluations import load_evaluation
@@ -169,6 +170,8 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
     tested = None
     if evaluation is not None:
         tested = load_evaluation(read := InputFile(evaluation))
+        if not isinstance(tested, EvaluationRecord):
+            raise InputError(f"{evaluation} is of points; name an evaluation of the calibrated arm on a capture.")
         sources += [fingerprint(read), *tested.recording.sources]
     return dcc_xml(
         record,

@@ -150,7 +150,7 @@ def plan(
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
     from ..files.kits import read_kit
-    from ..files.plans import kit_csv, kit_manifest, plan_csv, plan_manifest, procedure_csv, procedure_manifest
+    from ..files.plans import plan_csv, plan_manifest
     from ..planning.design import plan as run
     from ..planning.kit import plan_kit
     from ..summaries.planning import kit_plan_summary, plan_summary, procedure_summary
@@ -169,7 +169,7 @@ def plan(
             stylus=stylus_mm, seed=seed, bars=bar_mm or None, measuring_range=range_mm,
         ))  # fmt: skip
         summary = procedure_summary(planned, specification.name)
-        summary["written"] = files.write(planned, procedure_csv, procedure_manifest)
+        summary["written"] = files.write(planned, plan_csv, plan_manifest)
         show_summary(summary, as_json, evaluation_views.procedure)
         return
     points = _given_sockets(socket, sockets, length, region)
@@ -196,14 +196,15 @@ def plan(
     with plan_views.progress() as progress:
         settings = {"poses": poses, **chosen._replace(progress=progress)._asdict()}
         if things is not None:
-            planned, made = plan_kit(specification.arm, things, **settings), (kit_plan_summary, kit_csv, kit_manifest)
+            planned, summarise = plan_kit(specification.arm, things, **settings), kit_plan_summary
         else:
             placed = {"sockets": points or sockets or _SOCKETS, "length": _range(length_mm), "u": u_mm}
             placed |= {"lengths": [length_option(text) for text in length or ()], "cone": assumed.cone}
-            planned, made = run(specification.arm, **placed, **settings), (plan_summary, plan_csv, plan_manifest)
-    summarise, table, manifest_of = made
+            planned, summarise = run(specification.arm, **placed, **settings), plan_summary
     stated = assumed.stated | {"angles": angles, "model": model}
-    summary = summarise(planned, specification.name) | stated | {"written": files.write(planned, table, manifest_of)}
+    summary = (
+        summarise(planned, specification.name) | stated | {"written": files.write(planned, plan_csv, plan_manifest)}
+    )
     show_summary(summary, as_json, plan_views.plan if kit is None else plan_views.kit_plan)
 
 
@@ -217,7 +218,7 @@ def _specification(arm: str, links: Mapping[str, Any], held: str | None, model: 
         specification = specification._replace(held=fixed, free=free)
     if model is None:
         return specification
-    from ..files.joint_models import with_model
+    from ..files.joint_options import with_model
 
     return with_model(specification, model)
 

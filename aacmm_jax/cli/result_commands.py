@@ -27,7 +27,7 @@ _KINDS = {
         "calibration_views.calibration",
     ),
     "evaluation": ("evaluations.load_evaluation", "evaluation.evaluation_summary", "evaluation_views.evaluation"),
-    "points": ("evaluations.load_points", "evaluation.points_summary", "evaluation_views.points"),
+    "points": ("evaluations.load_evaluation", "evaluation.points_summary", "evaluation_views.points"),
 }
 
 
@@ -176,8 +176,8 @@ def _evaluated_points(
     """Run the acceptance tests of a manifest of points; the summary."""
     from ..acceptance.record import PointsRecord
     from ..acceptance.standards import STANDARDS, checked_standards
-    from ..files.evaluations import save_points
-    from ..files.points import read_points
+    from ..files.evaluations import save_evaluation
+    from ..files.manifest import read_points
     from ..summaries.evaluation import points_summary
 
     if manifest.suffix != ".toml":
@@ -191,7 +191,7 @@ def _evaluated_points(
         record = PointsRecord(measured, standards=chosen, **of_test)
         summary = points_summary(record)
         if output is not None:
-            save_points(output, record, summary)
+            save_evaluation(output, record, summary)
             summary["written"] = str(output)
     return summary
 

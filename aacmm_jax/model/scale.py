@@ -1,10 +1,10 @@
 """The scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
 
 The uncertainty of k comes from the lengths and the scatter at their ends (here, `scale_and_weights`), and from the
-identified parameters (`calibration.scale_fix`).
+identified parameters (`calibration.stages`).
 """
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -153,6 +153,34 @@ class MeasuredEnds(NamedTuple):
     nominal: Float[AnyArray, " l"]
     u: Float[AnyArray, " l"]
 
+    @property
+    def vectors(self) -> Float[AnyArray, "l 3"]:
+        """From the start to the end of each length."""
+        return self.positions[self.ends[:, 1]] - self.positions[self.ends[:, 0]]
+
+    @property
+    def measured(self) -> Float[AnyArray, " l"]:
+        """The measured lengths."""
+        return namespace(self.positions).linalg.norm(self.vectors, axis=-1)
+
+    @property
+    def by_positions(self) -> Float[AnyArray, "l e 3"]:
+        """Derivatives of the measured lengths."""
+        xp, unit = namespace(self.positions), np.eye(len(self.positions))
+        pull = xp.asarray(unit[self.ends[:, 1]] - unit[self.ends[:, 0]])
+        return pull[:, :, None] * (self.vectors / self.measured[:, None])[:, None, :]
+
+    def covariance(self, scale_factor: Float[AnyArray, "..."] | float = 1.0) -> Float[AnyArray, "l l"]:
+        """Of measured minus nominal lengths, mm^2, by an arm that is ``scale_factor`` times too large.
+
+        Each length's own u, and the scatter at each end. Lengths that share a socket share its scatter, so they are
+        correlated.
+        """
+        xp, by = namespace(self.positions, self.u, scale_factor), self.by_positions
+        scatter = xp.einsum("lec,ecd,med->lm", by, self.covariances, by)
+        # The least variance, (1e-12 mm)^2, only keeps a noise-free simulation's weights finite.
+        return xp.diag((scale_factor * self.u) ** 2 + 1e-24) + scatter
+
 
 def ends_of_sockets(tips: Float[AnyArray, "N 3"], capture: Capture, sigma: Float[AnyArray, ""]) -> MeasuredEnds:
     """The ends of a capture's lengths, at the means of their tips, given the standard deviation of a coordinate."""
@@ -166,27 +194,18 @@ def ends_of_sockets(tips: Float[AnyArray, "N 3"], capture: Capture, sigma: Float
 
 def scale_and_weights(measured: MeasuredEnds) -> tuple[Scale, Float[AnyArray, " l"]]:
     """k, and its derivative by each measured length, 1/mm; NaN where the scatter is unknown."""
-    xp, (positions, covariances, ends, nominal, u) = namespace(measured), measured
-    vectors, unit = positions[ends[:, 1]] - positions[ends[:, 0]], np.eye(len(positions))
-    length = xp.linalg.norm(vectors, axis=-1)
-    ratio = length / nominal
-    # Derivatives of the measured lengths by the positions.
-    by = xp.asarray(unit[ends[:, 1]] - unit[ends[:, 0]])[:, :, None] * (vectors / length[:, None])[:, None, :]
-
-    def covariance(factor: Any, of_ends: Float[AnyArray, "e 3 3"]) -> Float[AnyArray, "l l"]:
-        # Of measured minus nominal lengths by an arm that is so many times too large: each length's own u, and the
-        # scatter at each end, by which lengths that share a socket are correlated. The least variance, (1e-12 mm)^2,
-        # only keeps a noise-free simulation's weights finite.
-        return xp.diag((factor * u) ** 2 + 1e-24) + xp.einsum("lec,ecd,med->lm", by, of_ends, by)
-
-    weight = nominal**2 / xp.diagonal(covariance(ratio, xp.where(xp.isnan(covariances), 0.0, covariances)))
-    weight = weight / xp.sum(weight)
-    value = xp.sum(weight * ratio)
-    relative = weight / nominal
-    predicted = relative @ covariance(value, covariances) @ relative
-    observed = xp.sum(weight * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
-    of_k = xp.sqrt(xp.maximum(predicted, observed))
-    return Scale(value, of_k, length, nominal, xp.maximum(observed - predicted, 0.0)), relative
+    xp = namespace(measured)
+    length = measured.measured
+    ratio = length / measured.nominal
+    weighing = measured._replace(covariances=xp.where(xp.isnan(measured.covariances), 0.0, measured.covariances))
+    weight = measured.nominal**2 / xp.diagonal(weighing.covariance(ratio))
+    weight_of = weight / xp.sum(weight)
+    value = xp.sum(weight_of * ratio)
+    relative = weight_of / measured.nominal
+    predicted = relative @ measured.covariance(value) @ relative
+    observed = xp.sum(weight_of * (ratio - value) ** 2) / max(ratio.shape[0] - 1, 1)
+    u = xp.sqrt(xp.maximum(predicted, observed))
+    return Scale(value, u, length, measured.nominal, xp.maximum(observed - predicted, 0.0)), relative
 
 
 @checked_arguments

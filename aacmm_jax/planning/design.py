@@ -13,8 +13,7 @@ from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
-from ..kinematics.cones import Cone, Cones
-from ..kinematics.workspace import configurations_at, reached
+from ..kinematics.workspace import Cone, Cones, configurations_at, reached
 from ..uncertainty.identifiability import observability
 from .fedorov_exchange import Candidates, exchange
 from .information import (

@@ -18,8 +18,7 @@ from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
-from ..kinematics.cones import Cone, cones_of
-from ..kinematics.workspace import reached
+from ..kinematics.workspace import Cone, cones_of, reached
 from ..uncertainty.identifiability import observability
 from .fedorov_exchange import exchange
 from .information import LOOSE, DesignProblem, Prediction, best_poses, prediction_of, predictions

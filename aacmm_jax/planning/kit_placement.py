@@ -14,8 +14,7 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.rotations import rotation_vector
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
-from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
-from ..kinematics.workspace import SearchRegion, reached, total_link_length
+from ..kinematics.workspace import TOOL_AXIS, Cone, SearchRegion, cones_of, reached, total_link_length
 from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation
 from .fedorov_exchange import Candidates, relaxed_value

@@ -15,10 +15,18 @@ from ..data.noise import CLASSES, ArmNoise, Noise, small_arm_noise
 from ..data.simulation import socket_point
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.collisions import Cell, HalfSpace
-from ..kinematics.cones import TOOL_AXIS, Cone, Cones, cones_of
 from ..kinematics.corrections import Expansion
 from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import SearchRegion, arm_reach, search_region, total_link_length
+from ..kinematics.workspace import (
+    TOOL_AXIS,
+    Cone,
+    Cones,
+    SearchRegion,
+    arm_reach,
+    cones_of,
+    search_region,
+    total_link_length,
+)
 from ..uncertainty.volume import default_length
 
 LEAST_POSES = 2  # in a socket: one shows no scatter

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.files.plans import kit_manifest, save_plan
+from aacmm_jax.files.plans import plan_manifest, save_plan
 from aacmm_jax.kinematics.workspace import search_region
 from aacmm_jax.planning import KitItem, KitPlan, kit_placement, plan_kit
 from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, _best, covariance_of, exchange
@@ -134,7 +134,7 @@ def test_files_of_every_kind_can_be_imported(paper_arm, tmp_path):
     rows = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(rows) == 1 + found.poses
     assert rows[0].startswith("pose,observation,point,x_mm,y_mm,z_mm,q_1_deg")
-    (tmp_path / "capture.toml").write_text(kit_manifest(found, "cheng2018-simulation"))
+    (tmp_path / "capture.toml").write_text(plan_manifest(found, "cheng2018-simulation"))
     for one in found.observations:
         stored = one.stored()
         extra = [np.zeros((one.q.shape[0], 0))]
