@@ -54,7 +54,7 @@ def planned_arm(
     --cone-deg and --normal. ``cell``: its file, whether collisions are checked, and the radius of the links.
     ``sockets``: names that may be named.
     """
-    from ..data.arm_classes import CLASSES
+    from ..data.noise import CLASSES
     from ..files.cells import load_cell
     from ..planning.problem import PlanOptions
 
