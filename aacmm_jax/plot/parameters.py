@@ -9,7 +9,7 @@ from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import people_read
 from ..kinematics.arm import is_length, parameter_unit
-from ..summaries.harmonics import listed_apart
+from ..summaries.result_tables import listed_apart
 from ..summaries.tables import decimals_for, format_number
 from .charts import Axis, Chart, Marks, Plot, level, linear, logarithmic, names
 from .figures import draw
