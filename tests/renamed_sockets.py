@@ -3,7 +3,7 @@
 import dataclasses
 
 import aacmm_jax as aj
-from aacmm_jax.data.observations.socket import position_of
+from aacmm_jax.data.observations.held import position_of
 
 
 def renamed_sockets(record: aj.calibration.CalibrationRecord, *names: str) -> aj.calibration.CalibrationRecord:

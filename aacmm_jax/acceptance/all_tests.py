@@ -18,30 +18,23 @@ from ..data.recording import Recording
 from ..data.sphere import checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
-from . import asme_b89_4_22, iso_10360_12, jjf_1408
-from .geometry import postures_of
+from .geometry import points_of, postures_of
 from .judgement import MOST, Influences, Limit, Rule, checked_influences, checked_limit, decide, without_test
-from .requirements import StandardTest
-from .requirements import requirements_table as table_of
+from .requirements import TESTS
 from .results import METRICS, AcceptanceTest, Measured, Metric
-from .spheres import points_of
 from .standards import DEFAULT_RULES
 
-TESTS: tuple[StandardTest, ...] = (*jjf_1408.TESTS, *asme_b89_4_22.TESTS, *iso_10360_12.TESTS)
 NO_INFLUENCES = Influences()
 _Millimetres = Annotated[float, Range(least=0, most=MOST, unit="mm")]
 _FARTHEST = 1e6  # mm: no arm reaches a kilometre
 
 
 def measured_by(arm: Arm, recording: Recording) -> Measured:
-    """Compute what an arm measures where the poses of a recording were taken.
+    """Compute what an arm measures where the poses of a recording were taken, mm.
 
     Args:
         arm: The arm, for example a calibrated one.
         recording: Joint readings in sockets and on spheres, with the reference lengths.
-
-    Returns:
-        Points of sockets and spheres in mm, the lengths, and the arm's reach.
 
     Example:
         >>> measured = aj.acceptance.measured_by(result.arm, recording)
@@ -58,14 +51,8 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     lengths = tuple(length for length in capture.lengths if length.start in sockets and length.end in sockets)
     spheres = tuple(sphere._replace(groups=tuple(next(points) for _ in sphere.groups)) for sphere in recording.spheres)
     reach = arm_reach(arm)
-    return Measured(
-        sockets,
-        lengths,
-        spheres,
-        reach,
-        measuring_range=recording.measuring_range,
-        postures=postures_of(arm, recording, reach),
-    )
+    postures = postures_of(arm, recording, reach)
+    return Measured(sockets, lengths, spheres, reach, measuring_range=recording.measuring_range, postures=postures)
 
 
 @checked_arguments
@@ -77,10 +64,13 @@ def run(
     influences: Influences = NO_INFLUENCES,
     rule: Rule | None = None,
 ) -> list[AcceptanceTest]:
-    """Run every test that the measured points allow.
+    """Run every test that the measured points allow and that has at least one metric.
 
     Source: JJF 1408-2013 as used by Cheng et al. 2018, ASME B89.4.22-2004, ISO 10360-12:2016; formulas stated from
-    secondary sources (`requirements_table` says which, and how certain they are). Decisions: see `decide`.
+    secondary sources (`requirements_table` says which, and how certain they are). Decisions: see `decide`. A test says
+    what its full procedure would also need, and bears the standard's name (`AcceptanceTest.called`) only where nothing
+    that can be checked is missing. `InputError` for points that are not in mm, and for a limit of a metric that these
+    points do not give, or that grows with a length although the metric is not of one.
 
     Args:
         measured: Points of sockets and spheres, and reference lengths, mm.
@@ -88,14 +78,6 @@ def run(
         u_test: Standard uncertainty that seat and fixture add to every test value, mm.
         influences: What else adds to it: in proportion to a length, and thermal expansion of artefact and arm.
         rule: Decision rule (a key of `RULES`); by default ISO 14253-1:2017, and simple acceptance for ASME.
-
-    Returns:
-        One `AcceptanceTest` for each test with at least one metric; each says what its full procedure would also need.
-        It bears the standard's name (`AcceptanceTest.called`) only where nothing that can be checked is missing.
-
-    Raises:
-        InputError: The points are not points in mm; a limit names no metric or one that these points do not give; or a
-            limit grows with a length for a metric that is not of a length.
 
     Example:
         >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
@@ -124,16 +106,6 @@ def run(
     return [
         test._replace(metrics=tuple(_decided(metric, given, test.rule) for metric in test.metrics)) for test in tests
     ]
-
-
-def requirements_table() -> str:
-    """The requirements of every test as Markdown: whether they are checked, their source, and how certain that is.
-
-    Example:
-        >>> print(aj.acceptance.requirements_table().splitlines()[0])
-        ## JJF 1408-2013
-    """
-    return table_of(TESTS)
 
 
 def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:

@@ -1,20 +1,22 @@
-"""Geometry of a test: how touches are spread over a sphere, where bars and spheres were, and how the arm was held."""
+"""Geometry of a test: spheres fitted to touches and how these are spread; where bars were; how the arm was held."""
 
 import functools
 import itertools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from ..core.arrays import Numbers, as_floats
+from ..core.errors import InputError
 from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import Reach, skeleton
 from .results import Measured, Postures
-from .spheres import EXACT_POINTS, fit_sphere
 
+EXACT_POINTS = 4  # a sphere goes through so many points exactly, so they have no form error
+_COINCIDENT = 1e-7  # distance of two points, relative to the extent of all, below which they count as one
 # Rings of touches on the upper half of a sphere, from its pole down, by the number of touches: elevation in degrees,
 # touches, and azimuth of the first in degrees. That of 25 is ISO 10360-5's (background knowledge): every ring is turned
 # by 22.5 deg against the ring above it. Those of 9 and 5 are background knowledge too.
@@ -28,7 +30,108 @@ _BY_HAND = math.radians(8)  # added to the largest gap of the recommended patter
 _RING_GAP = math.radians(12)  # touches whose elevations differ by more are of different rings
 _SAME_DIRECTION = math.radians(10)
 LEFT_OR_RIGHT = math.radians(15)  # of the elbow against the vertical: nearer it is neither left nor right
-_SAME_PLACE, LEAST_SPREAD, _LEAST_ACROSS = 0.05, 0.1, 0.03  # parts of the range; of directions, mean square
+_SAME_PLACE, _LEAST_ACROSS = 0.05, 0.03  # part of the range; of directions, mean square
+_SAME_ARTEFACT = 0.01  # lengths that differ by less (relative) belong to one artefact
+
+
+class FittedSphere(NamedTuple):
+    """The least-squares sphere of points, mm."""
+
+    centre: Float[np.ndarray, " 3"]
+    radius: float
+    residuals: Float[np.ndarray, " m"]  # distance of each point from the centre, less the radius
+
+    @property
+    def form(self) -> float:
+        """Largest less smallest distance of the points from the centre, mm."""
+        return float(np.ptp(self.residuals))
+
+
+def points_of(points: Numbers, what: str) -> Float[np.ndarray, "m 3"]:
+    """Points ``(m, 3)``, at least one, as a NumPy array, or `InputError` that names ``what``."""
+    array = np.asarray(as_floats(points, what))
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+        raise InputError(f"{what} have shape {array.shape}; give (x, y, z) in mm, one row per point, at least one row.")
+    return array
+
+
+def fit_sphere(points: Numbers) -> FittedSphere:
+    """Fit a sphere by least squares of the points' distances from its surface.
+
+    Solved by SciPy's Levenberg-Marquardt method (MINPACK), from the algebraic solution. `InputError` for fewer than
+    four points, and for points in one plane.
+
+    Args:
+        points: Points ``(m, 3)``, mm.
+
+    Example:
+        >>> directions = np.concatenate([np.eye(3), -np.eye(3)])
+        >>> sphere = aj.acceptance.fit_sphere([100.0, 0.0, 0.0] + 12.5 * directions)
+        >>> print(sphere.centre.round(6), round(sphere.radius, 6))
+        [100.   0.   0.] 12.5
+    """
+    from scipy import optimize
+
+    given = points_of(points, "points on a sphere")
+    if len(given) < EXACT_POINTS:
+        raise InputError(
+            f"a sphere needs at least {EXACT_POINTS} points, but {len(given)} are given; touch it at more points."
+        )
+    middle = given.mean(axis=0)
+    centred = given - middle
+    size = float(np.linalg.norm(centred, axis=1).max())
+    if size == 0 or np.linalg.svd(centred / size, compute_uv=False)[2] < 1e-6:
+        raise InputError("the points on a sphere lie in one plane, which determines no sphere; touch it on all sides.")
+    # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the centre; with lengths of about 1 it is also well conditioned.
+    scaled = centred / size
+    rows = np.column_stack([2 * scaled, np.ones(len(scaled))])
+    start = np.linalg.lstsq(rows, np.sum(scaled**2, axis=1), rcond=None)[0]
+    start[3] = np.sqrt(max(start[3] + start[:3] @ start[:3], 1e-12))
+
+    def residuals(unknown: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(scaled - unknown[:3], axis=1) - unknown[3]
+
+    def jacobian(unknown: np.ndarray) -> np.ndarray:
+        away = unknown[:3] - scaled
+        return np.column_stack([away / np.linalg.norm(away, axis=1, keepdims=True), -np.ones(len(scaled))])
+
+    solve: Any = optimize.least_squares
+    solution = solve(residuals, start, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return FittedSphere(middle + size * solution.x[:3], float(size * solution.x[3]), size * solution.fun)
+
+
+def enclosing_sphere(points: Numbers) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre ``(3,)`` and radius of the smallest sphere that contains all points, by Welzl's algorithm (miniball), mm.
+
+    Args:
+        points: Points ``(m, 3)``, mm, at least one.
+
+    Example:
+        >>> centre, radius = aj.acceptance.enclosing_sphere([[0, 0, 0], [2, 0, 0], [1, 0.5, 0]])
+        >>> print(centre, radius)
+        [1. 0. 0.] 1.0
+    """
+    import miniball
+
+    given = points_of(points, "points")
+    middle = given.mean(axis=0)
+    size = float(np.abs(given - middle).max())
+    if size == 0:
+        return middle, 0.0
+    # Nearly coincident points would make the algorithm's small systems singular; all points count again in the radius.
+    apart = separate((given - middle) / size, _COINCIDENT)
+    ball: Any = miniball.get_bounding_ball(apart, rng=np.random.default_rng(0))
+    centre = middle + size * ball[0]
+    return centre, float(np.linalg.norm(given - centre, axis=1).max())
+
+
+def separate(points: Float[np.ndarray, "m 3"], least: float) -> Float[np.ndarray, "k 3"]:
+    """Points that are farther apart than ``least`` from those kept before them."""
+    kept: list[int] = []
+    for i, point in enumerate(points):
+        if np.all(np.linalg.norm(points[kept] - point, axis=1) > least):
+            kept.append(i)
+    return points[kept]
 
 
 def unit_rows(rows: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
@@ -48,12 +151,15 @@ def touch_directions(count: int) -> Float[np.ndarray, "m 3"]:
     return np.concatenate(rows)
 
 
-def directions_on_sphere(points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-    """Directions of touches from the centre of the sphere that fits them."""
-    return unit_rows(points - fit_sphere(points).centre)
+def covers_hemisphere(points: Float[np.ndarray, "m 3"], count: int) -> bool:
+    """Whether the touches of one sphere are spread over a hemisphere as the recommended ``count`` of them are."""
+    if len(points) < EXACT_POINTS:
+        return False
+    directions = unit_rows(points - fit_sphere(points).centre)
+    return _hemisphere_gap(directions) <= _recommended_gap(count) + _BY_HAND
 
 
-def hemisphere_gap(directions: Float[np.ndarray, "m 3"]) -> float:
+def _hemisphere_gap(directions: Float[np.ndarray, "m 3"]) -> float:
     """Largest angle, rad, from a direction of a hemisphere to the nearest touch, for the hemisphere that suits best."""
     grid, inside = _grid()
     nearest = np.arccos(np.clip((grid @ directions.T).max(axis=1), -1, 1))
@@ -61,35 +167,8 @@ def hemisphere_gap(directions: Float[np.ndarray, "m 3"]) -> float:
 
 
 @functools.cache
-def allowed_gap(count: int) -> float:
-    """The largest `hemisphere_gap` that counts as the recommended spread of so many touches, rad."""
-    return hemisphere_gap(touch_directions(count)) + _BY_HAND
-
-
-def covers_hemisphere(points: Float[np.ndarray, "m 3"], count: int) -> bool:
-    """Whether the touches of one sphere are spread over a hemisphere as the recommended ``count`` of them are."""
-    return len(points) >= EXACT_POINTS and hemisphere_gap(directions_on_sphere(points)) <= allowed_gap(count)
-
-
-def least_turn(points: Float[np.ndarray, "m 3"]) -> float:
-    """Smallest angle about the pole by which a ring of touches is turned against the ring above it, rad.
-
-    The pole is the touch that the others lie about; 0 where they are in no rings.
-    """
-    directions = directions_on_sphere(points)
-    pole = directions[int(np.argmax(directions @ directions.mean(axis=0)))]
-    across = unit_rows(np.cross(pole, np.eye(3)[int(np.argmin(np.abs(pole)))])[None])[0]
-    polar = np.arccos(np.clip(directions @ pole, -1, 1))
-    azimuth = np.arctan2(directions @ np.cross(pole, across), directions @ across)
-    order = np.argsort(polar)
-    rings = np.split(order, np.flatnonzero(np.diff(polar[order]) > _RING_GAP) + 1)[1:]
-    if len(rings) < 2:
-        return 0.0
-    turns = [
-        np.abs((azimuth[lower][:, None] - azimuth[upper][None] + np.pi) % (2 * np.pi) - np.pi).min()
-        for upper, lower in itertools.pairwise(rings)
-    ]
-    return float(min(turns))
+def _recommended_gap(count: int) -> float:
+    return _hemisphere_gap(touch_directions(count))
 
 
 @functools.cache
@@ -102,13 +181,43 @@ def _grid() -> tuple[Float[np.ndarray, "g 3"], Bool[np.ndarray, "g g"]]:
     return grid, grid @ grid.T >= 0
 
 
-class BarPositions(NamedTuple):
-    """Where one bar was measured: a row a position."""
+def least_turn(points: Float[np.ndarray, "m 3"]) -> float:
+    """Smallest angle about the pole by which a ring of touches is turned against the ring above it, rad.
 
-    length: float  # mm
+    The pole is the touch that the others lie about; 0 where they are in no rings.
+    """
+    directions = unit_rows(points - fit_sphere(points).centre)
+    pole = directions[int(np.argmax(directions @ directions.mean(axis=0)))]
+    across = unit_rows(np.cross(pole, np.eye(3)[int(np.argmin(np.abs(pole)))])[None])[0]
+    polar = np.arccos(np.clip(directions @ pole, -1, 1))
+    azimuth = np.arctan2(directions @ np.cross(pole, across), directions @ across)
+    order = np.argsort(polar)
+    rings = np.split(order, np.flatnonzero(np.diff(polar[order]) > _RING_GAP) + 1)[1:]
+    turns = [
+        np.abs((azimuth[lower][:, None] - azimuth[upper][None] + np.pi) % (2 * np.pi) - np.pi).min()
+        for upper, lower in itertools.pairwise(rings)
+    ]
+    return float(min(turns, default=0.0))
+
+
+class BarPositions(NamedTuple):
+    """Where bars were measured: a row a position."""
+
+    lengths: Float[np.ndarray, " k"]  # mm
     middles: Float[np.ndarray, "k 3"]  # mm
     directions: Float[np.ndarray, "k 3"]
-    readings: tuple[int, ...]
+    readings: Int[np.ndarray, " k"]  # number of them
+
+    def chosen(self, index: Any) -> "BarPositions":
+        """Some of the positions."""
+        return BarPositions(*(part[index] for part in self))
+
+    def artefacts(self) -> list["BarPositions"]:
+        """The positions of each artefact, the shortest first."""
+        order = np.argsort(self.lengths, kind="stable")
+        values = self.lengths[order]
+        parts = np.split(order, np.flatnonzero(np.diff(values) > _SAME_ARTEFACT * values[1:]) + 1)
+        return [self.chosen(part) for part in parts if len(part)]
 
     @property
     def in_all_directions(self) -> bool:
@@ -121,67 +230,43 @@ class BarPositions(NamedTuple):
         """RMS distance of the middles from their mean, relative to a size."""
         return float(np.sqrt(np.mean(np.sum((self.middles - self.middles.mean(axis=0)) ** 2, axis=1)))) / size
 
-    def distinct(self, size: float | None) -> "BarPositions":
-        """Positions that differ from one another by 10 degrees or more, or in place by 5 % of the size (mm)."""
-        near = _SAME_PLACE * (self.length if size is None else size)
+    def distinct(self, size: float | None) -> int:
+        """How many differ from one another by 10 degrees or more, or in place by 5 % of the size (mm)."""
+        near = _SAME_PLACE * (float(np.mean(self.lengths)) if size is None else size)
         kept: list[int] = []
         for i, (middle, direction) in enumerate(zip(self.middles, self.directions, strict=True)):
             along = np.abs(self.directions[kept] @ direction) > math.cos(_SAME_DIRECTION)
             close = np.linalg.norm(self.middles[kept] - middle, axis=1) < near
             if not np.any(along & close):
                 kept.append(i)
-        return BarPositions(
-            self.length, self.middles[kept], self.directions[kept], tuple(self.readings[i] for i in kept)
-        )
+        return len(kept)
 
 
-def bar_positions(measured: Measured, groups: Sequence[Sequence[float]]) -> list[BarPositions]:
-    """The positions of each bar, of which ``groups`` has the calibrated values."""
-    positions = []
-    pairs = {frozenset((length.start, length.end)): length for length in measured.lengths}
-    for values in groups:
-        lengths = [length for length in pairs.values() if min(values) <= float(length.value) <= max(values)]
-        ends = [[measured.sockets[name] for name in (length.start, length.end)] for length in lengths]
-        start, end = (np.array([pair[i].mean(axis=0) for pair in ends]) for i in (0, 1))
-        readings = tuple(min(map(len, pair)) for pair in ends)
-        positions.append(BarPositions(float(np.mean(values)), (start + end) / 2, unit_rows(end - start), readings))
-    return positions
-
-
-def all_bars(bars: Sequence[BarPositions]) -> BarPositions:
-    """The positions of all bars together."""
+def bar_positions(measured: Measured) -> BarPositions:
+    """The positions of all lengths, one for each pair of sockets."""
+    lengths = {frozenset((length.start, length.end)): length for length in measured.lengths}.values()
+    ends = [[measured.sockets[name] for name in (length.start, length.end)] for length in lengths]
+    start, end = (np.array([pair[i].mean(axis=0) for pair in ends]).reshape(-1, 3) for i in (0, 1))
     return BarPositions(
-        float(np.mean([bar.length for bar in bars])),
-        np.concatenate([bar.middles for bar in bars]),
-        np.concatenate([bar.directions for bar in bars]),
-        tuple(number for bar in bars for number in bar.readings),
+        np.array([float(length.value) for length in lengths]),
+        (start + end) / 2,
+        unit_rows(end - start),
+        np.array([min(map(len, pair)) for pair in ends], dtype=int),
     )
 
 
-def size_of(measured: Measured) -> float | None:
-    """The maker's measuring range (a diameter), mm; twice the reach by the model where it is not stated."""
-    if measured.measuring_range is not None:
-        return measured.measuring_range
-    return None if measured.reach is None else 2 * measured.reach.radius
-
-
-def separate_places(points: Sequence[Float[np.ndarray, " 3"]], least: float) -> int:
-    """How many points are farther apart than ``least`` from one another, mm."""
-    kept: list[np.ndarray] = []
-    for point in points:
-        if all(np.linalg.norm(point - other) >= least for other in kept):
-            kept.append(point)
-    return len(kept)
-
-
 def postures_of(arm: Arm, recording: Recording, reach: Reach) -> Postures:
-    """The postures of the poses in sockets and on spheres."""
+    """The sides of the elbow in sockets, and the directions of the probe on spheres: from the last frame's origin to
+    the tip, or of its z axis where these coincide."""
     sockets = recording.capture.sockets
     q = [np.asarray(readings) for readings in sockets.values()]
     sides = elbow_sides(arm, np.concatenate(q), reach) if q else np.zeros(0)
     elbows = np.split(sides, np.cumsum([len(readings) for readings in q])[:-1]) if q else []
+    probe = np.asarray(arm.probe) if np.any(arm.probe) else np.array([0.0, 0.0, 1.0])
     probes = {
-        (sphere.name, sphere.test): tuple(probe_directions(arm, np.asarray(group)) for group in sphere.groups)
+        (sphere.name, sphere.test): tuple(
+            unit_rows(np.asarray(arm.pose(np.asarray(group)))[:, :3, :3] @ probe) for group in sphere.groups
+        )
         for sphere in recording.spheres
     }
     return Postures(dict(zip(sockets, elbows, strict=True)), probes)
@@ -200,10 +285,3 @@ def elbow_sides(arm: Arm, q: Float[np.ndarray, "m n"], reach: Reach) -> Float[np
     elbow = off[np.arange(len(q)), np.argmax(np.linalg.norm(off, axis=2), axis=1)]
     left = unit_rows(np.column_stack([-line[:, 1], line[:, 0], np.zeros(len(line))]))
     return np.arcsin(np.clip(np.sum(unit_rows(elbow) * left, axis=1), -1, 1))
-
-
-def probe_directions(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m 3"]:
-    """Directions of the probe, from the last frame's origin to the tip; where these coincide, of its z axis."""
-    rotations = np.asarray(arm.pose(q))[:, :3, :3]
-    probe = np.asarray(arm.probe)
-    return unit_rows(rotations @ (probe if np.any(probe) else np.array([0.0, 0.0, 1.0])))

@@ -67,12 +67,6 @@ def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule
         expanded: Expanded uncertainty U of the test value (coverage factor 2), mm.
         rule: A key of `RULES`.
 
-    Returns:
-        "conforms", "fails" or "undecided".
-
-    Raises:
-        InputError: An argument is not a number, the limit or U is negative or infinite, or the rule is unknown.
-
     Example:
         >>> print(aj.acceptance.decide(0.040, limit=0.050, expanded=0.010))
         conforms
@@ -99,11 +93,11 @@ def worst(decisions: list[Decision]) -> Decision | None:
     return next((decision for decision in DECISIONS if decision in decisions), None)
 
 
-def without_test(name: str, known: Collection[str]) -> str:
+def without_test(name: str, metrics: Collection[str]) -> str:
     """The end of a message on a metric that no test has: why it has none, or which names there are."""
     if name.strip().lower() == "e_bi":
         return "; lengths probed from opposite directions cannot be recorded, and E_Uni is what is tested."
-    return nearest(name, known, len(known))
+    return nearest(name, metrics, len(metrics))
 
 
 def checked_limit(limit: Limit, what: str) -> Limit:
@@ -127,17 +121,17 @@ def limit_of_text(text: str, given: str) -> Limit:
     return checked_limit(limit, given)
 
 
-def read_limits(texts: list[str], known: Mapping[str, str]) -> dict[str, Limit]:
-    """Limits by the name of a metric, from texts ``NAME=A`` or ``NAME=A+L/K`` in mm; ``known`` has the names."""
+def read_limits(texts: list[str], metrics: Mapping[str, str]) -> dict[str, Limit]:
+    """Limits by the name of a metric, from texts ``NAME=A`` or ``NAME=A+L/K`` in mm; ``metrics`` has the names."""
     limits: dict[str, Limit] = {}
-    names = {name.lower(): name for name in known}
+    names = {name.lower(): name for name in metrics}
     for text in texts:
         given, equals, value = text.partition("=")
         name = names.get(given.strip().lower())
         if not equals:
             raise InputError(f"--mpe '{text}' is not NAME=A or NAME=A+L/K, in mm; for example E_Uni=0.025+L/40000.")
         if name is None:
-            raise InputError(f"--mpe '{text}' names the unknown metric '{given}'{without_test(given, known)}")
+            raise InputError(f"--mpe '{text}' names the unknown metric '{given}'{without_test(given, metrics)}")
         if name in limits:
             raise InputError(f"--mpe gives {name} two limits; give it one.")
         limits[name] = limit_of_text(value, f"--mpe {name}={value}")
@@ -170,14 +164,10 @@ class Expansion(NamedTuple):
 
     @property
     def u(self) -> float:
-        """Standard uncertainty of `relative`.
-
-        Source: JCGM 100:2008, 5.1 and, for the product of both uncertainties, which counts near 20 C, H.1.7.
-        """
+        """Standard uncertainty of `relative`: JCGM 100:2008, 5.1."""
         away = self.temperature - REFERENCE_TEMPERATURE
-        return math.hypot(
-            away * self.u_coefficient, self.coefficient * self.u_temperature, self.u_coefficient * self.u_temperature
-        )
+        of_both = self.u_coefficient * self.u_temperature  # counts near 20 C: H.1.7
+        return math.hypot(away * self.u_coefficient, self.coefficient * self.u_temperature, of_both)
 
 
 class Influences(NamedTuple):
@@ -206,11 +196,8 @@ class Influences(NamedTuple):
 
         A warm artefact is longer, and a warm arm, whose model is that of 20 C, measures too short.
         """
-        return length * (_relative(self.arm) - _relative(self.artefact))
-
-
-def _relative(body: Expansion | None) -> float:
-    return 0.0 if body is None else body.relative
+        arm, artefact = (0.0 if body is None else body.relative for body in (self.arm, self.artefact))
+        return length * (arm - artefact)
 
 
 def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:

@@ -19,15 +19,9 @@ from ..kinematics.chain import Geometry
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .all_tests import (
-    NO_INFLUENCES,
-    AcceptanceTest,
-    Measured,
-    checked_limits,
-    measured_by,
-    run,
-)
+from .all_tests import NO_INFLUENCES, checked_limits, measured_by, run
 from .judgement import Influences, Limit, Rule
+from .results import AcceptanceTest, Measured
 from .standards import OF_SPHERES, STANDARDS, Standard, checked_standards
 
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
@@ -144,10 +138,12 @@ def evaluation_of(
     influences: Influences = NO_INFLUENCES,
     rule: Rule | None = None,
 ) -> EvaluationRecord:
-    """Evaluate a calibration on a capture.
+    """Evaluate a calibration on a capture; the record has warnings on what makes it doubtful.
 
     A socket counts as identified from if the calibration used any of its poses. Of another observation, the poses that
     it did not use are held out, as far as they determine their geometry: that is fitted to the arm.
+    `InputError` for an impossible limit, one whose metric nothing can be measured for, and observations that do not
+    determine their own unknown geometry.
 
     Args:
         record: The calibration.
@@ -160,13 +156,6 @@ def evaluation_of(
         influences: What else adds uncertainty: in proportion to a length, and thermal expansion.
         rule: Decision rule, a key of `RULES`; by default that of each standard.
 
-    Returns:
-        The record, with warnings on what makes it doubtful.
-
-    Raises:
-        InputError: A limit is impossible, there is nothing to measure its metric on, or the observations do not
-            determine their own unknown geometry.
-
     Example:
         >>> limits = {"Length": 0.1}
         >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal), limits=limits)
@@ -177,9 +166,8 @@ def evaluation_of(
     used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
     recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, used))
     check_geometry(record.calibrated.arm, recording.capture)
-    readings = {name: np.asarray(q) for name, q in recording.capture.sockets.items()}
-    readings |= {observation.name: np.asarray(observation.q) for observation in recording.capture.observations}
-    shared = {name: sum(row.tobytes() in used for row in q) for name, q in readings.items()}
+    readings = dict(recording.capture.sockets) | {part.name: part.q for part in recording.capture.observations}
+    shared = {name: sum(row.tobytes() in used for row in np.asarray(q)) for name, q in readings.items()}
     warnings = []
     if not record.converged or not record.plausible_scale:
         reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
@@ -249,12 +237,11 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     """A sentence on metrics that were decided although no uncertainty was stated for them, if there are any."""
     metrics = (metric for test in tests for metric in test.metrics)
     names = [metric.name for metric in metrics if metric.decision is not None and metric.worst.expanded == 0]
-    if not names:
-        return []
-    return [
+    sentence = (
         f"No uncertainty was stated for {', '.join(names)}, so U is 0 and the decision ignores it; state what seat "
         "and fixture contribute (--test-u-mm), and the temperatures (--expansion)."
-    ]
+    )
+    return [sentence] if names else []
 
 
 def same_arm(one: Arm, other: Arm) -> bool:

@@ -1,31 +1,47 @@
-"""Requirements of standards as data: what a test needs, what of it is checked, from which source, and how certain.
+"""The tests of the standards as data: metrics, what a test needs, from which source that is known, and how certain.
 
-A standard is one module with a table of `StandardTest`. What its text says was not available to this project; a source
-names where the requirement was found, and no clause number that was not.
+What the texts say was not available to this project; a source names where the requirement was found, and no clause
+number that was not.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ..data.sphere import ProbedSphere, SphereTest
-from .geometry import BarPositions, all_bars, bar_positions, covers_hemisphere, separate_places, size_of
+from . import metrics
+from .geometry import (
+    EXACT_POINTS,
+    LEFT_OR_RIGHT,
+    BarPositions,
+    bar_positions,
+    covers_hemisphere,
+    fit_sphere,
+    least_turn,
+    separate,
+    unit_rows,
+)
 from .judgement import Influences
-from .lengths import distinct_lengths, values_by_artefact
-from .results import AcceptanceTest, Measured, Metric
-from .spheres import EXACT_POINTS, fit_sphere
-from .standards import EDITIONS
+from .metrics import SPAT_POSES, ZONES, articulated, spheres_for, zone_of
+from .results import AcceptanceTest, Measured, Metric, percent
+from .standards import ASME_B89_4_22, EDITIONS, ISO_10360_12, JJF_1408
 
-Confidence = Literal["public source", "secondary source", "background", "own reading"]
+Confidence = Literal[
+    "public source",  # a public page that is named
+    "background",  # background knowledge of the standard, without a source at hand
+    "own reading",  # the standard asks for it in words; the number by which it is judged is ours
+]
+Metrics = Callable[[Measured, Influences], Sequence[Metric]]
 Origin = tuple[str, Confidence]  # the source, and how certain it is
-CONFIDENCES: dict[Confidence, str] = {
-    "public source": "found in a public page that is named",
-    "secondary source": "stated by a paper or data sheet, not by the standard itself",
-    "background": "background knowledge of the standard, without a source at hand",
-    "own reading": "the standard asks for it in words; the number by which it is judged is ours",
-}
+BARS = ((0.5, 0.75), (1.2, 1.5))  # of ASME B89.4.22: fractions of the reach
+LONGEST = 0.66  # least length of the longest bar of ISO 10360-12, as a part of the measuring range
 _LEAST_APART = 0.1  # of two positions of a sphere, as a part of the measuring range
+_LEAST_SPREAD = 0.1  # of the places of bars, as a part of the measuring range
+_LEAST_RING_TURN, _LEAST_PROBE_TURN = math.radians(15), math.radians(10)
+_LEAST_ELBOW = 3  # poses with the elbow on either side
 
 
 class Requirement(NamedTuple):
@@ -43,201 +59,363 @@ class StandardTest(NamedTuple):
 
     standard: str  # a key of `standards.EDITIONS`
     title: str
-    metrics: Callable[[Measured, Influences], Sequence[Metric]]
+    metrics: Metrics
     requirements: tuple[Requirement, ...]
 
     def run(self, measured: Measured, influences: Influences) -> AcceptanceTest | None:
         """The test of those metrics that have values; None if none has."""
-        metrics = tuple(metric for metric in self.metrics(measured, influences) if metric.values)
-        if not metrics:
+        with_values = tuple(metric for metric in self.metrics(measured, influences) if metric.values)
+        if not with_values:
             return None
         checks = (requirement.lacking for requirement in self.requirements)
         sentences = (check(measured) for check in checks if check is not None)
-        return AcceptanceTest(self.standard, self.title, metrics, tuple(filter(None, sentences)))
+        return AcceptanceTest(self.standard, self.title, with_values, tuple(filter(None, sentences)))
 
 
-def _range_lacking(measured: Measured) -> str:
-    stated = measured.measuring_range is not None
-    return "" if stated else "The measuring range that the maker states is not given (measuring_range)."
+def _wrong(measured: Measured, test: SphereTest, wrong: Callable[[ProbedSphere], list[str]]) -> str | None:
+    """What is wrong of the spheres of a test, in one list."""
+    named = [text for sphere in spheres_for(measured, test) for text in wrong(sphere)]
+    return ", ".join(named) if named else None
 
 
-RANGE_STATED = Requirement(
-    "the measuring range is the one that the maker states",
-    *("data sheets of makers give it as a diameter", "background"),
-    _range_lacking,
-)
-CONDITIONS = Requirement(
+def _groups(
+    measured: Measured, test: SphereTest, condition: Callable[[np.ndarray], bool], kind: str = "group"
+) -> str | None:
+    """The groups of touches of the spheres of a test that are so."""
+    return _wrong(
+        measured,
+        test,
+        lambda sphere: [f"'{sphere.name}', {kind} {i}" for i, group in enumerate(sphere.groups, 1) if condition(group)],
+    )
+
+
+def _sphere_positions(measured: Measured, test: SphereTest, positions: int) -> str | None:
+    groups = [group for sphere in spheres_for(measured, test) for group in sphere.groups if len(group) >= EXACT_POINTS]
+    count = len(groups)
+    if measured.size and groups:
+        count = len(separate(np.array([fit_sphere(group).centre for group in groups]), _LEAST_APART * measured.size))
+    return None if count >= positions else str(max(count, 1))
+
+
+def _orientations(measured: Measured) -> str | None:
+    if measured.postures is None:
+        return "Points do not tell the orientations of the probe; record joint readings."
+    for (name, test), groups in measured.postures.probes.items():
+        if test == "articulation":
+            means = unit_rows(np.array([directions.mean(axis=0) for directions in groups]))
+            if any(mean @ other > math.cos(_LEAST_PROBE_TURN) for mean, other in itertools.combinations(means, 2)):
+                return f"The orientations of the probe must differ; on sphere '{name}' two are nearly the same."
+    return None
+
+
+def _zones(measured: Measured) -> str | None:
+    if measured.reach is None:
+        return "The reach of the arm and its shoulder are unknown, so that its zones cannot be told apart."
+    radius = (measured.size or 0.0) / 2
+    zones = {zone_of(measured, points) for points in articulated(measured).values()}
+    absent = [
+        f"at {percent(zone)} of the reach ({zone[0] * radius:.0f} to {zone[1] * radius:.0f} mm from the shoulder)"
+        for zone in ZONES
+        if zone not in zones
+    ]
+    return f"A socket with {SPAT_POSES} poses is required {' and '.join(absent)}." if absent else None
+
+
+def _elbow(measured: Measured) -> str | None:
+    if measured.postures is None:
+        return "Points do not tell on which side the elbow was; record joint readings."
+    bad = []
+    for name in articulated(measured):
+        sides = np.sin(measured.postures.elbows[name])
+        if min(np.sum(sides >= math.sin(LEFT_OR_RIGHT)), np.sum(sides <= -math.sin(LEFT_OR_RIGHT))) < _LEAST_ELBOW:
+            bad.append(name)
+    few = f"{_LEAST_ELBOW} poses"
+    sentence = f"The elbow must be on the left in {few} and on the right in {few} of every socket ({', '.join(bad)})."
+    return sentence if bad else None
+
+
+def _two_bars(measured: Measured, positions: int) -> str | None:
+    bars = _bars(measured)
+    if len(bars) != len(BARS):
+        return f"Two bars are required, no fewer and no more ({len(bars)} given)."
+    fewest = min(len(bar.lengths) for bar in bars)
+    return None if fewest >= positions else f"Each bar is required in {positions} positions."
+
+
+def bar_range(bar: tuple[float, float], radius: float) -> str:
+    """The lengths of a bar of ASME B89.4.22 in words."""
+    return f"{percent(bar)} of the reach ({bar[0] * radius:.0f} to {bar[1] * radius:.0f} mm)"
+
+
+def _bar_lengths(measured: Measured) -> str | None:
+    if measured.size is None:
+        return "The reach of the arm is unknown, so that the lengths of the bars cannot be judged."
+    radius = measured.size / 2
+    values = np.array([float(length.value) for length in measured.lengths]) / radius
+    wanted = [bar_range(bar, radius) for bar in BARS if not np.any((values >= bar[0]) & (values <= bar[1]))]
+    return f"A bar of {' and one of '.join(wanted)} is required." if wanted else None
+
+
+def _longest(measured: Measured) -> str | None:
+    if measured.measuring_range is None:
+        return None  # a requirement of its own
+    longest, least = max(float(length.value) for length in measured.lengths), LONGEST * measured.measuring_range
+    sentence = f"A length of {least:.0f} mm or more is required (66 % of the range); the longest has {longest:.0f} mm."
+    return None if longest >= least else sentence
+
+
+def _fewer(needed: int, number: int) -> str | None:
+    return None if number >= needed else str(number)
+
+
+def _bars(measured: Measured, by_bar: bool = True) -> list[BarPositions]:
+    """The positions of each bar, or of all together."""
+    positions = bar_positions(measured)
+    return positions.artefacts() if by_bar else [positions]
+
+
+def _places(measured: Measured, by_bar: bool) -> str | None:
+    """Of bars over the measuring volume; not judged where its size is unknown."""
+    size = measured.size
+    if size is None:
+        return "The size of the measuring volume is unknown, so that the places of the bars cannot be judged."
+    narrowest = min(bar.spread(size) for bar in _bars(measured, by_bar))
+    sentence = (
+        f"The places must be spread over the measuring volume: their middles scatter by {100 * narrowest:.1f} % of "
+        f"it, and {100 * _LEAST_SPREAD:.0f} % are required."
+    )
+    return None if narrowest >= _LEAST_SPREAD else sentence
+
+
+# Requirements by kind: what they say; the sentence on what is lacking; and what puts that into words (None where
+# nothing is lacking, "" where the sentence has no room for words). In both texts, {0} are these words, {1} and so on
+# the numbers that a test gives.
+_KINDS: dict[str, tuple[str, str, Callable[..., str | None]]] = {
+    "size": (
+        "a sphere of {2} to {3} mm",
+        "A sphere of {2} to {3} mm is required ({0}).",
+        lambda m, test, low, high: _wrong(
+            m, test, lambda s: [] if low <= s.diameter <= high else [f"'{s.name}' has {s.diameter:g} mm"]
+        ),
+    ),
+    "touches": (
+        "{2} points in every group of touches",
+        "{2} points per group are required (fewer: {0}).",
+        lambda m, test, points: _groups(m, test, lambda group: len(group) < points),
+    ),
+    "spread of touches": (
+        "touches evenly over at least a hemisphere: no gap wider by 8 degrees than those of the recommended pattern",
+        "The touches must be spread over a hemisphere ({0}: they are not).",
+        # Of groups that are too small, the number of touches speaks.
+        lambda m, test, points: _groups(
+            m, test, lambda group: len(group) >= points and not covers_hemisphere(group, points)
+        ),
+    ),
+    "groups": (
+        "{2} {3} of the sphere",
+        "{2} {3} of a sphere are required ({0}).",
+        lambda m, test, number, _: _wrong(
+            m, test, lambda s: [f"'{s.name}' has {len(s.groups)}"] if len(s.groups) < number else []
+        ),
+    ),
+    "rings": (
+        "rings of touches turned against each other, by 22.5 deg or more (15 as touched by hand)",
+        "The rings of touches must be turned by 22.5 deg or more against each other ({0}).",
+        lambda m, test, points: _groups(
+            m, test, lambda group: len(group) >= points and least_turn(group) < _LEAST_RING_TURN, "repeat"
+        ),
+    ),
+    "places of the sphere": (
+        "the sphere in {2} positions, of which the worse counts; apart by 10 % of the range or more",
+        "The sphere must be measured in {2} positions far apart; it was in {0}.",
+        _sphere_positions,
+    ),
+    "orientations": ("five different orientations of the probe, by 10 degrees or more", "{0}", _orientations),
+    "zones": (
+        "a socket with 10 articulations in each of three zones: 0 to 20, 20 to 80, 80 to 100 % of the reach",
+        "{0}",
+        _zones,
+    ),
+    "elbow": (
+        "the elbow on the left and on the right: in 3 poses each or more, 15 degrees off the vertical",
+        "{0}",
+        _elbow,
+    ),
+    "two bars": ("two bars, each in {1} positions or more", "{0}", _two_bars),
+    "lengths of the bars": ("bars of 50 to 75 % and of 120 to 150 % of the reach", "{0}", _bar_lengths),
+    "longest": ("the longest length at least 66 % of the measuring range", "{0}", _longest),
+    "lengths": (
+        "{1} different calibrated lengths",
+        "{1} different lengths are required ({0} given).",
+        lambda m, needed: _fewer(needed, len(_bars(m))),
+    ),
+    "readings": (
+        "{1} readings of each length in each position",
+        "{1} readings in each position are required (a position has {0}).",
+        lambda m, needed: _fewer(needed, min(bar_positions(m).readings.tolist(), default=0)),
+    ),
+    "positions": (
+        "{1} positions of the bars, different by 10 degrees, or in place by 5 % of the range",
+        "{1} different positions are required ({0} given).",
+        lambda m, needed: _fewer(needed, sum(bar.distinct(m.size) for bar in _bars(m))),
+    ),
+    "positions of each": (
+        "{1} positions of every length, different by 10 degrees, or in place by 5 % of the range",
+        "{1} different positions of every length are required (one has {0}).",
+        lambda m, needed: _fewer(needed, min(bar.distinct(m.size) for bar in _bars(m))),
+    ),
+    "directions": (
+        "directions of the bars in all three dimensions, 10 degrees out of any plane (RMS)",
+        "The directions must be horizontal, vertical and inclined, not in one plane.",
+        lambda m, by_bar: None if all(bar.in_all_directions for bar in _bars(m, by_bar)) else "",
+    ),
+    "places": (
+        "places over the measuring volume: middles scatter by 10 % of the range or more (RMS)",
+        "{0}",
+        _places,
+    ),
+    "socket": (
+        "a socket in {1} poses or more; the paper's Table 3 has 70",
+        "A socket measured in {1} poses or more is required.",
+        lambda m, poses: None if any(len(points) >= poses for points in m.tested.values()) else "",
+    ),
+    "range": (
+        "the measuring range is the one that the maker states",
+        "The measuring range that the maker states is not given (measuring_range).",
+        lambda m: "" if m.measuring_range is None else None,
+    ),
+}
+
+
+def _need(kind: str, origin: Origin, *numbers: int | str | bool) -> Requirement:
+    """A requirement of a kind with its numbers; those of spheres begin with the test that they were touched for."""
+    says, sentence, lacking = _KINDS[kind]
+
+    def check(measured: Measured) -> str:
+        words = lacking(measured, *numbers)
+        return "" if words is None else sentence.format(words, *numbers)
+
+    return Requirement(says.format("", *numbers), *origin, check)
+
+
+_ASME: Origin = ("background knowledge of ASME B89.4.22", "background")
+_ASME_READING: Origin = (_ASME[0], "own reading")
+_KREON: Origin = ("digitalscan3d.com/iso-10360-12-standard-for-measuring-arms (Kreon)", "public source")
+_OBERON: Origin = ("oberon3d.com, on ISO 10360-12 (the same maker, in Polish)", "public source")
+_ISO_5: Origin = ("as in ISO 10360-5", "background")
+_PAPER = "Cheng et al. 2018, section 4"
+_RANGE = _need("range", ("data sheets of makers give it as a diameter", "background"))
+_CONDITIONS = Requirement(
     "the test is done within the maker's rated conditions: temperature and its gradients, warm-up, mounting",
     *("ISO 10360 and ASME B89.4.22 in general", "background"),
 )
-CALIBRATED = Requirement(
+_CALIBRATED = Requirement(
     "artefacts are calibrated and traceable, and are not those that the probe was qualified on",
     *("ISO 10360 in general", "background"),
 )
 
 
-def spheres_for(measured: Measured, test: SphereTest) -> list[ProbedSphere]:
-    """The spheres touched for one test."""
-    return [sphere for sphere in measured.spheres if sphere.test == test]
+def _test(standard: str, title: str, metrics: Metrics, *requirements: Requirement) -> StandardTest:
+    return StandardTest(standard, title, metrics, (*requirements, _CONDITIONS))
 
 
-def of_spheres(
-    says: str, test: SphereTest, wrong: Callable[[ProbedSphere], Iterable[str]], sentence: str, origin: Origin
-) -> Requirement:
-    """A requirement of every sphere of a test: ``wrong`` names what lacks it, where the sentence has ``{}``."""
-
-    def lacking(measured: Measured) -> str:
-        named = [text for sphere in spheres_for(measured, test) for text in wrong(sphere)]
-        return sentence.format(", ".join(named)) if named else ""
-
-    return Requirement(says, *origin, lacking)
-
-
-def groups_where(sphere: ProbedSphere, condition: Callable[[np.ndarray], bool], kind: str = "group") -> list[str]:
-    """The groups of touches that are so, as sentences name them."""
-    numbers = (number for number, group in enumerate(sphere.groups, start=1) if condition(group))
-    return [f"'{sphere.name}', {kind} {number}" for number in numbers]
-
-
-def sphere_size(test: SphereTest, low: float, high: float, origin: Origin) -> Requirement:
-    """A sphere with a diameter in a range, mm."""
-
-    def wrong(sphere: ProbedSphere) -> list[str]:
-        return [] if low <= sphere.diameter <= high else [f"'{sphere.name}' has {sphere.diameter:g} mm"]
-
-    size = f"a sphere of {low:g} to {high:g} mm"
-    return of_spheres(size, test, wrong, f"A{size[1:]} is required ({{}}).", origin)
-
-
-def touches(test: SphereTest, points: int, origin: Origin) -> Requirement:
-    """So many touches in every group."""
-
-    def wrong(sphere: ProbedSphere) -> list[str]:
-        return groups_where(sphere, lambda group: len(group) < points)
-
-    says = f"{points} points in every group of touches"
-    return of_spheres(says, test, wrong, f"{points} points per group are required (fewer: {{}}).", origin)
-
-
-def spread_touches(test: SphereTest, points: int, origin: Origin) -> Requirement:
-    """Touches spread over a hemisphere; of groups that are too small, `touches` speaks."""
-
-    def wrong(sphere: ProbedSphere) -> list[str]:
-        return groups_where(sphere, lambda group: len(group) >= points and not covers_hemisphere(group, points))
-
-    says = "touches evenly over at least a hemisphere: no gap wider by 8 degrees than those of the recommended pattern"
-    sentence = "The touches must be spread over a hemisphere ({}: they are not)."
-    return of_spheres(says, test, wrong, sentence, origin)
-
-
-def groups_of_touches(test: SphereTest, groups: int, kind: str, origin: Origin) -> Requirement:
-    """So many repeats or orientations of every sphere."""
-
-    def wrong(sphere: ProbedSphere) -> list[str]:
-        return [f"'{sphere.name}' has {len(sphere.groups)}"] if len(sphere.groups) < groups else []
-
-    sentence = f"{groups} {kind} of a sphere are required ({{}})."
-    return of_spheres(f"{groups} {kind} of the sphere", test, wrong, sentence, origin)
-
-
-def sphere_positions(test: SphereTest, positions: int, origin: Origin) -> Requirement:
-    """The sphere in so many positions."""
-
-    def lacking(measured: Measured) -> str:
-        fitted = [group for s in spheres_for(measured, test) for group in s.groups if len(group) >= EXACT_POINTS]
-        size = size_of(measured)
-        count = separate_places([fit_sphere(g).centre for g in fitted], _LEAST_APART * size) if size else len(fitted)
-        if count >= positions:
-            return ""
-        return f"The sphere must be measured in {positions} positions far apart; it was in {max(count, 1)}."
-
-    says = f"the sphere in {positions} positions, of which the worse counts; apart by 10 % of the range or more"
-    return Requirement(says, *origin, lacking)
-
-
-class _Count(NamedTuple):
-    """A number that the positions of bars have, in a measuring range (mm) whose size may be unknown; ``{n}`` is the
-    one that is needed, ``{}`` the one that they have."""
-
-    says: str
-    sentence: str
-    count: Callable[[list[BarPositions], float | None], float]
-
-
-_DIRECTIONS = (
-    "directions of the bars in all three dimensions, 10 degrees out of any plane (RMS)",
-    "The directions must be horizontal, vertical and inclined, not in one plane.",
+TESTS = (
+    _test(
+        JJF_1408,
+        "single point and length, as in Cheng et al. 2018",
+        metrics.single_point_and_length,
+        _need("socket", (_PAPER, "own reading"), 10),
+        _need("positions", (f"{_PAPER}: a length measured 30 times", "own reading"), 30),
+        _CALIBRATED,
+    ),
+    _test(
+        ASME_B89_4_22,
+        "effective diameter",
+        metrics.effective_diameter,
+        _need("size", _ASME, "effective-diameter", 10, 50),
+        _need("touches", _ASME, "effective-diameter", 9),
+        _need("groups", _ASME, "effective-diameter", 3, "repeats"),
+        _need("spread of touches", _ASME_READING, "effective-diameter", 9),
+        _need("rings", _ASME, "effective-diameter", 9),
+        _CALIBRATED,
+    ),
+    _test(
+        ASME_B89_4_22,
+        "single-point articulation",
+        metrics.articulation,
+        _need("zones", _ASME),
+        _need("elbow", ("FARO's public instructions swing the elbow from side to side", "own reading")),
+        _RANGE,
+    ),
+    _test(
+        ASME_B89_4_22,
+        "volumetric",
+        metrics.volumetric,
+        _need("two bars", _ASME, 5),
+        _need("lengths of the bars", _ASME),
+        _need("positions", _ASME_READING, 20),
+        _need("directions", _ASME_READING, False),
+        _need("places", _ASME_READING, False),
+        _RANGE,
+        _CALIBRATED,
+    ),
+    _test(
+        ISO_10360_12,
+        "probing size and form",
+        metrics.probing,
+        _need("size", _ISO_5, "probing", 10, 51),
+        _need("touches", _KREON, "probing", 25),
+        _need("spread of touches", ("pattern of ISO 10360-5", "own reading"), "probing", 25),
+        _need("places of the sphere", _KREON, "probing", 2),
+        _RANGE,
+        _CALIBRATED,
+    ),
+    _test(
+        ISO_10360_12,
+        "articulated location",
+        metrics.location,
+        _need("size", _ISO_5, "articulation", 10, 51),
+        _need("groups", _KREON, "articulation", 5, "orientations"),
+        _need("touches", _KREON, "articulation", 5),
+        _need("spread of touches", ("as for 25 points", "own reading"), "articulation", 5),
+        _need("orientations", (_KREON[0], "own reading")),
+        _need("places of the sphere", _OBERON, "articulation", 2),
+        _RANGE,
+        _CALIBRATED,
+    ),
+    _test(
+        ISO_10360_12,
+        "length error",
+        metrics.length_error,
+        _need("lengths", ("as in ISO 10360-2 (a maker's public summary: 5 gauges)", "background"), 5),
+        _need("positions of each", ("as in ISO 10360-2 (the same: 7 directions)", "own reading"), 7),
+        _need("readings", ("as in ISO 10360-2 (the same: 3 times)", "background"), 3),
+        _need("directions", ("as in ISO 10360-2, with diagonals of the volume", "own reading"), True),
+        _need("places", ("the lengths are to sample the volume", "own reading"), True),
+        _RANGE,
+        _need("longest", ("as in ISO 10360-2 of the longest diagonal", "background")),
+        Requirement(
+            "lengths probed from one direction at both ends, or between centres; sockets are. E_Bi is another test",
+            *("ISO 10360-12, symbols of makers", "background"),
+        ),
+        _CALIBRATED,
+    ),
 )
-_COUNTS = {
-    "lengths": _Count(
-        "{n} different calibrated lengths",
-        "{n} different lengths are required ({} given).",
-        lambda bars, size: len(bars),
-    ),
-    "readings": _Count(
-        "{n} readings of each length in each position",
-        "{n} readings in each position are required (a position has {}).",
-        lambda bars, size: min((number for bar in bars for number in bar.readings), default=0),
-    ),
-    "positions": _Count(
-        "{n} positions of the bars, different by 10 degrees, or in place by 5 % of the range",
-        "{n} different positions are required ({} given).",
-        lambda bars, size: sum(len(bar.distinct(size).readings) for bar in bars),
-    ),
-    "positions of each": _Count(
-        "{n} positions of every length, different by 10 degrees, or in place by 5 % of the range",
-        "{n} different positions of every length are required (one has {}).",
-        lambda bars, size: min(len(bar.distinct(size).readings) for bar in bars),
-    ),
-    "directions": _Count(*_DIRECTIONS, lambda bars, size: all_bars(bars).in_all_directions),
-    "directions of each": _Count(*_DIRECTIONS, lambda bars, size: all(bar.in_all_directions for bar in bars)),
-}
 
 
-def _bars(measured: Measured) -> list[BarPositions]:
-    groups = values_by_artefact(distinct_lengths(measured.lengths))
-    return bar_positions(measured, [group.tolist() for group in groups])
+def requirements_table() -> str:
+    """The requirements of every test as Markdown: whether they are checked, their source, and how certain that is.
 
-
-def of_bars(kind: str, needed: int, origin: Origin) -> Requirement:
-    """So many of a key of `_COUNTS`."""
-    says, sentence, count = _COUNTS[kind]
-
-    def lacking(measured: Measured) -> str:
-        number = count(_bars(measured), size_of(measured))
-        return "" if number >= needed else sentence.format(number, n=needed)
-
-    return Requirement(says.format(n=needed), *origin, lacking)
-
-
-def spread_places(every_bar: bool, least: float, origin: Origin) -> Requirement:
-    """Bars in places over the measuring volume; not judged where its size is unknown."""
-
-    def lacking(measured: Measured) -> str:
-        bars, size = _bars(measured), size_of(measured)
-        if size is None:
-            return "The size of the measuring volume is unknown, so that the places of the bars cannot be judged."
-        narrowest = min(bar.spread(size) for bar in (bars if every_bar else [all_bars(bars)]))
-        if narrowest >= least:
-            return ""
-        return (
-            f"The places must be spread over the measuring volume: their middles scatter by {100 * narrowest:.1f} % of "
-            f"it, and {100 * least:.0f} % are required."
-        )
-
-    says = f"places over the measuring volume: middles scatter by {100 * least:.0f} % of the range or more (RMS)"
-    return Requirement(says, *origin, lacking)
-
-
-def requirements_table(tests: Sequence[StandardTest]) -> str:
-    """The requirements of tests as Markdown, those that are checked and those that nothing recorded can show."""
+    Example:
+        >>> print(aj.acceptance.requirements_table().splitlines()[0])
+        ## JJF 1408-2013
+    """
     lines = []
-    for standard in dict.fromkeys(test.standard for test in tests):
+    for standard, tests in itertools.groupby(TESTS, key=lambda test: test.standard):
         lines += [f"## {EDITIONS[standard]}", "", "| test | requirement | checked | source | confidence |"]
         lines += ["|---|---|---|---|---|"]
-        for test in (test for test in tests if test.standard == standard):
-            for requirement in test.requirements:
-                says, source, confidence, lacking = requirement
+        for test in tests:
+            for says, source, confidence, lacking in test.requirements:
                 checked = "no" if lacking is None else "yes"
                 lines.append(f"| {test.title} | {says} | {checked} | {source} | {confidence} |")
         lines.append("")

@@ -125,9 +125,8 @@ class Postures(NamedTuple):
     """How the arm was held at each pose, which points do not tell."""
 
     elbows: Mapping[str, Float[np.ndarray, " m"]]  # by socket: angle of the elbow to the left of the vertical, rad
-    probes: Mapping[
-        tuple[str, str], tuple[Float[np.ndarray, "m 3"], ...]
-    ]  # by sphere and test: of each group's touches
+    # By sphere and test: directions of the probe at each group's touches.
+    probes: Mapping[tuple[str, str], tuple[Float[np.ndarray, "m 3"], ...]]
 
 
 class Measured(NamedTuple):
@@ -149,6 +148,13 @@ class Measured(NamedTuple):
     measured: str = ""  # day on which the points were recorded
     measuring_range: float | None = None  # diameter of the measuring volume as the maker states it, mm
     postures: Postures | None = None  # None of points, which do not tell how the arm was held
+
+    @property
+    def size(self) -> float | None:
+        """The maker's measuring range (a diameter), mm; twice the reach by the model where it is not stated."""
+        if self.measuring_range is not None:
+            return self.measuring_range
+        return None if self.reach is None else 2 * self.reach.radius
 
     @property
     def tested(self) -> dict[str, Float[np.ndarray, "m 3"]]:

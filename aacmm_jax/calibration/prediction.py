@@ -19,7 +19,7 @@ from ..core.distributions import chance
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.copies import visits_of
-from ..data.observations.socket import position_of
+from ..data.observations.held import position_of
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty

@@ -90,7 +90,7 @@ def arm(
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
     if model is not None:
-        from ..files.joint_models import with_model
+        from ..files.joint_options import with_model
 
         specification = with_model(specification, model)
     frame = first_frame(specification)
@@ -187,7 +187,7 @@ def _check_summary(
     from ..diagnostics.reading_words import reading_check_summary
     from ..files.reading_checks import angles_toml, units_toml
 
-    angles = check.explained and (check.best.hypothesis.changes or check.best.angle != 1)
+    angles = check.explained and check.best.hypothesis._replace(length=1.0).changes
     return reading_check_summary(check, specification.name, unit=unit, positions=positions) | {
         "angles": angles_toml(check.best, unit, manifest) if angles else None,
         "units": units_toml(check.best, positions) if check.explained else None,

@@ -110,9 +110,9 @@ def correct(
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
     from ..data.reference_length import check_temperatures
-    from ..files.manifest_angles import with_temperature
+    from ..files.manifest_rows import with_temperature
     from ..kinematics.arm import correction_names
-    from ..kinematics.corrections.expansion import Expansion
+    from ..kinematics.corrections import Expansion
 
     if Expansion.words[0] not in correction_names(calibrated):
         if temperature is not None:

@@ -146,6 +146,7 @@ def _urdf(record: Any, specification: Any) -> tuple[str, list[str]]:
 
 def _certificate(calibration: InputFile, record: Any, about: Path | None, evaluation: Path | None) -> str:
     """The text of a certificate, with the acceptance tests of an evaluation where one is named."""
+    from ..acceptance.record import EvaluationRecord
     from ..certificate import dcc_xml
     from ..files.hdf5 import read_tables
 
@@ -154,6 +155,8 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
     tested = None
     if evaluation is not None:
         tested = files.load_evaluation(read := InputFile(evaluation))
+        if not isinstance(tested, EvaluationRecord):
+            raise InputError(f"{evaluation} is of points; name an evaluation of the calibrated arm on a capture.")
         sources += [fingerprint(read), *tested.recording.sources]
     return dcc_xml(
         record,

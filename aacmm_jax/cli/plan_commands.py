@@ -163,7 +163,7 @@ def plan(
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
-    from ..files import plans
+    from ..files.plans import plan_csv, plan_manifest
 
     given = dict(locals())  # all options by name
     words, links = summaries.planning, {"base": base, "tip": tip}
@@ -174,7 +174,7 @@ def plan(
             others = tuple(name for name in specification.free if name not in fixed)
             specification = specification._replace(held=fixed, free=others)
         if model is not None:
-            from ..files.joint_models import with_model
+            from ..files.joint_options import with_model
 
             specification = with_model(specification, model)
     _check_options(context, kit is not None, acceptance is not None)
@@ -184,23 +184,16 @@ def plan(
             specification.arm, acceptance, above=above_mm, margin=margin_deg * DEG, diameter=sphere_mm,
             stylus=stylus_mm, seed=seed, bars=bar_mm or None, measuring_range=range_mm,
         ))  # fmt: skip
-        summarise, view, texts = (
-            words.procedure_summary,
-            words.procedure,
-            (plans.procedure_csv, plans.procedure_manifest),
-        )
-        stated = {}
+        summarise, view, stated = words.procedure_summary, words.procedure, {}
     else:
         planned, stated = _planned(specification, given, links)
-        summarise, view, texts = words.plan_summary, words.plan, (plans.plan_csv, plans.plan_manifest)
-        if kit is not None:
-            summarise, view, texts = words.kit_plan_summary, words.kit_plan, (plans.kit_csv, plans.kit_manifest)
+        summarise, view = (words.plan_summary, words.plan) if kit is None else (words.kit_plan_summary, words.kit_plan)
     with together(output, manifest):
-        write_text(output, texts[0](planned, angles))
+        write_text(output, plan_csv(planned, angles))
         if manifest is not None:
             # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
             urdf = specification.urdf if arm.lower().endswith(".urdf") else None
-            write_text(manifest, texts[1](planned, arm_for(manifest, arm), urdf, angles))
+            write_text(manifest, plan_manifest(planned, arm_for(manifest, arm), urdf, angles))
     written = f"{output}" if manifest is None else f"{output}, {manifest}"
     show_summary(summarise(planned, specification.name) | stated | {"written": written}, as_json, view)
 

@@ -25,7 +25,7 @@ _KINDS = {
     "capture": ("load_capture", "calibration.capture_summary", calibration_views.capture),
     "calibration": ("load_calibration", "calibration.calibration_summary", calibration_views.calibration),
     "evaluation": ("load_evaluation", "evaluation.evaluation_summary", evaluation_views.evaluation),
-    "points": ("load_points", "evaluation.points_summary", evaluation_views.points),
+    "points": ("load_evaluation", "evaluation.points_summary", evaluation_views.points),
 }
 
 
@@ -169,7 +169,7 @@ def _evaluated_points(
     record = acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
     summary = summaries.evaluation.points_summary(record)
     if output is not None:
-        files.save_points(output, record, summary)
+        files.save_evaluation(output, record, summary)
     return summary
 
 

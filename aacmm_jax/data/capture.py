@@ -17,8 +17,8 @@ from ..core.text import shorten
 from ..kinematics.arm import Arm, by_joint
 from .copies import NOTHING_REPEATED, Repeated, check_different, checked_visits, visits_of, without_copies
 from .observations.declared import checked_name, checked_readings
+from .observations.held import Socket, sockets_of
 from .observations.observation import AbstractObservation
-from .observations.socket import Socket, sockets_of
 from .reference_length import ReferenceLength, check_temperatures
 
 # Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.

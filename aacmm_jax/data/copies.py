@@ -9,8 +9,8 @@ from jaxtyping import Int
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.text import pluralise, shorten
+from .observations.held import Socket
 from .observations.observation import AbstractObservation
-from .observations.socket import Socket
 
 
 class Repeated(NamedTuple):

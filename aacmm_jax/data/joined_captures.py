@@ -14,8 +14,8 @@ from ..core.errors import InputError
 from .capture import Capture, check_one_capture
 from .copies import visits_of
 from .observations.declared import checked_name
+from .observations.held import Socket
 from .observations.observation import AbstractObservation
-from .observations.socket import Socket
 from .reference_length import ReferenceLength
 
 

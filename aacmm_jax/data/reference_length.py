@@ -10,7 +10,7 @@ from ..core.arguments import Range, checked, shown
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray
-from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from ..kinematics.corrections import REFERENCE_TEMPERATURE
 
 _LENGTH = Annotated[Float[AnyArray, ""], Range(above=0, unit="mm")]
 _UNCERTAINTY = Annotated[Float[AnyArray, ""], Range(least=0, unit="mm")]

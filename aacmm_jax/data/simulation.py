@@ -16,13 +16,12 @@ from ..core.random_keys import random_generator, random_key, random_numbers
 from ..core.units import ARCSEC
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.chain import length_scale
-from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
 from .capture import Capture, ReferenceLength
 from .noise import Noise
 from .observations.declared import MOST_POSES
-from .observations.observation import AbstractObservation
-from .observations.simulated import AbstractSimulated
+from .observations.observation import AbstractObservation, AbstractSimulated
 from .reference_length import check_temperatures
 
 

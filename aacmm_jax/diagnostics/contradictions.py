@@ -11,7 +11,7 @@ from ..calibration.results import Calibration, Identification
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..data.capture import Capture, names_in, part_of
-from ..data.observations.socket import Socket
+from ..data.observations.held import Socket
 from .equations import PROBE, Equations, Rows
 from .findings import Case, Finding, case_of, chance_text
 from .group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of

@@ -8,7 +8,7 @@ import numpy as np
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
-from ..kinematics.near_degeneracy import SHARE_OF_BOUNDS
+from ..kinematics.independence import SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds, Parameters
 from ..uncertainty.identifiability import Observability, observability, rms_of_noise
 from .findings import Case, Finding

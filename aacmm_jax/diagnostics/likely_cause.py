@@ -16,9 +16,9 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import shorten
 from ..core.units import DEG, INCH, UM, M, length_unit
 from ..data.capture import Capture
-from ..data.observations.measured_transforms import MeasuredTransforms
+from ..data.observations.held import Socket
+from ..data.observations.measured import MeasuredTransforms
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.parameters import Parameters
 from ..kinematics.workspace import total_link_length

@@ -12,7 +12,6 @@ from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, correction_names, parameter_names, parameter_unit, value_of
-from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
@@ -38,7 +37,8 @@ def compare(
     The two are taken as independent, so variances add (JCGM 100, 5.1.2) and effective degrees of freedom follow Welch
     and Satterthwaite (annex G.4). A common error, such as that of one artefact's certified length, cancels in the
     change, so the uncertainty is then too large rather than too small. k is not compared: it is a correction of
-    stage 1, not a parameter of the arm.
+    stage 1, not a parameter of the arm. `InputError` for arms with different numbers of joints, and for lengths that do
+    not fit into the volume.
 
     Args:
         old: The earlier calibration.
@@ -49,13 +49,6 @@ def compare(
         seed: Seed of their positions.
         labels: How sentences name the two.
 
-    Returns:
-        Changes with their uncertainties, a test of all together, the change of lengths, and warnings.
-
-    Raises:
-        InputError: The arms have different numbers of joints, ``level`` is out of range, or the lengths do not fit into
-            the volume.
-
     Example:
         >>> changed = aj.drift.compare(record, record_in_june, points=20)
         >>> print([name for name, moved in zip(changed.names, changed.moved) if moved])
@@ -63,8 +56,7 @@ def compare(
         >>> print(changed.sentences()[0][:60])
         Probe remounted: a change of the probe alone (probe_x by -0.
     """
-    _check_arms([old, new], labels)
-    return _compared(old, new, _names([old, new]), level, _lengths(old, points, length, seed), labels)
+    return _compared([old, new], labels, level, (points, length, seed))[0]
 
 
 @checked_arguments
@@ -78,9 +70,10 @@ def trend(
     seed: int = 0,
     labels: Sequence[str] | None = None,
 ) -> Trend:
-    """Compare every calibration with the first in time, by the same lengths.
+    """Compare every calibration with the first in time, by the same lengths, in the order of the dates.
 
     All changes share the error of the first calibration: if all later ones differ alike, the first was probably wrong.
+    `InputError` as for `compare`, for fewer than two calibrations, and for what is no date.
 
     Args:
         records: Two or more calibrations of one arm, in any order.
@@ -91,12 +84,6 @@ def trend(
         length: As for `compare`.
         seed: As for `compare`.
         labels: How sentences name the calibrations (default: number and date).
-
-    Returns:
-        The comparisons in the order of the dates.
-
-    Raises:
-        InputError: As for `compare`; or there are fewer than two calibrations, or a date is not one.
 
     Example:
         >>> trend = aj.drift.trend([record, record_in_june], ["2026-01-31", "2026-06-30"], points=20)
@@ -109,25 +96,54 @@ def trend(
         raise InputError(f"there are {len(records)} calibrations and {len(dates)} dates; give one date each.")
     moments = [moment(date) for date in dates]
     order = sorted(range(len(records)), key=lambda i: moments[i])
-    sorted_records = [records[i] for i in order]
     names = [f"calibration {number} ({moments[i]:%Y-%m-%d})" for number, i in enumerate(order, start=1)]
     names = names if labels is None else [labels[i] for i in order]
-    _check_arms(sorted_records, names)
-    lengths = _lengths(sorted_records[0], points, length, seed)
-    drifts = [
-        _compared(sorted_records[0], record, _names(sorted_records), level, lengths, (names[0], name))
-        for record, name in zip(sorted_records[1:], names[1:], strict=True)
-    ]
+    drifts = _compared([records[i] for i in order], names, level, (points, length, seed))
     return Trend(tuple(moments[i] for i in order), tuple(order), tuple(drifts))
 
 
+def moment(date: datetime.datetime | str) -> datetime.datetime:
+    """A date with its time zone, UTC by default. Raises `InputError` for a text that is not a date."""
+    try:
+        time = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
+    except ValueError as error:
+        raise InputError(f"'{date}' is not a date; give it like 2026-03-01 or 2026-03-01T12:00:00+00:00.") from error
+    return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
+
+
 def _compared(
+    records: Sequence[CalibrationRecord],
+    labels: Sequence[str],
+    level: float,
+    volume: tuple[int, float | None, int],
+) -> list[Drift]:
+    """Every calibration against the first, by the same parameters and lengths; ``volume``: number, length, and seed."""
+    first, *others = records
+    arms = [record.recording.nominal for record in records]
+    for arm, label in zip(arms, labels, strict=True):
+        if arm.arm.joints != arms[0].arm.joints:
+            raise InputError(
+                f"{labels[0]} is of '{arms[0].name}' with {arms[0].arm.joints} joints and {label} of '{arm.name}' with "
+                f"{arm.arm.joints}, which are different arms; compare calibrations of one arm."
+            )
+    points, length, seed = volume
+    length = default_length(first.calibrated.arm) if length is None else length
+    ends = sample_lengths(first.calibrated.arm, points, length=length, seed=seed)
+    # Those of the first in its order, then those that others add.
+    names = tuple(dict.fromkeys(name for record in records for name in record.names))
+    return [
+        _of_two(first, new, names, level, (length, *ends), (labels[0], label))
+        for new, label in zip(others, labels[1:], strict=True)
+    ]
+
+
+def _of_two(
     old: CalibrationRecord,
     new: CalibrationRecord,
     names: tuple[str, ...],
     level: float,
     lengths: tuple[float, np.ndarray, np.ndarray],
-    labels: Sequence[str],
+    labels: tuple[str, str],
 ) -> Drift:
     """``lengths``: their length, and the configurations at both ends."""
     arms = old.calibrated.arm, new.calibrated.arm
@@ -136,7 +152,10 @@ def _compared(
     certain = np.array([not reason for reason in reasons])
     uncertainties = [uncertainty_of(record) for record in (old, new)]
     law = uncertainties[0].law.joined(uncertainties[1].law)
-    parts = np.concatenate([_parts(uncertainty, names) for uncertainty in uncertainties], axis=1)
+    # Variances part by part; 0 of parameters that are fixed.
+    slopes = [np.array([[float(name == other) for other in u.names] for name in names]) for u in uncertainties]
+    pairs = zip(uncertainties, slopes, strict=True)
+    parts = np.concatenate([np.asarray(u.parts(slope.reshape(len(names), -1))) for u, slope in pairs], axis=1)
     parts = np.where(certain[:, None], parts, 0.0)
     u = np.where(certain, np.sqrt(parts.sum(axis=1)), np.nan)
     return Drift(
@@ -163,19 +182,6 @@ def _values(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
     return np.array([float(value_of(arm, name)) if name in present else down.get(name, 0.0) for name in names])
 
 
-def _names(records: Sequence[CalibrationRecord]) -> tuple[str, ...]:
-    """Parameters that are free in any calibration: those of the first in its order, then those that others add."""
-    return tuple(dict.fromkeys(name for record in records for name in record.names))
-
-
-def _lengths(
-    record: CalibrationRecord, points: int, length: float | None, seed: int
-) -> tuple[float, np.ndarray, np.ndarray]:
-    arm = record.calibrated.arm
-    length = default_length(arm) if length is None else length
-    return (length, *sample_lengths(arm, points, length=length, seed=seed))
-
-
 def _why_open(records: Sequence[CalibrationRecord], name: str) -> str:
     """Why the change of a parameter has no uncertainty; empty if it has one."""
     reasons = []
@@ -194,50 +200,22 @@ def _why_open(records: Sequence[CalibrationRecord], name: str) -> str:
     return " and ".join(f"{reason} in the {which} one" for reason, which in places if reason)
 
 
-def _parts(uncertainty: Uncertainty, names: tuple[str, ...]) -> Float[np.ndarray, "p c"]:
-    """Variances of parameters in the order of ``names``, part by part; 0 for fixed ones."""
-    slopes = np.array([[float(name == other) for other in uncertainty.names] for name in names])
-    return np.asarray(uncertainty.parts(slopes.reshape(len(names), -1)))
-
-
-def _check_arms(records: Sequence[CalibrationRecord], labels: Sequence[str]) -> None:
-    """Refuse calibrations of arms with different numbers of joints."""
-    arms = [record.recording.nominal for record in records]
-    for arm, label in zip(arms, labels, strict=True):
-        if arm.arm.joints != arms[0].arm.joints:
-            raise InputError(
-                f"{labels[0]} is of '{arms[0].name}' with {arms[0].arm.joints} joints and {label} of '{arm.name}' with "
-                f"{arm.arm.joints}, which are different arms; compare calibrations of one arm."
-            )
-
-
-def moment(date: datetime.datetime | str) -> datetime.datetime:
-    """A date with its time zone, UTC by default. Raises `InputError` for a text that is not a date."""
-    try:
-        time = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
-    except ValueError as error:
-        raise InputError(f"'{date}' is not a date; give it like 2026-03-01 or 2026-03-01T12:00:00+00:00.") from error
-    return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
-
-
-def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[str]) -> Iterator[str]:
+def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str, str]) -> Iterator[str]:
     """What makes a comparison doubtful, the most serious first."""
     for record, label in zip((old, new), labels, strict=True):
         if not record.converged:
             yield f"Failed: {label}. {record.reason} Its changes mean nothing."
         elif not record.plausible_scale:
             yield f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm."
+    both = f"Not independent: {labels[0]} and {labels[1]}"
     poses = [{row.tobytes() for row in np.asarray(record.recording.capture.readings)} for record in (old, new)]
     if poses[0] == poses[1]:
         values = [_values(record.calibrated.arm, old.names) for record in (old, new)]
         same = old.names == new.names and np.array_equal(values[0], values[1])
         what = "are one and the same calibration" if same else "are of the same capture"
-        yield f"Not independent: {labels[0]} and {labels[1]} {what}, so drift cannot be seen."
+        yield f"{both} {what}, so drift cannot be seen."
     elif common := len(poses[0] & poses[1]):
-        yield (
-            f"Not independent: {labels[0]} and {labels[1]} share {common} of {len(poses[1])} poses, so the "
-            "uncertainties of the changes are wrong."
-        )
+        yield f"{both} share {common} of {len(poses[1])} poses, so the uncertainties of the changes are wrong."
     nominal = [record.recording.nominal for record in (old, new)]
     names = tuple(dict.fromkeys(name for specification in nominal for name in parameter_names(specification.arm)))
     values = zip(names, *(_values(specification.arm, names) for specification in nominal), strict=True)
@@ -249,13 +227,10 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: Sequence[s
             "fixed parameters count as drift."
         )
     if old.final_method != new.final_method:
-        yield (
-            f"Different methods: {labels[0]} is {old.final_method}, {labels[1]} {new.final_method}; "
-            "this is part of the change."
-        )
+        methods = f"{labels[0]} is {old.final_method}, {labels[1]} {new.final_method}"
+        yield f"Different methods: {methods}; this is part of the change."
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
-        alone = [name for name in record.names if name not in other.names]
-        if alone:
+        if alone := [name for name in record.names if name not in other.names]:
             yield (
                 f"Free in {label} only: {shorten(alone)}. Other parameters may compensate for them in the other one; "
                 "lengths can still be compared."

@@ -2,6 +2,7 @@
 
 import datetime
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ..core.text import shorten
 from ..core.units import people_read_change
-from .statistics import JointTest, LengthChange
+from .statistics import JointTest, LengthChange, ProbeTest
 
 
 class Drift(NamedTuple):
@@ -64,10 +65,9 @@ class Drift(NamedTuple):
     def findings(self) -> list[str]:
         """What was found: of all parameters together, of each, of lengths, and of parameters without uncertainty."""
         probe = self.joint_test.probe
-        together = (_of_all(self), _of_probe(self))
+        together = _of_all(self), "" if probe is None else _of_probe(self, probe)
         together = together[::-1] if probe is not None and probe.remounted else together
-        lengths = (_of_lengths(self), _of_scale(self.lengths))
-        sentences = (*together, _of_each(self), *lengths, _of_undetermined(self))
+        sentences = (*together, _of_each(self), *_of_lengths(self.lengths, self.level), _of_undetermined(self))
         return [sentence for sentence in sentences if sentence]
 
 
@@ -133,12 +133,9 @@ def _of_all(drift: Drift) -> str:
     )
 
 
-def _of_probe(drift: Drift) -> str:
-    """Whether the probe was remounted, or the arm has changed; empty where nothing has, or the probe is not tested."""
-    test, probe = drift.joint_test, drift.joint_test.probe
-    if probe is None:
-        return ""
-    share = 100 * (1 - probe.statistic / test.statistic)
+def _of_probe(drift: Drift, probe: ProbeTest) -> str:
+    """Whether the probe was remounted, or the arm has changed."""
+    share = 100 * (1 - probe.statistic / drift.joint_test.statistic)
     change = ", ".join(f"{name} by {in_words('mm', value)}" for name, value in probe.change)
     if not probe.remounted:
         return f"Not only the probe has changed: a remounted probe would explain {share:.0f} % of the changes."
@@ -170,33 +167,30 @@ def _of_each(drift: Drift) -> str:
     return f"{start}: {shorten(changes)}."
 
 
-def _of_lengths(drift: Drift) -> str:
-    lengths = drift.lengths
+def _of_lengths(lengths: LengthChange, level: float) -> Iterator[str]:
+    """The change of lengths, and that of the scale, where it has an uncertainty."""
     start = f"Lengths of {lengths.length:g} mm"
-    if not np.all(np.isfinite(lengths.u)):
-        return (
+    if np.all(np.isfinite(lengths.u)):
+        percent = 100 * float(np.mean(lengths.moved))
+        yield (
+            f"{start} over the volume changed by {lengths.rms:.4f} mm RMS, where the uncertainties alone would give "
+            f"{lengths.rms_by_chance:.4f} mm, and at most by {lengths.largest:+.4f} mm; {percent:.0f} % of them moved "
+            f"beyond their uncertainty ({100 * (1 - level):.2g} % would by chance)."
+        )
+    else:
+        yield (
             f"{start} changed by {lengths.rms:.4f} mm RMS, at most {lengths.largest:+.4f} mm, but the data of one "
             "calibration leave them open, so this may not be drift."
         )
-    percent = 100 * float(np.mean(lengths.moved))
-    return (
-        f"{start} over the volume changed by {lengths.rms:.4f} mm RMS, where the uncertainties alone would give "
-        f"{lengths.rms_by_chance:.4f} mm, and at most by {lengths.largest:+.4f} mm; {percent:.0f} % of them moved "
-        f"beyond their uncertainty ({100 * (1 - drift.level):.2g} % would by chance)."
-    )
-
-
-def _of_scale(lengths: LengthChange) -> str:
-    if not math.isfinite(lengths.u_scale_change):
-        return ""
-    relation = "beyond" if abs(lengths.scale_change) > lengths.expanded_scale_change else "within"
-    word = "longer" if lengths.scale_change > 0 else "shorter"
-    expanded = 1e6 * lengths.expanded_scale_change
-    decimals = 1 if expanded < 10 else 0  # no more than the uncertainty allows
-    return (
-        f"On average the same lengths measure {1e6 * abs(lengths.scale_change):.{decimals}f} um/m {word} than before "
-        f"(U = {expanded:.{decimals}f} um/m), which is {relation} the uncertainty."
-    )
+    if math.isfinite(lengths.u_scale_change):
+        relation = "beyond" if abs(lengths.scale_change) > lengths.expanded_scale_change else "within"
+        word = "longer" if lengths.scale_change > 0 else "shorter"
+        expanded = 1e6 * lengths.expanded_scale_change
+        decimals = 1 if expanded < 10 else 0  # no more than the uncertainty allows
+        yield (
+            f"On average the same lengths measure {1e6 * abs(lengths.scale_change):.{decimals}f} um/m {word} than "
+            f"before (U = {expanded:.{decimals}f} um/m), which is {relation} the uncertainty."
+        )
 
 
 def _of_undetermined(drift: Drift) -> str:

@@ -195,15 +195,18 @@ def _probe_test(
         factors, _, rank, _ = np.linalg.lstsq(which, whitened, rcond=1e-9)
         return float(np.sum((whitened - which @ factors) ** 2)), int(rank), factors
 
-    total = float(np.sum(whitened**2))
+    explained = float(np.sum(whitened**2))
     left, fitted, factors = left_by(of_probe)
+    explained -= left
     redundancy = len(whitened) - fitted
     if fitted == 0 or redundancy < 1:
         return None
-    others = min(left_by(columns[:, [i]])[0] for i in range(columns.shape[1]))
-    ratio = (total - left) / fitted / max(left / redundancy, 1e-300)
-    significant = f_tail(ratio, fitted, redundancy) < _REMOUNTED_LEVEL
-    remounted = significant and total - left > _REMOUNTED_SHARE * total and left < others
+    ratio = explained / fitted / max(left / redundancy, 1e-300)
+    remounted = (
+        f_tail(ratio, fitted, redundancy) < _REMOUNTED_LEVEL
+        and explained > _REMOUNTED_SHARE * (explained + left)
+        and left < min(left_by(columns[:, [i]])[0] for i in range(columns.shape[1]))
+    )
     change = tuple(zip(PROBE, map(float, factors), strict=True))
     return ProbeTest(left, redundancy, probability(left, fitted), ratio, change, remounted)
 
@@ -256,10 +259,10 @@ def length_change(
     """Change of ``lengths``: their length, mm, and the configurations at both ends (``(v, n)`` each)."""
     length, start, end = lengths
     uncertainties = [uncertainty_of(record) for record in (old, new)]
-    measured = [tuple(np.asarray(part) for part in _measured(item, start, end)) for item in uncertainties]
-    (before, *parts_before), (after, *parts_after) = measured
+    measured = [map(np.asarray, _measured(item, start, end)) for item in uncertainties]
+    (before, after), *pairs = zip(*measured, strict=True)
     law = uncertainties[0].law.joined(uncertainties[1].law)
-    parts, of_mean = (np.concatenate(pair, axis=-1) for pair in zip(parts_before, parts_after, strict=True))
+    parts, of_mean = (np.concatenate(pair, axis=-1) for pair in pairs)
     u, u_scale_change = np.sqrt(parts.sum(axis=-1)), float(np.sqrt(of_mean.sum()) / np.mean(before))
     return LengthChange(
         length=length,

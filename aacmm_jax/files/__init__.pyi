@@ -20,13 +20,11 @@ from .controllers import python_program as python_program
 from .controllers import zero_offsets as zero_offsets
 from .controllers import zero_offsets_csv as zero_offsets_csv
 from .evaluations import load_evaluation as load_evaluation
-from .evaluations import load_points as load_points
 from .evaluations import save_evaluation as save_evaluation
-from .evaluations import save_points as save_points
 from .kits import read_kit as read_kit
 from .manifest import read_manifest as read_manifest
+from .manifest import read_points as read_points
 from .plans import save_plan as save_plan
-from .points import read_points as read_points
 from .ur_kinematics import ur_kinematics_yaml as ur_kinematics_yaml
 from .urdf import link_masses as link_masses
 from .urdf import save_urdf as save_urdf

@@ -1,21 +1,23 @@
-"""What an arm file (TOML) may hold, and a commented template of one."""
+"""What an arm file (TOML) may hold, with noise, joint corrections and priors; and a commented template of one."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from ..core.errors import InputError
-from ..core.units import DEG
+from ..core.units import DEG, LENGTH_UNITS
 from ..data.arm_classes import CLASSES, SEATING, ArmNoise, class_noise, noise_of_repeatability
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
-from .corrections import CorrectionsTable
-from .priors import PriorTable
-from .toml import Strict, each_once
+from ..kinematics.corrected_arm import corrected_like, with_corrections
+from ..kinematics.priors import Prior, possible_names, unit_of_group
+from .toml import Point, Strict, each_once
 
+GEOMETRY = {"alpha": "rad", "a": "mm", "d": "mm", "theta": "rad", "beta": "rad", "probe": "mm"}
 _MOST_JOINTS = 20
 # alpha, a, d, joint by joint, as often as needed: of a small measuring arm (shoulder, elbow, wrist), and of a shorter
 # chain, whose tip still reaches a volume.
@@ -70,14 +72,73 @@ class NoiseTable(Strict):
         """The noise; what the table does not state is that of its class, by default ``default``."""
         name = self.arm_class or default
         seating = SEATING if self.seating_mm is None else self.seating_mm
-        if self.encoder_arcsec is not None:
-            noise = Noise(encoder_arcsec=self.encoder_arcsec, seating=seating)
-        elif self.repeatability_mm is not None:
+        if self.repeatability_mm is not None:
             noise = noise_of_repeatability(arm, self.repeatability_mm, seating)
         else:
-            noise = Noise(encoder_arcsec=np.asarray(class_noise(arm, name).encoder_arcsec), seating=seating)
+            usual = np.asarray(class_noise(arm, name).encoder_arcsec)
+            stated = self.encoder_arcsec
+            noise = Noise(encoder_arcsec=usual if stated is None else stated, seating=seating)
         noise.check(arm.joints)
         return ArmNoise(name, noise, self.source or f"class {name}: {CLASSES[name].source}")
+
+
+class CorrectionsTable(Strict):
+    """The table ``[corrections]``: a model, or coefficients by name with the nominal arm that they are of."""
+
+    model: str | None = None
+    coefficients: dict[str, FiniteFloat] = Field(default_factory=dict)  # rad, or mm of a prismatic joint
+    gravity: Point = Field(default_factory=lambda: [0.0, 0.0, -1.0])
+    mass: list[NonNegativeFloat] | None = None  # of each link, kg
+    centre: list[Point] | None = None  # of its mass in its frame, in the unit of lengths
+    nominal: dict[str, list[FiniteFloat]] = Field(default_factory=dict)  # in the file's units
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "CorrectionsTable":
+        if (self.model is None) == (not self.coefficients):
+            raise ValueError("give either model, such as 'gravity,harmonics=1', or coefficients by name.")
+        if self.nominal and not self.coefficients:
+            raise ValueError("nominal is of coefficients; leave it out of a model.")
+        unknown = set(self.nominal) - {*GEOMETRY}
+        if unknown:
+            raise ValueError(f"nominal has no '{min(unknown)}'; it has lists of alpha, a, d, theta, beta, and probe.")
+        return self
+
+    def corrected(self, arm: Arm, units: Mapping[str, float]) -> Arm:
+        """The arm with these corrections; ``units`` are the file's, in mm and rad."""
+        centre = None if self.centre is None else units["mm"] * np.array(self.centre)
+        options = {"mass": self.mass, "centre": centre, "gravity": self.gravity}
+        if self.model is not None:
+            return with_corrections(arm, self.model, **options)
+        nominal = {kind: units[GEOMETRY[kind]] * np.array(row) for kind, row in self.nominal.items()}
+        return with_coefficients(arm, self.coefficients, nominal, options)
+
+
+def with_coefficients(
+    arm: Arm, coefficients: Mapping[str, float], nominal: Mapping[str, np.ndarray], options: Mapping[str, Any]
+) -> Arm:
+    """The arm with coefficients of functions that are of another, nominal, arm; ``options`` of `with_corrections`."""
+    corrected = with_corrections(arm.replace(**nominal), list(coefficients), **options)
+    values = np.array(list(coefficients.values()), dtype=float)
+    return corrected_like(corrected, arm).replace(coefficients=values, gravity=options["gravity"])
+
+
+class PriorTable(Strict):
+    """The table ``[priors]`` of an arm file: by group, in the units of that file."""
+
+    sd: dict[str, PositiveFloat] = Field(default_factory=dict)
+    mean: dict[str, FiniteFloat] = Field(default_factory=dict)
+    learn: list[str] = Field(default_factory=list)
+
+    def prior(self, arm: Arm, units: Mapping[str, float]) -> Prior:
+        """The prior; ``units`` are the file's, in mm and rad; others, such as rad/m, are the same in every file."""
+        names = possible_names(arm)
+        sd, mean = (
+            {group: value * units.get(unit_of_group(group, names), 1.0) for group, value in values.items()}
+            for values in (self.sd, self.mean)
+        )
+        prior = Prior(sd, mean=mean, learn=self.learn)
+        prior.check(arm)
+        return prior
 
 
 class ArmFile(Strict):
@@ -88,7 +149,7 @@ class ArmFile(Strict):
     convention: Literal["standard", "craig"] = "standard"
     length_unit: Literal["mm", "m"]
     angle_unit: Literal["rad", "deg"]
-    probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, default_factory=lambda: [0.0, 0.0, 0.0])]
+    probe: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     joint: list[JointTable] = Field(default_factory=list)
     prismatic: Annotated[list[PositiveInt], AfterValidator(each_once)] = Field(default_factory=list)  # joints from 1
     urdf: str | None = None  # instead of rows of joints: a URDF beside this file
@@ -101,9 +162,9 @@ class ArmFile(Strict):
     priors: PriorTable | None = None
 
     @property
-    def units(self) -> tuple[float, float]:
+    def units(self) -> dict[str, float]:
         """The units of lengths and angles, in mm and rad."""
-        return {"mm": 1.0, "m": 1000.0}[self.length_unit], {"rad": 1.0, "deg": DEG}[self.angle_unit]
+        return {"mm": LENGTH_UNITS[self.length_unit], "rad": {"rad": 1.0, "deg": DEG}[self.angle_unit]}
 
     @model_validator(mode="after")
     def _rows_or_urdf(self) -> "ArmFile":
@@ -158,11 +219,7 @@ class ArmFile(Strict):
 
 
 def arm_template(joints: int = 6) -> str:
-    """The text of an arm file in which every key is explained, valid as it stands.
-
-    Raises:
-        InputError: The number is not between 1 and 20.
-    """
+    """The text of an arm file in which every key is explained, valid as it stands; of 1 to 20 joints."""
     if not 1 <= joints <= _MOST_JOINTS:
         raise InputError(f"an arm of {joints} joints cannot be written; give a number from 1 to {_MOST_JOINTS}.")
     pattern = _FEW_ROWS if joints < len(_ROWS) else _ROWS

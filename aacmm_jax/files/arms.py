@@ -3,7 +3,7 @@
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -12,21 +12,17 @@ from ..core.errors import InputError, naming, nearest
 from ..core.text import printable
 from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture
-from ..kinematics.arm import Arm, is_length
+from ..kinematics.arm import Arm, correction_names, is_length
 from ..kinematics.axes_to_dh import without_far_frames
+from ..kinematics.corrected_arm import loads_of
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
 from ..uncertainty.target_parameters import determined_parameters
-from .arm_tables import ArmFile, NoiseTable
-from .corrections import corrections_toml
+from .arm_tables import GEOMETRY, ArmFile, NoiseTable
 from .outputs import as_path, storable, write_text
-from .priors import prior_toml
 from .toml import read_toml
 from .ur_kinematics import read_ur_kinematics
 from .urdf import read_urdf
-
-if TYPE_CHECKING:
-    from tomlkit import TOMLDocument
 
 _SHIPPED = Path(__file__).with_name("shipped_arms")
 _ROBOTS = (".urdf", ".xacro")  # the latter for the message that says how to expand it
@@ -87,17 +83,11 @@ def load_specification(
     """The arm of a file with its name, its proposed identification and, of a URDF, what an export needs.
 
     A file without an ``[identification]`` table gets the parameters that thorough data would determine well, of
-    `Parameters.independent`, and the default bounds. The other arguments are those of `load_arm`.
+    `Parameters.independent`, and the default bounds. ``source`` is, like all arguments that are not named here, that of
+    `load_arm`; ``probe`` is in mm.
 
     Args:
-        source: As of `load_arm`.
-        base: As of `load_arm`.
-        tip: As of `load_arm`.
-        probe: As of `load_arm`, mm.
         capture: What was observed, where it is known.
-
-    Raises:
-        InputError: There is neither, or the file is not an arm's.
 
     Example:
         >>> robot = aj.files.load_specification("robot.urdf")
@@ -115,18 +105,10 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
 
     A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
     ``kinematics.yaml`` (`data.arm_classes`). Plans assume this noise; a calibration estimates it from the data, and
-    compares it with that of a table.
-
-    Args:
-        source: As of `load_arm`.
-        base: As of `load_arm`.
-        tip: As of `load_arm`.
+    compares it with that of a table. ``source`` is, like all arguments that are not named here, that of `load_arm`.
 
     Returns:
         Class of the arm, its noise (rad and mm, as `Noise` has it), and where the numbers come from.
-
-    Raises:
-        InputError: There is no such arm, or the numbers do not fit it.
 
     Example:
         >>> usual = aj.files.load_noise("panda")
@@ -141,15 +123,9 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
 
 
 def usual_noise(source: str | os.PathLike, *, base: str | None = None, tip: str | None = None) -> ArmNoise | None:
-    """The noise of the ``[noise]`` table of an arm's file; None where it has none.
+    """The noise of the ``[noise]`` table of an arm's file, as `load_noise` has it; None where it has none.
 
-    Args:
-        source: As of `load_arm`.
-        base: As of `load_arm`.
-        tip: As of `load_arm`.
-
-    Returns:
-        Class of the arm, its noise (rad and mm, as `Noise` has it), and where the numbers come from.
+    ``source`` is, like all arguments that are not named here, that of `load_arm`.
 
     Example:
         >>> print(aj.files.usual_noise("robot.urdf"))
@@ -209,9 +185,9 @@ def read_arm(
 
 
 def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpecification:
-    length, angle = model.units
+    units = model.units
     if model.urdf is not None:
-        tool = length * np.array(model.probe) if probe is None else probe
+        tool = units["mm"] * np.array(model.probe) if probe is None else probe
         specification = read_urdf(path.parent / model.urdf, base=model.base, tip=model.tip, probe=tool)
     else:
         arm = _arm_of_rows(model)
@@ -220,27 +196,27 @@ def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpec
     if model.thermometer:
         arm = arm.replace(thermometer=True)
     if model.corrections is not None:
-        arm = model.corrections.corrected(arm, length, angle)
-    prior = None if model.priors is None else model.priors.prior(arm, length, angle)
+        arm = model.corrections.corrected(arm, units)
+    prior = None if model.priors is None else model.priors.prior(arm, units)
     specification = specification._replace(arm=arm, name=model.name or path.stem, prior=prior)
     proposed = model.identification
     if proposed is None:
         return specification
+    widths = {name: units["mm" if is_length(name) else "rad"] * width for name, width in proposed.override.items()}
     specification = specification._replace(
         held=None if proposed.held is None else tuple(proposed.held),
         free=tuple(proposed.free),
-        length=proposed.length * length,
-        override={name: width * (length if is_length(name) else angle) for name, width in proposed.override.items()},
+        length=proposed.length * units["mm"],
+        angle=specification.angle if proposed.angle is None else proposed.angle * units["rad"],
+        override=widths,
     )
-    if proposed.angle is not None:
-        specification = specification._replace(angle=proposed.angle * angle)
     specification.bounds()  # refuses names that the arm does not have
     return specification
 
 
 def _arm_of_rows(model: ArmFile) -> Arm:
     """The arm of a table of joints."""
-    rows, (length, angle) = model.joint, model.units
+    rows, (length, angle) = model.joint, model.units.values()
     links = [(row.alpha, row.a) for row in rows]
     if model.convention == "craig":
         # Rx(alpha_{i-1}) Tx(a_{i-1}) Rz Tz: the link after joint i is in row i + 1; there is none after the last joint.
@@ -252,7 +228,9 @@ def _arm_of_rows(model: ArmFile) -> Arm:
         a=[length * a for _, a in links],
         d=[length * row.d for row in rows],
         theta=[angle * row.theta for row in rows],
-        beta=None if all(row.beta is None for row in rows) else [angle * (row.beta or 0.0) for row in rows],
+        beta=None
+        if all(row.beta is None for row in rows)
+        else [0.0 if row.beta is None else angle * row.beta for row in rows],
         probe=[length * x for x in model.probe],
         limits=None if rows[0].limits is None else limits,
         prismatic=model.prismatic,
@@ -294,56 +272,64 @@ def save_arm(arm: Arm, path: str | os.PathLike, *, name: str = "", source: str =
         >>> print(np.array_equal(aj.load_arm("calibrated.toml").a, result.arm.a))
         True
     """
-    write_text(path, arm_toml(arm, name=name, source=source))
+    write_text(path, specification_toml(ArmSpecification(arm, name), source=source, proposed=False))
 
 
-def arm_toml(arm: Arm, *, name: str = "", source: str = "") -> str:
-    """The text of an arm file without a proposed identification: standard convention, mm and rad."""
-    return _document(ArmSpecification(arm, name), source).as_string()
-
-
-def specification_toml(specification: ArmSpecification, *, source: str = "") -> str:
-    """The text of an arm file with its proposed identification: standard convention, mm and rad."""
+def specification_toml(specification: ArmSpecification, *, source: str = "", proposed: bool = True) -> str:
+    """The text of an arm file: standard convention, mm and rad; with its identification where that is ``proposed``."""
     import tomlkit
 
-    document = _document(specification, source)
-    proposed = tomlkit.table()
-    if specification.held is not None:
-        proposed["held"] = list(specification.held)
-    if specification.free:
-        proposed["free"] = list(specification.free)
-    proposed["length"] = float(specification.length)
-    proposed["angle"] = float(specification.angle)
-    if specification.override:
-        proposed["override"] = {name: float(width) for name, width in specification.override.items()}
-    document["identification"] = proposed
-    if specification.prior is not None:
-        document["priors"] = prior_toml(specification.prior)
-    return document.as_string()
-
-
-def _document(specification: ArmSpecification, source: str) -> "TOMLDocument":
-    import tomlkit
-
-    document = tomlkit.document()
-    arm = single(specification.arm)
+    document, arm = tomlkit.document(), single(specification.arm)
     named = {"name": specification.name, "source": source}
     document.update({key: printable(storable(text)) for key, text in named.items() if text})
     document.update({"convention": "standard", "length_unit": "mm", "angle_unit": "rad"})
-    document["probe"] = [float(x) for x in np.asarray(arm.probe)]
+    geometry = {kind: np.asarray(getattr(arm, kind)).tolist() for kind in GEOMETRY if getattr(arm, kind) is not None}
+    document["probe"] = geometry.pop("probe")
     facts = {"prismatic": list(arm.prismatic), "thermometer": arm.thermometer}
     document.update({key: fact for key, fact in facts.items() if fact})
     rows = tomlkit.array().multiline(True)
     for i in range(arm.joints):
         row = tomlkit.inline_table()
-        for kind in ("alpha", "a", "d", "theta", "beta"):
-            values = getattr(arm, kind)
-            if values is not None:
-                row[kind] = float(np.asarray(values)[i])
+        row.update({kind: values[i] for kind, values in geometry.items()})
         if arm.limits is not None:
             row["limits"] = list(arm.limits[i])
         rows.append(row)
     document["joint"] = rows
     if arm.corrections is not None:
-        document["corrections"] = corrections_toml(arm)
-    return document
+        document["corrections"] = _corrections(arm)
+    if proposed:
+        document["identification"] = _given(
+            held=None if specification.held is None else list(specification.held),
+            free=list(specification.free) or None,
+            length=float(specification.length),
+            angle=float(specification.angle),
+            override={name: float(width) for name, width in specification.override.items()} or None,
+        )
+    prior = specification.prior if proposed else None
+    if prior is not None:  # a group of which nothing is known cannot be in it
+        document["priors"] = _given(
+            sd={group: float(value) for group, value in prior.sd.items()} or None,
+            mean={group: float(value) for group, value in prior.mean.items()} or None,
+            learn=[group for group, learned in zip(prior.groups, prior.learned, strict=True) if learned] or None,
+        )
+    return document.as_string()
+
+
+def _corrections(arm: Arm) -> dict[str, object]:
+    """The table ``[corrections]`` of an arm that has some, mm and rad."""
+    assert arm.corrections is not None
+    nominal, loads = arm.corrections.nominal, loads_of(arm)
+    values = np.asarray(arm.coefficients).tolist()
+    return _given(
+        gravity=np.asarray(arm.gravity).tolist(),
+        mass=None if loads is None else list(loads.mass),
+        centre=None if loads is None else [list(centre) for centre in loads.centre],
+        coefficients=dict(zip(correction_names(arm)[: len(values)], values, strict=True)),
+        nominal=_given(**{kind: getattr(nominal, kind) for kind in GEOMETRY}),
+    )
+
+
+def _given(**entries: Any) -> dict[str, Any]:
+    """Entries that are not None; arrays as lists."""
+    listed = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in entries.items()}
+    return {key: value for key, value in listed.items() if value is not None}

@@ -2,33 +2,31 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from ..core.errors import naming
+from ..core.errors import InputError, naming
 from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
 from ..data.copies import UNKNOWN, Repeated
+from ..data.observations.declared import Entry
+from ..data.observations.observation import AbstractObservation, kinds
 from ..data.recording import Recording
 from ..data.sphere import ProbedSphere, checked_sphere
-from ..kinematics.arm import Arm, readings_unit
+from ..kinematics.arm import Arm, correction_names, readings_unit
+from ..kinematics.corrected_arm import loads_of
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
 from ..kinematics.priors import Prior
-from .corrections import corrected_of, correction_variables
+from .arm_tables import GEOMETRY, with_coefficients
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
-from .observations import observation_tables, observations_of, reading_variables, readings_of
-from .records import record_in, row_values, rows_table, table_of, values_in
-from .schema import LENGTHS, RECORDING, SPECIFICATION, SPHERES, USUAL_NOISE
+from .records import Field, attribute_name, record_in, row_values, rows_table, table_of, values_in
+from .schema import ARM, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
 from .sense import read_checked
 
-_GEOMETRY = {
-    "alpha": ("rad", "link twist"),
-    "a": ("mm", "link length"),
-    "d": ("mm", "link offset"),
-    "theta": ("rad", "joint zero offset"),
-    "beta": ("rad", "Hayati's angle"),
-}
+_OBSERVATION = "observation_"
 
 
 def save_capture(path: str | os.PathLike, recording: Recording, summary: Mapping[str, Any] | None = None) -> None:
@@ -51,13 +49,10 @@ def save_capture(path: str | os.PathLike, recording: Recording, summary: Mapping
 
 
 def load_capture(path: str | os.PathLike) -> Recording:
-    """Read a capture with its arms, from a capture file or from a calibration file.
+    """Read a capture with its arms, in mm and rad, from a capture file or from a calibration file.
 
     Args:
         path: the file to read.
-
-    Returns:
-        The recording, in mm and rad.
 
     Raises:
         InputError: the file does not exist, is damaged, is not of this kind, or was written by another version.
@@ -77,11 +72,13 @@ def recording_attributes(recording: Recording) -> Mapping[str, Any]:
 
 
 def recording_tables(recording: Recording) -> dict[str, Table]:
-    """The tables of a recording: ``capture``, ``reference``, ``nominal_arm``, and one for each observation."""
-    capture, arm = recording.capture, recording.nominal.arm
-    unit = readings_unit(arm)
+    """The tables of a recording: ``capture``, ``reference``, ``nominal_arm``, and one for each observation.
+
+    Those of observations are named by number, since names of observations may hold what names of groups may not.
+    """
+    capture, arm, urdf = recording.capture, recording.nominal.arm, recording.nominal.urdf
     check_one_capture(capture)
-    poses = reading_variables("angle", np.asarray(capture.q), arm.joints, unit)
+    poses = _reading_variables("angle", np.asarray(capture.q), arm)
     poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket that held the tip"))
     if capture.visits is not None:
         visits = np.array(capture.visits)
@@ -100,21 +97,31 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
         "reference": rows_table("length", capture.lengths, LENGTHS),
         "nominal_arm": arm_table(recording.nominal),
     }
-    if recording.nominal.urdf is not None:
-        tables["urdf"] = _urdf_table(recording.nominal.urdf)
+    if urdf is not None:  # so that an export does not need the file
+        lines = urdf.text.splitlines(keepends=True)
+        variables = columns("urdf_line", text=(lines, "", "line of the URDF, with its end"))
+        tables["urdf"] = Table(variables, {"base": urdf.base, "tip": urdf.tip})
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
     if recording.spheres:
-        tables["sphere"] = sphere_table(recording.spheres, unit=unit, joints=arm.joints)
+        tables["sphere"] = sphere_table(recording.spheres, arm)
     if recording.usual is not None:
         tables["usual_noise"] = table_of(recording.usual, USUAL_NOISE)
-    return tables | observation_tables(capture.observations, arm.joints, unit)
+    for number, observation in enumerate(capture.observations, start=1):
+        stored = observation.stored()
+        q = stored.pop("q", None)
+        fields = {entry.name: _field(entry) for entry in observation.entries if entry.name in stored}
+        table = table_of(SimpleNamespace(**stored), fields)
+        readings = {} if q is None else _reading_variables("q", np.asarray(q), arm)
+        attributes = {"kind": observation.kind, "name": observation.name} | dict(table.attributes)
+        tables[f"{_OBSERVATION}{number}"] = Table(readings | table.variables, attributes)
+    return tables
 
 
 def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
     """The recording that a file's tables hold."""
     poses, nominal = stored.tables["capture"], specification_of(path, stored, "nominal_arm")
-    q, owner = readings_of(poses, "angle"), np.asarray(poses["socket"]).astype(str)
+    q, owner = _readings_of(poses, "angle"), np.asarray(poses["socket"]).astype(str)
     names = list(dict.fromkeys(owner.tolist()))
     visits = poses.get("visit")
     if visits is not None:
@@ -124,26 +131,71 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
         tuple(zip(given.get("repeated_sockets", ()), given.get("repeated_poses", ()), strict=True)),
         tuple(zip(given.get("repeated_starts", ()), given.get("repeated_ends", ()), strict=True)),
     )
+    numbers = sorted(int(name.removeprefix(_OBSERVATION)) for name in stored.tables if name.startswith(_OBSERVATION))
     true = specification_of(path, stored, "true_arm") if "true_arm" in stored.tables else None
     with naming(path):
         capture = Capture(
             {name: q[owner == name] for name in names},
             lengths_of(stored),
-            observations_of(path, stored),
+            [_observation(path, stored.tables[f"{_OBSERVATION}{number}"]) for number in numbers],
             repeated=repeated,
             sessions=given.get("sessions") or (),
             visits=visits,
         )
         spheres = tuple(checked_sphere(sphere, capture.columns) for sphere in spheres_of(stored))
         check_readings(capture, nominal.arm, advice='import them with unit = "deg" in [angles] of the manifest')
+    table = stored.tables.get("urdf")
+    if table is not None:
+        text = "".join(map(str, table["text"]))
+        nominal = nominal._replace(urdf=UrdfSource(text, table.attributes["base"], table.attributes["tip"]))
     return Recording(
         capture,
-        nominal._replace(urdf=_urdf_of(stored.tables.get("urdf"))),
+        nominal,
         true,
         spheres=spheres,
         usual=record_in(ArmNoise, USUAL_NOISE, stored.tables.get("usual_noise")),
         **values_in(Recording, RECORDING, stored.tables, stored.attributes),
     )
+
+
+def _field(entry: Entry) -> Field:
+    content = "number" if entry.content == "points" else entry.content
+    return Field(entry.says, entry.unit, entry.dimensions, content)
+
+
+def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObservation:
+    """The observation of a table, by the entries that its kind declares; checked as when it was made."""
+    attributes = table.attributes
+    kind = kinds().get(attributes["kind"])
+    if kind is None:
+        raise InputError(
+            f"{path} holds an observation of the unknown kind '{attributes['kind']}'; update aacmm_jax, or make the "
+            "file again."
+        )
+    values: dict[str, Any] = {}
+    for entry in kind.entries:
+        name = entry.name if entry.dimensions else attribute_name(entry.name, _field(entry))
+        source = table if entry.dimensions else attributes
+        if entry.name == "q" and name in table:
+            values[name] = _readings_of(table, name)
+        elif entry.required or name in source:
+            value = source[name]
+            values[entry.name] = value.astype(str) if entry.dimensions and entry.content == "text" else value
+    return kind.rebuilt(attributes["name"], values)
+
+
+def _reading_variables(name: str, readings: Float[np.ndarray, "N n"], arm: Arm, rows: str = "pose") -> dict:
+    """Readings as variables: those of the joints, and the temperature that may follow them."""
+    variables = {name: Variable((rows, "joint"), readings[:, : arm.joints], readings_unit(arm), "joint reading")}
+    if readings.shape[1] > arm.joints:
+        variables["temperature"] = Variable((rows,), readings[:, arm.joints], "degC", "temperature of the arm")
+    return variables
+
+
+def _readings_of(table: Mapping[str, np.ndarray], name: str) -> Float[np.ndarray, "N n"]:
+    """The readings that `_reading_variables` wrote, with the temperature last where there is one."""
+    temperature = table.get("temperature")
+    return table[name] if temperature is None else np.concatenate([table[name], temperature[:, None]], axis=1)
 
 
 def lengths_of(stored: Stored) -> tuple[ReferenceLength, ...]:
@@ -153,23 +205,18 @@ def lengths_of(stored: Stored) -> tuple[ReferenceLength, ...]:
     return tuple(ReferenceLength(*row) for row in zip(*columns, strict=True))
 
 
-def sphere_table(
-    spheres: Sequence[ProbedSphere], *, points: bool = False, unit: str = "rad", joints: int | None = None
-) -> Table:
-    """Touched spheres, by poses or points, one row a touch; what belongs to a sphere is in every row of it.
-
-    ``unit`` is that of readings, of so many joints.
-    """
+def sphere_table(spheres: Sequence[ProbedSphere], arm: Arm | None = None) -> Table:
+    """Touched spheres, by poses of an arm or by points, one row a touch, with what belongs to the sphere in each."""
     rows = [
         (sphere, number, q) for sphere in spheres for number, group in enumerate(sphere.groups, start=1) for q in group
     ]
+    values = np.array([touched for *_, touched in rows])
     variables = rows_table("touch", (sphere for sphere, *_ in rows), SPHERES).variables | columns(
         "touch", group=([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist")
     )
-    values = np.array([touched for *_, touched in rows])
-    if points:
+    if arm is None:
         return Table(variables | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")})
-    return Table(variables | reading_variables("angle", values, joints or values.shape[1], unit, "touch"))
+    return Table(variables | _reading_variables("angle", values, arm, "touch"))
 
 
 def spheres_of(stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]:
@@ -177,7 +224,7 @@ def spheres_of(stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]
     table = stored.tables.get("sphere")
     if table is None:
         return ()
-    touched, groups = readings_of(table, entry), table["group"]
+    touched, groups = _readings_of(table, entry), table["group"]
     keys = list(zip(table["sphere"].tolist(), table["test"].tolist(), strict=True))
     spheres = []
     for key in dict.fromkeys(keys):
@@ -188,43 +235,33 @@ def spheres_of(stored: Stored, entry: str = "angle") -> tuple[ProbedSphere, ...]
     return tuple(spheres)
 
 
-def _urdf_table(source: UrdfSource) -> Table:
-    """The text of the URDF that the nominal arm was read from, so that an export does not need the file."""
-    lines = source.text.splitlines(keepends=True)
-    variables = columns("urdf_line", text=(lines, "", "line of the URDF, with its end"))
-    return Table(variables, {"base": source.base, "tip": source.tip})
-
-
-def _urdf_of(table: StoredTable | None) -> UrdfSource | None:
-    if table is None:
-        return None
-    return UrdfSource("".join(map(str, table["text"])), table.attributes["base"], table.attributes["tip"])
-
-
 def arm_table(specification: ArmSpecification) -> Table:
     """An arm as a table over ``joint``, with its proposed identification in attributes."""
-    arm = single(specification.arm)
-    variables = columns("axis", probe=(np.asarray(arm.probe), "mm", "tip in the last frame"))
-    for kind, (unit, says) in _GEOMETRY.items():
-        values = getattr(arm, kind)
-        if values is not None:
-            variables |= columns("joint", **{kind: (np.asarray(values), unit, says)})
-    variables |= correction_variables(arm)
+    arm, prior = single(specification.arm), specification.prior
+    values = dict.fromkeys(ARM) | specification._asdict() | {kind: getattr(arm, kind) for kind in GEOMETRY}
+    values |= {"prismatic": arm.prismatic or None, "thermometer": arm.thermometer or None}
     if arm.limits is not None:
-        for name, values in zip(("lowest", "highest"), np.transpose(arm.limits), strict=True):
-            variables |= columns("joint", **{name: (values, readings_unit(arm), f"{name} reading of the joint")})
-    attributes = {"prismatic": arm.prismatic or None, "thermometer": arm.thermometer or None}
-    prior = specification.prior
+        values["lowest"], values["highest"] = np.transpose(arm.limits)
+    if arm.corrections is not None:
+        numbers, loads = np.asarray(arm.coefficients), loads_of(arm)
+        values |= {f"nominal_{kind}": getattr(arm.corrections.nominal, kind) for kind in GEOMETRY}
+        values |= {} if loads is None else {"mass": loads.mass, "centre": loads.centre}
+        values |= {"coefficient": correction_names(arm)[: len(numbers)], "coefficients": numbers}
+        values |= {"coefficient_unit": [function.unit for function in arm.corrections.functions.terms]}
+        values["gravity"] = arm.gravity
     if prior is not None:
         # Without a standard deviation a group is learned, or nothing is known of it.
-        attributes |= {
+        values |= {
             "prior_groups": prior.groups,
             "prior_sd": [float(prior.sd[group]) if group in prior.sd else np.inf for group in prior.groups],
             "prior_learned": [group for group, learned in zip(prior.groups, prior.learned, strict=True) if learned],
             "prior_mean_of": tuple(prior.mean),
             "prior_mean": [float(value) for value in prior.mean.values()],
         }
-    return Table(variables, attributes | dict(table_of(specification, SPECIFICATION).attributes))
+    table = table_of(SimpleNamespace(**values), ARM)
+    for name in {"lowest", "highest"} & table.variables.keys():
+        table.variables[name] = table.variables[name]._replace(units=readings_unit(arm))
+    return table
 
 
 def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmSpecification:
@@ -235,13 +272,18 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
         limits = list(zip(table["lowest"].tolist(), table["highest"].tolist(), strict=True))
     with naming(path):
         arm = Arm(
-            **{kind: table.get(kind) if kind == "beta" else table[kind] for kind in (*_GEOMETRY, "probe")},
+            **{kind: table.get(kind) if kind == "beta" else table[kind] for kind in GEOMETRY},
             limits=limits,
             prismatic=list(attributes.get("prismatic", ())),
             thermometer=bool(attributes.get("thermometer", False)),
         )
-        arm = corrected_of(arm, table)
-    proposed = values_in(ArmSpecification, SPECIFICATION, table, attributes)
+        if "coefficients" in table:
+            nominal = {kind: table[f"nominal_{kind}"] for kind in GEOMETRY if f"nominal_{kind}" in table}
+            coefficients = dict(zip(map(str, table["coefficient"]), table["coefficients"], strict=True))
+            options = {key: table.get(key) for key in ("mass", "centre", "gravity")}
+            arm = with_coefficients(arm, coefficients, nominal, options)
+    fields = {key: field for key, field in ARM.items() if key in ArmSpecification._fields}
+    proposed = values_in(ArmSpecification, fields, table, attributes)
     widths = (proposed["length"], proposed["angle"], *proposed["override"].values())
     check_sense(path, {"a half-width is not positive and finite": not all(0 < width < np.inf for width in widths)})
     prior = None

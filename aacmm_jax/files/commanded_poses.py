@@ -11,8 +11,7 @@ from ..core.errors import InputError
 from ..core.text import csv_text
 from ..core.units import DEG, LENGTH_UNITS
 from ..kinematics.arm import Arm, by_joint
-from .manifest_angles import header_units
-from .table_columns import TEMPERATURE, find_named, position_columns, reading_columns
+from .table_columns import TEMPERATURE, find_named, header_units, position_columns, reading_columns
 from .text_lines import Column
 from .text_table import TextTable
 

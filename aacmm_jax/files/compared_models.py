@@ -3,25 +3,31 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-
-from .hdf5 import Table, check_sense, columns, opened, undamaged, write_tables
+from .hdf5 import check_sense, opened, undamaged, write_tables
+from .records import Fields, number, rows_table, text, truth
 
 KIND = "model comparison"
-# Columns of the table of models: unit and meaning.
-_MODELS = {
-    "parameters": ("1", "free parameters"),
-    "effective_parameters": ("1", "parameters that the data determine"),
-    "rms_inside": ("mm", "RMS distance of the poses that the model was fitted to"),
-    "rms_outside": ("mm", "RMS error in regions that the model has not seen"),
-    "u_outside": ("mm", "standard error of rms_outside, by the scatter of the regions"),
-    "ratio": ("1", "mean of (error / predicted standard deviation)^2 outside"),
-    "log_evidence": ("1", "log of the evidence, but for what all models have in common"),
-    "difference": ("mm2", "mean square outside less that of the best model"),
-    "u_difference": ("mm2", "standard error of the difference"),
-    "cpu_seconds": ("s", "CPU time"),
+_MODELS: Fields = {
+    "parameters": number("free parameters", "1"),
+    "effective_parameters": number("parameters that the data determine", "1"),
+    "rms_inside": number("RMS distance of the poses that the model was fitted to", "mm"),
+    "rms_outside": number("RMS error in regions that the model has not seen", "mm"),
+    "u_outside": number("standard error of rms_outside, by the scatter of the regions", "mm"),
+    "ratio": number("mean of (error / predicted standard deviation)^2 outside", "1"),
+    "log_evidence": number("log of the evidence, but for what all models have in common", "1"),
+    "difference": number("mean square outside less that of the best model", "mm2"),
+    "u_difference": number("standard error of the difference", "mm2"),
+    "cpu_seconds": number("CPU time", "s"),
+}
+_REGIONS: Fields = {
+    "model": text("model of the joints"),
+    "region": text("region that was left out"),
+    "poses": number("its poses", "1"),
+    "rms": number("RMS error of its poses", "mm"),
+    "ratio": number("mean of (error / predicted standard deviation)^2", "1"),
 }
 _NEEDED = ("parameters", "effective_parameters", "rms_inside", "rms_outside", "log_evidence", "cpu_seconds")
 _LARGEST = 1e12
@@ -49,29 +55,12 @@ def save_compared_models(
         >>> print(aj.files.load_compared_models("models.h5")["arm"])
         Cheng 2018, simulated arm
     """
-    models, rows = summary["models"], [(row["model"], region) for row in summary["models"] for region in row["regions"]]
-    by_model = {
-        name: (np.array([row[name] for row in models], float), unit, says) for name, (unit, says) in _MODELS.items()
-    }
-    by_region = columns(
-        "row",
-        model=([model for model, _ in rows], "", "model of the joints"),
-        region=([region["region"] for _, region in rows], "", "region that was left out"),
-        poses=([region["poses"] for _, region in rows], "1", "its poses"),
-        rms=(np.array([region["rms"] for _, region in rows], float), "mm", "RMS error of its poses"),
-        ratio=(
-            np.array([region["ratio"] for _, region in rows], float),
-            "1",
-            "mean of (error / predicted standard deviation)^2",
-        ),
-    )
-    converged = np.array([bool(row["converged"]) for row in models])
+    models = [SimpleNamespace(**row) for row in summary["models"]]
+    regions = [SimpleNamespace(model=row.model, **region) for row in models for region in row.regions]
+    fields = {"model": text("model of the joints"), **_MODELS, "converged": truth("whether its calibration converged")}
     tables = {  # for other programs: the summary has all of it
-        "models": Table(
-            columns("model", model=([row["model"] for row in models], "", "model of the joints"), **by_model)
-            | columns("model", converged=(converged, "", "whether its calibration converged"))
-        ),
-        "by_region": Table(by_region),
+        "models": rows_table("model", models, fields),
+        "by_region": rows_table("row", regions, _REGIONS),
     }
     write_tables(path, KIND, tables, {"sources": list(sources) or None, "seed": seed}, summary=summary)
 

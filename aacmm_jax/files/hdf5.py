@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 FORMAT = "aacmm_jax"
 FORMAT_VERSION = 6  # fields are declared since 6, and earlier files are refused
 _IN_MEMORY = 64 * 2**20  # bytes up to which a file is read at once, not in parts
-_TRUTH = "bool"  # how xarray marks truth values, which netCDF-4 lacks
 
 
 class Variable(NamedTuple):
@@ -87,36 +86,35 @@ def write_tables(
         if extend is not None:
             extend(file)
 
-    with write_atomically(path, advice, same_kind=lambda earlier: _is_of_kind(earlier, kind)) as temporary:
+    def is_of_kind(earlier: Path) -> bool:
+        with contextlib.suppress(InputError), opened(earlier, (kind,)):
+            return True
+        return False
+
+    with write_atomically(path, advice, same_kind=is_of_kind) as temporary:
         if extend is None:
-            temporary.write_bytes(_image(fill))
+            # Python writes the bytes, since the HDF5 library crashes the process on a full disk.
+            with h5py.File("image", "w", driver="core", backing_store=False, track_order=True) as file:
+                fill(file)
+                file.flush()
+                temporary.write_bytes(file.id.get_file_image())
         else:
             with _PatientFile(temporary, "w+b") as stream:
                 with h5py.File(stream, "w", track_order=True) as file:
                     fill(file)
-                stream.check()
+                if stream.failure is not None:
+                    raise stream.failure
         with open(temporary, "rb+") as whole:
             vouch_for(seal(whole))
 
 
-def _image(fill: Callable[[Any], None]) -> bytes:
-    """The bytes of an HDF5 file. Python writes them, since the HDF5 library crashes the process on a full disk."""
-    import h5py
-
-    with h5py.File("image", "w", driver="core", backing_store=False, track_order=True) as file:
-        fill(file)
-        file.flush()
-        return file.id.get_file_image()
-
-
 class _PatientFile(io.FileIO):
     """A file for the HDF5 library, which crashes the process where a write fails (a full disk): it is told of success,
-    and `check` raises the first failure."""
+    and the first failure is kept."""
 
     failure: OSError | None = None
 
     def write(self, content: Any) -> int:
-        """As a raw file's, but all is taken."""
         left = memoryview(content).cast("B")
         try:
             while len(left) and self.failure is None:
@@ -126,17 +124,11 @@ class _PatientFile(io.FileIO):
         return len(content)
 
     def truncate(self, size: int | None = None) -> int:
-        """As a raw file's."""
         try:
             return super().truncate(size)
         except OSError as failure:
             self.failure = self.failure or failure
             return size or 0
-
-    def check(self) -> None:
-        """Raise what went wrong, if anything did."""
-        if self.failure is not None:
-            raise self.failure
 
 
 def provenance(kind: str) -> dict[str, Any]:
@@ -175,8 +167,17 @@ def _write_group(group: Any, table: Table) -> None:
     coordinates: dict[str, Variable] = {}
     for variable in table.variables.values():
         for dimension, size in zip(variable.dimensions, np.shape(variable.values), strict=True):
-            if dimension not in table.variables:
-                coordinates[dimension] = _coordinate(dimension, size, table.variables)
+            if dimension in table.variables:
+                continue
+            first = dimension.removesuffix("_2")
+            says = first if first == dimension else f"{first}, second axis"
+            if first == "axis":
+                coordinate = Variable((dimension,), ["x", "y", "z"], "", says)
+            elif first in table.variables:
+                coordinate = table.variables[first]._replace(dimensions=(dimension,), long_name=says)
+            else:
+                coordinate = Variable((dimension,), np.arange(1, size + 1), "1", f"{says} number")
+            coordinates[dimension] = coordinate
     variables = coordinates | table.variables
     for name, variable in variables.items():
         values = np.asarray(variable.values)
@@ -191,7 +192,7 @@ def _write_group(group: Any, table: Table) -> None:
         dataset = group.create_dataset(name, **options)
         dataset.attrs["long_name"] = variable.long_name
         if truth:
-            dataset.attrs["dtype"] = _TRUTH
+            dataset.attrs["dtype"] = "bool"  # how xarray marks truth values, which netCDF-4 lacks
         elif not text:
             dataset.attrs["units"] = variable.units
         if variable.dimensions == (name,):
@@ -200,17 +201,6 @@ def _write_group(group: Any, table: Table) -> None:
         for axis, dimension in enumerate(variable.dimensions):
             if dimension != name:
                 group[name].dims[axis].attach_scale(group[dimension])
-
-
-def _coordinate(dimension: str, size: int, variables: Mapping[str, Variable]) -> Variable:
-    """The coordinate of a dimension: x, y and z; labels as of the first of two equal axes; else numbers from 1."""
-    first = dimension.removesuffix("_2")
-    said = first if first == dimension else f"{first}, second axis"
-    if first == "axis":
-        return Variable((dimension,), ["x", "y", "z"], "", said)
-    if first != dimension and first in variables:
-        return variables[first]._replace(dimensions=(dimension,), long_name=said)
-    return Variable((dimension,), np.arange(1, size + 1), "1", f"{said} number")
 
 
 class Entries(dict[str, Any]):
@@ -233,7 +223,7 @@ class StoredTable(Entries):
 
 
 class Stored(NamedTuple):
-    """What `read_tables` returns: the attributes of the file, and a `StoredTable` by name."""
+    """The attributes of a file, and a `StoredTable` by name."""
 
     attributes: Entries
     tables: Entries
@@ -323,15 +313,6 @@ def undamaged(path: str | os.PathLike) -> Iterator[None]:
         if is_from_jax(error) or isinstance(error, AssertionError | FloatingPointError):
             raise
         raise damaged(path) from error
-
-
-def _is_of_kind(path: Path, kind: str) -> bool:
-    """Whether a file can be read as one of a kind."""
-    try:
-        with opened(path, (kind,)):
-            return True
-    except InputError:
-        return False
 
 
 def _check_kind(attributes: Entries, kinds: Sequence[str], wanted: str) -> None:

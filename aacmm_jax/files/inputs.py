@@ -107,22 +107,6 @@ def fingerprint(path: str | os.PathLike, folder: str | os.PathLike | None = None
     return storable_name(f"{name} (SHA-256 {digest})")
 
 
-class InputFiles:
-    """The files of a manifest in the order in which they are opened; ``share`` as of `InputFile`."""
-
-    def __init__(self, manifest: InputFile, share: float):
-        self._files, self._share = [manifest], share
-
-    def open(self, path: str | os.PathLike) -> InputFile:
-        """Read another file."""
-        self._files.append(InputFile(path, self._share))
-        return self._files[-1]
-
-    def sources(self, folder: Path) -> tuple[str, ...]:
-        """The `fingerprint` of each file."""
-        return tuple(dict.fromkeys(fingerprint(file, folder) for file in self._files))
-
-
 def storable_name(text: str) -> str:
     """A name in a form that HDF5 can hold: bytes that are not UTF-8 are written as escapes."""
     return text.encode(errors="backslashreplace").decode()

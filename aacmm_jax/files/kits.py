@@ -12,7 +12,7 @@ from pydantic import Field, FiniteFloat, NonNegativeInt, PositiveInt, create_mod
 
 from ..core.errors import InputError
 from ..data.observations.declared import Entry
-from ..data.observations.simulated import AbstractSimulated, simulated_kinds
+from ..data.observations.observation import AbstractSimulated, simulated_kinds
 from ..planning.kit_placement import KitItem
 from .toml import Strict, read_toml
 

@@ -1,139 +1,32 @@
-"""The manifest of a capture (TOML): which text files hold which socket or observation, in which unit; the lengths."""
+"""The manifest of a capture (TOML): which text files hold which socket or observation, in which unit; the lengths.
 
-import datetime
+A manifest of points, instead of poses, is for acceptance tests of arms that report coordinates.
+"""
+
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    FiniteFloat,
-    NonNegativeFloat,
-    PositiveFloat,
-    create_model,
-    model_validator,
-)
 
-from ..acceptance.standards import Standard
-from ..core.errors import InputError, naming
+from ..acceptance.results import Measured
+from ..core.errors import InputError, naming, nearest
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings
 from ..data.joined_captures import join_sessions
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
 from ..data.recording import Recording
-from ..data.sphere import ProbedSphere, SphereTest, checked_sphere
-from ..kinematics.corrections.expansion import REFERENCE_TEMPERATURE
+from ..data.sphere import ProbedSphere, checked_sphere
+from ..kinematics.workspace import Reach
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
-from .inputs import InputFile, InputFiles
-from .manifest_angles import Angles, Readings
-from .manifest_observations import Source, name_of, observations, parts
-from .manifest_tables import FIELDS, TABLES, Picked, SocketTable, Table
+from .inputs import InputFile
+from .manifest_rows import Readings, Source, name_of, parts, points_of
+from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded, Sessions
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
-from .text_lines import TABLE_SHARE
-from .toml import Strict, each_once, read_toml
-
-
-class _Length(Strict):
-    start: str = Field(alias="from")
-    end: str = Field(alias="to")
-    value: float
-    u: NonNegativeFloat = 0.0
-    expansion: FiniteFloat = 0.0  # of the artefact, 1/K
-    temperature_C: FiniteFloat = REFERENCE_TEMPERATURE  # at which it was measured
-    u_expansion: NonNegativeFloat = 0.0
-    u_temperature: NonNegativeFloat = 0.0  # K
-
-    def between(self, start: str, end: str) -> ReferenceLength:
-        """The length between these sockets, as long as it was when it was measured."""
-        return ReferenceLength.at_temperature(
-            *(start, end, self.value, self.u),
-            expansion=self.expansion,
-            temperature=self.temperature_C,
-            u_expansion=self.u_expansion,
-            u_temperature=self.u_temperature,
-        )
-
-
-class _Sphere(Table):
-    name: str
-    test: SphereTest
-    diameter: PositiveFloat
-    u: NonNegativeFloat = 0.0
-    stylus: NonNegativeFloat = 0.0
-    form: NonNegativeFloat = 0.0
-    u_form: NonNegativeFloat = 0.0
-
-
-class _Points(Strict):
-    unit: Literal["mm", "m", "um", "inch"] | None = None  # by default that of the header
-    columns: Picked | None = None  # of x, y and z
-    reach: PositiveFloat | None = None  # mm
-    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
-    shoulder: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm
-
-    @model_validator(mode="after")
-    def _both(self) -> "_Points":
-        if (self.reach is None) != (self.shoulder is None):
-            raise ValueError(
-                "give reach and shoulder together: zones are distances from the shoulder, in the points' frame."
-            )
-        return self
-
-
-def _day(value: Any) -> Any:
-    return value.date() if isinstance(value, datetime.datetime) else value
-
-
-class _Recorded(Strict):
-    """What manifests of poses and of points have in common."""
-
-    date: Annotated[datetime.date, Field(strict=False), BeforeValidator(_day)] | None = None  # when it was recorded
-    socket: list[SocketTable] = Field(default_factory=list)
-    length: list[_Length] = Field(default_factory=list)
-    sphere: list[_Sphere] = Field(default_factory=list)
-
-
-class _Sessions(Strict):
-    """What differs between the sessions that tables name."""
-
-    probe: Literal["remounted", "same"] = "remounted"
-
-
-class _Poses(_Recorded):
-    arm: str
-    base: str | None = None  # links of a URDF
-    tip: str | None = None
-    probe: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None  # mm, from the tip link
-    acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
-    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
-    angles: Angles | None = None
-    sessions: _Sessions | None = None
-
-
-PosesManifest: type[_Poses] = create_model("PosesManifest", __base__=_Poses, **FIELDS)
-
-
-class PointsManifest(_Recorded):
-    """A manifest of points instead of poses."""
-
-    points: _Points
-
-    @model_validator(mode="after")
-    def _own_tip(self) -> "PointsManifest":
-        for entry in (*self.socket, *self.sphere):
-            seated = isinstance(entry, SocketTable) and (entry.target or entry.session)
-            if seated or entry.temperature_C is not None:
-                raise ValueError(
-                    "target, session and temperature_C are for manifests of poses, but "
-                    f"'{entry.name or entry.paths[0]}' has points, which say where the tip was; leave them out."
-                )
-        return self
+from .toml import read_toml
 
 
 def read_manifest(path: str | os.PathLike) -> Recording:
@@ -176,7 +69,7 @@ def read_manifest(path: str | os.PathLike) -> Recording:
         path: the manifest (TOML).
 
     Returns:
-        The recording: capture and nominal arm, in mm and rad, with the SHA-256 of each file.
+        Capture and nominal arm, in mm and rad, with the SHA-256 of each file.
 
     Raises:
         InputError: names the file, the place in it and what to do.
@@ -206,37 +99,40 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
     with naming(path):
         arm = arm_beside(path.parent, model.arm)
         nominal, proposed = read_arm(arm, base=model.base, tip=model.tip, probe=model.probe)
-        files = InputFiles(manifest, TABLE_SHARE)
         readings = Readings(nominal.arm, model.angles)
-        source = Source(path.parent, files.open, "q", readings)
-        recorded = read_recorded(model, source)
+        source = Source(manifest, "q", readings)
+        sockets, lengths, spheres = _read_recorded(model, source)
         # Where another tip than the arm's own probe was held, it is an observation.
-        seats = [seated for seated in recorded.sockets.values() if not seated.target]
-        targets = [seated for seated in recorded.sockets.values() if seated.target]
+        seats = [seated for seated in sockets.values() if not seated.target]
         observed: list[tuple[str, AbstractObservation]] = [
-            (seated.session, Socket(seated.name, seated.poses, target=seated.target)) for seated in targets
+            (seated.session, Socket(seated.name, seated.poses, target=seated.target))
+            for seated in sockets.values()
+            if seated.target
         ]
         for kind in TABLES:
             for entry in () if kind is Socket else getattr(model, kind.table):
                 for values in _fields(path.parent, entry, kind.table):
-                    observed += observations(source, kind, entry, values)
+                    name = name_of(entry, values)
+                    for part in parts(source, kind, entry, values, f"[[{kind.table}]] '{name}'"):
+                        named = f"{name}/{part.group}" if entry.group is not None else name
+                        observed.append((part.session, kind.rebuilt(named, part.rows)))
         if not seats and not observed:
             raise InputError("there is neither a [[socket]] nor another observation; add one.")
         if any(seated.session for seated in seats) or any(session for session, _ in observed):
-            remounted = (model.sessions or _Sessions()).probe == "remounted"
-            capture = _in_sessions(seats, recorded.lengths, observed, remounted)
+            remounted = (model.sessions or Sessions()).probe == "remounted"
+            capture = _in_sessions(seats, lengths, observed, remounted)
         elif model.sessions is not None:
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
         else:
-            capture = _capture(seats, recorded.lengths, [observation for _, observation in observed])
+            capture = _capture(seats, lengths, [observation for _, observation in observed])
         if capture.columns == nominal.arm.joints + 1:
             nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
         check_readings(capture, nominal.arm)
         recording = Recording(
             capture,
             nominal if proposed else with_parameters(nominal, capture),
-            spheres=recorded.spheres,
-            sources=files.sources(path.parent),
+            spheres=spheres,
+            sources=source.fingerprints(),
             measured=str(model.date or ""),
             acceptance=(model.acceptance,) if isinstance(model.acceptance, str) else tuple(model.acceptance),
             measuring_range=model.measuring_range,
@@ -245,7 +141,61 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
         return recording, readings
 
 
-class Seated(NamedTuple):
+def read_points(path: str | os.PathLike) -> Measured:
+    """Read a manifest of points and every file that it names; paths are relative to the manifest.
+
+    ``[points]`` has ``unit`` (mm, m, um, inch; by default that of the header), optionally ``columns`` of x, y and z,
+    the ``measuring_range`` that the maker states (a diameter, mm), and, for the zones of ASME B89.4.22, the arm's
+    ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
+    `read_manifest`, with files of x, y, z: columns of these names, or the only three.
+
+    Args:
+        path: the manifest (TOML).
+
+    Returns:
+        The measured points, mm.
+
+    Raises:
+        InputError: names the file, the place in it and what to do.
+
+    Example:
+        >>> from pathlib import Path
+        >>> np.savetxt("near.csv", true.position(capture.sockets["A"]), delimiter=",")
+        >>> _ = Path("points.toml").write_text('''[points]
+        ... unit = "mm"
+        ... [[socket]]
+        ... name = "near"
+        ... file = "near.csv"
+        ... ''')
+        >>> print(aj.files.read_points("points.toml").sockets["near"].shape)
+        (40, 3)
+    """
+    model = read_toml(manifest := InputFile(path), PointsManifest)
+    stated = model.points
+    with naming(as_path(path)):
+        source = Source(manifest, "points", lambda text, wanted: points_of(text, wanted, stated))
+        seated, lengths, spheres = _read_recorded(model, source)
+        for length in lengths:
+            for end in (length.start, length.end):
+                if end not in seated:
+                    raise InputError(
+                        f"length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
+                        f"{nearest(end, seated)}"
+                    )
+        if not seated and not spheres:
+            raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")
+        return Measured(
+            {name: socket.poses for name, socket in seated.items()},
+            tuple(lengths),
+            spheres,
+            None if stated.reach is None else Reach(np.array(stated.shoulder), stated.reach),
+            sources=source.fingerprints(),
+            measured=str(model.date or ""),
+            measuring_range=stated.measuring_range,
+        )
+
+
+class _Seated(NamedTuple):
     """The poses of one socket."""
 
     session: str  # empty where there are none
@@ -255,27 +205,26 @@ class Seated(NamedTuple):
     visits: np.ndarray | None
 
 
-class Recorded(NamedTuple):
+def _read_recorded(
+    model: Recorded, source: Source
+) -> tuple[dict[str, _Seated], list[ReferenceLength], tuple[ProbedSphere, ...]]:
     """The sockets, lengths and spheres that a manifest names; names of sockets begin with their session."""
-
-    sockets: dict[str, Seated]
-    lengths: list[ReferenceLength]
-    spheres: tuple[ProbedSphere, ...]
-
-
-def read_recorded(model: _Recorded, source: Source) -> Recorded:
-    """Read the tables of sockets and spheres of a manifest. Raises `InputError`."""
-    sockets: dict[str, Seated] = {}
+    sockets: dict[str, _Seated] = {}
     fields: list[dict[str, str]] = []
     for entry in model.socket:
         for values in _fields(source.folder, entry, "socket"):
             fields.append(values)
-            for seated in _seated(source, entry, values):
-                name = "/".join(filter(None, (seated.session, seated.name)))
+            stated = name_of(entry, values)
+            named = "" if entry.name is None and entry.group is not None else stated
+            for part in parts(source, Socket, entry, values, f"[[socket]] '{stated}'"):
+                within = "/".join(filter(None, (named, part.group)))
+                name = "/".join(filter(None, (part.session, within)))
                 check_name(name)
                 if name in sockets:
                     raise InputError(f"socket '{name}' is defined twice; give its files in one [[socket]].")
-                sockets[name] = seated
+                visits = None if entry.visits is None else part.files
+                poses, target = part.rows[source.quantity], part.rows.get("target", "")
+                sockets[name] = _Seated(part.session, within, poses, target, visits)
     spheres = []
     for entry in model.sphere:
         if any((entry.name, entry.test) == (other.name, other.test) for other in spheres):
@@ -288,28 +237,18 @@ def read_recorded(model: _Recorded, source: Source) -> Recorded:
         ]
         numbers = (entry.diameter, entry.u, entry.stylus, entry.form, entry.u_form)
         spheres.append(checked_sphere(ProbedSphere(entry.name, entry.test, tuple(groups), *numbers)))
-    return Recorded(sockets, _lengths(model.length, fields, sockets), tuple(spheres))
-
-
-def _seated(source: Source, entry: SocketTable, values: Mapping[str, str]) -> Iterator[Seated]:
-    """The sockets of one entry: one, or one for each session and group."""
-    stated = name_of(entry, values)
-    named = "" if entry.name is None and entry.group is not None else stated
-    for part in parts(source, Socket, entry, values, f"[[socket]] '{stated}'"):
-        name = "/".join(filter(None, (named, part.group)))
-        visits = None if entry.visits is None else part.files
-        yield Seated(part.session, name, part.rows[source.quantity], part.rows.get("target", ""), visits)
+    return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
 
 
 def _capture(
-    seats: Sequence[Seated], lengths: Sequence[ReferenceLength], observed: Sequence[AbstractObservation]
+    seats: Sequence[_Seated], lengths: Sequence[ReferenceLength], observed: Sequence[AbstractObservation]
 ) -> Capture:
     visits = {seated.name: seated.visits for seated in seats if seated.visits is not None}
     return Capture({seated.name: seated.poses for seated in seats}, lengths, observed, visits=visits or None)
 
 
 def _in_sessions(
-    seats: Sequence[Seated],
+    seats: Sequence[_Seated],
     lengths: Sequence[ReferenceLength],
     observed: Sequence[tuple[str, AbstractObservation]],
     remounted: bool,
@@ -351,8 +290,8 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
     if not name and fields:
         line = "/".join(f"{{{field}}}" for field in sorted(fields - of_session))
         raise InputError(f"file '{first}' has {in_braces(fields)}, so add name = \"{line}\" in [[{table}]].")
-    for what, text, known in (("name", name, of_session), *(("file", file, set()) for file in entry.paths[1:])):
-        if fields_of(text) | known != fields:
+    for what, text, of_others in (("name", name, of_session), *(("file", file, set()) for file in entry.paths[1:])):
+        if fields_of(text) | of_others != fields:
             raise InputError(
                 f"{table} {what} '{text}' has {in_braces(fields_of(text))}, but file '{first}' has "
                 f"{in_braces(fields)}; use the same fields in the name and in every file."
@@ -363,7 +302,7 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
 
 
 def _lengths(
-    entries: Sequence[_Length], fields: Sequence[dict[str, str]], sockets: Mapping[str, Seated]
+    entries: Sequence[Length], fields: Sequence[dict[str, str]], sockets: Mapping[str, _Seated]
 ) -> list[ReferenceLength]:
     """Reference lengths; one with fields in braces gives every combination that the sockets' files have."""
     lengths = []

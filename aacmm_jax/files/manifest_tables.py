@@ -1,13 +1,19 @@
-"""The tables of a manifest that name files: one a kind, made of what the kind declares."""
+"""What a manifest may hold (TOML): the arm, tables of files, one a kind, made of what it declares, and lengths."""
 
+import datetime
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     Field,
     FiniteFloat,
+    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -15,16 +21,22 @@ from pydantic import (
     model_validator,
 )
 
+from ..acceptance.standards import Standard
 from ..core.errors import InputError
-from ..core.text import quoted
+from ..core.units import ANGLE_UNITS, LENGTH_UNITS
+from ..data.capture import ReferenceLength
 from ..data.observations.declared import Entry
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation, kinds
-from ..data.observations.socket import Socket
+from ..data.sphere import SphereTest
+from ..kinematics.arm import Arm, by_joint
+from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from .text_lines import Column
-from .toml import Strict, each_once
+from .toml import Point, Strict, each_once
 
 NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
 _EULER = re.compile("[xyz]{3}|[XYZ]{3}")
+_ByJoint = PositiveFloat | Annotated[list[PositiveFloat], Field(min_length=1)]
 
 
 class Preset(NamedTuple):
@@ -86,6 +98,43 @@ Picked = PositiveInt | str | Annotated[list[PositiveInt | str], Field(min_length
 def as_list(picked: Column | list[Column]) -> list[Column]:
     """Columns as they are picked: one of them is a list, too."""
     return picked if isinstance(picked, list) else [picked]
+
+
+class Angles(Strict):
+    """How every column of readings is turned into rad, or mm of a prismatic joint."""
+
+    unit: Literal["rad", "deg", "arcsec", "gon", "mrad", "counts"]
+    counts_per_turn: _ByJoint | None = None
+    sign: Literal[1, -1] | list[Literal[1, -1]] = 1
+    offset: FiniteFloat | list[FiniteFloat] = 0.0
+    columns: Picked | None = None
+    linear_unit: Literal["mm", "m", "um", "inch", "counts"] = "mm"  # of prismatic joints
+    counts_per_mm: _ByJoint | None = None
+
+    @model_validator(mode="after")
+    def _counts(self) -> "Angles":
+        if (self.unit == "counts") != (self.counts_per_turn is not None):
+            raise ValueError("give counts_per_turn with unit = 'counts', and only with it.")
+        if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
+            raise ValueError("give counts_per_mm with linear_unit = 'counts', and only with it.")
+        return self
+
+    def converted(self, readings: Float[np.ndarray, "N n"], arm: Arm) -> Float[np.ndarray, "N n"]:
+        """Readings in rad, and in mm of prismatic joints."""
+
+        def numbers(key: str) -> np.ndarray:
+            array = np.asarray(getattr(self, key), dtype=float)
+            if array.ndim and array.shape != (arm.joints,):
+                raise InputError(
+                    f"angles.{key} has {array.size} values, but there are {arm.joints} joints; give one, or one a "
+                    "joint."
+                )
+            return array
+
+        angular = 2 * math.pi / numbers("counts_per_turn") if self.counts_per_turn else ANGLE_UNITS[self.unit]
+        linear = 1 / numbers("counts_per_mm") if self.counts_per_mm else LENGTH_UNITS[self.linear_unit]
+        units = np.where(by_joint(arm, False, True), linear, angular)
+        return numbers("sign") * (readings - numbers("offset")) * units
 
 
 class Table(Strict):
@@ -168,33 +217,110 @@ def _stated(entry: Entry) -> Any:
 
 
 TABLES = {kind: _model(kind) for kind in kinds().values()}
-FIELDS: dict[str, Any] = {
+
+
+class Length(Strict):
+    """A certified length between two sockets."""
+
+    start: str = Field(alias="from")
+    end: str = Field(alias="to")
+    value: float
+    u: NonNegativeFloat = 0.0
+    expansion: FiniteFloat = 0.0  # of the artefact, 1/K
+    temperature_C: FiniteFloat = REFERENCE_TEMPERATURE  # at which it was measured
+    u_expansion: NonNegativeFloat = 0.0
+    u_temperature: NonNegativeFloat = 0.0  # K
+
+    def between(self, start: str, end: str) -> ReferenceLength:
+        """The length between these sockets, as long as it was when it was measured."""
+        return ReferenceLength.at_temperature(
+            *(start, end, self.value, self.u),
+            expansion=self.expansion,
+            temperature=self.temperature_C,
+            u_expansion=self.u_expansion,
+            u_temperature=self.u_temperature,
+        )
+
+
+class Sphere(Table):
+    """A sphere touched for acceptance tests."""
+
+    name: str
+    test: SphereTest
+    diameter: PositiveFloat
+    u: NonNegativeFloat = 0.0
+    stylus: NonNegativeFloat = 0.0
+    form: NonNegativeFloat = 0.0
+    u_form: NonNegativeFloat = 0.0
+
+
+class PointsTable(Strict):
+    """How points are written, and what is known of the arm that reported them."""
+
+    unit: Literal["mm", "m", "um", "inch"] | None = None  # by default that of the header
+    columns: Picked | None = None  # of x, y and z
+    reach: PositiveFloat | None = None  # mm
+    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
+    shoulder: Point | None = None  # mm
+
+    @model_validator(mode="after")
+    def _both(self) -> "PointsTable":
+        if (self.reach is None) != (self.shoulder is None):
+            raise ValueError(
+                "give reach and shoulder together: zones are distances from the shoulder, in the points' frame."
+            )
+        return self
+
+
+def _day(value: Any) -> Any:
+    return value.date() if isinstance(value, datetime.datetime) else value
+
+
+class Recorded(Strict):
+    """What manifests of poses and of points have in common."""
+
+    date: Annotated[datetime.date, Field(strict=False), BeforeValidator(_day)] | None = None  # when it was recorded
+    socket: list[SocketTable] = Field(default_factory=list)
+    length: list[Length] = Field(default_factory=list)
+    sphere: list[Sphere] = Field(default_factory=list)
+
+
+class Sessions(Strict):
+    """What differs between the sessions that tables name."""
+
+    probe: Literal["remounted", "same"] = "remounted"
+
+
+class _Poses(Recorded):
+    arm: str
+    base: str | None = None  # links of a URDF
+    tip: str | None = None
+    probe: Point | None = None  # mm, from the tip link
+    acceptance: Standard | Annotated[list[Standard], AfterValidator(each_once)] = Field(default_factory=list)
+    measuring_range: PositiveFloat | None = None  # diameter of the measuring volume as the maker states it, mm
+    angles: Angles | None = None
+    sessions: Sessions | None = None
+
+
+_FIELDS: dict[str, Any] = {
     kind.table: (list[table], Field(default_factory=list))  # pyright: ignore[reportInvalidTypeForm]
     for kind, table in TABLES.items()
 }
+PosesManifest: type[_Poses] = create_model("PosesManifest", __base__=_Poses, **_FIELDS)
 
 
-class Wanted(NamedTuple):
-    """What the manifest states of the readings, or points, in a table."""
+class PointsManifest(Recorded):
+    """A manifest of points instead of poses."""
 
-    columns: Sequence[Column] | None
-    unit: str | None
-    usual_unit: str | None  # of the preset, where neither the manifest nor the header states one
-    taken: Sequence[int]  # columns, from 0, that hold something else
-    temperature: float | None
+    points: PointsTable
 
-
-def checked_unit(
-    where: object, what: str, header: str | None, stated: str | None, usual: str | None, units: Iterable[str]
-) -> str | None:
-    """The unit that the manifest states, or the header, or the preset. Raises `InputError` where the first two differ,
-    or it is none of ``units``."""
-    if header is not None and stated not in (None, header):
-        raise InputError(
-            f"{where}: the header of the {what} says {quoted(header)[1:-1]}, but the manifest {stated}; correct one of "
-            "them."
-        )
-    unit = stated or header or usual
-    if unit is not None and unit not in units:
-        raise InputError(f"{where}: the {what} are in {quoted(unit)}; give one of {', '.join(units)}.")
-    return unit
+    @model_validator(mode="after")
+    def _one_tip(self) -> "PointsManifest":
+        for entry in (*self.socket, *self.sphere):
+            seated = isinstance(entry, SocketTable) and (entry.target or entry.session)
+            if seated or entry.temperature_C is not None:
+                raise ValueError(
+                    "target, session and temperature_C are for manifests of poses, but "
+                    f"'{entry.name or entry.paths[0]}' has points, which say where the tip was; leave them out."
+                )
+        return self

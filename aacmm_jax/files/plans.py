@@ -2,39 +2,40 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+import textwrap
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 
-from ..acceptance.procedure import TOUCHED, Procedure
-from ..acceptance.procedure_items import ProcedureItem
+from ..acceptance.procedure import TOUCHED, Procedure, ProcedureItem
 from ..acceptance.standards import PLANNED
 from ..core.text import csv_text
 from ..core.units import DEG
 from ..data.observations.declared import Entry
+from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.observations.socket import Socket
-from ..kinematics.arm import Arm, by_joint
+from ..kinematics.arm import by_joint
 from ..kinematics.parameters import UrdfSource
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from .outputs import write_text
 
 Angles = Literal["deg", "rad"]
+Planned = Plan | KitPlan | Procedure
 
 
-def save_plan(path: str | os.PathLike, plan: Plan | KitPlan, *, angles: Angles = "deg") -> None:
+def save_plan(path: str | os.PathLike, plan: Planned, *, angles: Angles = "deg") -> None:
     """Write the poses of a plan as CSV, in the order in which to take them.
 
     Columns: ``pose``, ``move`` (where there are approach points: "approach", "pose" and "retract" for each pose),
-    ``socket`` (of a kit: ``observation`` and ``point``), ``x_mm``, ``y_mm``, ``z_mm`` (the tip), ``q_1_deg`` or
-    ``q_1_rad`` and so on (joint readings; ``q_1_mm`` of a prismatic joint), ``probe_direction_x``, ``_y``, ``_z`` (the
-    last frame's z axis).
+    ``socket`` (of a kit: ``observation`` and ``point``; of an acceptance test: ``test``, ``name`` and the ``file`` for
+    the reading), ``x_mm``, ``y_mm``, ``z_mm`` (the tip), ``q_1_deg`` or ``q_1_rad`` and so on (joint readings;
+    ``q_1_mm`` of a prismatic joint), ``probe_direction_x``, ``_y``, ``_z`` (the last frame's z axis).
 
     Args:
         path: the file to write.
-        plan: what `planning.plan` or `planning.plan_kit` returned.
+        plan: what `planning.plan`, `planning.plan_kit` or `acceptance.plan_procedure` returned.
         angles: the unit of the joint readings.
 
     Raises:
@@ -47,56 +48,67 @@ def save_plan(path: str | os.PathLike, plan: Plan | KitPlan, *, angles: Angles =
         >>> print(Path("plan.csv").read_text().split(",")[:6])
         ['pose', 'socket', 'x_mm', 'y_mm', 'z_mm', 'q_1_deg']
     """
-    write_text(path, plan_csv(plan, angles) if isinstance(plan, Plan) else kit_csv(plan, angles))
+    write_text(path, plan_csv(plan, angles))
 
 
-def plan_csv(plan: Plan, angles: Angles = "deg") -> str:
+def plan_csv(plan: Planned, angles: Angles = "deg") -> str:
     """The text of `save_plan`."""
-    names = list(plan.sockets)
-    owners = [names[owner] for owner in plan.owner]
-    points = np.array([plan.sockets[name] for name in owners])
-    approach, above = plan.motion.approach, points + plan.retract * plan.cones.normals[plan.owner]
-    moves = None if approach is None else (approach, above)
-    return _poses_csv(plan.arm, ["socket"], [[owner] for owner in owners], (plan.q, points), angles, moves)
+    moved = above = None  # readings and tips of the approach, which has a row before and after each pose
+    if isinstance(plan, Plan):
+        names = list(plan.sockets)
+        headings, labels = ["socket"], [[names[owner]] for owner in plan.owner]
+        q, tips = plan.q, np.array([plan.sockets[name] for (name,) in labels])
+        moved, above = plan.motion.approach, tips + plan.retract * plan.cones.normals[plan.owner]
+    elif isinstance(plan, KitPlan):
+        headings, (labels, q, tips, moved, above) = ["observation", "point"], _kit_poses(plan)
+        moved = moved if plan.retract else None
+    else:
+        items = (*plan.sockets, *plan.touches)
+        headings, labels = (
+            ["test", "name", "file"],
+            [[item.test, item.name, _file_of(plan, item)] for item in items for _ in item.q],
+        )
+        q, tips = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("q", "points"))
+    readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(plan.arm, angles, "mm"), start=1)]
+    direction = [f"probe_direction_{axis}" for axis in "xyz"]
+    move = [] if moved is None else ["move"]
+    rows: list[list[Any]] = [["pose", *move, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction]]
+    unit, digits = (DEG, 3) if angles == "deg" else (1.0, 6)
+    units = np.array(by_joint(plan.arm, unit, 1.0))
+
+    def numbers(q: np.ndarray, tips: np.ndarray) -> list[list[str]]:
+        rows = zip(tips, q / units, np.asarray(plan.arm.pose(q))[:, :3, 2], strict=True)
+        return [
+            [*(f"{x:.3f}" for x in tip), *(f"{x:.{digits}f}" for x in reading), *(f"{x:.2f}" for x in axis)]
+            for tip, reading, axis in rows
+        ]
+
+    at_poses, around = numbers(q, tips), [] if moved is None or above is None else numbers(moved, above)
+    for i, label in enumerate(labels):
+        pose = [i + 1, *(["pose"] if move else []), *label, *at_poses[i]]
+        if moved is None or not np.all(np.isfinite(moved[i])):
+            rows.append(pose)
+            continue
+        before, after = ([i + 1, name, *label, *around[i]] for name in ("approach", "retract"))
+        rows += [before, pose, after]
+    return csv_text(rows)
 
 
-def plan_manifest(plan: Plan, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
-    """A manifest for the readings of a planned calibration, in which the calibrated lengths are to be filled in.
-
-    ``urdf``: where the arm is a URDF, its links.
-    """
-    lines = _manifest_start(
-        arm,
-        urdf,
-        "# A calibration, as planned. Fill in the calibrated lengths and uncertainties (k = 1), record a file for each",
-        "# socket (one row a pose, in the order of the plan), then: aacmm import THIS.toml -o capture.h5",
-        angles=angles,
-    )
-    for name in plan.sockets:
-        lines += _table("socket", {"name": name, "file": f"{name}.csv"})
-    for length in plan.lengths:
-        ends = {"from": length.start, "to": length.end}
-        lines += _table("length", ends | _length(round(float(length.value), 6), float(length.u)))
-    return "\n".join(lines) + "\n"
-
-
-def kit_csv(plan: KitPlan, angles: Angles = "deg") -> str:
-    """A row for each pose of a plan with a kit: observation, point of an artefact or plane, position, readings."""
-    labels, points, q, approach, above = [], [], [], [], []
+def _kit_poses(plan: KitPlan) -> tuple[list[list[str]], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Labels, readings and tips of the poses of a plan with a kit, and those of the approach, which may be NaN."""
+    labels, q, tips, moved, above = [], [], [], [], []
     motions = plan.motions or (None,) * len(plan.kit)
     for simulated, observation, motion in zip(plan.kit, plan.observations, motions, strict=True):
         label, readings = _label(observation), np.asarray(observation.q)
         touched = [""] * len(readings) if label is None else observation.stored()[label.name]
         labels += [[observation.name, str(point)] for point in touched]
         arm = plan.arm if simulated.offset is None else plan.arm.replace(probe=simulated.offset)
-        points.append(np.asarray(arm.position(readings)))
+        approach = None if motion is None else motion.approach
         q.append(readings)
-        moved = np.full_like(readings, np.nan) if motion is None or motion.approach is None else motion.approach
-        approach.append(moved)
-        above.append(np.asarray(arm.position(moved)))
-    poses = np.concatenate(q), np.concatenate(points)
-    moves = (np.concatenate(approach), np.concatenate(above)) if plan.retract else None
-    return _poses_csv(plan.arm, ["observation", "point"], labels, poses, angles, moves)
+        tips.append(np.asarray(arm.position(readings)))
+        moved.append(np.full_like(readings, np.nan) if approach is None else approach)
+        above.append(np.asarray(arm.position(moved[-1])))
+    return labels, np.concatenate(q), np.concatenate(tips), np.concatenate(moved), np.concatenate(above)
 
 
 def _label(observation: AbstractObservation) -> Entry | None:
@@ -104,23 +116,79 @@ def _label(observation: AbstractObservation) -> Entry | None:
     return next((e for e in observation.entries if e.content == "text" and e.dimensions == ("pose",)), None)
 
 
-def kit_manifest(plan: KitPlan, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
-    """A manifest for the readings of a plan with a kit, in which certified values are to be filled in.
+def _file_of(procedure: Procedure, item: ProcedureItem) -> str:
+    """The file that the manifest of an acceptance test expects an item's readings in."""
+    if item.test not in TOUCHED:
+        return f"{item.name}.csv"
+    several = sum((other.test, other.name) == (item.test, item.name) for other in procedure.touches) > 1
+    return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
 
-    Files hold the joint readings in their first columns and, where something is measured, its numbers in the next.
-    ``urdf`` says the links where the arm is a URDF.
+
+_ROWS = "(one row a pose, in the order of the plan{}), then: aacmm import THIS.toml -o {}.h5"
+_WHAT = {
+    Plan: "A calibration, as planned. Fill in the calibrated lengths and uncertainties (k = 1), record a file for each "
+    "socket " + _ROWS.format("", "capture"),
+    KitPlan: "A calibration, as planned. Fill in certified values and uncertainties (k = 1), record the files "
+    + _ROWS.format(": joint readings, then what was measured", "capture"),
+    Procedure: "{}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, record a "
+    "file for each socket and each group of touches " + _ROWS.format("", "acceptance"),
+}
+
+
+def plan_manifest(plan: Planned, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
+    """A manifest for the readings of a plan, in which the certified values are to be filled in.
+
+    Files hold the joint readings in their first columns and, where something is measured, its numbers in the next;
+    readings of prismatic joints are in mm. ``urdf``: where the arm is a URDF, its links.
     """
-    lines = _manifest_start(
-        arm,
-        urdf,
-        "# A calibration, as planned. Fill in certified values and uncertainties (k = 1), record the files (one row a",
-        "# pose, in the order of the plan: joint readings, then what was measured), then: aacmm import THIS.toml -o",
-        "# capture.h5",
-        angles=angles,
-    )
-    for observation in plan.observations:
-        lines += _table(observation.table, _observation(observation, plan.arm.joints))
+    entries: dict[str, Any] = {"arm": arm} | ({} if urdf is None else {"base": urdf.base, "tip": urdf.tip})
+    what, tables, size = _WHAT[type(plan)], [], []
+    if isinstance(plan, Plan):
+        tables += [("socket", {"name": name, "file": f"{name}.csv"}) for name in plan.sockets]
+        for length in plan.lengths:
+            value = _length(round(float(length.value), 6), float(length.u))
+            tables.append(("length", {"from": length.start, "to": length.end} | value))
+    elif isinstance(plan, KitPlan):
+        tables += [(item.table, _observation(item, plan.arm.joints)) for item in plan.observations]
+    else:
+        entries, what = entries | {"acceptance": plan.standard}, what.format(PLANNED[plan.standard])
+        stated = f"measuring_range = {plan.measuring_range:.0f}   # mm: its diameter, as the maker states it"
+        size = [stated if plan.range_stated else f"# {stated}; planned: twice the reach"]
+        tables = _of_procedure(plan)
+    date = "# date = 2026-01-31   # when it was recorded"
+    comment = textwrap.fill(what, 118, initial_indent="# ", subsequent_indent="# ")
+    lines = [comment, *_entries(entries), date, *size, "", "[angles]", f'unit = "{angles}"']
+    for heading, table in tables:
+        lines += ["", f"[[{heading}]]", *_entries(table)]
     return "\n".join(lines) + "\n"
+
+
+def _of_procedure(procedure: Procedure) -> list[tuple[str, dict[str, Any]]]:
+    """The tables of an acceptance test."""
+    tables: list[tuple[str, dict[str, Any]]] = []
+    kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
+    for kind in kinds:
+        pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"
+        tables.append(("socket", {"name": pattern, "file": f"{pattern}.csv"}))
+    for kind in kinds:
+        value = next((value for start, _, value in procedure.lengths if start.startswith(f"{kind}/")), None)
+        if value is not None:
+            ends = {"from": f"{kind}/{{position}}/a", "to": f"{kind}/{{position}}/b"}
+            tables.append(("length", ends | _length(value, 0.002)))
+    for sphere in procedure.spheres:
+        touches = [item for item in procedure.touches if (item.name, TOUCHED[item.test]) == (sphere.name, sphere.test)]
+        entries = {
+            "name": sphere.name,
+            "test": sphere.test,
+            "files": [_file_of(procedure, item) for item in touches],
+            "diameter": (sphere.diameter, "mm: the calibrated diameter"),
+            "u": (0.0005, "mm: its standard uncertainty"),
+            "stylus": (sphere.stylus, "mm: diameter of the probe's ball"),
+            "form": (0.0, "mm: its calibrated form error"),
+            "u_form": (0.0, "mm: the standard uncertainty of that"),
+        }
+        tables.append(("sphere", entries))
+    return tables
 
 
 def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any]:
@@ -158,21 +226,6 @@ def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any
     return table
 
 
-def _manifest_start(
-    arm: str, urdf: UrdfSource | None, *comments: str, acceptance: str | None = None, angles: Angles = "deg"
-) -> list[str]:
-    """The first lines of a manifest of readings; those of prismatic joints are in mm, which is the default."""
-    entries = {"arm": arm} | ({} if urdf is None else {"base": urdf.base, "tip": urdf.tip})
-    entries |= {} if acceptance is None else {"acceptance": acceptance}
-    date = "# date = 2026-01-31   # when it was recorded"
-    return [*comments, *_entries(entries), date, "", "[angles]", f'unit = "{angles}"']
-
-
-def _table(heading: str, entries: Mapping[str, Any]) -> list[str]:
-    """A table of a manifest."""
-    return ["", f"[[{heading}]]", *_entries(entries)]
-
-
 def _entries(entries: Mapping[str, Any]) -> list[str]:
     """Lines of TOML: of each key a value, or a value and what it is."""
     pairs = {key: entry if isinstance(entry, tuple) else (entry, "") for key, entry in entries.items()}
@@ -181,110 +234,13 @@ def _entries(entries: Mapping[str, Any]) -> list[str]:
 
 def _toml(value: Any) -> str:
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{_key(key)} = {_toml(entry)}' for key, entry in value.items())} }}"
+        keys = [key if key.isidentifier() and key.isascii() else _toml(key) for key in value]
+        pairs = zip(keys, map(_toml, value.values()), strict=True)
+        return f"{{ {', '.join(f'{key} = {text}' for key, text in pairs)} }}"
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
     return json.dumps(value, ensure_ascii=False)  # as TOML writes texts, numbers and truth values
 
 
-def _key(name: str) -> str:
-    return name if name.isidentifier() and name.isascii() else _toml(name)
-
-
 def _length(value: float, u: float) -> dict[str, Any]:
     return {"value": (value, "mm: the calibrated length"), "u": (u, "mm: its standard uncertainty")}
-
-
-def procedure_csv(procedure: Procedure, angles: Angles = "deg") -> str:
-    """A row for each pose of an acceptance test: test, name, file for its reading, position, readings."""
-    items = (*procedure.sockets, *procedure.touches)
-    labels = ([item.test, item.name, file_of(procedure, item)] for item in items for _ in item.q)
-    q, points = (np.concatenate([getattr(item, kind) for item in items]) for kind in ("q", "points"))
-    return _poses_csv(procedure.arm, ["test", "name", "file"], labels, (q, points), angles)
-
-
-def _poses_csv(
-    arm: Arm,
-    headings: list[str],
-    labels: Iterable[list[str]],
-    poses: tuple[np.ndarray, np.ndarray],
-    angles: Angles = "deg",
-    moves: tuple[np.ndarray, np.ndarray] | None = None,
-) -> str:
-    """A row for each pose: number, labels, where the tip is (mm), joint readings, direction of the probe.
-
-    ``poses`` are readings and tips; ``moves`` are those of the approach, which have a row before and after each pose;
-    not where they are not finite.
-    """
-    readings = [f"q_{i}_{unit}" for i, unit in enumerate(by_joint(arm, angles, "mm"), start=1)]
-    direction = [f"probe_direction_{axis}" for axis in "xyz"]
-    move = [] if moves is None else ["move"]
-    rows: list[list[Any]] = [["pose", *move, *headings, "x_mm", "y_mm", "z_mm", *readings, *direction]]
-    unit, digits = (DEG, 3) if angles == "deg" else (1.0, 6)
-    units = np.array(by_joint(arm, unit, 1.0))
-
-    def numbers(q: np.ndarray, tips: np.ndarray) -> list[list[str]]:
-        rows = zip(tips, q / units, np.asarray(arm.pose(q))[:, :3, 2], strict=True)
-        return [
-            [*(f"{x:.3f}" for x in tip), *(f"{x:.{digits}f}" for x in reading), *(f"{x:.2f}" for x in axis)]
-            for tip, reading, axis in rows
-        ]
-
-    at_poses, around = numbers(*poses), None if moves is None else numbers(*moves)
-    for i, label in enumerate(labels):
-        pose = [i + 1, *(["pose"] if move else []), *label, *at_poses[i]]
-        if moves is None or around is None or not np.all(np.isfinite(moves[0][i])):
-            rows.append(pose)
-            continue
-        before, after = ([i + 1, name, *label, *around[i]] for name in ("approach", "retract"))
-        rows += [before, pose, after]
-    return csv_text(rows)
-
-
-def file_of(procedure: Procedure, item: ProcedureItem) -> str:
-    """The file that a manifest of `procedure_manifest` expects an item's readings in."""
-    if item.test not in TOUCHED:
-        return f"{item.name}.csv"
-    several = sum((other.test, other.name) == (item.test, item.name) for other in procedure.touches) > 1
-    return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
-
-
-def procedure_manifest(procedure: Procedure, arm: str, urdf: UrdfSource | None = None, angles: Angles = "deg") -> str:
-    """A manifest for the readings of an acceptance test, in which the calibrated values are to be filled in.
-
-    ``urdf``: where the arm is a URDF, its links.
-    """
-    lines = _manifest_start(
-        arm,
-        urdf,
-        f"# {PLANNED[procedure.standard]}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your",
-        "# artefacts, record a file for each socket and each group of touches (one row a pose, in the order of the",
-        "# plan), then: aacmm import THIS.toml -o acceptance.h5",
-        acceptance=procedure.standard,
-        angles=angles,
-    )
-    size = f"measuring_range = {procedure.measuring_range:.0f}   # mm: its diameter, as the maker states it"
-    lines.insert(lines.index(""), size if procedure.range_stated else f"# {size}; planned: twice the reach")
-    kinds = dict.fromkeys(item.name.split("/")[0] for item in procedure.sockets)
-    for kind in kinds:
-        pattern = f"{kind}/{{zone}}" if kind == "spat" else f"{kind}/{{position}}/{{side}}"
-        lines += _table("socket", {"name": pattern, "file": f"{pattern}.csv"})
-    for kind in kinds:
-        value = next((value for start, _, value in procedure.lengths if start.startswith(f"{kind}/")), None)
-        if value is not None:
-            ends = {"from": f"{kind}/{{position}}/a", "to": f"{kind}/{{position}}/b"}
-            lines += _table("length", ends | _length(value, 0.002))
-    for sphere in procedure.spheres:
-        touches = [item for item in procedure.touches if (item.name, TOUCHED[item.test]) == (sphere.name, sphere.test)]
-        entries = {
-            "name": sphere.name,
-            "test": sphere.test,
-            "files": [file_of(procedure, item) for item in touches],
-            "diameter": (sphere.diameter, "mm: the calibrated diameter"),
-            "u": (0.0005, "mm: its standard uncertainty"),
-            "stylus": (sphere.stylus, "mm: diameter of the probe's ball"),
-            "form": (0.0, "mm: its calibrated form error"),
-            "u_form": (0.0, "mm: the standard uncertainty of that"),
-        }
-        lines += _table("sphere", entries)
-    return "\n".join(lines) + "\n"

@@ -22,7 +22,7 @@ from ..data.recording import Recording
 from ..diagnostics.reading_fit import Explanation
 from .inputs import InputFile
 from .manifest import read_manifest, readings_of_manifest
-from .manifest_angles import Angles
+from .manifest_tables import Angles
 
 _ROLES = {
     "commanded": "cmd cmds command commanded target tgt desired des setpoint set ref reference goal nominal soll sp",

@@ -47,13 +47,42 @@ SPHERES: Fields = {
     "u_form": number("standard uncertainty of the form error", "mm", least=0),
 }
 
-SPECIFICATION: Fields = {
+_COEFFICIENTS = ("coefficient", "coefficient_2")
+_GEOMETRY: Fields = {
+    "alpha": number("link twist", "rad", "joint"),
+    "a": number("link length", "mm", "joint"),
+    "d": number("link offset", "mm", "joint"),
+    "theta": number("joint zero offset", "rad", "joint"),
+    "beta": number("Hayati's angle", "rad", "joint"),
+    "probe": number("tip in the last frame", "mm", "axis"),
+}
+ARM: Fields = {
     "name": text("what the arm is called"),
     "length": number("half-width of the bounds of lengths", "mm", name="half_width_length_mm"),
     "angle": number("half-width of the bounds of angles", "rad", name="half_width_angle_rad"),
     "override": mapping("half-widths of single parameters, mm or rad"),
     "held": text("fixed parameters"),
     "free": text("parameters that are free in addition"),
+    **_GEOMETRY,
+    "coefficient": text("name of the coefficient", "coefficient"),
+    "coefficients": number("coefficient of a joint correction, in its own unit", "1", "coefficient"),
+    "coefficient_unit": text("unit of the coefficient", "coefficient"),
+    "gravity": number("direction of gravity in the base frame", "1", "axis"),
+    **{
+        f"nominal_{kind}": field._replace(says=f"{field.says} of the arm of the functions")
+        for kind, field in _GEOMETRY.items()
+    },
+    "mass": number("mass of the link", "kg", "joint"),
+    "centre": number("centre of mass in its frame", "mm", "joint", "axis"),
+    "lowest": number("lowest reading of the joint", "rad", "joint"),
+    "highest": number("highest reading of the joint", "rad", "joint"),
+    "prismatic": count("prismatic joints"),
+    "thermometer": truth("whether a temperature follows the readings"),
+    "prior_groups": text("groups of parameters with a prior"),
+    "prior_sd": number("their standard deviations, mm or rad", ""),
+    "prior_learned": text("groups whose standard deviation is learned"),
+    "prior_mean_of": text("parameters or groups with a mean"),
+    "prior_mean": number("their means, mm or rad", ""),
 }
 
 _SQUARE = ("parameter", "parameter_2")
@@ -180,7 +209,6 @@ def _law(dimension: str) -> Field:
     )
 
 
-_COEFFICIENTS = ("coefficient", "coefficient_2")
 SHARED_ERRORS: Fields = {
     "kinds": text("what poses share", "shared_kind", name="shared_kind"),
     "units": text("unit of its standard deviation", "shared_kind"),

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from ..core.errors import InputError
 from ..core.text import quoted
-from ..core.units import LENGTH_UNITS
+from ..core.units import ANGLE_UNITS, LENGTH_UNITS
+from ..kinematics.arm import Arm
 from .text_lines import Column, bare_name, stem_and_number
 from .text_table import TextTable
 
@@ -154,3 +155,26 @@ def position_columns(table: TextTable) -> tuple[list[int], str | None] | None:
     """The columns of a position, and the unit that the header states."""
     choices = (find_named(table, names, tuple(LENGTH_UNITS)) for names in _POSITIONS)
     return next(filter(None, choices), None)
+
+
+def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str | None) -> tuple[str | None, str | None]:
+    """The units that the header states for readings of revolute and of prismatic joints, or None; ``stated``: that of
+    the former in the manifest.
+
+    Raises:
+        InputError: It states units of something else.
+    """
+    slides = [picked[i - 1] for i in arm.prismatic]
+    turns = [i for i in picked if i not in slides]
+    kinds = (("revolute", turns, ANGLE_UNITS, stated), ("prismatic", slides, LENGTH_UNITS, None))
+    units = []
+    for joints, columns, possible, stated_unit in kinds:
+        unit = text.unit(columns, stated_unit)
+        if unit not in (None, "counts", *possible):
+            raise InputError(
+                f"{text.path} states {quoted(unit)} for readings of {joints} joints "
+                f"({quoted(text.header[columns[0]])}), but these are in {', '.join(possible)} or counts; pick their "
+                "columns with columns = [...], or correct the header."
+            )
+        units.append(unit)
+    return units[0], units[1]

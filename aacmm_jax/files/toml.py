@@ -5,15 +5,16 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
 from ..core.errors import InputError, nearest
 from ..core.text import is_control, quoted
 from .inputs import InputFile
 
 Model = TypeVar("Model", bound=BaseModel)
+Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _MOST_CHARACTERS = 4_000_000  # a manifest of ten thousand sockets has less than a tenth of them
 _DEEPEST = 16  # levels of tables and lists, and parts of a dotted key
 _LARGEST = 1e20  # numbers whose squares are far from the limits of a float, and all seeds

@@ -110,8 +110,7 @@ def read_urdf(
         except UnicodeDecodeError as error:
             raise InputError("it is not text in UTF-8; save it as UTF-8.") from error
         robot = parse_urdf(text)
-        base = _base(robot, base, tip)
-        source = UrdfSource(text, base, _tip(robot, base, tip))
+        source = UrdfSource(text, *_ends(robot, base, tip))
         arm = urdf_chain(source).arm
         return ArmSpecification(arm if probe is None else with_tool(arm, probe), Path(file).stem, urdf=source)
 
@@ -136,15 +135,13 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
     path = _joints_between(robot, source.base, source.tip)
     joints, before, frames, frame, fixed = [], [], [], np.eye(4), np.eye(4)
     for joint in path:
-        if joint.kind == "fixed":
-            fixed = fixed @ joint.origin
-            continue
-        _check_moving(joint)
-        frame = frame @ fixed @ joint.origin
-        joints.append(joint)
-        before.append(fixed)
-        frames.append(frame)
-        fixed = np.eye(4)
+        fixed_before, fixed = fixed, fixed @ joint.origin
+        if joint.kind != "fixed":
+            _check_moving(joint)
+            frame, fixed = frame @ fixed_before @ joint.origin, np.eye(4)
+            joints.append(joint)
+            before.append(fixed_before)
+            frames.append(frame)
     if not joints:
         raise InputError(f"no joint moves between {quoted(source.base)} and {quoted(source.tip)}; name other links.")
     length = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in path)
@@ -170,9 +167,6 @@ def link_masses(chain: UrdfChain) -> LinkMasses:
 
     Args:
         chain: The chain, from `urdf_chain`.
-
-    Returns:
-        Masses ``(n,)``, kg, and centres of mass ``(n, 3)`` in each link's D-H frame, mm.
 
     Example:
         >>> chain = aj.files.urdf_chain(aj.files.load_specification("robot.urdf").urdf)
@@ -223,23 +217,23 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
             f"the arm has {arm.joints} joints, but the URDF {len(chain.joints)}; give one that was calibrated from it."
         )
     before, after = geometry_of(chain.arm), geometry_of(arm)
-    origins: dict[str, tuple[str | None, str | None]] = {}
+    origins: dict[str, dict[str, str]] = {}
     frame, nominal_origins = np.eye(4), chain.origins
     frames = calibrated_frames(nominal_origins, before, after, chain.base)
     for joint, fixed, old, new in zip(chain.joints, chain.before, nominal_origins, frames, strict=True):
         frame = frame @ new
         if new is not old:
-            origins[joint.name] = _changed_attributes(inverse(fixed) @ new, joint.origin)
+            origins[joint.name] = _changed(inverse(fixed) @ new, joint.origin)
     tip = tip_frame(after, chain.base)
     tool = np.asarray(nominal.arm.probe) - np.asarray(chain.arm.probe)
     has_tool = bool(np.linalg.norm(tool) > 1e-9)
     # A tool is no part of the file: the tip link then follows the last D-H frame alone.
     link = tip_frame(after._replace(probe=before.probe), chain.base) if has_tool else tip
-    if chain.tip_joint is not None and not same_transform(frame @ chain.tip, link):
-        new = inverse(frame @ chain.tip_before) @ link
-        origins[chain.tip_joint.name] = _changed_attributes(new, chain.tip_joint.origin)
-    elif chain.tip_joint is None:
+    if chain.tip_joint is None:
         link = frame @ chain.tip
+    elif not same_transform(frame @ chain.tip, link):
+        new = inverse(frame @ chain.tip_before) @ link
+        origins[chain.tip_joint.name] = _changed(new, chain.tip_joint.origin)
     name, added, notes = nominal.urdf.tip, "", ()
     if not same_transform(link, tip):
         name, added = _added_link(chain.robot, nominal.urdf.tip, inverse(link) @ tip)
@@ -270,12 +264,12 @@ def save_urdf(arm: Arm, path: str | os.PathLike, *, nominal: ArmSpecification) -
     return exported
 
 
-def _changed_attributes(new: Transform, old: Transform) -> tuple[str | None, str | None]:
-    """xyz in m and rpy in rad with all digits; None where the file's own text says the same."""
-    shifted = old.copy()
+def _changed(new: Transform, old: Transform) -> dict[str, str]:
+    """xyz in m and rpy in rad with all digits, those of which the file's own text does not say the same."""
+    shifted, (xyz, rpy) = old.copy(), _attributes(new)
     shifted[:3, 3] = new[:3, 3]
-    xyz, rpy = _attributes(new)
-    return None if same_transform(shifted, old) else xyz, None if same_transform(shifted, new) else rpy
+    changed = {} if same_transform(shifted, old) else {"xyz": xyz}
+    return changed if same_transform(shifted, new) else changed | {"rpy": rpy}
 
 
 def _attributes(transform: Transform) -> tuple[str, str]:
@@ -358,29 +352,24 @@ def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
     )
 
 
-def _base(robot: Robot, base: str | None, tip: str | None) -> str:
-    """The base link that is named, else the root."""
+def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
+    """The base and the tip link that are named, else the root, and the only end of a chain that moves."""
     for what, link in (("base", base), ("tip", tip)):
         if link is not None and link not in robot.links:
             raise InputError(f"there is no link {quoted(link)} for the {what}; its links are {_listed(robot.links)}.")
-    if base is not None:
-        return base
-    if tip is not None and (back := _joints_before(robot, tip)):
-        return back[-1].parent
-    roots = [link for link in robot.links if link not in robot.joint_before]
-    if not robot.links:
-        raise InputError("it has no <link>; name the URDF of a robot.")
-    if not roots:
-        raise InputError("every link has a joint before it, in a circle; a URDF is a tree, so correct it.")
-    if len(roots) > 1:
-        raise InputError(f"it has {len(roots)} roots, {_listed(roots)}; name the base (base= or --base).")
-    return roots[0]
-
-
-def _tip(robot: Robot, base: str, tip: str | None) -> str:
-    """The tip link that is named, else the only end of a chain that moves."""
+    if base is None and tip is not None and (back := _joints_before(robot, tip)):
+        base = back[-1].parent
+    if base is None:
+        roots = [link for link in robot.links if link not in robot.joint_before]
+        if not robot.links:
+            raise InputError("it has no <link>; name the URDF of a robot.")
+        if not roots:
+            raise InputError("every link has a joint before it, in a circle; a URDF is a tree, so correct it.")
+        if len(roots) > 1:
+            raise InputError(f"it has {len(roots)} roots, {_listed(roots)}; name the base (base= or --base).")
+        base = roots[0]
     if tip is not None:
-        return tip
+        return base, tip
     tips, inner = [], {joint.parent for joint in robot.joints.values()}
     for link in (link for link in robot.links if link not in inner):
         back = _joints_before(robot, link)
@@ -391,7 +380,7 @@ def _tip(robot: Robot, base: str, tip: str | None) -> str:
         raise InputError(f"no joint after {quoted(base)} moves; name another base (base= or --base).")
     if len(tips) > 1:
         raise InputError(f"its chains end at {_listed(tips)}; name the tip (tip= or --tip).")
-    return tips[0]
+    return base, tips[0]
 
 
 def _listed(links: Iterable[str]) -> str:

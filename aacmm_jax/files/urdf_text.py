@@ -32,6 +32,7 @@ _ALIKE = 0.7  # of difflib: one wrong, missing, exchanged or repeated letter in 
 _LARGEST = 1e6  # m and rad, of positions, angles and directions
 _LARGEST_ANGLE = 6.3  # rad, of roll, pitch and yaw: one revolution
 _METRE = 1000.0  # mm
+_ZERO = (0.0, 0.0, 0.0)
 _EXPAND = "so it is a xacro file; expand it with 'xacro FILE.xacro > FILE.urdf' and name that."
 
 
@@ -65,13 +66,6 @@ _NAMES = {
 }
 
 
-class Place(NamedTuple):
-    """Where a start tag is in the text, as bytes of its UTF-8."""
-
-    start: int
-    end: int
-
-
 class Element(NamedTuple):
     """An element that is read, with those inside it."""
 
@@ -79,7 +73,7 @@ class Element(NamedTuple):
     attributes: dict[str, str]
     words: str  # what messages call it
     line: int
-    place: Place
+    place: tuple[int, int]  # where its start tag begins and ends, as bytes of the text in UTF-8
     children: list["Element"]
 
     @property
@@ -118,6 +112,28 @@ class Element(NamedTuple):
             raise InputError(f"{stated}; it must be {'a number' if len(default) == 1 else f'{len(default)} numbers'}.")
         return values
 
+    def origin(self) -> Transform:
+        """The transform, mm, of the ``<origin>`` in it; by default none."""
+        transform, origin = np.eye(4), self.child("origin")
+        if origin is not None:
+            angles = origin.numbers("rpy", _ZERO)
+            if np.any(np.abs(angles) > _LARGEST_ANGLE):
+                raise InputError(
+                    f"{origin.where} has rpy = {quoted(origin.attributes['rpy'])}, more than a revolution, as if in "
+                    "degrees; a URDF is in rad, so convert it."
+                )
+            transform[:3, :3] = roll_pitch_yaw_matrix(angles)
+            transform[:3, 3] = _METRE * origin.numbers("xyz", _ZERO)
+        return transform
+
+    def check_name(self, what: str, name: str, known: list[str]) -> None:
+        """Refuse the name of an attribute or element in it that is misspelt, or not one of those ``known``."""
+        if not _NAMES[self.name].others or difflib.get_close_matches(name.casefold(), known, n=1, cutoff=_ALIKE):
+            shape = "<{}>" if what == "element" else "{}"
+            meant = nearest(shape.format(name.casefold()), map(shape.format, known)) if known else "; take it out."
+            shown = f"<{quoted(name)[1:-1]}>" if what == "element" else quoted(name)
+            raise InputError(f"{self.where} has an unknown {what} {shown}{meant}")
+
 
 class UrdfJoint(NamedTuple):
     """A joint as the file states it, in mm and rad."""
@@ -130,16 +146,14 @@ class UrdfJoint(NamedTuple):
     axis: Float[np.ndarray, " 3"] | None  # of length 1, in the child; None where it is 0
     limits: tuple[float, float] | None  # rad, or mm of a prismatic joint
     mimics: str | None
-    place: Place
-    origin_place: Place | None  # where there is an <origin>
+    element: Element
 
 
 class UrdfLink(NamedTuple):
     """A link: its mass in kg and its centre of mass in its frame in mm, or None where the file does not state them."""
 
-    name: str
-    mass: float | None
-    centre: Float[np.ndarray, " 3"] | None
+    mass: float | None = None
+    centre: Float[np.ndarray, " 3"] | None = None
 
 
 class UrdfShape(NamedTuple):
@@ -174,7 +188,7 @@ def parse_urdf(text: str) -> Robot:
         name = element.text("name")
         if name in items:
             raise InputError(f"{element.where} is there twice; rename one.")
-        items[name] = read(element, name)
+        items[name] = read(element)
     for joint in joints.values():
         for link in (joint.parent, joint.child):
             if link not in links:
@@ -190,58 +204,7 @@ def parse_urdf(text: str) -> Robot:
     return Robot(joints, links, before, end)
 
 
-def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
-    """The collision shapes of each link that has some, of a text that `parse_urdf` takes; kinds that a URDF does not
-    know are left out. Raises `InputError` where a shape has no size."""
-    shapes: dict[str, tuple[UrdfShape, ...]] = {}
-    for link in _parsed(text)[0].children:
-        if link.name == "link":
-            collisions = [child for child in link.children if child.name == "collision"]
-            pairs = [(child.child("geometry"), _origin(child.child("origin"))) for child in collisions]
-            known = [_shape(shape.children[0], origin) for shape, origin in pairs if shape and shape.children]
-            if known:
-                shapes[link.text("name")] = tuple(known)
-    return shapes
-
-
-def edited(text: str, origins: Mapping[str, tuple[str | None, str | None]], robot: Robot, added: str = "") -> str:
-    """The text with other origins, and with elements ``added`` at its end; everything else stays to the byte.
-
-    ``origins`` has by joint the new xyz (m) and rpy (rad), each None where it stays.
-    """
-    content = text.encode()
-    changes: list[tuple[int, int, bytes]] = [(robot.end, robot.end, added.encode())]
-    for name, values in origins.items():
-        joint = robot.joints[name]
-        new = {key: value for key, value in zip(("xyz", "rpy"), values, strict=True) if value is not None}
-        if joint.origin_place is None:  # an element after the joint's start tag, indented as what follows
-            start = end = joint.place.end
-            indent = content[end:][: len(content[end:]) - len(content[end:].lstrip())].decode()
-            tag = indent + _with_attributes("<origin/>", new)
-        else:
-            start, end = joint.origin_place
-            tag = _with_attributes(content[start:end].decode(), new)
-        changes.append((start, end, tag.encode()))
-    for start, end, new_content in sorted(changes, reverse=True):
-        content = content[:start] + new_content + content[end:]
-    return content.decode()
-
-
-def _with_attributes(tag: str, values: Mapping[str, str]) -> str:
-    """A start tag with other values of some attributes; those it lacks are added at its end."""
-    for name, value in values.items():
-        tag, count = re.subn(
-            rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""",
-            lambda match, value=value: f"{match[1]}{match[2][0]}{value}{match[2][0]}",
-            tag,
-            count=1,
-        )
-        if not count:
-            tag = re.sub(r"\s*/?>$", lambda end, name=name, value=value: f' {name}="{value}"{end[0]}', tag)
-    return tag
-
-
-def _joint(element: Element, name: str) -> UrdfJoint:
+def _joint(element: Element) -> UrdfJoint:
     ends = []
     for end in ("parent", "child"):
         child = element.child(end)
@@ -249,39 +212,51 @@ def _joint(element: Element, name: str) -> UrdfJoint:
             raise InputError(f"{element.where} has no <{end} link=...>; add it.")
         ends.append(child.text("link"))
     kind = element.text("type")
-    origin, axis, limit, mimic = (element.child(part) for part in ("origin", "axis", "limit", "mimic"))
+    axis, limit, mimic = (element.child(part) for part in ("axis", "limit", "mimic"))
     direction = np.array([1.0, 0.0, 0.0])  # which the format's specification says
     if axis is not None:
         axis.text("xyz")
-        direction = axis.numbers("xyz", (0.0, 0.0, 0.0))
+        direction = axis.numbers("xyz", _ZERO)
     size = float(np.linalg.norm(direction))
     limits = None
     if limit is not None and {"lower", "upper"} & limit.attributes.keys():
         unit = _METRE if kind == "prismatic" else 1.0
         limits = (unit * limit.numbers("lower", (0.0,))[0], unit * limit.numbers("upper", (0.0,))[0])
     return UrdfJoint(
-        name,
+        element.text("name"),
         kind,
         *ends,
-        origin=_origin(origin),
+        origin=element.origin(),
         axis=direction / size if size > 0 else None,
         limits=limits,
         mimics=None if mimic is None else mimic.attributes.get("joint", ""),
-        place=element.place,
-        origin_place=None if origin is None else origin.place,
+        element=element,
     )
 
 
-def _link(element: Element, name: str) -> UrdfLink:
+def _link(element: Element) -> UrdfLink:
     inertial = element.child("inertial")
     mass = None if inertial is None else inertial.child("mass")
     if inertial is None or mass is None:
-        return UrdfLink(name, None, None)
+        return UrdfLink()
     mass.text("value")
     value = float(mass.numbers("value", (0.0,))[0])
     if value < 0:
         raise InputError(f"{mass.where} is {value:g} kg; it cannot be negative.")
-    return UrdfLink(name, value, _origin(inertial.child("origin"))[:3, 3])
+    return UrdfLink(value, inertial.origin()[:3, 3])
+
+
+def collision_shapes(text: str) -> dict[str, tuple[UrdfShape, ...]]:
+    """The collision shapes of each link that has some, of a text that `parse_urdf` takes; kinds that a URDF does not
+    know are left out. Raises `InputError` where a shape has no size."""
+    shapes: dict[str, tuple[UrdfShape, ...]] = {}
+    for link in _parsed(text)[0].children:
+        for collision in link.children if link.name == "link" else ():
+            geometry = collision.child("geometry")
+            if collision.name == "collision" and geometry is not None and geometry.children:
+                name, shape = link.text("name"), _shape(geometry.children[0], collision.origin())
+                shapes[name] = (*shapes.get(name, ()), shape)
+    return shapes
 
 
 def _shape(element: Element, origin: Transform) -> UrdfShape:
@@ -289,25 +264,43 @@ def _shape(element: Element, origin: Transform) -> UrdfShape:
         scale = _METRE * element.numbers("scale", (1.0, 1.0, 1.0))
         return UrdfShape("mesh", origin, tuple(scale.tolist()), element.text("filename"))
     names = _NAMES[element.name].attributes.split()
-    missing = (0.0,) * 3 if element.name == "box" else (0.0,)
+    missing = _ZERO if element.name == "box" else (0.0,)
     size = np.concatenate([_METRE * element.numbers(name, missing) for name in names])
     if not np.all(size > 0):
         raise InputError(f"{element.where} has no size above 0; give its {' and '.join(names)}.")
     return UrdfShape(element.name, origin, tuple(size.tolist()), "")
 
 
-def _origin(element: Element | None) -> Transform:
-    transform = np.eye(4)
-    if element is not None:
-        angles = element.numbers("rpy", (0.0, 0.0, 0.0))
-        if np.any(np.abs(angles) > _LARGEST_ANGLE):
-            raise InputError(
-                f"{element.where} has rpy = {quoted(element.attributes['rpy'])}, more than a revolution, as if in "
-                "degrees; a URDF is in rad, so convert it."
+def edited(text: str, origins: Mapping[str, Mapping[str, str]], robot: Robot, added: str = "") -> str:
+    """The text with other origins, and with elements ``added`` at its end; everything else stays to the byte.
+
+    ``origins`` has by joint the new xyz (m) and rpy (rad), those that change.
+    """
+    content = text.encode()
+    changes: list[tuple[int, int, str]] = [(robot.end, robot.end, added)]
+    for name, values in origins.items():
+        joint = robot.joints[name].element
+        origin = joint.child("origin")
+        if origin is None:  # an element after the joint's start tag, indented as what follows
+            start = end = joint.place[1]
+            after = content[end:]
+            tag = after[: len(after) - len(after.lstrip())].decode() + "<origin/>"
+        else:
+            start, end = origin.place
+            tag = content[start:end].decode()
+        for key, value in values.items():
+            tag, count = re.subn(
+                rf"""(\s{key}\s*=\s*)("[^"]*"|'[^']*')""",
+                lambda match, value=value: f"{match[1]}{match[2][0]}{value}{match[2][0]}",
+                tag,
+                count=1,
             )
-        transform[:3, :3] = roll_pitch_yaw_matrix(angles)
-        transform[:3, 3] = _METRE * element.numbers("xyz", (0.0, 0.0, 0.0))
-    return transform
+            if not count:
+                tag = re.sub(r"\s*/?>$", lambda end, key=key, value=value: f' {key}="{value}"{end[0]}', tag)
+        changes.append((start, end, tag))
+    for start, end, tag in sorted(changes, reverse=True):
+        content = content[:start] + tag.encode() + content[end:]
+    return content.decode()
 
 
 @lru_cache(maxsize=1)
@@ -324,12 +317,14 @@ def _parsed(text: str) -> tuple[Element, int]:
     def start(name: str, attributes: dict[str, str]) -> None:
         line, begin = parser.CurrentLineNumber, parser.CurrentByteIndex
         if name.startswith("xacro:"):
-            raise InputError(f"line {line} has {_tag(name)}, {_EXPAND}")
+            raise InputError(f"line {line} has <{quoted(name)[1:-1]}>, {_EXPAND}")
         if len(stack) > _DEEPEST:
             raise InputError(f"line {line} nests elements too deeply; no URDF has more than {_DEEPEST} levels.")
         parent = stack[-1] if stack else None
         if not stack and name != "robot":
-            raise InputError(f"its root element is {_tag(name)}, but that of a URDF is <robot>; name a URDF file.")
+            raise InputError(
+                f"its root element is <{quoted(name)[1:-1]}>, but that of a URDF is <robot>; name a URDF file."
+            )
         if stack and (parent is None or not _is_read(name, parent, line)):
             stack.append(None)
             return
@@ -339,8 +334,16 @@ def _parsed(text: str) -> tuple[Element, int]:
             words = f"{name} {quoted(attributes['name'])}" if attributes.get("name") else f"a {name}"
         else:
             words = f"<{name}> of {parent.words.partition(' of ')[2] if parent.words[0] == '<' else parent.words}"
-        element = Element(name, attributes, words, line, Place(begin, _end_of_tag(content, begin)), [])
-        _check_attributes(element)
+        # A ``>`` in a value does not end a tag.
+        tag = re.compile(rb"""<(?:[^"'>]++|"[^"]*+"|'[^']*+')*+>""").match(content, begin)
+        place = (begin, len(content) if tag is None else tag.end())  # None of no XML, which the parser refuses
+        element = Element(name, attributes, words, line, place, [])
+        known = _NAMES[name].attributes.split()
+        for key in attributes:
+            if key == "quat_xyzw":
+                raise InputError(f"{element.where} has a quaternion, quat_xyzw; write its angles as rpy.")
+            if key not in known and ":" not in key and key != "xmlns":
+                element.check_name("attribute", key, known)
         (root if parent is None else parent.children).append(element)
         stack.append(element)
 
@@ -369,46 +372,19 @@ def _parsed(text: str) -> tuple[Element, int]:
 
 def _is_read(name: str, parent: Element, line: int) -> bool:
     """Whether an element is read; refuse one whose name is misspelt, repeated or at the wrong place."""
-    names = _NAMES[parent.name]
-    once, known = names.once.split(), [*names.once.split(), *names.often.split()]
-    where = f"line {line}: {parent.words}"
-    if name in known:
+    parent = parent._replace(line=line)  # for messages
+    once, often = _NAMES[parent.name].once.split(), _NAMES[parent.name].often.split()
+    if name in (*once, *often):
         earlier = parent.child(name)
         if name in once and earlier is not None:
             raise InputError(
-                f"{where} has a second {_tag(name)}, after that of line {earlier.line}; take one of them out."
+                f"{parent.where} has a second <{name}>, after that of line {earlier.line}; take one of them out."
             )
         if parent.name == "geometry" and parent.children:
-            raise InputError(f"{where} has two shapes; give each a <collision> of its own.")
+            raise InputError(f"{parent.where} has two shapes; give each a <collision> of its own.")
         return name in _NAMES
-    if ":" in name:
-        return False
     if name in _NAMES:
-        raise InputError(f"{where} holds {_tag(name)}, which does not belong there; move it.")
-    if not names.others or difflib.get_close_matches(name.casefold(), known, n=1, cutoff=_ALIKE):
-        meant = nearest(_tag(name.casefold()), map(_tag, known)) if known else "; take it out."
-        raise InputError(f"{where} has an unknown element {_tag(name)}{meant}")
+        raise InputError(f"{parent.where} holds <{name}>, which does not belong there; move it.")
+    if ":" not in name:
+        parent.check_name("element", name, [*once, *often])
     return False
-
-
-def _check_attributes(element: Element) -> None:
-    names = _NAMES[element.name]
-    known = names.attributes.split()
-    for name in element.attributes:
-        if name in known or ":" in name or name == "xmlns":
-            continue
-        if name == "quat_xyzw":
-            raise InputError(f"{element.where} has a quaternion, quat_xyzw; write its angles as rpy.")
-        if not names.others or difflib.get_close_matches(name.casefold(), known, n=1, cutoff=_ALIKE):
-            meant = nearest(name.casefold(), known)
-            raise InputError(f"{element.where} has an unknown attribute {quoted(name)}{meant}")
-
-
-def _tag(name: str) -> str:
-    return f"<{quoted(name)[1:-1]}>"
-
-
-def _end_of_tag(content: bytes, start: int) -> int:
-    """Where a start tag ends; a ``>`` in a value does not end it."""
-    tag = re.compile(rb"""<(?:[^"'>]++|"[^"]*+"|'[^']*+')*+>""").match(content, start)
-    return len(content) if tag is None else tag.end()  # None of text that is no XML, which the parser refuses

@@ -1,6 +1,6 @@
 """The arm: its Denavit-Hartenberg chain, Jacobian, parameters, inverse kinematics and workspace.
 
-Which parameters data determine: `independence` and `near_degeneracy` for an arm, `uncertainty` for a capture.
+Which parameters data determine: `independence` for an arm, `uncertainty` for a capture.
 """
 
 import lazy_loader as _lazy_loader

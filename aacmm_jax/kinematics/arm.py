@@ -17,14 +17,13 @@ from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.text import pluralise
 from .chain import Corrections, Geometry, JointKinds, tip_pose
-from .jacobian import tip_jacobian, tip_position
+from .jacobian import Indices, tip_jacobian, tip_position
 
-# Steps of about 1 mm and 1 mrad are comparable at the tip of an arm of about 1 m.
-_LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3
 LENGTHS = ("a", "d", "probe")
-_AXES = ("x", "y", "z")
-_BY_JOINT, _BY_TERM, _VECTOR = (Float[Array, shape] for shape in ("... joints", "... coefficients", "... 3"))
 DOWN = (0.0, 0.0, -1.0)
+_AXES = ("x", "y", "z")
+_LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3  # comparable at the tip of an arm of about 1 m
+_BY_JOINT, _BY_TERM, _VECTOR = (Float[Array, shape] for shape in ("... joints", "... coefficients", "... 3"))
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
 
@@ -40,15 +39,13 @@ class Arm(eqx.Module):
         a: Link lengths ``(..., n)``, mm.
         d: Link offsets ``(..., n)``, mm; of a prismatic joint, its zero offset.
         theta: Zero offsets of the joints ``(..., n)``, rad; by default 0. Of a prismatic joint, a constant angle.
-        beta: Hayati and Mirmirani's (1985) additional angles for nearly parallel axes ``(..., n)``, rad; by default
-            unused.
+        beta: Hayati and Mirmirani's (1985) angles for nearly parallel axes ``(..., n)``, rad; by default unused.
         probe: Tip in the last frame ``(..., 3)``, mm.
         limits: Lowest and highest reading of each joint, n pairs, rad, or mm of prismatic joints; not calibrated, but
             respected when poses are made.
         prismatic: Numbers of the prismatic joints, from 1: ``(1,)`` for an arm on a linear axis.
         coefficients: Of the corrections' functions ``(..., k)``; by default 0.
-        gravity: Direction of gravity in the base frame ``(..., 3)``, for corrections by its moments; by default
-            (0, 0, -1).
+        gravity: Direction of gravity in the base frame ``(..., 3)``, for corrections by its moments; by default down.
         corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
         thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
             expansion makes use. Where it is missing, the arm is taken to be at 20 C.
@@ -94,31 +91,26 @@ class Arm(eqx.Module):
         thermometer: bool = False,
     ):
         sizes: dict[str, int] = {}
-
-        def array(value: Numbers, what: str, kind: Any = _BY_JOINT) -> Any:
-            return checked(value, kind, what, sizes)
-
-        self.alpha = array(alpha, "alpha", Annotated[_BY_JOINT, NOT_EMPTY])
-        self.a, self.d = array(a, "a"), array(d, "d")
-        self.theta = array(np.zeros(self.alpha.shape) if theta is None else theta, "theta")
-        self.beta = None if beta is None else array(beta, "beta")
-        self.probe = array(probe, "probe", _VECTOR)
+        self.alpha = checked(alpha, Annotated[_BY_JOINT, NOT_EMPTY], "alpha", sizes)
+        self.a, self.d = checked(a, _BY_JOINT, "a", sizes), checked(d, _BY_JOINT, "d", sizes)
+        self.theta = checked(np.zeros(self.alpha.shape) if theta is None else theta, _BY_JOINT, "theta", sizes)
+        self.beta = None if beta is None else checked(beta, _BY_JOINT, "beta", sizes)
+        self.probe = checked(probe, _VECTOR, "probe")
         self.corrections, self.coefficients, self.gravity = corrections, None, None
         if corrections is not None:
             sizes["coefficients"] = len(corrections.functions.terms)
             given = np.zeros(sizes["coefficients"]) if coefficients is None else coefficients
-            self.coefficients = array(given, "coefficients", _BY_TERM)
-            self.gravity = array(DOWN if gravity is None else gravity, "gravity", _VECTOR)
+            self.coefficients = checked(given, _BY_TERM, "coefficients", sizes)
+            self.gravity = checked(DOWN if gravity is None else gravity, _VECTOR, "gravity")
         elif coefficients is not None or gravity is not None:
             raise InputError("coefficients and gravity need an arm made by with_corrections().")
-        kinds = ("alpha", "a", "d", "theta", "beta", "probe", "coefficients", "gravity")
-        batches = [array.shape[:-1] for array in (getattr(self, kind) for kind in kinds) if array is not None]
+        arrays = (self.alpha, self.a, self.d, self.theta, self.beta, self.probe, self.coefficients, self.gravity)
+        batches = [array.shape[:-1] for array in arrays if array is not None]
         try:
             np.broadcast_shapes(*batches)
         except ValueError as error:
-            raise InputError(
-                f"the parameters have the batch shapes {', '.join(map(str, batches))}; make them alike."
-            ) from error
+            shapes = ", ".join(map(str, batches))
+            raise InputError(f"the parameters have the batch shapes {shapes}; make them alike.") from error
         numbers = checked(prismatic, Sequence[Annotated[int, Range(1, self.joints)]], "prismatic")
         self.prismatic = tuple(sorted({int(number) for number in numbers}))
         self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic)
@@ -164,11 +156,9 @@ class Arm(eqx.Module):
         Raises:
             InputError: A name is unknown, or q has another number of joints.
         """
-        if names is None:
-            names = parameter_names(self)
-        names = (names,) if isinstance(names, str) else items_of(names, "names")
+        names = parameter_names(self) if names is None else (names,) if isinstance(names, str) else names
         joints, corrections = self.joints, correction_names(self)
-        indices = tuple(located(joints, corrections, name, extra=("q",)) for name in names)
+        indices = tuple(located(joints, corrections, name, extra=("q",)) for name in items_of(names, "names"))
         return _evaluated(partial(tip_jacobian, indices=indices), self, q)
 
     def replace(self, **changes: Any) -> "Arm":
@@ -182,18 +172,12 @@ class Arm(eqx.Module):
             InputError: A name is unknown, or the arm that results is refused.
         """
         whole = [field.name for field in dataclasses.fields(self)]
-        arguments: dict[str, Any] = {key: changes.get(key, getattr(self, key)) for key in whole}
+        arguments: dict[str, Any] = {name: changes.pop(name, getattr(self, name)) for name in whole}
         for name, value in changes.items():
-            if name in whole:
-                continue
             kind, i = locate(self, name)
-            value = as_floats(math.nan if value is None else value, name)
             array = np.zeros(self.alpha.shape) if arguments[kind] is None else as_floats(arguments[kind], kind)
-            array, value = to_numpy((array, value))
-            xp = namespace(array, value)
-            array = xp.broadcast_to(array, (*np.broadcast_shapes(array.shape[:-1], value.shape), array.shape[-1]))
-            chosen = np.arange(array.shape[-1]) == i
-            arguments[kind] = xp.where(chosen, value[..., None], array)
+            array, value = to_numpy((array, as_floats(math.nan if value is None else value, name)))
+            arguments[kind] = namespace(array, value).where(np.arange(array.shape[-1]) == i, value[..., None], array)
         return Arm(**arguments)
 
 
@@ -211,54 +195,13 @@ def _evaluated(function: Callable, arm: Arm, q: Numbers) -> Any:
 
 def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Float[AnyArray, "... n"]:
     """Readings as an array like the arm's or another, or `InputError` where they do not have the arm's columns."""
-    alpha = arm.alpha
-    array, joints = as_array(q, "q", like=alpha if like is None else like), alpha.shape[-1]
+    array, joints = as_array(q, "q", like=arm.alpha if like is None else like), arm.joints
     if array.shape[-1:] not in ((joints,), (joints + arm.thermometer,)):
         other = ", and a thermometer" if arm.thermometer else ""
         raise InputError(
             f"q has shape {array.shape}, but the arm has {joints} joints{other}; the last axis is the joint."
         )
     return array
-
-
-def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) -> Arm:
-    """The arm of a geometry."""
-    arrays = geometry._replace(kinds=None)._asdict()
-    del arrays["kinds"]
-    prismatic = () if geometry.kinds is None else geometry.kinds.prismatic
-    return Arm(**arrays, limits=limits, prismatic=[i for i, slides in enumerate(prismatic, start=1) if slides])
-
-
-def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
-    """One of two values for each joint: that of revolute joints, or that of prismatic ones."""
-    prismatic = arm.prismatic
-    return [linear if i in prismatic else angular for i in range(1, arm.joints + 1)]
-
-
-def readings_unit(arm: Arm) -> str:
-    """The unit of an array of readings of an arm, in words."""
-    return "rad, mm of prismatic joints" if arm.prismatic else "rad"
-
-
-def checked_limits(
-    limits: Sequence[Sequence[float]], joints: int, prismatic: tuple[int, ...] = ()
-) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest reading of each joint, rad or mm, or `InputError` that names the joint."""
-    try:
-        rows = [tuple(float(reading) for reading in row) for row in limits]
-    except (TypeError, ValueError):
-        rows = []  # no rows of numbers
-    if len(rows) != joints or any(len(row) != 2 for row in rows):
-        units = "rad, of prismatic joints in mm" if prismatic else "rad"
-        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in {units}, one per joint.")
-    for i, (low, high) in enumerate(rows, start=1):
-        if not -math.inf < low < high < math.inf:
-            unit = "mm" if i in prismatic else "rad"
-            raise InputError(
-                f"limits of joint {i} are {low:g} to {high:g} {unit}; they must be finite, and the lower below the "
-                "upper."
-            )
-    return tuple((low, high) for low, high in rows)
 
 
 def check_columns(arm: Arm, columns: int) -> None:
@@ -274,68 +217,22 @@ def check_columns(arm: Arm, columns: int) -> None:
         )
 
 
-def is_single(arm: Arm) -> bool:
-    """Whether this is one arm and not a batch."""
-    return all(array.ndim == 1 for array in jax.tree.leaves(arm.geometry))
-
-
-def parameter_names(arm: Arm) -> tuple[str, ...]:
-    """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z, and
-    those of its corrections.
-
-    Args:
-        arm: One arm, or a batch of them.
-
-    Example:
-        >>> print(aj.kinematics.parameter_names(arm)[:7])
-        ('alpha_1', 'alpha_2', 'alpha_3', 'alpha_4', 'alpha_5', 'alpha_6', 'a_1')
-    """
-    kinds = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",))
-    joints = arm.joints
-    by_joint = [f"{kind}_{i}" for kind in kinds for i in range(1, joints + 1)]
-    return (*by_joint, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))
-
-
-def without_corrections(arm: Arm) -> Arm:
-    """The arm whose joints do what they read."""
-    return arm.replace(coefficients=None, gravity=None, corrections=None)
-
-
-def correction_names(arm: Arm) -> tuple[str, ...]:
-    """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
-    corrections = arm.corrections
-    if corrections is None:
-        return ()
-    functions = corrections.functions
-    return (*functions.names, *(f"gravity_{axis}" for axis in _AXES if functions.by_gravity.any()))
-
-
-def locate(arm: Arm, name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
-    """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
-    return located(arm.joints, correction_names(arm), name, extra)
-
-
-def located(joints: int, corrections: tuple[str, ...], name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
-    """`locate` for an arm with so many joints and corrections of these names."""
-    kinds = ("alpha", "a", "d", "theta", "beta", *extra)
-    kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
-    if (kind == "probe" or name in corrections) and index in _AXES:
-        return kind, _AXES.index(index)
-    if name in corrections:
-        return "coefficients", corrections.index(name)
-    if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
-        return kind, int(index) - 1
-    names = [*(f"{k}_{i}" for k in kinds for i in range(1, joints + 1)), *(f"probe_{axis}" for axis in _AXES)]
-    given = name if isinstance(name, str) else shown(name)
-    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*names, *corrections])}")
-
-
-def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:
-    """`Arm.replace` for whole arrays without its checks: in numerical code a diverged iteration may hold NaN."""
-    kinds = tuple(changes)
-    return eqx.tree_at(
-        lambda x: [getattr(x, kind) for kind in kinds], arm, list(changes.values()), is_leaf=lambda x: x is None
-    )
+def checked_limits(
+    limits: Sequence[Sequence[float]], joints: int, prismatic: tuple[int, ...] = ()
+) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest reading of each joint, rad or mm, or `InputError` that names the joint."""
+    try:
+        rows = [tuple(float(reading) for reading in row) for row in limits]
+    except (TypeError, ValueError):
+        rows = []  # no rows of numbers
+    if len(rows) != joints or any(len(row) != 2 for row in rows):
+        units = "rad, of prismatic joints in mm" if prismatic else "rad"
+        raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in {units}, one per joint.")
+    for i, (low, high) in enumerate(rows, start=1):
+        if not -math.inf < low < high < math.inf:
+            reading = f"{low:g} to {high:g} {'mm' if i in prismatic else 'rad'}"
+            raise InputError(f"limits of joint {i} are {reading}; they must be finite, and the lower below the upper.")
+    return tuple((low, high) for low, high in rows)
 
 
 def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[np.ndarray, "n 2"]:
@@ -354,16 +251,77 @@ def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[np
     return np.asarray(checked_limits(rows, arm.joints, arm.prismatic))
 
 
-def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:
-    """Derivatives of the tips by named parameters at N configurations."""
-    return in_chunks(lambda rows: np.asarray(arm.jacobian(rows, names)), q)
+def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) -> Arm:
+    """The arm of a geometry."""
+    prismatic = () if geometry.kinds is None else geometry.kinds.prismatic
+    arrays = {name: value for name, value in geometry._asdict().items() if name != "kinds"}
+    return Arm(**arrays, limits=limits, prismatic=[i for i, slides in enumerate(prismatic, start=1) if slides])
 
 
-def value_of(arm: Arm, name: str) -> np.ndarray:
-    """Value of a named parameter of a concrete arm, mm or rad, with the arm's batch axes."""
-    # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
-    kind, i = locate(arm, name)
-    return np.asarray(getattr(arm, kind))[..., i]
+def by_joint(arm: Arm, angular: Any, linear: Any) -> list[Any]:
+    """One of two values for each joint: that of revolute joints, or that of prismatic ones."""
+    prismatic = arm.prismatic
+    return [linear if i in prismatic else angular for i in range(1, arm.joints + 1)]
+
+
+def readings_unit(arm: Arm) -> str:
+    """The unit of an array of readings of an arm, in words."""
+    return "rad, mm of prismatic joints" if arm.prismatic else "rad"
+
+
+def is_single(arm: Arm) -> bool:
+    """Whether this is one arm and not a batch."""
+    return all(array.ndim == 1 for array in jax.tree.leaves(arm.geometry))
+
+
+def without_corrections(arm: Arm) -> Arm:
+    """The arm whose joints do what they read."""
+    return arm.replace(coefficients=None, gravity=None, corrections=None)
+
+
+def parameter_names(arm: Arm) -> tuple[str, ...]:
+    """All parameter names of an arm: alpha, a, d, theta, (beta,) by joint from 1, then probe_x, probe_y, probe_z, and
+    those of its corrections.
+
+    Args:
+        arm: One arm, or a batch of them.
+
+    Example:
+        >>> print(aj.kinematics.parameter_names(arm)[:7])
+        ('alpha_1', 'alpha_2', 'alpha_3', 'alpha_4', 'alpha_5', 'alpha_6', 'a_1')
+    """
+    kinds, numbers = ("alpha", "a", "d", "theta") + (() if arm.beta is None else ("beta",)), range(1, arm.joints + 1)
+    of_joints = [f"{kind}_{i}" for kind in kinds for i in numbers]
+    return (*of_joints, *(f"probe_{axis}" for axis in _AXES), *correction_names(arm))
+
+
+def correction_names(arm: Arm) -> tuple[str, ...]:
+    """Names of the coefficients of an arm's corrections, and of the components of gravity where some depend on it."""
+    corrections = arm.corrections
+    if corrections is None:
+        return ()
+    functions = corrections.functions
+    return (*functions.names, *(f"gravity_{axis}" for axis in _AXES if functions.by_gravity.any()))
+
+
+def locate(arm: Arm, name: str) -> tuple[str, int]:
+    """Kind and 0-based index of a parameter name: ``d_3 -> ("d", 2)``; an `InputError` names the nearest spelling."""
+    return located(arm.joints, correction_names(arm), name)
+
+
+def located(joints: int, corrections: tuple[str, ...], name: str, extra: tuple[str, ...] = ()) -> tuple[str, int]:
+    """`locate` for an arm with so many joints and corrections of these names."""
+    kinds = ("alpha", "a", "d", "theta", "beta", *extra)
+    kind, _, index = name.rpartition("_") if isinstance(name, str) else ("", "", "")
+    if (kind == "probe" or name in corrections) and index in _AXES:
+        return kind, _AXES.index(index)
+    if name in corrections:
+        return "coefficients", corrections.index(name)
+    if kind in kinds and index.isdecimal() and str(int(index)) == index and 1 <= int(index) <= joints:
+        return kind, int(index) - 1
+    names = [*(f"{k}_{i}" for k in kinds for i in range(1, joints + 1)), *(f"probe_{axis}" for axis in _AXES)]
+    given = name if isinstance(name, str) else shown(name)
+    raise InputError(f"unknown parameter '{given}' of a {joints}-joint arm{nearest(given, [*names, *corrections])}")
 
 
 def is_length(name: str) -> bool:
@@ -375,14 +333,31 @@ def parameter_unit(arm: Arm, name: str) -> str:
     """Unit of a parameter: mm, rad, or of a correction's coefficient its own; "1" of a pure number."""
     kind, i = locate(arm, name)
     if kind == "coefficients" and arm.corrections is not None:
-        function = arm.corrections.functions.terms[i]
-        return function.unit.replace("rad", "mm") if function.joint in arm.prismatic else function.unit
+        term = arm.corrections.functions.terms[i]
+        return term.unit.replace("rad", "mm") if term.joint in arm.prismatic else term.unit
     return "1" if kind == "gravity" else "mm" if kind in LENGTHS else "rad"
+
+
+def natural_steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
+    """Natural step of each named parameter: 1 mm for a length, 1 mrad for an angle."""
+    return np.where([is_length(name) for name in names], _LENGTH_STEP, _ANGLE_STEP)
+
+
+def value_of(arm: Arm, name: str) -> np.ndarray:
+    """Value of a named parameter of a concrete arm, mm or rad, with the arm's batch axes."""
+    # Read with NumPy: under jit even a constant arm's values become tracers once JAX computes with them.
+    kind, i = locate(arm, name)
+    return np.asarray(getattr(arm, kind))[..., i]
+
+
+def jacobian_at(arm: Arm, q: Float[np.ndarray, "N n"], names: Sequence[str]) -> Float[np.ndarray, "N 3 p"]:
+    """Derivatives of the tips by named parameters at N configurations."""
+    return in_chunks(lambda rows: np.asarray(arm.jacobian(rows, names)), q)
 
 
 @numpy_if_known
 def with_values(
-    geometry: Geometry, vector: Float[AnyArray, "... p"], indices: tuple[tuple[str, int], ...]
+    geometry: Geometry, vector: Float[AnyArray, "... p"], indices: Indices
 ) -> dict[str, Float[AnyArray, "... n"]]:
     """The arrays, by kind, that change when the parameters at ``indices`` take the values of ``vector``."""
     changed = {}
@@ -399,9 +374,10 @@ def with_values(
     return changed
 
 
-def natural_steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
-    """Natural step of each named parameter: 1 mm for a length, 1 mrad for an angle."""
-    return np.where([is_length(name) for name in names], _LENGTH_STEP, _ANGLE_STEP)
+def with_arrays(arm: Arm, **changes: AnyArray | None) -> Arm:
+    """`Arm.replace` for whole arrays without its checks: in numerical code a diverged iteration may hold NaN."""
+    kinds, is_none = tuple(changes), lambda value: value is None
+    return eqx.tree_at(lambda arm: [getattr(arm, kind) for kind in kinds], arm, [*changes.values()], is_leaf=is_none)
 
 
 def neighbouring_arm(arm: Arm, names: Sequence[str]) -> Arm:

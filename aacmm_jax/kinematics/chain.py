@@ -26,6 +26,9 @@ from jaxtyping import Bool, Float
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, scan
 from .joint_functions import JointErrors, KnownFunctions, joint_errors_of
 
+Vectors = Float[AnyArray, "... 3 N"]
+ByJoint = Float[AnyArray, "n ... 3 N"]  # a vector of each joint
+
 _UNIT = 1000.0  # mm: a slide of 1 mm counts as much as a rotation of 1 mrad, like the natural steps of parameters
 
 
@@ -57,22 +60,18 @@ class Corrections(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """Parameters of a chain as arrays, and the static facts about its joints.
-
-    Lengths mm, angles rad; ``beta`` is None where Hayati's angle is unused, ``kinds`` where all joints are revolute,
-    the last three where joints do what they read.
-    """
+    """Parameters of a chain as arrays, and the static facts about its joints; mm and rad."""
 
     alpha: Float[AnyArray, "... n"]
     a: Float[AnyArray, "... n"]
     d: Float[AnyArray, "... n"]
     theta: Float[AnyArray, "... n"]
-    beta: Float[AnyArray, "... n"] | None
+    beta: Float[AnyArray, "... n"] | None  # Hayati's angle; None where it is unused
     probe: Float[AnyArray, "... 3"]
     kinds: JointKinds | None = None
     coefficients: Float[AnyArray, "... k"] | None = None  # of the corrections' functions
     gravity: Float[AnyArray, "... 3"] | None = None  # its direction in the base frame
-    corrections: Corrections | None = None
+    corrections: Corrections | None = None  # None where joints do what they read
 
 
 class JointMotion(NamedTuple):
@@ -94,13 +93,13 @@ class ForwardPass(NamedTuple):
     The axes and origins are arrays with the joints first; of `forward_pass_by_joints`, tuples of one array a joint.
     """
 
-    frame: tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"]]  # x, y, z
-    tip: Float[AnyArray, "... 3 N"]
-    z_before: Float[AnyArray, "n ... 3 N"]  # axis of the reading, theta and d
-    origin_before: Float[AnyArray, "n ... 3 N"]
-    x: Float[AnyArray, "n ... 3 N"]  # axis of a and alpha
-    y: Float[AnyArray, "n ... 3 N"] | None  # axis of beta
-    origin: Float[AnyArray, "n ... 3 N"]
+    frame: tuple[Vectors, Vectors, Vectors]  # x, y, z
+    tip: Vectors
+    z_before: ByJoint  # axis of the reading, theta and d
+    origin_before: ByJoint
+    x: ByJoint  # axis of a and alpha
+    y: ByJoint | None  # axis of beta
+    origin: ByJoint
     kinds: JointKinds | None = None
     errors: JointErrors | None = None  # of a chain with corrections
 
@@ -120,28 +119,26 @@ def reading_units(geometry: Geometry) -> Float[np.ndarray, " n"]:
     return np.ones(geometry.alpha.shape[-1]) if geometry.kinds is None else geometry.kinds.units
 
 
-def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion:
-    """What readings do to the joints of a chain, for `forward_pass`: computed once for many arms of the same kind.
-
-    Cosines and sines are half of the time of a forward pass. Of the geometry, only what an identification does not
-    change matters: the kinds of the joints, and the nominal arm of its corrections.
-
-    ``q`` is ``(..., n)``, rad, or mm of prismatic joints; ``(..., n + 1)`` with a thermometer, C.
-    """
-    return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
-
-
 def of_joints(geometry: Geometry, rows: Float[AnyArray, "columns ..."]) -> Float[AnyArray, "n ..."]:
     """The readings of the joints alone, which come first, without that of a thermometer."""
     joints = geometry.alpha.shape[-1]
     return rows if rows.shape[0] == joints else rows[:joints]
 
 
+def joint_motion(geometry: Geometry, q: Float[AnyArray, "... n"]) -> JointMotion:
+    """What readings do to the joints of a chain, for `forward_pass`: computed once for many arms of the same kind.
+
+    Cosines and sines are half of the time of a forward pass. Of the geometry, only what an identification does not
+    change matters: the kinds of the joints, and the nominal arm of its corrections. ``q`` is ``(..., n)``, rad, or mm
+    of prismatic joints; ``(..., n + 1)`` with a thermometer, C.
+    """
+    return joint_motion_of_rows(geometry, joints_first(q, max(q.ndim - 1, 1)))
+
+
 def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"]) -> JointMotion:
     """`joint_motion` of readings that have the joints first and the configurations last."""
     corrections = geometry.corrections
-    xp = namespace(rows, corrections)
-    readings = of_joints(geometry, rows)
+    xp, readings = namespace(rows, corrections), of_joints(geometry, rows)
     if geometry.kinds is None:
         motion = JointMotion(xp.cos(readings), xp.sin(readings), None)
     else:
@@ -171,24 +168,22 @@ def forward_pass_by_joints(geometry: Geometry, motion: JointMotion) -> ForwardPa
     an ``optimization_barrier``.)
     """
 
+    def unrolled(body: Callable, carry: Any, inputs: Any) -> tuple[Any, Any]:
+        rows, structure = jax.tree.flatten(inputs)
+        outputs = []
+        for i in range(len(rows[0])):
+            carry, output = body(carry, jax.tree.unflatten(structure, [row[i] for row in rows]))
+            outputs.append(output)
+        return carry, jax.tree.map(lambda *leaves: leaves, *outputs)
+
     def compute(geometry: Geometry, motion: JointMotion) -> ForwardPass:
-        return _forward_pass(geometry, motion, _unrolled)
+        return _forward_pass(geometry, motion, unrolled)
 
     def never(*operands: Any) -> ForwardPass:
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(compute, *operands))
 
     possible = ~(motion.cos.ravel()[0] > 2)  # true of every cosine, also of NaN
     return jax.lax.cond(possible, compute, never, geometry, motion)
-
-
-def _unrolled(body: Callable, start: Any, inputs: Any) -> tuple[Any, Any]:
-    """`scan` without a loop; its outputs are tuples of one array a step."""
-    rows, structure = jax.tree.flatten(inputs)
-    carry, outputs = start, []
-    for i in range(len(rows[0])):
-        carry, output = body(carry, jax.tree.unflatten(structure, [row[i] for row in rows]))
-        outputs.append(output)
-    return carry, jax.tree.map(lambda *leaves: leaves, *outputs)
 
 
 def _joints_first(geometry: Geometry, motion: JointMotion) -> tuple[Geometry, JointMotion]:
@@ -258,7 +253,7 @@ def joint_errors(
 ) -> tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "... 1 N"]]:
     """What the corrections add to each joint's theta, rad, or to d of a prismatic joint, mm; the scale of lengths."""
     errors = _errors_of(*_joints_first(geometry, motion))
-    return errors.added, errors.length_scale
+    return errors.added, namespace(errors.added).ones_like(errors.added[0]) if errors.scale is None else errors.scale
 
 
 def length_scale(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[AnyArray, " N"]:
@@ -280,9 +275,7 @@ def frame_axes(forward: ForwardPass) -> tuple[AnyArray, AnyArray, AnyArray]:
     return xp.cross(forward.y, z, axis=-2), forward.y, z
 
 
-def components_last(
-    rows: Float[AnyArray, "... 3 N"], geometry: Geometry, q: Float[AnyArray, "... n"]
-) -> Float[AnyArray, "... 3"]:
+def components_last(rows: Vectors, geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3"]:
     """``(..., 3, N) -> (..., N, 3)``; without the axis of configurations where neither q nor the arm has a batch."""
     moved = namespace(rows).moveaxis(rows, -2, -1)
     return moved if max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1 else moved[0]

@@ -12,8 +12,7 @@ from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
 from .chain import Corrections, Geometry, forward_pass, joint_motion, joints_first
-from .corrections.kind import Loads, Term
-from .corrections.kinds import term_of, terms_of
+from .corrections import Loads, Term, term_of, terms_of
 from .joint_functions import KnownFunctions
 
 _CONFIGURATIONS = 300
@@ -77,18 +76,11 @@ def with_corrections(
     return plain.replace(corrections=Corrections(KnownFunctions(terms), plain.geometry), gravity=down)
 
 
-def corrected_like(corrected: Arm, arm: Arm) -> Arm:
-    """An arm of other parameters with the corrections of a corrected one, and their functions on its nominal arm."""
-    changes = {kind: getattr(corrected, kind) for kind in ("corrections", "coefficients", "gravity")}
-    return arm.replace(**changes)
-
-
 def _determined(arm: Arm, terms: Sequence[Term], gravity: Float[np.ndarray, " 3"]) -> tuple[Term, ...]:
     """The terms whose functions are no combination of a constant and of those before them, joint by joint."""
     if not terms:
         return ()
-    limits = joint_limits(arm, None)
-    limits = np.concatenate([limits, [_TEMPERATURES]])
+    limits = np.concatenate([joint_limits(arm, None), [_TEMPERATURES]])
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_CONFIGURATIONS, arm.joints + 1))
     values, chosen = function_values(arm.geometry, terms, q, gravity), []
     constant = np.full((_CONFIGURATIONS, 1), _CONFIGURATIONS**-0.5)
@@ -105,24 +97,24 @@ def function_values(
     """The function of each term at N configurations, in units of its coefficient's effect (rad, or mm)."""
     functions = KnownFunctions(tuple(terms))
     rows = functions.values(joints_first(q, 1), forward_pass(nominal, joint_motion(nominal, q)))[:, 0]
-    weight = np.array([*gravity, 1.0])[functions.component_of_row]
+    weight = np.concatenate([gravity if by_gravity else [1.0] for by_gravity in functions.by_gravity])
     return np.add.reduceat(weight[:, None] * rows, functions.first_row)
+
+
+def corrected_like(corrected: Arm, arm: Arm) -> Arm:
+    """An arm of other parameters with the corrections of a corrected one, and their functions on its nominal arm."""
+    return arm.replace(**{kind: getattr(corrected, kind) for kind in ("corrections", "coefficients", "gravity")})
 
 
 def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
     """The same arm with more corrections than it has, by the names of their coefficients, which are 0."""
-    joints = arm.joints
-    added = tuple(term for term in (term_of(name, joints) for name in names) if term is not None)
+    added = tuple(term for term in (term_of(name, arm.joints) for name in names) if term is not None)
     if arm.corrections is None:
         return arm.replace(corrections=Corrections(KnownFunctions(added), arm.geometry), gravity=np.array(DOWN))
     assert arm.coefficients is not None
-    terms = (*arm.corrections.functions.terms, *added)
+    functions = KnownFunctions((*arm.corrections.functions.terms, *added))
     coefficients = namespace(arm.coefficients).concatenate([arm.coefficients, np.zeros(len(added))])
-    return arm.replace(
-        corrections=Corrections(KnownFunctions(terms), arm.corrections.nominal),
-        coefficients=coefficients,
-        gravity=arm.gravity,
-    )
+    return arm.replace(corrections=arm.corrections._replace(functions=functions), coefficients=coefficients)
 
 
 def loads_of(arm: Arm) -> Loads | None:

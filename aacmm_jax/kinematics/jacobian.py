@@ -23,11 +23,14 @@ from jaxtyping import Array, Float, Int
 
 from ..core._compat import SymbolicZero
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, set_at
+from ..core.rotations import cross
 from .chain import (
+    ByJoint,
     ForwardPass,
     Geometry,
     JointKinds,
     JointMotion,
+    Vectors,
     components_last,
     forward_pass,
     forward_pass_by_joints,
@@ -38,43 +41,34 @@ from .chain import (
 )
 from .joint_functions import KnownFunctions
 
-
-def _cross(u: Float[AnyArray, "... 3 N"], v: Float[AnyArray, "... 3 N"]) -> Float[AnyArray, "... 3 N"]:
-    (u0, u1, u2), (v0, v1, v2) = ((w[..., 0, :], w[..., 1, :], w[..., 2, :]) for w in (u, v))
-    return namespace(u, v).stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=-2)
-
+Indices = tuple[tuple[str, int], ...]  # parameters: each a kind (or ``q``, a reading) and a 0-based index
+Columns = Float[AnyArray, "... p 3 N"]
 
 _ROTATIONS = {"alpha": ("x", "origin"), "theta": ("z_before", "origin_before"), "beta": ("y", "origin")}
 _SLIDES = {"a": "x", "d": "z_before", "probe": "frame"}
+_ALL = slice(None)
 
 
-def jacobian_columns(forward: ForwardPass) -> dict[str, Float[AnyArray, "k ... 3 N"]]:
-    """Derivative of the tip by every parameter: kind -> one vector per joint (or probe axis)."""
-    kinds = ("alpha", "a", "d", "theta", *(() if forward.y is None else ("beta",)), "probe")
-    kinds = kinds if forward.errors is None else (*kinds, "coefficients", "gravity")
-    return {kind: _columns(forward, kind) for kind in kinds}
+def _column(forward: ForwardPass, kind: str, at: int | slice) -> Vectors:
+    """Derivative of the tip by a geometric parameter of one joint (or probe axis), or of all."""
+    tip = forward.tip if isinstance(at, int) else forward.tip[None]
+    if kind in _ROTATIONS:
+        axis, origin = (getattr(forward, name)[at] for name in _ROTATIONS[kind])
+        return cross(axis, tip - origin)
+    axis = namespace(tip).stack(forward.frame)[at] if kind == "probe" else getattr(forward, _SLIDES[kind])[at]
+    if forward.errors is None or forward.errors.scale is None:
+        return axis
+    return axis * (forward.errors.scale if isinstance(at, int) else forward.errors.scale[None])  # lengths expand
 
 
 def _columns(forward: ForwardPass, kind: str) -> Float[AnyArray, "k ... 3 N"]:
     """Derivative of the tip by all parameters of a kind."""
     if kind in ("coefficients", "gravity"):
         return _by_errors(forward, kind, reading_columns(forward), _tip_by_scale(forward))
-    if kind == "probe":
-        return _of_length(forward, namespace(forward.tip).stack(forward.frame))
-    return _at(forward, kind, slice(None))
+    return _column(forward, kind, _ALL)
 
 
-def _at(forward: ForwardPass, kind: str, at: int | slice) -> Float[AnyArray, "... 3 N"]:
-    """Derivative of the tip by a parameter of one joint, or of several."""
-    if kind in _ROTATIONS:
-        axis, origin = (getattr(forward, name)[at] for name in _ROTATIONS[kind])
-        return _cross(axis, (forward.tip if isinstance(at, int) else forward.tip[None]) - origin)
-    return _of_length(forward, getattr(forward, _SLIDES[kind])[at])
-
-
-def _by_errors(
-    forward: ForwardPass, kind: str, by_reading: Float[AnyArray, "n ... 3 N"], by_scale: Float[AnyArray, "... 3 N"]
-) -> Float[AnyArray, "k ... 3 N"]:
+def _by_errors(forward: ForwardPass, kind: str, by_reading: ByJoint, by_scale: Vectors) -> Float[AnyArray, "k ... 3 N"]:
     """Columns of coefficients or of gravity, from those of the joints' readings and of the scale of all lengths."""
     assert forward.errors is not None
     if kind == "gravity":
@@ -85,70 +79,57 @@ def _by_errors(
     return forward.errors.by_coefficient * by_reading[functions.moved]
 
 
-def reading_columns(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
+def _tip_by_scale(forward: ForwardPass) -> Vectors:
+    """Derivative of the tip by the scale of all lengths."""
+    return forward.tip if forward.errors is None or forward.errors.scale is None else forward.tip / forward.errors.scale
+
+
+def reading_columns(forward: ForwardPass) -> ByJoint:
     """Derivative of the tip by every joint reading, mm per rad, or mm per mm of a prismatic joint.
 
     A reading enters only in its sum with ``theta``, or with ``d`` of a prismatic joint. That corrections change with
     the readings, by as little as a gear ratio errs, is left out here; `tip_jacobian` has it.
     """
-    rotations = _at(forward, "theta", slice(None))
+    rotations = _column(forward, "theta", _ALL)
     if forward.kinds is None:
         return rotations
-    slides = _at(forward, "d", slice(None))
+    slides = _column(forward, "d", _ALL)
     return namespace(forward).where(forward.kinds.mask(rotations.ndim), slides, rotations)
 
 
-def _of_length(forward: ForwardPass, columns: Float[AnyArray, "... 3 N"]) -> Float[AnyArray, "... 3 N"]:
-    """Columns of lengths, which grow with the temperature."""
-    if forward.errors is None or forward.errors.scale is None:
-        return columns
-    return columns * (forward.errors.scale if columns.ndim == forward.tip.ndim else forward.errors.scale[None])
-
-
-def _tip_by_scale(forward: ForwardPass) -> Float[AnyArray, "... 3 N"]:
-    """Derivative of the tip by the scale of all lengths."""
-    return forward.tip if forward.errors is None or forward.errors.scale is None else forward.tip / forward.errors.scale
-
-
-def reading_rotations(forward: ForwardPass) -> Float[AnyArray, "n ... 3 N"]:
+def reading_rotations(forward: ForwardPass) -> ByJoint:
     """Derivative of the last frame's orientation, as a rotation vector, by every joint reading."""
     if forward.kinds is None:
         return forward.z_before
     return namespace(forward).where(forward.kinds.mask(forward.z_before.ndim), 0.0, forward.z_before)
 
 
-def _parameter_of(kinds: JointKinds | None, kind: str, i: int) -> str:
-    """The kind of the parameter that a reading ``q`` is added to; other kinds as they are."""
-    if kind != "q":
-        return kind
-    return "theta" if kinds is None or not kinds.prismatic[i] else "d"
+def _parameters(kinds: JointKinds | None, indices: Indices) -> Indices:
+    """The parameters, with theta or d, which a reading is added to, in the place of ``q``."""
+    slides = () if kinds is None else kinds.prismatic
+    return tuple((("d" if any(slides[i : i + 1]) else "theta") if kind == "q" else kind, i) for kind, i in indices)
 
 
 @compiled(jit=partial(jax.jit, static_argnames=("indices",)))
-def stacked_jacobian_columns(
-    forward: ForwardPass, indices: tuple[tuple[str, int], ...]
-) -> Float[AnyArray, "... p 3 N"]:
-    """The Jacobian columns of some parameters, each a kind (or ``q``, a reading) and a 0-based index."""
-    wanted = [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
+def stacked_jacobian_columns(forward: ForwardPass, indices: Indices) -> Columns:
+    """The Jacobian columns of some parameters."""
+    wanted = _parameters(forward.kinds, indices)
     if isinstance(forward.x, tuple):
-        chosen = [_at(forward, kind, i) for kind, i in wanted]
-    else:
-        columns = {kind: _columns(forward, kind) for kind in dict.fromkeys(kind for kind, _ in wanted)}
-        chosen = [columns[kind][i] for kind, i in wanted]
-    return _stacked(chosen, forward)
+        return _stacked([_column(forward, kind, i) for kind, i in wanted], forward)
+    columns = {kind: _columns(forward, kind) for kind in dict.fromkeys(kind for kind, _ in wanted)}
+    return _stacked([columns[kind][i] for kind, i in wanted], forward)
 
 
-def rotation_columns(forward: ForwardPass, indices: tuple[tuple[str, int], ...]) -> Float[AnyArray, "... p 3 N"]:
+def rotation_columns(forward: ForwardPass, indices: Indices) -> Columns:
     """Derivative of the last frame's orientation, as a rotation vector, by some parameters; 0 for lengths."""
-    still = namespace(forward).zeros_like(forward.tip)
-    wanted = [(_parameter_of(forward.kinds, kind, i), i) for kind, i in indices]
+    still, wanted = namespace(forward).zeros_like(forward.tip), _parameters(forward.kinds, indices)
     axes: dict[str, Any] = {kind: getattr(forward, axis) for kind, (axis, _) in _ROTATIONS.items()}
     for kind in {kind for kind, _ in wanted} & {"coefficients", "gravity"}:
         axes[kind] = _by_errors(forward, kind, reading_rotations(forward), still)
     return _stacked([still if axes.get(kind) is None else axes[kind][i] for kind, i in wanted], forward)
 
 
-def _stacked(columns: list[Float[AnyArray, "... 3 N"]], forward: ForwardPass) -> Float[AnyArray, "... p 3 N"]:
+def _stacked(columns: list[Vectors], forward: ForwardPass) -> Columns:
     xp, shape = namespace(forward), forward.tip.shape
     return xp.stack(columns, axis=-3) if columns else xp.zeros((*shape[:-2], 0, *shape[-2:]))
 
@@ -159,7 +140,7 @@ class SharedColumns(NamedTuple):
     What is done to all columns (weights, products) then need be done to few of them.
     """
 
-    few: tuple[tuple[str, int], ...]  # parameters whose columns are needed
+    few: Indices  # parameters whose columns are needed
     source: Int[np.ndarray, " p"]  # of which of them each parameter's column is a multiple
     coefficients: Int[np.ndarray, " c"]  # the parameters that are coefficients of joints
     functions: Int[np.ndarray, " c"]  # their functions
@@ -175,7 +156,7 @@ class SharedColumns(NamedTuple):
 
 
 @lru_cache(maxsize=32)
-def shared_columns(functions: KnownFunctions | None, indices: tuple[tuple[str, int], ...]) -> SharedColumns:
+def shared_columns(functions: KnownFunctions | None, indices: Indices) -> SharedColumns:
     """How the columns of some parameters follow from fewer, for an arm with these corrections."""
     # Thermal expansion moves no joint (-1): its column is its own.
     moved = [-1 if functions is None or kind != "coefficients" else int(functions.moved[i]) for kind, i in indices]
@@ -193,15 +174,13 @@ def shared_columns(functions: KnownFunctions | None, indices: tuple[tuple[str, i
 class PoseColumns(NamedTuple):
     """Tips and last frames of poses, and their derivatives by some parameters."""
 
-    tip: Float[AnyArray, "... 3 N"]
-    frame: tuple[Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"], Float[AnyArray, "... 3 N"]]
-    columns: Float[AnyArray, "... p 3 N"]  # of the tip
-    turned: Float[AnyArray, "... p 3 N"] | None  # of the last frame's orientation, as rotation vectors
+    tip: Vectors
+    frame: tuple[Vectors, Vectors, Vectors]
+    columns: Columns  # of the tip
+    turned: Columns | None  # of the last frame's orientation, as rotation vectors
 
 
-def pose_columns(
-    geometry: Geometry, motion: JointMotion, indices: tuple[tuple[str, int], ...], rotations: bool
-) -> PoseColumns:
+def pose_columns(geometry: Geometry, motion: JointMotion, indices: Indices, rotations: bool) -> PoseColumns:
     """Of one chain without corrections; under `jax.vmap` in the way that is fastest for a batch on each platform.
 
     No derivative passes.
@@ -253,14 +232,14 @@ def _tip_position_jvp(primals, tangents):
     geometry, q = primals
     geometry_dot, q_dot = tangents
     forward = forward_pass(geometry, joint_motion(geometry, q))
-    columns = jacobian_columns(forward)
     rank = forward.tip.ndim - 1
     moved = jnp.zeros_like(forward.tip)
-    for kind, column in columns.items():
+    kinds = ("alpha", "a", "d", "theta", *(() if forward.y is None else ("beta",)), "probe")
+    for kind in kinds if forward.errors is None else (*kinds, "coefficients", "gravity"):
         tangent = getattr(geometry_dot, kind)
         # Unperturbed arguments arrive as symbolic zeros: a derivative by parameters then never touches q.
         if not isinstance(tangent, SymbolicZero):
-            moved = moved + jnp.sum(column * joints_first(tangent, rank), axis=0)
+            moved = moved + jnp.sum(_columns(forward, kind) * joints_first(tangent, rank), axis=0)
     if not isinstance(q_dot, SymbolicZero):
         moved = moved + jnp.sum(reading_columns(forward) * of_joints(geometry, joints_first(q_dot, rank)), axis=0)
         if geometry.corrections is not None:
@@ -282,10 +261,8 @@ def tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Float[AnyAr
 
 
 @compiled(jit=partial(jax.jit, static_argnames=("indices",)))
-def tip_jacobian(
-    geometry: Geometry, q: Float[AnyArray, "... n"], indices: tuple[tuple[str, int], ...]
-) -> Float[AnyArray, "... 3 p"]:
-    """Derivative of the tip by some parameters, each a kind (``alpha`` ... ``probe``, or ``q``) and a 0-based index."""
+def tip_jacobian(geometry: Geometry, q: Float[AnyArray, "... n"], indices: Indices) -> Float[AnyArray, "... 3 p"]:
+    """Derivative of the tip by some parameters or readings."""
     forward = forward_pass(geometry, joint_motion(geometry, q))
     stacked, xp = stacked_jacobian_columns(forward, indices), namespace(geometry, q)
     if geometry.corrections is not None and any(kind == "q" for kind, _ in indices):

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.numpy_or_jax import AnyArray, broadcast_after_first, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at
 
 
 @jax.tree_util.register_static
@@ -27,7 +27,7 @@ from ..core.numpy_or_jax import AnyArray, broadcast_after_first, namespace, set_
 class KnownFunctions:
     """The functions of a chain's corrections, static in every program."""
 
-    terms: tuple[Any, ...]  # of `corrections.kind.Term`: a coefficient's name, unit, joint and kind
+    terms: tuple[Any, ...]  # of `corrections.Term`: a coefficient's name, unit, joint and kind
 
     def __hash__(self) -> int:
         return hash(self.names)  # kept: every call of a compiled program asks for it
@@ -35,10 +35,11 @@ class KnownFunctions:
     def values(self, q: Float[AnyArray, "n ... 1 N"], forward: Any) -> Float[AnyArray, "rows ... 1 N"]:
         """All rows at N configurations, with the nominal arm's forward pass there; neighbours of one kind together."""
         runs = [tuple(run) for _, run in groupby(self.terms, key=lambda term: type(term.kind))]
-        values = [run[0].kind.values(run, q, forward) for run in runs]
+        values, xp = [run[0].kind.values(run, q, forward) for run in runs], namespace(q, forward)
         # Those of frames have the batch of the nominal arms, others that of the readings alone.
         batch = np.broadcast_shapes(*(rows.shape[1:] for rows in values))
-        return namespace(q, forward).concatenate([broadcast_after_first(rows, batch) for rows in values])
+        filled = [rows.reshape(len(rows), *(1,) * (len(batch) + 1 - rows.ndim), *rows.shape[1:]) for rows in values]
+        return xp.concatenate([xp.broadcast_to(rows, (len(rows), *batch)) for rows in filled])
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -53,27 +54,13 @@ class KnownFunctions:
     @cached_property
     def by_gravity(self) -> Bool[np.ndarray, " k"]:
         """Whether a function is the product of the direction of gravity with three rows."""
-        return np.array([term.rows == 3 for term in self.terms])
-
-    @cached_property
-    def term_of_row(self) -> Int[np.ndarray, " rows"]:
-        """The function, from 0, that each row belongs to."""
-        return np.repeat(np.arange(len(self.terms)), np.where(self.by_gravity, 3, 1))
+        return np.array([term.kind.rows == 3 for term in self.terms])
 
     @cached_property
     def first_row(self) -> Int[np.ndarray, " k"]:
         """The first row of each function."""
-        return np.searchsorted(self.term_of_row, np.arange(len(self.terms)))
-
-    @cached_property
-    def component_of_row(self) -> Int[np.ndarray, " rows"]:
-        """The component of gravity that each row is multiplied by; 3 for those of other functions."""
-        place = np.arange(len(self.term_of_row)) - self.first_row[self.term_of_row]
-        return np.where(self.by_gravity[self.term_of_row], place, 3)
-
-    def of_joints(self, joints: int) -> Float[np.ndarray, "n k"]:
-        """1 where a function moves a joint, else 0."""
-        return (np.arange(joints)[:, None] == self.moved).astype(float)
+        sizes = np.where(self.by_gravity, 3, 1)
+        return np.cumsum(sizes) - sizes
 
     @property
     def expands(self) -> bool:
@@ -90,11 +77,6 @@ class JointErrors(NamedTuple):
     functions: KnownFunctions
     scale: Float[AnyArray, "... 1 N"] | None  # of all lengths; None without thermal expansion
 
-    @property
-    def length_scale(self) -> Float[AnyArray, "... 1 N"]:
-        """What all lengths are multiplied by."""
-        return namespace(self.added).ones_like(self.added[0]) if self.scale is None else self.scale
-
 
 def joint_errors_of(
     functions: KnownFunctions,
@@ -105,8 +87,9 @@ def joint_errors_of(
 ) -> JointErrors:
     """The errors of the joints of a chain from the rows of its functions."""
     xp = namespace(rows, coefficients, gravity)
-    of_joints, heavy = functions.of_joints(joints), np.flatnonzero(functions.by_gravity)
+    of_joints = (np.arange(joints)[:, None] == functions.moved).astype(float)  # 1 where a function moves a joint
     by_coefficient, by_gravity = rows, xp.zeros((joints, 3, *rows.shape[1:]))
+    heavy = np.flatnonzero(functions.by_gravity)
     if len(heavy):
         of_axes = [rows[functions.first_row[heavy] + i] for i in range(3)]
         moments = gravity[:1] * of_axes[0] + gravity[1:2] * of_axes[1] + gravity[2:] * of_axes[2]

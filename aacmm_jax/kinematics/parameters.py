@@ -31,6 +31,7 @@ from .arm import (
 from .chain import Geometry
 from .independence import generic_poses, independent_names
 from .inverse_kinematics import SocketPoses
+from .jacobian import Indices
 from .priors import Prior
 
 _HalfWidth = Annotated[float, Range(least=0, infinite=True)]
@@ -73,11 +74,10 @@ class Parameters(eqx.Module):
         """Free parameters by name: by default the 4n - 3 of Cheng et al. 2018, in their order.
 
         These are all but ``d_1``, ``theta_1`` (they move the base frame), ``a_n``, ``alpha_n`` (redundant with the
-        probe), ``probe_x`` and ``probe_y``.
-
-        Of a prismatic joint i only the direction matters, since neighbouring links do not rotate against each other:
-        three of the lengths about it say where the next axis is, and a_i and d_(i+1) are fixed too (``theta_n`` and
-        ``probe_z`` for the last joint). Each prismatic joint leaves two parameters less (Everett and Hollerbach 1988).
+        probe), ``probe_x`` and ``probe_y``. Of a prismatic joint i only the direction matters, since neighbouring links
+        do not rotate against each other: three of the lengths about it say where the next axis is, and a_i and d_(i+1)
+        are fixed too (``theta_n`` and ``probe_z`` for the last joint). Each prismatic joint leaves two parameters less
+        (Everett and Hollerbach 1988).
 
         Args:
             arm: The arm; it supplies the values of the fixed parameters.
@@ -88,8 +88,7 @@ class Parameters(eqx.Module):
         Raises:
             InputError: The arm has no such parameter, or one is named as held and as free.
         """
-        n = arm.joints
-        free = _unique_names(arm, free, "free")
+        n, free = arm.joints, _unique_names(arm, free, "free")
         if held is None:
             held = {"theta_1", "d_1", f"a_{n}", f"alpha_{n}", "probe_x", "probe_y"}
             held |= {f"a_{i}" for i in arm.prismatic} | {f"d_{i + 1}" for i in arm.prismatic if i < n}
@@ -101,20 +100,17 @@ class Parameters(eqx.Module):
                 raise InputError(f"parameter '{name}' is named as held and as free; name it once.")
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
-        wanted = [
-            name
-            for name in parameter_names(arm)
-            if name not in held and (name in free or not name.startswith(("beta_", "gravity_")))
-        ]
+        usual = [name for name in parameter_names(arm) if name in free or not name.startswith(("beta_", "gravity_"))]
+        wanted = tuple(name for name in usual if name not in held)
         if not wanted:
             raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
-        return cls(base=arm, names=tuple(wanted))
+        return cls(base=arm, names=wanted)
 
     @classmethod
     def independent(cls, arm: Arm, capture: SocketPoses | None = None) -> "Parameters":
         """A largest set of parameters that a capture determines well; redundant ones are fixed at their nominal values.
 
-        Fixed too is one parameter of every near-degenerate combination (`near_degeneracy`). For the paper's arm with
+        Fixed too is one parameter of every near-degenerate combination (`independence`). For the paper's arm with
         a reference length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are
         nearly parallel, d of the first is fixed and Hayati's beta is free instead. Observations besides sockets count
         as positions of the tip in an unknown frame, which is the most that spheres, planes and distances may say;
@@ -148,7 +144,7 @@ class Parameters(eqx.Module):
         """Natural step of each free parameter ``(p,)``: 1 mm for a length, 1 mrad for an angle."""
         return namespace(self.base).asarray(natural_steps(self.names))
 
-    def indices(self) -> tuple[tuple[str, int], ...]:
+    def indices(self) -> Indices:
         """Kind and 0-based index of each free parameter."""
         return _located(self.base.joints, correction_names(self.base), self.names)
 
@@ -177,10 +173,8 @@ class Parameters(eqx.Module):
                 "choose the free parameters of this arm (Parameters.free_of)."
             )
         tools: Any = np if is_concrete(*jax.tree.leaves(arm.geometry)) else jnp  # see `joined`
-        values = {kind: tools.asarray(getattr(arm, kind)) for kind in ("alpha", "a", "d", "theta", "probe")}
-        values["beta"] = tools.zeros_like(values["alpha"]) if arm.beta is None else tools.asarray(arm.beta)
-        if arm.corrections is not None:
-            values |= {"coefficients": tools.asarray(arm.coefficients), "gravity": tools.asarray(arm.gravity)}
+        kinds = {kind: getattr(arm, kind) for kind, _ in self.indices()}
+        values = {kind: tools.asarray(0.0 * arm.alpha if array is None else array) for kind, array in kinds.items()}
         rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))
         return np.stack(rows, axis=-1) if namespace(arm) is np else joined(rows, axis=-1, new=True)
 
@@ -214,16 +208,16 @@ class Parameters(eqx.Module):
 
 
 @lru_cache(maxsize=256)
-def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
+def _located(joints: int, corrections: tuple[str, ...], names: tuple[str, ...]) -> Indices:
     return tuple(located(joints, corrections, name) for name in names)
 
 
 def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     names = (names,) if isinstance(names, str) else tuple(names)
     _located(arm.joints, correction_names(arm), names)
-    if len(set(names)) != len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"parameter '{twice}' is named twice in {what}; name it once.")
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise InputError(f"parameter '{name}' is named twice in {what}; name it once.")
     return names
 
 
@@ -261,13 +255,12 @@ class Bounds(eqx.Module):
         self.space = space
         self.lower, self.upper = space.checked_vector(lower, "lower"), space.checked_vector(upper, "upper")
         if is_concrete(self.lower, self.upper):
-            wrong = ~(np.asarray(self.lower) <= np.asarray(self.upper))  # also true for NaN
-            if wrong.any():
-                i = int(np.argwhere(wrong)[0][-1])
-                low, high = np.asarray(self.lower)[..., i].ravel()[0], np.asarray(self.upper)[..., i].ravel()[0]
+            low, high = np.broadcast_arrays(np.asarray(self.lower), np.asarray(self.upper))
+            for index in np.argwhere(~(low <= high))[:1]:  # also where one is NaN
+                at = tuple(index)
                 raise InputError(
-                    f"bounds of {space.names[i]} are {low:g} to {high:g}; the lower must be a number not above the "
-                    "upper."
+                    f"bounds of {space.names[at[-1]]} are {low[at]:g} to {high[at]:g}; the lower must be a number not "
+                    "above the upper."
                 )
 
     @classmethod
@@ -302,8 +295,8 @@ class Bounds(eqx.Module):
 
     def active(self, vector: Float[AnyArray, "... p"]) -> Int[AnyArray, "... p"]:
         """Which parameters of ``(..., p)`` are on a bound: -1 on the lower, +1 on the upper, 0 inside."""
-        on_lower, on_upper, xp = vector <= self.lower, vector >= self.upper, namespace(self.lower, vector)
-        return xp.where(on_lower, -1, xp.where(on_upper, 1, 0))
+        xp = namespace(self.lower, vector)
+        return xp.where(vector <= self.lower, -1, xp.where(vector >= self.upper, 1, 0))
 
 
 @checked_arguments
@@ -330,17 +323,11 @@ def perturbed_arm(space: Parameters, *, length: NotNegative, angle: NotNegative,
 
 
 class UrdfSource(NamedTuple):
-    """The URDF that an arm was read from: what is needed to write one with the calibrated arm.
+    """The URDF that an arm was read from: what is needed to write one with the calibrated arm."""
 
-    Args:
-        text: The whole file.
-        base: Name of the link that does not move.
-        tip: Name of the link at the end of the chain.
-    """
-
-    text: str
-    base: str
-    tip: str
+    text: str  # the whole file
+    base: str  # name of the link that does not move
+    tip: str  # name of the link at the end of the chain
 
 
 class ArmSpecification(NamedTuple):

@@ -13,12 +13,12 @@ from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from .arm import Arm, correction_names, is_length, natural_steps, parameter_names
-from .corrections.harmonics import Harmonics, orders_of
-from .corrections.kinds import all_kinds, coefficient_of, is_kind, unit_of_coefficient
+from .corrections import KINDS, Harmonics, coefficient_of, unit_of_coefficient
 
+MIXED = "mm and mrad"
+LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
 _BROAD = 10.0  # standard deviation at which the search for a learned one begins, in natural steps
 _Deviation = Annotated[Float[Array, ""], ANY_NUMBER, Range(above=0, infinite=True)]
-LEAST_STEPS = 1e-4  # smallest learned standard deviation, in natural steps: 0.1 um, 0.02 arcsec
 
 
 class Prior(eqx.Module):
@@ -82,12 +82,12 @@ class Prior(eqx.Module):
     def check(self, arm: Arm) -> None:
         """Raise `InputError` for a group that holds no parameter of an arm."""
         names = possible_names(arm)
-        corrections = [kind.model for kind in all_kinds() if any(_is_correction(kind.model, name) for name in names)]
         for group in (*self.groups, *self.mean):
             if not any(is_of_group(group, name) for name in names):
-                stems = dict.fromkeys(name.rsplit("_", 1)[0] for name in names)
-                kinds = ("all", "lengths", "angles", *corrections, *stems, *names)
-                raise InputError(f"the prior is of '{group}', and the arm has no such parameter{nearest(group, kinds)}")
+                corrections = (kind for kind in KINDS if any(is_of_group(kind, name) for name in names))
+                stems = (name.rsplit("_", 1)[0] for name in names)
+                hint = nearest(group, dict.fromkeys(["all", "lengths", "angles", *corrections, *stems, *names]))
+                raise InputError(f"the prior is of '{group}', and the arm has no such parameter{hint}")
 
     def of(self, names: tuple[str, ...], nominal: Float[AnyArray, " p"]) -> "ParameterPrior | None":
         """The prior of the named parameters, mm and rad; None where it says nothing of any of them."""
@@ -96,26 +96,22 @@ class Prior(eqx.Module):
         # Each parameter belongs to the closest of the groups that hold it, and has its standard deviation.
         owners = [_owner(self.groups, name) for name in names]
         mean, sd, parts = xp.asarray(nominal), xp.asarray(_BROAD * steps), []
-        for number, (group, learned) in enumerate(zip(self.groups, self.learned, strict=True)):
-            indices, stated = tuple(i for i, owner in enumerate(owners) if owner == number), group in self.sd
+        for group, learned in zip(self.groups, self.learned, strict=True):
+            indices, stated = tuple(i for i, owner in enumerate(owners) if owner == group), group in self.sd
             if not indices or not (learned or stated):
                 continue
-            unit, index = _unit(names[i] for i in indices), np.array(indices)
+            unit, index = _unit([names[i] for i in indices]), np.array(indices)
             if stated:
                 factors = steps[index] if unit == MIXED else np.ones(len(index))
                 sd = set_at(sd, index, given.sd[group] * xp.asarray(factors))
             parts.append((group, learned, learned and stated, indices, unit))
         if not parts:
             return None
-        means = tuple(self.mean)
         for i, name in enumerate(names):
-            owner = _owner(means, name)
+            owner = _owner(tuple(self.mean), name)
             if owner is not None:
-                mean = set_at(mean, i, given.mean[means[owner]])
+                mean = set_at(mean, i, given.mean[owner])
         return ParameterPrior(mean, sd, *zip(*parts, strict=True))
-
-
-MIXED = "mm and mrad"
 
 
 class ParameterPrior(eqx.Module):
@@ -145,30 +141,20 @@ def is_of_group(group: str, name: str) -> bool:
     """Whether a group holds a parameter."""
     if group in ("lengths", "angles"):
         return is_length(name) == (group == "lengths")
-    if is_kind(group.partition("=")[0]):
-        return _is_correction(group, name)
+    kind, _, option = group.partition("=")
+    if kind in KINDS:  # all its coefficients, or those of the orders that an option names
+        term = coefficient_of(name)
+        if term is None or term.kind.model != kind:
+            return False
+        return not option or (kind == Harmonics.model and term.number in (Harmonics.orders_of(option) or ()))
     return group in ("all", name, name.rsplit("_", 1)[0]) or fnmatchcase(name, group)
 
 
-def _is_correction(group: str, name: str) -> bool:
-    """Whether a coefficient is of the kind of a group, and of its orders where it names some."""
-    kind, _, option = group.partition("=")
-    coefficient = coefficient_of(name)
-    if coefficient is None or coefficient.kind.model != kind:
-        return False
-    return not option or (kind == Harmonics.model and coefficient.number in (orders_of(option) or ()))
-
-
-def _owner(groups: tuple[str, ...], name: str) -> int | None:
-    """Number of the group that a parameter belongs to."""
-    holders = [(_closeness(group, name), i) for i, group in enumerate(groups) if is_of_group(group, name)]
-    return max(holders)[1] if holders else None
-
-
-def _closeness(group: str, name: str) -> int:
-    if is_kind(group.partition("=")[0]):
-        return 3 if "=" in group else 2
-    return {name: 4, "lengths": 1, "angles": 1, "all": 0}.get(group, 3)
+def _owner(groups: tuple[str, ...], name: str) -> str | None:
+    """The closest of the groups that hold a parameter; of equals, the last."""
+    closeness = {name: 4, "all": 0, "lengths": 1, "angles": 1, **dict.fromkeys(KINDS, 2)}
+    holders = [(closeness.get(group, 3), i) for i, group in enumerate(groups) if is_of_group(group, name)]
+    return groups[max(holders)[1]] if holders else None
 
 
 def possible_names(arm: Arm) -> tuple[str, ...]:
@@ -178,11 +164,10 @@ def possible_names(arm: Arm) -> tuple[str, ...]:
 
 def unit_of_group(group: str, names: Iterable[str]) -> str:
     """The unit of a group's standard deviation: "mm", "rad", `MIXED`, or that of coefficients of one kind."""
-    return _unit(name for name in names if is_of_group(group, name))
+    return _unit([name for name in names if is_of_group(group, name)])
 
 
-def _unit(names: Iterable[str]) -> str:
-    names = list(names)
+def _unit(names: list[str]) -> str:
     units, lengths = {unit_of_coefficient(name) for name in names}, {is_length(name) for name in names}
     if len(units) == 1 and "" not in units:
         return units.pop()
@@ -195,18 +180,12 @@ def default_prior(arm: Arm) -> Prior:
 
     Learned from the data, each expected to a factor of 4.5: lengths (1 mm), angles (1 mrad), gravity (1 mrad for links
     with levers of 1 m, or for 100 N m), gear and coupled (0.02 %), thermal expansion (20 um/(m K)), and one group for
-    each octave of harmonics (0.05 mrad).
+    each octave of harmonics (0.05 mrad), of which all joints share one scale: the error of an encoder or a gear is a
+    function whose harmonics fade with their order at a rate that nobody knows beforehand. A scale for each joint fails
+    where a joint moves little, since high orders imitate anything there (`benchmarks/NOTES.md`).
 
     Args:
-        arm: The nominal arm, with the corrections that are calibrated.
-
-    Returns:
-        The prior of the groups that the arm has.
-
-    One scale for each kind of parameter, and for harmonics one an octave of the order, which all joints share: the
-    error of an encoder or a gear is a function whose harmonics fade with their order at a rate that nobody knows
-    beforehand. A scale for each joint fails where a joint moves little, since high orders imitate anything there
-    (`benchmarks/NOTES.md`).
+        arm: The nominal arm, with the corrections that are calibrated; the prior has the groups that it has.
 
     Example:
         >>> bending = aj.kinematics.with_corrections(aj.load_arm("ur10e"), "gravity,harmonics=1")
@@ -215,13 +194,13 @@ def default_prior(arm: Arm) -> Prior:
         ('lengths', 'angles', 'gravity', 'harmonics=1')
     """
     terms = () if arm.corrections is None else arm.corrections.functions.terms
-    kinds: dict[str, float] = {}
-    slides: dict[str, float] = {}
-    for kind in all_kinds():
-        kinds |= kind.usual([term for term in terms if term.kind.model == kind.model])
+    usual: dict[str, float] = {}
+    for model, kind in KINDS.items():
+        usual |= kind.usual([term for term in terms if term.kind.model == model])
+    for kind in KINDS.values():
         if kind.usual_of_slide is not None:
             # Coefficients of a slide are in mm, so that they cannot share a scale with those of joints that turn.
-            slides |= {f"{word}*_{joint}": kind.usual_of_slide for joint in arm.prismatic for word in kind.words}
+            usual |= {f"{word}*_{joint}": kind.usual_of_slide for joint in arm.prismatic for word in kind.words}
     names = correction_names(arm)
-    usual = {group: sd for group, sd in (kinds | slides).items() if any(is_of_group(group, name) for name in names)}
-    return Prior({"lengths": 1.0, "angles": 1e-3} | usual, learn=True)
+    groups = {group: sd for group, sd in usual.items() if any(is_of_group(group, name) for name in names)}
+    return Prior({"lengths": 1.0, "angles": 1e-3} | groups, learn=True)

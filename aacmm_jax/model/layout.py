@@ -13,8 +13,10 @@ Example: of two sockets that a length joins, and a tracker that saw two targets,
     layout.classes    # ((1, 6),): one component of two positions, coupled by the length
 """
 
-from collections.abc import Iterable, Sequence
-from functools import cached_property, lru_cache
+import itertools
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -105,16 +107,51 @@ def unknowns_of(observation: AbstractObservation) -> dict[str, Units]:
 def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[str, str]]) -> Layout:
     """The layout of a problem; ``ends`` are the names of the positions at the ends of its reference lengths."""
     used = [unknowns_of(observation) for observation in observations]
-    users: dict[str, list[int]] = {}
-    for number, parts in enumerate(used):
-        for name in parts:
-            users.setdefault(name, []).append(number)
-    alone = {name: numbers[0] for name, numbers in users.items() if len(numbers) == 1}
+    units = {name: units for parts in used for name, units in parts.items()}
+    users = Counter(name for parts in used for name in parts)
+    alone = {name: number for number, parts in enumerate(used) for name in parts if users[name] == 1}
     # A length with one shared end says something of what is shared alone.
     half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
     alone = {name: number for name, number in alone.items() if name not in half}
-    component = _connected(len(observations), [(alone[a], alone[b]) for a, b in ends if a in alone])
-    return _Problem(observations, used, alone, component).layout()
+    first = _connected(len(observations), [(alone[a], alone[b]) for a, b in ends if a in alone])
+    sizes = Counter[int]()  # numbers of each component
+    for name, number in alone.items():
+        sizes[first[number]] += len(units[name])
+    private = {name for name, number in alone.items() if sizes[first[number]] <= _LARGEST_COMPONENT}
+    members = Counter(first)
+    problem = [
+        _Member(number, observation, parts, [n for n in parts if n in private], at, sizes[at], members[at] > 1)
+        for number, (observation, parts, at) in enumerate(zip(observations, used, first, strict=True))
+    ]
+    classes = _by(lambda member: member.kind, [member for member in problem if member.private])
+    # Classes with linear rows come last.
+    classes = sorted(classes, key=lambda members: members[0].is_linear)
+    names, shapes, places, of = [name for name in units if name not in private], [], {}, {}
+    shared = sum(len(units[name]) for name in names)
+    for number, some in enumerate(classes):
+        components: dict[int, list[str]] = {}
+        for member in some:
+            components.setdefault(member.first, []).extend(member.private)
+        places |= {at: place for place, at in enumerate(components)}
+        of |= {member.number: number for member in some}
+        names += itertools.chain(*components.values())
+        shapes.append((len(components), some[0].size))
+    linear = sum(some[0].is_linear for some in classes)
+    layout = Layout(tuple((name, units[name]) for name in names), shared, tuple(shapes), linear, ())
+    stops = np.cumsum([observation.q.shape[-2] for observation in observations]).tolist()
+    groups = []
+    for some in _by(lambda member: member.key, problem):
+        ordered = sorted(some, key=lambda member: places.get(member.first, 0))
+        groups.append(_group(ordered, layout, of.get(some[0].number, -1), places, stops))
+    return layout._replace(groups=tuple(groups))
+
+
+def _by(label: Callable[["_Member"], Hashable], members: Sequence["_Member"]) -> list[list["_Member"]]:
+    """Members with the same label together."""
+    together: dict[Hashable, list[_Member]] = {}
+    for member in members:
+        together.setdefault(label(member), []).append(member)
+    return list(together.values())
 
 
 def _connected(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
@@ -133,91 +170,50 @@ def _connected(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
     return [root(number) for number in range(count)]
 
 
-class _Problem:
-    """What follows from the parts that observations use, and from those that one alone uses."""
+class _Member(NamedTuple):
+    """An observation of a problem."""
 
-    def __init__(
-        self,
-        observations: Sequence[AbstractObservation],
-        used: list[dict[str, Units]],
-        alone: dict[str, int],
-        component: list[int],  # the first observation of the component of each
-    ):
-        self.observations, self.used, self.component = observations, used, component
-        self.units = {name: units for parts in used for name, units in parts.items()}
-        size = np.zeros(len(observations), dtype=int)
-        for name, number in alone.items():
-            size[component[number]] += len(self.units[name])
-        self.size = size[component].tolist()  # how many numbers the component of each observation has
-        self.private = {name for name, number in alone.items() if self.size[number] <= _LARGEST_COMPONENT}
-        coupled = {first for number, first in enumerate(component) if first != number}
-        self.coupled = [first in coupled for first in component]
+    number: int
+    observation: AbstractObservation
+    parts: dict[str, Units]
+    private: list[str]  # the parts that it alone uses
+    first: int  # number of the first observation of its component
+    size: int  # of its component
+    coupled: bool  # whether a length makes one component of it and others
 
-    def own(self, number: int) -> list[str]:
-        """The private parts of an observation."""
-        return [name for name in self.used[number] if name in self.private]
-
-    def kind(self, number: int) -> object:
-        """What the components of one class have in common."""
-        return ("coupled", self.size[number]) if self.coupled[number] else self.key(number)
-
-    def key(self, number: int) -> object:
+    @property
+    def key(self) -> Hashable:
         """What observations that are evaluated together have in common; the number itself of one that is alone."""
-        observation = self.observations[number]
-        together = self.coupled[number] and bool(self.own(number))
-        if observation.alike is None or observation.q.shape[-2] > _MOST_STACKED:
-            return number, together
-        roles = tuple((units, name in self.private) for name, units in self.used[number].items())
-        size = self.size[number] if together else 0
-        return type(observation), observation.alike, bool(observation.target), roles, size
+        together = self.coupled and bool(self.private)
+        if self.observation.alike is None or self.observation.q.shape[-2] > _MOST_STACKED:
+            return self.number, together
+        roles = tuple((units, name in self.private) for name, units in self.parts.items())
+        targeted, size = bool(self.observation.target), self.size if together else 0
+        return type(self.observation), self.observation.alike, targeted, roles, size
 
-    def is_linear(self, number: int) -> bool:
-        """Whether an observation is linear in a component that is its own."""
-        return self.observations[number].linear and len(self.used[number]) == 1 and not self.coupled[number]
+    @property
+    def kind(self) -> Hashable:
+        """What the components of one class have in common."""
+        return ("coupled", self.size) if self.coupled else self.key
 
-    @cached_property
-    def classes(self) -> list[list[int]]:
-        """Observations of the components of each class; classes with linear rows come last."""
-        by_kind: dict[object, list[int]] = {}
-        for number in range(len(self.observations)):
-            if self.own(number):
-                by_kind.setdefault(self.kind(number), []).append(number)
-        return sorted(by_kind.values(), key=lambda numbers: self.is_linear(numbers[0]))
+    @property
+    def is_linear(self) -> bool:
+        """Whether the observation is linear in a component that is its own."""
+        return self.observation.linear and len(self.parts) == 1 and not self.coupled
 
-    def layout(self) -> Layout:
-        """The layout."""
-        names = [name for name in self.units if name not in self.private]
-        shared, sizes, places, number_of = sum(len(self.units[name]) for name in names), [], {}, {}
-        for of, numbers in enumerate(self.classes):
-            components: dict[int, list[str]] = {}
-            for number in numbers:
-                components.setdefault(self.component[number], []).extend(self.own(number))
-            places |= {first: place for place, first in enumerate(components)}
-            number_of |= dict.fromkeys(numbers, of)
-            names += [name for parts in components.values() for name in parts]
-            sizes.append((len(components), self.size[numbers[0]]))
-        linear = sum(self.is_linear(numbers[0]) for numbers in self.classes)
-        layout = Layout(tuple((name, self.units[name]) for name in names), shared, tuple(sizes), linear, ())
-        members: dict[object, list[int]] = {}
-        for number in range(len(self.observations)):
-            members.setdefault(self.key(number), []).append(number)
-        ordered = (sorted(some, key=lambda number: places.get(self.component[number], 0)) for some in members.values())
-        groups = (self._group(some, layout, number_of.get(some[0], -1), places) for some in ordered)
-        return layout._replace(groups=tuple(groups))
 
-    def _group(self, members: list[int], layout: Layout, of: int, places: dict[int, int]) -> Group:
-        positions = layout.positions
-        roles = tuple(
-            Role(tuple(int(positions[name][0]) for name in names), len(self.units[names[0]]), names[0] in self.private)
-            for names in zip(*(self.used[number] for number in members), strict=True)
-        )
-        stops = np.cumsum([observation.q.shape[-2] for observation in self.observations]).tolist()
-        counts = [self.observations[number].q.shape[-2] for number in members]
-        poses = tuple((stops[number] - count, stops[number]) for number, count in zip(members, counts, strict=True))
-        sizes, start = (), ()
-        if of >= 0:
-            components = [places[self.component[number]] for number in members]
-            sizes = tuple(np.bincount(components, weights=counts, minlength=layout.classes[of][0]).astype(int).tolist())
-            own = next(role for role in roles if role.private)
-            start = tuple(layout.component_of(index)[2] for index in own.first)
-        return Group(tuple(members), poses, roles, bool(self.observations[members[0]].target), of, sizes, start)
+def _group(members: Sequence[_Member], layout: Layout, of: int, places: dict[int, int], stops: Sequence[int]) -> Group:
+    positions, roles = layout.positions, []
+    for names in zip(*(member.parts for member in members), strict=True):
+        first = tuple(int(positions[name][0]) for name in names)
+        roles.append(Role(first, len(members[0].parts[names[0]]), names[0] in members[0].private))
+    counts = [member.observation.q.shape[-2] for member in members]
+    poses = tuple((stops[member.number] - m, stops[member.number]) for member, m in zip(members, counts, strict=True))
+    sizes, start = (), ()
+    if of >= 0:
+        components = [places[member.first] for member in members]
+        sizes = tuple(np.bincount(components, weights=counts, minlength=layout.classes[of][0]).astype(int).tolist())
+        own = next(role for role in roles if role.private)
+        start = tuple(layout.component_of(index)[2] for index in own.first)
+    numbers, targeted = tuple(member.number for member in members), bool(members[0].observation.target)
+    return Group(numbers, poses, tuple(roles), targeted, of, sizes, start)

@@ -17,10 +17,9 @@ from jaxtyping import Float
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from ..core.pytree import pytree, static
 from ..data.capture import Capture, check_one_capture, check_readings
-from ..data.observations.artefact import platform_frames
-from ..data.observations.measured_points import AbstractMeasured
+from ..data.observations.held import platform_frames, position_of, sockets_of
+from ..data.observations.measured import AbstractMeasured
 from ..data.observations.observation import AbstractObservation, Tips, offset_of
-from ..data.observations.socket import position_of, sockets_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import ForwardPass, Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters

@@ -1,7 +1,7 @@
 """The scale k, which repeatability cannot determine, from reference lengths (Cheng et al. 2018, section 2.3).
 
 The uncertainty of k comes from the lengths and the scatter at their ends (here, `scale_and_weights`), and from the
-identified parameters (`calibration.scale_fix`).
+identified parameters (`calibration.stages`).
 """
 
 from typing import Annotated, NamedTuple

@@ -124,7 +124,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             raise InputError(
                 "--scale nominal is for captures without a scale, but these observations fix it; leave it out."
             )
-        return identify(bounds.space.base, capture, bounds, **solving.of_stage1)
+        return identify(bounds.space.base, capture, bounds, **solving.solving._asdict())
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)

@@ -12,7 +12,7 @@ from ..data.arm_classes import ArmNoise
 from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
 from ..kinematics.corrected_arm import function_values, loads_of
-from ..kinematics.corrections.kinds import terms_of
+from ..kinematics.corrections import terms_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach, closest_approach, total_link_length
 from ..planning.first_capture import (

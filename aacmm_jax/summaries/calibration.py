@@ -24,7 +24,7 @@ from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.tried_poses import tried_poses
 from ..diagnostics.usability import on_bounds
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
-from ..kinematics.corrections.kinds import coefficient_of
+from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.shared_errors import SharedErrors

@@ -12,7 +12,7 @@ from ..calibration.prediction import NOTHING, Agreement, unseen_errors
 from ..core.errors import InputError
 from ..core.text import common_labels
 from ..data.capture import Capture, names_in, part_of
-from ..data.observations.socket import Socket
+from ..data.observations.held import Socket
 from ..diagnostics.findings import sentences
 from ..diagnostics.held_out import no_better, surprise
 from ..pipeline.cross_validation import groups_of

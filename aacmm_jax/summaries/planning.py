@@ -12,9 +12,9 @@ from ..acceptance.standards import PLANNED
 from ..core.text import pluralise
 from ..data.noise import linear_encoder_mm
 from ..planning.design import Plan
-from ..planning.information import MORE, Prediction
 from ..planning.kit import KitPlan
 from ..planning.motion import Motion
+from ..planning.problem import MORE, Prediction
 from .calibration import reference_length_rows
 from .tables import Styled, View, listed, number, warnings_of, written_of
 

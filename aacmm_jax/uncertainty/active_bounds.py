@@ -2,7 +2,7 @@
 
 A covariance at active bounds is conditional: the parameter on its bound counts as known, and all others follow from
 that. This is right where the data would carry the parameter well past its bound, so that the bound is knowledge. It
-is wrong where the parameter drifted there along a near-degenerate direction (`kinematics.near_degeneracy`): then the
+is wrong where the parameter drifted there along a near-degenerate direction (`kinematics.independence`): then the
 bound is the accidental end of that direction, and the parameters that imitate each other inherit a false exactness
 from it.
 
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import AnyArray, namespace
-from ..kinematics.near_degeneracy import LEAST_MOVEMENT, SHARE_OF_BOUNDS
+from ..kinematics.independence import LEAST_MOVEMENT, SHARE_OF_BOUNDS
 from ..kinematics.parameters import Bounds
 from .covariance import inverse_information
 from .linearisation import Linearisation

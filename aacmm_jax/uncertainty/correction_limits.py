@@ -9,9 +9,7 @@ from jaxtyping import Float
 from ..core.text import listed, pluralise
 from ..kinematics.arm import Arm
 from ..kinematics.corrected_arm import function_values
-from ..kinematics.corrections.gears import GearRatio
-from ..kinematics.corrections.gravity import Gravity
-from ..kinematics.corrections.kind import Term
+from ..kinematics.corrections import GearRatio, Gravity, Term
 
 _ZERO = 1e-9  # of what the function is elsewhere
 # Of the whole function: what is left of it beside a constant, or a straight line. A first harmonic leaves 5 % of itself

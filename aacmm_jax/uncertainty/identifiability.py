@@ -21,9 +21,16 @@ from ..kinematics.arm import (
     with_arrays,
 )
 from ..kinematics.chain import Geometry, joint_motion
-from ..kinematics.independence import generic_poses, nearly_parallel, rigid_motions, tip_movements
+from ..kinematics.independence import (
+    TradeOff,
+    generic_poses,
+    nearly_parallel,
+    reduced_echelon,
+    rigid_motions,
+    tip_movements,
+    trade_offs,
+)
 from ..kinematics.inverse_kinematics import project_to_targets
-from ..kinematics.near_degeneracy import TradeOff, reduced_echelon, trade_offs
 from ..kinematics.parameters import Bounds, Parameters
 from .correction_limits import why_undetermined
 from .observed_identifiability import Agreeing
@@ -133,7 +140,7 @@ def observability(
 
     The poses are first moved to their socket's centroid, or onto the geometry of their observation, by this arm, a few
     mm at most, so that the errors of an arm that is not yet calibrated do not look like information. For
-    near-degenerate directions see `kinematics.near_degeneracy`.
+    near-degenerate directions see `kinematics.independence`.
 
     Args:
         arm: The arm, nominal or calibrated.

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ..core.linear_algebra import inverse_cholesky
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..data.observations.socket import position_of
+from ..data.observations.held import position_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters

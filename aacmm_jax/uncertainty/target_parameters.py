@@ -4,10 +4,10 @@ import numpy as np
 
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture
-from ..data.observations.measured_transforms import MeasuredTransforms
+from ..data.observations.measured import MeasuredTransforms
 from ..data.observations.observation import offset_of
 from ..kinematics.arm import Arm, correction_names, parameter_names
-from ..kinematics.corrections.expansion import Expansion
+from ..kinematics.corrections import Expansion
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
 

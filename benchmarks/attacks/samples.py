@@ -81,7 +81,7 @@ def results() -> Results:
         "observations": lambda path: aj.files.save_capture(path, observed_recording),
         "calibration from observations": lambda path: aj.files.save_calibration(path, observed_record),
         "evaluation": lambda path: aj.files.save_evaluation(path, evaluation),
-        "points": lambda path: aj.files.save_points(path, measured),
+        "points": lambda path: aj.files.save_evaluation(path, measured),
         "compared models": lambda path: aj.files.save_compared_models(path, compared, ["capture.h5"], 1),
     }
     return Results(arm, recording, observed_recording, record, writers)
@@ -93,7 +93,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "observations": aj.files.load_capture,
     "calibration from observations": aj.files.load_calibration,
     "evaluation": aj.files.load_evaluation,
-    "points": aj.files.load_points,
+    "points": aj.files.load_evaluation,
     "compared models": aj.files.load_compared_models,
 }
 

@@ -148,7 +148,7 @@ def urdf_content(path: Path) -> tuple:
     """All that arms, their masses and their bodies take from a URDF."""
     text = path.read_text(encoding="utf-8")
     robot = parse_urdf(text)
-    joints = {name: joint._replace(place=None, origin_place=None) for name, joint in robot.joints.items()}
+    joints = {name: joint._replace(element=None) for name, joint in robot.joints.items()}
     return joints, robot.links, collision_shapes(text)
 
 

@@ -18,14 +18,18 @@ from key_descriptions import DESCRIPTIONS
 from pydantic import BaseModel
 
 import aacmm_jax as aj
-from aacmm_jax.files import administrative_data, arm_tables, cells, kits, manifest, manifest_tables
+from aacmm_jax.files import administrative_data, arm_tables, cells, kits, manifest_tables
 from aacmm_jax.study import specification
 
 FOLDER = DOCS / "reference" / "files"
 # Page: title, what it is for, the model that reads it.
 FORMATS: dict[str, tuple[str, str, type[BaseModel]]] = {
-    "manifest": ("Manifest of a capture", "`aacmm import FILE`, `aj.files.read_manifest`", manifest.PosesManifest),
-    "points": ("Manifest of points", "`aacmm evaluate FILE`, `aj.files.read_points`", manifest.PointsManifest),
+    "manifest": (
+        "Manifest of a capture",
+        "`aacmm import FILE`, `aj.files.read_manifest`",
+        manifest_tables.PosesManifest,
+    ),
+    "points": ("Manifest of points", "`aacmm evaluate FILE`, `aj.files.read_points`", manifest_tables.PointsManifest),
     "arm": ("Arm", "an arm of every command, `aj.load_arm`", arm_tables.ArmFile),
     "study": ("Study", "`aacmm study FILE`, `aj.study.read_study`", specification.Specification),
     "kit": ("Kit of artefacts and instruments", "`aacmm plan --kit FILE`, `aj.files.read_kit`", kits._Kit),

@@ -19,7 +19,7 @@ from aacmm_jax.acceptance.all_tests import checked_limits
 from aacmm_jax.acceptance.judgement import read_limits
 from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
 from aacmm_jax.acceptance.standards import EDITIONS, STANDARDS
-from aacmm_jax.files.plans import procedure_csv, procedure_manifest
+from aacmm_jax.files.plans import plan_csv, plan_manifest
 from aacmm_jax.kinematics.workspace import Reach
 from tests.refusals import assert_refused
 
@@ -468,9 +468,9 @@ def test_a_limit_without_data_is_refused():
 
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(procedure, recorded, cheng, tmp_path):
     """As in a laboratory: plan, record a file for each socket and group of touches, import."""
-    (tmp_path / "acceptance.toml").write_text(procedure_manifest(procedure, "cheng2018-simulation"))
+    (tmp_path / "acceptance.toml").write_text(plan_manifest(procedure, "cheng2018-simulation"))
     files: dict[str, list[str]] = {}
-    for row in csv.DictReader(procedure_csv(procedure).splitlines()):
+    for row in csv.DictReader(plan_csv(procedure).splitlines()):
         files.setdefault(row["file"], []).append(" ".join(row[f"q_{i}_deg"] for i in range(1, 7)))
     for name, rows in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -642,7 +642,7 @@ def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
 
 
 def test_an_evaluation_of_points_is_stored_whole(tmp_path):
-    from aacmm_jax.files.evaluations import load_points, save_points
+    from aacmm_jax.files.evaluations import load_evaluation, save_evaluation
 
     spheres = (aj.data.ProbedSphere("S", "probing", (PLACE + 15.5 * AXES,), 31.0, 0.001, 0.0, 0.0002, 0.0001),)
     measured = lengths_of((0.01, 0.001, 100.0))._replace(
@@ -650,8 +650,8 @@ def test_an_evaluation_of_points_is_stored_whole(tmp_path):
     )
     cold = acceptance.Influences(arm=acceptance.Expansion(23e-6, 0.0, 15.0))
     record = acceptance.PointsRecord(measured, {"E_Uni": Limit(0.02, 49)}, 0.001, influences=cold)
-    save_points(tmp_path / "points.h5", record)
-    again = load_points(tmp_path / "points.h5")
+    save_evaluation(tmp_path / "points.h5", record)
+    again = load_evaluation(tmp_path / "points.h5")
     assert again.acceptance() == record.acceptance()
     assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
     written = aj.report.write_report(tmp_path / "points.h5", tmp_path / "points.html")

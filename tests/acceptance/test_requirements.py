@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.acceptance import geometry, measured_by, run
-from aacmm_jax.acceptance.all_tests import TESTS, requirements_table
 from aacmm_jax.acceptance.geometry import elbow_sides
 from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
-from aacmm_jax.acceptance.requirements import CONFIDENCES
+from aacmm_jax.acceptance.requirements import TESTS, Confidence, requirements_table
 from aacmm_jax.acceptance.results import Measured
 from aacmm_jax.kinematics.workspace import arm_reach
 from tests.example_counts import example_count
@@ -271,7 +271,7 @@ def test_every_requirement_that_is_checked_has_a_procedure_that_breaks_it():
     broken = {(title, words) for _, title, _, words in BROKEN}
     assert len(broken) >= len(checked)
     assert {title for title, _ in broken} == {title for title, _ in checked}
-    assert {one.confidence for test in TESTS for one in test.requirements} <= set(CONFIDENCES)
+    assert {one.confidence for test in TESTS for one in test.requirements} <= set(get_args(Confidence))
 
 
 def test_parallel_bars_beside_each_other_and_touches_of_a_cap_are_no_complete_test(complete):

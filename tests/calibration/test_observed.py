@@ -116,13 +116,12 @@ def test_a_target_and_its_station_are_found(paper_arm, true, bounds):
 
 
 def test_a_socket_is_a_socket_however_it_is_written(paper_arm, bounds, sockets):
-    """As an artefact of one point, a sphere of radius 0, points of one unknown frame; and with its position eliminated,
+    """As an artefact of one point, points of one unknown frame; and with its position eliminated,
     which is code of its own."""
     q = sockets.sockets["C"]
     others = {name: sockets.sockets[name] for name in ("A", "B")}
     written = {
         "socket": kinds.Socket("C", q),
-        "sphere": kinds.Sphere("C", q, diameter=0),
         "artefact": kinds.Artefact("C", {"point": (0, 0, 0)}, {"point": q}),
         "points": kinds.MeasuredPoints("C", q, np.zeros((len(q), 3))),
     }

@@ -80,11 +80,11 @@ REFUSED = {
     ),
     "a plane touched in one line": (
         lambda arm: kinds.Plane("wall", reaching(arm, np.array([400, -100, 200]) + 2 * LINE)),
-        "the touches of plane 'wall' are on one line, about which it can tilt; touch it beside the line.",
+        "the touches of plane 'wall' hardly determine where it is; touch it in places that are not on one line.",
     ),
     "a plane touched twice": (
         lambda arm: kinds.Plane("wall", Q[:2]),
-        "plane 'wall' has 2 touches, but a plane needs three at least; touch it more often.",
+        "plane 'wall' has 2 touches, but 3 unknowns; touch it more often.",
     ),
     "two planes touched in one line": (
         lambda arm: kinds.ParallelPlanes(
@@ -93,16 +93,16 @@ REFUSED = {
             reaching(arm, np.array([450, -100, 200]) + LINE[:15]),
             50.0,
         ),
-        "the touches of planes 'block' are on one line, about which it can tilt; touch it beside the line.",
+        "the touches of planes 'block' hardly determine where it is; touch it in places that are not on one line.",
     ),
     "a small cap": (
         lambda arm: kinds.Sphere("s", reaching(arm, on_cap(10))),
-        "the touches of sphere 's' cover a cap of 10 degrees about its middle, which hardly separates centre and "
-        "radius; touch it all over, or give its diameter.",
+        "the touches of sphere 's' hardly determine where it is; touch it all over, or give its diameter.",
     ),
     "a bore touched in one ring": (
         lambda arm: kinds.Cylinder("bore", reaching(arm, ring(25.0)), diameter=50.0),
-        "the touches of cylinder 'bore' are at one height of its axis, which can then tilt; touch it at two heights.",
+        "the touches of cylinder 'bore' hardly determine where it is; touch it all round at two heights, or give its "
+        "diameter.",
     ),
     "a covariance that is not positive": (
         lambda arm: kinds.MeasuredPoints("T", Q, POINTS, covariance=np.diag([1.0, 1.0, -0.1])),

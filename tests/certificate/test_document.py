@@ -24,8 +24,8 @@ from aacmm_jax.files.administrative_data import (
     Reference,
     read_administrative_data,
 )
-from aacmm_jax.kinematics.corrections import kinds
-from aacmm_jax.kinematics.corrections.kind import Loads
+from aacmm_jax.kinematics import corrections as kinds
+from aacmm_jax.kinematics.corrections import Loads
 from tests.certificate import dcc_model
 from tests.refusals import assert_refused
 from tests.renamed_sockets import renamed_sockets
@@ -385,7 +385,7 @@ def test_decisions_in_the_words_of_the_certificate(value, decision, word):
     from aacmm_jax.acceptance.results import MetricValue
     from aacmm_jax.certificate.acceptance_results import _conformity
 
-    assert _conformity(MetricValue("x", value, 0.01, None, 0.05, decision), 0.05) == word
+    assert _conformity(MetricValue("x", value, 0.01, None, 0.05, decision)) == word
 
 
 def test_a_conformity_rests_on_results(record, full, evaluation):
@@ -795,7 +795,7 @@ def test_a_certificate_whose_number_was_edited_is_refused(record):
         )
 
 
-@pytest.mark.parametrize("kind", kinds.all_kinds(), ids=lambda kind: kind.model)
+@pytest.mark.parametrize("kind", kinds.KINDS.values(), ids=lambda kind: kind.model)
 def test_every_unit_of_a_correction_has_its_name_in_d_si(kind):
     loads = Loads((1.0,) * 3, ((0.0, 0.0, 0.0),) * 3)
     units = {term.unit for with_masses in (None, loads) for term in kind.terms(3, "", with_masses)}

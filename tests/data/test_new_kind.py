@@ -8,11 +8,9 @@ import aacmm_jax as aj
 from aacmm_jax.core.linear_algebra import products_by_column, semidefinite_eigen
 from aacmm_jax.core.numpy_or_jax import AnyArray, namespace, to_numpy
 from aacmm_jax.core.rotations import cross, rotation_and_derivative, rotation_matrix
-from aacmm_jax.data.observations.declared import count, number, part
-from aacmm_jax.data.observations.fits import turned_z
-from aacmm_jax.data.observations.frames import variances
-from aacmm_jax.data.observations.observation import OTHER_KINDS, AbstractObservation, Rows, kinds
-from aacmm_jax.data.observations.simulated import AbstractSimulated
+from aacmm_jax.data.observations.declared import Part, declared
+from aacmm_jax.data.observations.geometry import turned_z, variances
+from aacmm_jax.data.observations.observation import OTHER_KINDS, AbstractObservation, AbstractSimulated, Rows, kinds
 from aacmm_jax.summaries.observations import capture_observations
 
 from .test_observations import TIPS, Q, check_derivatives, columns
@@ -24,9 +22,9 @@ class Wire(AbstractObservation):
     """Poses with the tip on a taut wire: across it, in two directions, its distance is 0."""
 
     kind, table, noun, rows = "wire", "wire", "wire", 2
-    sag: Float[AnyArray, ""] = number("standard deviation of the wire about its line", "mm", default=0.0)
+    sag: Float[AnyArray, ""] = declared("standard deviation of the wire about its line", "mm", default=0.0)
     # As the axis of a cylinder: the turn of z to its direction, and where it meets the plane across it.
-    line = part("line of {name}", "rad", "rad", "mm", "mm")
+    line = Part("line of {name}", "rad", "rad", "mm", "mm")
 
     def start(self, tips, offset):
         xp = namespace(tips)
@@ -58,8 +56,8 @@ class SimulatedWire(AbstractSimulated):
     """Poses at random places of a wire between two ends."""
 
     table = "wire"
-    ends: Float[np.ndarray, "2 3"] = number("both ends in the base frame", "mm", moves="point")
-    poses: int = count("number of poses")
+    ends: Float[np.ndarray, "2 3"] = declared("both ends in the base frame", "mm", moves="point")
+    poses: int = declared("number of poses")
 
     def tips(self, random):
         return self.ends[0] + random.uniform(size=(self.poses, 1)) * (self.ends[1] - self.ends[0])

@@ -50,7 +50,6 @@ def shifted(i, name, q):
 
 STACKS = {
     "socket": several(lambda i, name, q: kinds.Socket(name, q)),
-    "point": several(lambda i, name, q: kinds.Sphere(name, q, diameter=0)),
     "sphere": several(lambda i, name, q: kinds.Sphere(name, q)),
     "exact sphere": several(lambda i, name, q: kinds.Sphere(name, q, diameter=50 + i, stylus=2 * i)),
     "certified sphere": several(lambda i, name, q: kinds.Sphere(name, q, diameter=50 + i, u=0.1 + i)),
@@ -62,7 +61,7 @@ STACKS = {
     "transforms": several(transforms),
     "shifted": several(shifted),
 }
-SPHERES = [ALL[name] for name in ("sphere", "certified sphere", "exact sphere", "point")]
+SPHERES = [ALL[name] for name in ("sphere", "certified sphere", "exact sphere")]
 SEEN = unknowns_of(to_numpy(TRANSFORMS))
 
 
@@ -154,7 +153,7 @@ def test_what_is_linear_has_derivatives_that_depend_on_nothing(name):
     tips = TIPS._replace(position=1.1 * TIPS.position)
     both = observation.residual_with_errors(TIPS, first), observation.residual_with_errors(tips, moved)
     constant = all(np.array_equal(both[0].by_unknowns[part], both[1].by_unknowns[part]) for part in first)
-    assert observation.linear == constant == (name in ("socket", "point"))
+    assert observation.linear == constant == (name == "socket")
     assert observation.with_errors(observation.q, 0 * both[0].values, {}).linear == constant
 
 

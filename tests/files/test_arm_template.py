@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.arm_tables import ArmFile, Identification, JointTable, NoiseTable, arm_template
-from aacmm_jax.files.corrections import CorrectionsTable
-from aacmm_jax.files.priors import PriorTable
+from aacmm_jax.files.arm_tables import (
+    ArmFile,
+    CorrectionsTable,
+    Identification,
+    JointTable,
+    NoiseTable,
+    PriorTable,
+    arm_template,
+)
 
 
 @pytest.mark.parametrize("joints", [1, 2, 3, 6, 7, 20])

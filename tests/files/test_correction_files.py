@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.arms import arm_toml, load_specification, save_arm
+from aacmm_jax.files.arms import load_specification, save_arm, specification_toml
 from aacmm_jax.files.controllers import python_program
-from aacmm_jax.files.joint_models import with_model
+from aacmm_jax.files.joint_options import with_model
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from tests.prismatic_arms import SCARA
@@ -59,8 +59,13 @@ def test_an_arm_with_a_thermometer_comes_back(tmp_path):
         assert dict(file["capture/temperature"].attrs)["units"] == "degC"
 
 
+def plain_toml():
+    arm = corrected().replace(coefficients=None, gravity=None, corrections=None)
+    return specification_toml(aj.kinematics.ArmSpecification(arm), proposed=False)
+
+
 def test_a_model_in_an_arm_file(tmp_path):
-    plain = arm_toml(corrected().replace(coefficients=None, gravity=None, corrections=None))
+    plain = plain_toml()
     file = tmp_path / "arm.toml"
     file.write_text(plain + '\n[corrections]\nmodel = "harmonics=2"\ngravity = [0, 1, 0]\n')
     specification = load_specification(file)
@@ -80,10 +85,7 @@ def test_a_model_in_an_arm_file(tmp_path):
 
 def test_expansion_of_an_arm_file_is_free_at_several_temperatures(tmp_path):
     """Of a manifest, also with the same model on the command line, and of a study."""
-    (tmp_path / "arm.toml").write_text(
-        arm_toml(corrected().replace(coefficients=None, gravity=None, corrections=None))
-        + '\n[corrections]\nmodel = "expansion"\n'
-    )
+    (tmp_path / "arm.toml").write_text(plain_toml() + '\n[corrections]\nmodel = "expansion"\n')
     manifest = tmp_path / "capture.toml"
     manifest.write_text('arm = "arm.toml"\n[angles]\nunit = "rad"\n[[socket]]\nname = "A"\nfile = "A.csv"\n')
     q = np.random.default_rng(0).uniform(-1, 1, (8, 3))

@@ -231,7 +231,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         ),
         key=lambda one: ["parallel planes", "sphere", "cylinder", "plane", "socket"].index(one.kind),
     )
-    assert (planes.name, planes.side.count("one"), float(planes.between)) == ("block a", 3, 94.0)
+    assert (planes.name, planes.side.count("one"), float(planes.certified_size)) == ("block a", 3, 94.0)
     assert float(sphere.radius) == 12.7
     assert (float(cylinder.radius), float(cylinder.form)) == (7.0, 0.002)
     assert (plane.name, socket.target) == ("wall", "T")

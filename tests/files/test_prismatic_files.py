@@ -1,9 +1,12 @@
 """Arms with prismatic joints in files: which joints they are, and the units of their readings."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.data.observations.held import Socket
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files import controllers, plans
 from aacmm_jax.files.captures import load_capture, save_capture
@@ -11,6 +14,7 @@ from aacmm_jax.files.commanded_poses import corrected_csv, read_commanded_poses
 from aacmm_jax.files.manifest import read_manifest
 from aacmm_jax.files.text_table import TextTable
 from aacmm_jax.kinematics.parameters import ArmSpecification, perturbed_arm
+from aacmm_jax.planning.kit import KitPlan
 from aacmm_jax.summaries.calibration import arm_summary, capture_summary
 
 from ..prismatic_arms import GANTRY, LINEAR_AXIS, SCARA
@@ -108,11 +112,14 @@ def test_a_manifest_states_the_unit_of_slides(tmp_path):
 
 
 def test_plans_are_tables_with_the_unit_of_each_joint():
-    text = plans._poses_csv(SCARA, ["socket"], [["A"]] * 5, (Q, np.asarray(SCARA.position(Q))))
+    plan = KitPlan._make([()] * len(KitPlan._fields))
+    seated = {"kit": [SimpleNamespace(offset=None)], "observations": [Socket("A", Q)]}
+    text = plans.plan_csv(plan._replace(arm=SCARA, retract=0.0, **seated))
     header, first = (line.split(",") for line in text.splitlines()[:2])
-    assert header[5:9] == ["q_1_deg", "q_2_deg", "q_3_mm", "q_4_deg"]
+    assert header[:6] == ["pose", "observation", "point", "x_mm", "y_mm", "z_mm"]
+    assert header[6:10] == ["q_1_deg", "q_2_deg", "q_3_mm", "q_4_deg"]
     expected = Q[0] * [180 / np.pi, 180 / np.pi, 1, 180 / np.pi]
-    np.testing.assert_allclose(np.array(first[5:9], dtype=float), expected, atol=1e-3)
+    np.testing.assert_allclose(np.array(first[6:10], dtype=float), expected, atol=1e-3)
 
 
 def test_commanded_readings_and_their_correction(tmp_path):

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.redrawn import trials_of
+from aacmm_jax.calibration.redrawn import truth_of
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.diagnostics.missing_terms import FoundTerm, wider_model
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.chain import forward_pass, joint_motion, joints_first
 from aacmm_jax.kinematics.corrected_arm import function_values
-from aacmm_jax.kinematics.corrections.kinds import terms_of
+from aacmm_jax.kinematics.corrections import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
 from aacmm_jax.kinematics.joint_functions import KnownFunctions
 
@@ -179,7 +179,7 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         (["expansion_1"], "is of the whole arm and has no number"),
         (["cos1"], "is of a joint from 1 to 7"),
         ("coupled=2", "names no joints"),
-        ("coupled=2-9", "names joint 9 of 7"),
+        ("coupled=2-9", "is of a joint from 1 to 7"),
         (["cos1_9"], "is of a joint from 1 to 7"),
         (["compliance1_2"], "is of a link from 2 to 7"),
         (["d_3"], "'d_3' is not the name of a coefficient"),
@@ -229,8 +229,8 @@ def test_expansion_at_one_temperature_is_a_scale():
 def test_redrawn_readings_keep_their_temperature():
     capture, bounds = warm_capture(15, 25)
     result = aj.calibrate(bounds.space.base, capture, bounds)
-    trials = trials_of(result, capture, aj.Noise(encoder_arcsec=2, seating=0.005), np.full(2, 0.001))
-    drawn = np.asarray(trials.drawn(2, np.random.default_rng(0), np.ones((2, 1, 1)))[0].q)
+    noise, random = aj.Noise(encoder_arcsec=2, seating=0.005), np.random.default_rng(0)
+    drawn = np.asarray(truth_of(result, capture).drawn(2, noise, random)[0].q)
     np.testing.assert_array_equal(drawn[..., 6], np.broadcast_to(capture.q[:, 6], (2, 120)))
     assert np.all(np.ptp(drawn[..., :6], axis=0) > 0)
 

@@ -1,4 +1,4 @@
-"""A new kind of joint correction is one file: this one goes the whole way, and the package has never heard of it."""
+"""A new kind of joint correction is one class: this one goes the whole way, and the package has never heard of it."""
 
 from typing import ClassVar
 
@@ -11,12 +11,11 @@ from aacmm_jax.cli import calibration_views
 from aacmm_jax.cli.display import display
 from aacmm_jax.diagnostics.model_errors import model_tests
 from aacmm_jax.diagnostics.shared_errors import missing_functions
-from aacmm_jax.files.joint_models import with_model
-from aacmm_jax.files.priors import prior_of_text
+from aacmm_jax.files.joint_options import prior_of_text, with_model
+from aacmm_jax.kinematics import corrections as kinds
 from aacmm_jax.kinematics import default_prior, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
-from aacmm_jax.kinematics.corrections import kinds
-from aacmm_jax.kinematics.corrections.kind import AbstractCorrection, Sought
+from aacmm_jax.kinematics.corrections import AbstractCorrection, Sought
 from aacmm_jax.report import write_report
 from aacmm_jax.summaries.calibration import arm_summary
 
@@ -44,7 +43,9 @@ def bow():
     kind = Bow()
     kinds.register(kind)
     yield kind
-    kinds.unregister(kind)
+    del kinds.KINDS[kind.model]
+    kinds.coefficient_of.cache_clear()
+    kinds.terms_of.cache_clear()
 
 
 @pytest.fixture(scope="module")

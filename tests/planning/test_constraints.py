@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.plans import kit_csv, plan_csv, plan_manifest
+from aacmm_jax.files.plans import plan_csv, plan_manifest
 from aacmm_jax.kinematics import Box, Cell, Cone, HalfSpace, body_along_links
 from aacmm_jax.kinematics.workspace import skeleton
 from aacmm_jax.planning import kit_placement
@@ -183,7 +183,7 @@ def test_a_plate_carries_its_normal(panda, monkeypatch):
     assert of_tracker.approach is None
     summary = kit_plan_summary(found, "Panda")
     assert summary["largest_tilt_deg"] == pytest.approx(math.degrees(of_plate.tilt.max()))
-    rows = [line.split(",")[1:3] for line in kit_csv(found).splitlines()[1:]]
+    rows = [line.split(",")[1:3] for line in plan_csv(found).splitlines()[1:]]
     assert rows.count(["approach", "plate"]) == rows.count(["pose", "plate"]) == len(q)
     assert rows.count(["approach", "tracker"]) == 0
     with pytest.raises(aj.InputError, match=r"'plate' at .* cannot be reached in enough poses"):

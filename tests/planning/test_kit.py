@@ -6,12 +6,12 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.files.plans import kit_manifest, save_plan
+from aacmm_jax.files.plans import plan_manifest, save_plan
 from aacmm_jax.kinematics.workspace import search_region
 from aacmm_jax.planning import KitItem, KitPlan, kit_placement, plan_kit
-from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, _best, covariance_of, exchange
-from aacmm_jax.planning.information import DesignProblem, Prediction
+from aacmm_jax.planning.designs import Candidates, Objective, _best, covariance_of, exchange
 from aacmm_jax.planning.kit_placement import candidates_of_kit, least_poses
+from aacmm_jax.planning.problem import DesignProblem, Prediction
 from aacmm_jax.summaries.planning import kit_plan_summary
 
 from ..calibration.test_observed import BAR, BOX, FRAME, NOISE, SIMULATED
@@ -119,7 +119,10 @@ def test_a_whole_plan(paper_arm, space, monkeypatch):
 )
 def test_candidates_have_the_certified_values_that_were_stated(problem, simulated):
     """Not those of a certificate drawn at random: the plan's manifest repeats them."""
-    assert float(kit_placement.set_up(problem.region, simulated, 4).diameter) == 50.0
+    assert (
+        float(kit_placement.set_up(problem.region, kit_placement.Thing(KitItem(simulated), simulated), 4).diameter)
+        == 50.0
+    )
 
 
 def test_files_of_every_kind_can_be_imported(paper_arm, tmp_path):
@@ -134,7 +137,7 @@ def test_files_of_every_kind_can_be_imported(paper_arm, tmp_path):
     rows = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(rows) == 1 + found.poses
     assert rows[0].startswith("pose,observation,point,x_mm,y_mm,z_mm,q_1_deg")
-    (tmp_path / "capture.toml").write_text(kit_manifest(found, "cheng2018-simulation"))
+    (tmp_path / "capture.toml").write_text(plan_manifest(found, "cheng2018-simulation"))
     for one in found.observations:
         stored = one.stored()
         extra = [np.zeros((one.q.shape[0], 0))]

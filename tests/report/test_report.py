@@ -14,7 +14,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.plot import charts, svg
-from aacmm_jax.plot.uncertainty import tried_shades
+from aacmm_jax.plot.lengths import tried_shades
 from aacmm_jax.report import elements, write_report
 from aacmm_jax.report.html_page import _origin
 from aacmm_jax.summaries.tables import Table, decimals_for, format_number, number
@@ -289,7 +289,7 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
 def test_a_report_says_what_was_left_out(observed_record):
     from aacmm_jax.calibration.record import Removed
     from aacmm_jax.diagnostics.contradictions import removal
-    from aacmm_jax.report.tables import removed_tables
+    from aacmm_jax.report.elements import removed_tables
 
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     record = observed_record._replace(removed=(removed,))
@@ -356,7 +356,7 @@ def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
 
 def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
     """A table of thousands of rows is cut, not written out cell by cell for minutes."""
-    from aacmm_jax.report.tables import residual_chart
+    from aacmm_jax.report.elements import residual_chart
 
     arm = written.record.calibrated.arm
     q = np.tile(np.asarray(written.record.recording.capture.q), (120, 1)) + 1e-5 * np.random.default_rng(0).normal(
@@ -373,8 +373,7 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
     from aacmm_jax.plot.residuals import distances_in
-    from aacmm_jax.report.arm_view import view_of_arm
-    from aacmm_jax.report.tables import residual_chart, socket_table
+    from aacmm_jax.report.elements import residual_chart, socket_table, view_of_arm
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})
@@ -399,7 +398,7 @@ decision_rule = "a rule"
 
 def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
     from aacmm_jax.acceptance.record import PointsRecord
-    from aacmm_jax.files.evaluations import save_points
+    from aacmm_jax.files.evaluations import save_evaluation
 
     (tmp_path / "pass.toml").write_text(CONFORMITY.format("pass"))
     stated = aj.files.read_administrative_data(tmp_path / "pass.toml")
@@ -408,9 +407,9 @@ def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
             lambda kind=kind: write_report(written.folder / f"{kind}.h5", tmp_path / "r.html", stated), "simulated"
         )
     measured = aj.acceptance.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
-    save_points(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
+    save_evaluation(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
     assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
-    save_points(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
+    save_evaluation(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
     write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
     assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
     assert_refused(lambda: aj.certificate.dcc_xml(written.record, stated, created="2026-01-31T00:00:00"), "simulated")

@@ -1,15 +1,15 @@
 """Classes whose constructor, checks and fields follow from what they declare: observations, and what simulates them.
 
-``diameter: Float[AnyArray, ""] | None = number("certified diameter", "mm", default=None, uncertainty="u")`` in a class
-says all that there is to say of a datum: its name, type, meaning, unit, shape and default. The constructor takes it,
-files and manifests hold it, reports print it, and nothing else names it.
+``diameter: Float[AnyArray, ""] | None = declared("certified diameter", "mm", default=None, uncertainty="u")`` in a
+class says all that there is to say of a datum: its name, type, meaning, unit, shape and default. The constructor takes
+it, files and manifests hold it, reports print it, and nothing else names it.
 """
 
 import abc
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import FrozenInstanceError
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 MOST_POSES = 100_000  # to simulate, as in a study
 REQUIRED = inspect.Parameter.empty
 NAME = object()  # as a default: the name of the observation
+_CONTENTS = {str: "text", bool: "truth", int: "count", dict: "points"}
+_ARGUMENTS = {"number": "Numbers", "count": "int", "text": "str", "truth": "bool", "points": "dict"}
 
 
 class Entry(NamedTuple):
@@ -29,17 +31,21 @@ class Entry(NamedTuple):
     says: str
     unit: str = ""  # none for text and truth values
     dimensions: tuple[str, ...] = ()  # of an array in files: the first is "pose" where there is a row for each pose
-    content: Literal["number", "count", "text", "truth", "points"] = "number"
     default: Any = REQUIRED
     uncertainty: str = ""  # of a certified value: name of the entry with its standard uncertainty
     positive: bool = False  # a single number may not be 0
-    spread: bool = False  # of an array: one number for all poses is enough
-    raw: bool = False  # checked by `completed` of the class
+    spread: int | None = None  # of an array: with so many of its last dimensions it is the same for all poses
     of_session: bool = False  # a name that means something else in another session
     moves: Literal["", "point", "vector", "frame"] = ""  # with what is simulated, where that is placed elsewhere
     more: str = ""  # of its description, for whoever calls the constructor
     name: str = ""
     annotation: Any = None
+
+    @property
+    def content(self) -> str:
+        """By its type: number, count, text, truth or points (a dictionary of points by name)."""
+        alternatives = (get_origin(self.annotation), self.annotation, *get_args(self.annotation))
+        return next((_CONTENTS[one] for one in alternatives if one in _CONTENTS), "number")
 
     @property
     def described(self) -> str:
@@ -55,15 +61,27 @@ class Entry(NamedTuple):
         """Whether it has no default."""
         return self.default is REQUIRED
 
+    @property
+    def of_poses(self) -> bool:
+        """Whether it has a row for each pose."""
+        return self.dimensions[:1] == ("pose",)
 
-class Derived(NamedTuple):
-    """A field that `completed` makes of the data; it fixes a compiled program."""
+
+def declared(says: str, unit: str = "", *dimensions: str, **options: Any) -> Any:
+    """Declares a datum, whose annotation says what it is; a number is zero or positive, and ``options`` are those of
+    `Entry`."""
+    return Entry(says, unit, dimensions, **options)
 
 
 class Part:
-    """A part of the unknown geometry: its name, made of the fields in braces, is the value of the attribute."""
+    """Declares a part of the unknown geometry, of numbers with these units; its name, made of the fields in braces, is
+    the value of the attribute.
 
-    def __init__(self, label: str, units: tuple[str, ...], when: str = "", repeated: str = ""):
+    The units are repeated for each row of the field ``repeated``; the part exists only where the field ``when`` is
+    true.
+    """
+
+    def __init__(self, label: str, *units: str, when: str = "", repeated: str = ""):
         self.label, self.units, self.when, self.repeated = label, units, when, repeated
 
     def __get__(self, thing: Any, owner: Any = None) -> Any:
@@ -74,52 +92,14 @@ class Part:
         return self.units * getattr(thing, self.repeated).shape[0] if self.repeated else self.units
 
 
-def number(says: str, unit: str = "", *dimensions: str, **options: Any) -> Any:
-    """Declares a number, zero or positive, or an array, with ``dimensions`` in files; ``options`` as in `Entry`."""
-    return Entry(says, unit, dimensions, **options)
-
-
-def text(says: str, *dimensions: str, **options: Any) -> Any:
-    """Declares a name, or names."""
-    return Entry(says, "", dimensions, "text", **options)
-
-
-def truth(says: str, default: bool = False, more: str = "") -> Any:
-    """Declares what is true or false."""
-    return Entry(says, content="truth", default=default, more=more)
-
-
-def count(says: str) -> Any:
-    """Declares a number of poses."""
-    return Entry(says, content="count")
-
-
-def points(says: str) -> Any:
-    """Declares a dictionary of points by name, mm."""
-    return Entry(says, "mm", content="points")
-
-
-def derived() -> Any:
-    """Declares a field that `completed` fills in."""
-    return Derived()
-
-
-def part(label: str, *units: str, when: str = "", repeated: str = "") -> Any:
-    """Declares a part of the unknown geometry, of numbers with these units: repeated for each row of one field, and
-    only where another field is true."""
-    return Part(label, units, when, repeated)
-
-
 class Declared(abc.ABC):
     """A frozen object with a name and with what its class declares.
 
-    The constructor takes what has no default first.
-    A class may have a constructor of its own, which calls this one, and whose ``**options`` are then its entries with a
-    default.
+    The constructor takes what has no default first. A class may have a constructor of its own, which calls this one,
+    and whose ``**options`` are then its entries with a default.
     """
 
     entries: ClassVar[tuple[Entry, ...]] = ()
-    derived_fields: ClassVar[tuple[str, ...]] = ()
     parts: ClassVar[dict[str, Part]] = {}
     noun: ClassVar[str] = "observation"  # in messages
     keyword_only: ClassVar[bool] = True  # what has a default
@@ -130,20 +110,16 @@ class Declared(abc.ABC):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        declared = {name: value for name, value in vars(cls).items() if isinstance(value, Entry | Derived)}
-        for name in declared:
-            delattr(cls, name)
-        types = inspect.get_annotations(cls)
-        entries = {
-            name: entry._replace(name=name, annotation=types[name])
-            for name, entry in declared.items()
-            if isinstance(entry, Entry)
-        }
-        inherited = {entry.name: entry for base in reversed(cls.__mro__[1:]) for entry in getattr(base, "entries", ())}
+        types, entries = inspect.get_annotations(cls), {}
+        for base in reversed(cls.__mro__[1:]):
+            entries |= {entry.name: entry for entry in getattr(base, "entries", ())}
+        for name, value in list(vars(cls).items()):
+            if isinstance(value, Entry):
+                entries[name] = value._replace(name=name, annotation=types[name])
+                delattr(cls, name)
         # What all kinds may have comes last.
-        cls.entries = tuple(sorted((inherited | entries).values(), key=lambda e: e.name in ("target", "place")))
+        cls.entries = tuple(sorted(entries.values(), key=lambda entry: entry.name in ("target", "place")))
         cls.parts = cls.parts | {name: value for name, value in vars(cls).items() if isinstance(value, Part)}
-        cls.derived_fields = (*cls.derived_fields, *(declared.keys() - entries.keys()))
         cls._parameters = _signature(cls.entries, cls.keyword_only)
         parameters = list(cls._parameters.parameters.values())
         if "__init__" in vars(cls):
@@ -157,18 +133,17 @@ class Declared(abc.ABC):
     def __init__(self, name: str, *values: Any, **options: Any):
         given = self._parameters.bind(name, *values, **options)
         given.apply_defaults()
-        where = f"{self.noun} '{checked_name(name, f'{_article(self.noun)} {self.noun}')}'"
-        object.__setattr__(self, "name", name)
+        article = "an" if self.noun[:1] in "aeiou" else "a"
+        where = f"{self.noun} '{checked_name(name, f'{article} {self.noun}')}'"
+        vars(self)["name"] = name
         sizes: Sizes = {}
         for entry in self.entries:
             value = given.arguments[entry.name]
             if value is None and entry.default is NAME:
                 value = name
-            if not (entry.raw or (value is None and entry.default is None)):
-                value = _checked(entry, value, where, sizes)
-            object.__setattr__(self, entry.name, value)
-        for field, value in self.completed(where).items():
-            object.__setattr__(self, field, value)
+            absent = value is None and entry.default is None
+            vars(self)[entry.name] = None if absent else _checked(entry, value, where, sizes)
+        vars(self).update(self.completed(where))
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise FrozenInstanceError(f"cannot assign to field '{name}'")
@@ -201,50 +176,45 @@ def _documented(doc: str, entries: Sequence[Entry]) -> str:
 
 def _signature(entries: Sequence[Entry], keyword_only: bool) -> inspect.Signature:
     kind = inspect.Parameter
-    types = {"number": "Numbers", "count": "int", "text": "str", "truth": "bool", "points": "dict"}
     parameters = [kind("name", kind.POSITIONAL_OR_KEYWORD, annotation="str")]
     for entry in sorted(entries, key=lambda entry: not entry.required):
-        by_keyword = keyword_only and not entry.required
         default = None if entry.default is NAME else entry.default
-        annotation = types[entry.content] + (" | None" if default is None else "")
-        place = kind.KEYWORD_ONLY if by_keyword else kind.POSITIONAL_OR_KEYWORD
+        annotation = _ARGUMENTS[entry.content] + (" | None" if default is None else "")
+        place = kind.KEYWORD_ONLY if keyword_only and not entry.required else kind.POSITIONAL_OR_KEYWORD
         parameters.append(kind(entry.name, place, default=default, annotation=annotation))
     return inspect.Signature(parameters)
 
 
 def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
     """A value as the annotation of its entry says, or `InputError`; ``sizes`` are those of dimensions so far."""
-    what = f"{entry.name} of {where}"
-    if entry.content == "text" and not entry.dimensions:
+    what, content = f"{entry.name} of {where}", entry.content
+    if content == "text" and not entry.dimensions:
         return value if value == "" and entry.default == "" else checked_name(value, what)
     if entry.name == "q":
         value = checked_readings(where, value)
-    if entry.spread:
-        value = _spread(as_floats(value, what), (sizes["m"], 3)[: len(entry.dimensions)], what)
+    if entry.spread is not None:
+        value = _spread(as_floats(value, what), (sizes["m"], 3, 3)[: len(entry.dimensions)], entry.spread, what)
     value = checked(value, entry.annotation, what, sizes)
-    if entry.dimensions[:1] == ("pose",) and len(value) != sizes["m"]:
+    if entry.of_poses and len(value) != sizes["m"]:
         raise InputError(f"{what} has {len(value)} values; give one for each of the {sizes['m']} poses.")
-    if entry.content == "points":
+    if content == "points":
         return {name: tuple(map(float, point)) for name, point in value.items()}
-    if entry.content == "count":
+    if content == "count":
         Range(least=1, most=MOST_POSES)(value, what, sizes)
-    elif entry.content == "number" and value is not None and not np.ndim(value) and not entry.dimensions:
+    elif content == "number" and value is not None and not np.ndim(value) and not entry.dimensions:
         (Range(above=0) if entry.positive else Range(least=0))(value, what, sizes)
     return value
 
 
-def _spread(array: AnyArray, shape: tuple[int, ...], what: str) -> AnyArray:
-    """Standard uncertainties of all poses from one number, from one for each coordinate, or from all."""
-    if array.shape not in [shape[i:] for i in range(len(shape) + 1)]:
-        raise InputError(f"{what} has shape {array.shape}; give one number, or {shape}.")
-    if is_concrete(array) and np.any(np.asarray(array) < 0):
+def _spread(array: AnyArray, shape: tuple[int, ...], fewest: int, what: str) -> AnyArray:
+    """Values of all poses from those of one, or from all: standard uncertainties, or covariances."""
+    shapes = [shape[i:] for i in range(len(shape) - fewest, -1, -1)]
+    if array.shape not in shapes:
+        given = " or ".join(str(alternative) if alternative else "one number" for alternative in shapes)
+        raise InputError(f"{what} has shape {array.shape}; give {given}.")
+    if not fewest and is_concrete(array) and np.any(np.asarray(array) < 0):
         raise InputError(f"{what} is negative; a standard uncertainty must be zero or positive.")
-    return _broadcast(array, shape)
-
-
-@numpy_if_known
-def _broadcast(array: AnyArray, shape: tuple[int, ...]) -> AnyArray:
-    return namespace(array).broadcast_to(array, shape)
+    return numpy_if_known(lambda values: namespace(values).broadcast_to(values, shape))(array)
 
 
 def checked_name(name: object, what: str) -> str:
@@ -270,7 +240,3 @@ def checked_readings(where: str, readings: Numbers) -> AnyArray:
 def is_exact(u: AnyArray) -> bool:
     """Whether a certified value is exact, and not an unknown of its own; a traced uncertainty is not known to be 0."""
     return is_concrete(u) and float(u) == 0
-
-
-def _article(noun: str) -> str:
-    return "an" if noun[:1] in "aeiou" else "a"

@@ -1,8 +1,8 @@
 """What every kind of observation says: the constraint between the tip and an unknown geometry, and how both are found.
 
-A kind is one file of this folder: its data, the unknowns of its geometry, a start for them from nearly right tips, and
-its residuals with their derivatives. What it does not say (weights, covariance, robust losses, derivatives of a whole
-calibration) is the same for all kinds.
+A kind has its data, the unknowns of its geometry, a start for them from nearly right tips, and its residuals with their
+derivatives. What it does not say (weights, covariance, robust losses, derivatives of a whole calibration) is the same
+for all kinds. Beside it stands what simulates it: the true geometry, where the tip goes, and what is then recorded.
 """
 
 import abc
@@ -18,17 +18,26 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ...core.errors import InputError
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.pytree import register
-from .declared import Declared, number, text
+from ...core.rotations import rotation_matrix, rotation_vector
+from .declared import Declared, declared
 
 POINT = ("mm",) * 3
 FRAME = ("rad",) * 3 + POINT
+# Two components of the rotation vector that turns z to the normal, and the distance from the origin.
+PLANE = ("rad", "rad", "mm")
+# Two components of the rotation vector that turns z to the axis' direction, and where the axis meets the plane through
+# the origin across it, along the x and y axes that are turned likewise.
+AXIS = ("rad", "rad", "mm", "mm")
 
 # The numbers of each unknown as columns: one for all poses (p = 1), or one for each pose (p = m).
 Unknowns = Mapping[str, Float[AnyArray, "k p"]]
 Parts = dict[str, Float[AnyArray, " k"]]  # of each unknown
 Certified = dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]
+Readings = Float[np.ndarray, "m n"]
+Transforms = Float[np.ndarray, "m 4 4"]
 
 
 class Tips(NamedTuple):
@@ -68,16 +77,15 @@ class AbstractObservation(Declared):
 
     kind: ClassVar[str]
     table: ClassVar[str]  # name of its tables in a manifest
+    rows: ClassVar[int]  # residuals of a pose
+    derived: ClassVar[tuple[str, ...]] = ()  # fields of `completed` that are no entries
     rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
     stacks: ClassVar[bool] = True  # whether it can be evaluated together with others of the kind: see `alike`
-    rows: int  # residuals of a pose
     # Whether the residual is linear in all unknowns, with derivatives that do not depend on tips and unknowns.
-    linear: bool = False
+    linear: ClassVar[bool] = False
     fixes_scale: bool = False  # whether it determines the scale of the arm
-    q: Float[AnyArray, "m n"] = number("joint reading", "rad", "pose", "joint")
-    target: str = text("tip that was held or seen; empty: the arm's own probe", default="")
-
-    _of_poses: ClassVar[tuple[str, ...]]
+    q: Float[AnyArray, "m n"] = declared("joint reading", "rad", "pose", "joint")
+    target: str = declared("tip that was held or seen; empty: the arm's own probe", default="")
 
     # Of a repeated calibration: what is added to the residuals (r, m), and certified values in place of its own.
     shift: Float[AnyArray, "r m"] | None
@@ -87,8 +95,7 @@ class AbstractObservation(Declared):
         super().__init_subclass__(**options)
         leaves = [entry.name for entry in cls.entries if entry.content == "number"] + ["shift", "drawn"]
         others = [entry.name for entry in cls.entries if entry.content != "number"]
-        cls._of_poses = tuple(entry.name for entry in cls.entries if entry.dimensions[:1] == ("pose",))
-        register(cls, (*leaves,), ("name", *others, *cls.derived_fields))
+        register(cls, (*leaves,), ("name", *others, *cls.derived))
 
     def __init__(self, name: str, *values: Any, **options: Any):
         vars(self).update(shift=None, drawn=None)
@@ -113,8 +120,7 @@ class AbstractObservation(Declared):
         return {}
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
-        """A part of the unknown geometry as a person reads it; a kind whose numbers need another form says so itself,
-        such as a plane with its normal."""
+        """A part of the unknown geometry as a person reads it, by the units of its numbers."""
         return quantities_by_unit(self.unknowns[part], values)
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
@@ -126,8 +132,8 @@ class AbstractObservation(Declared):
     def unknowns(self) -> Mapping[str, tuple[str, ...]]:
         """Names of the parts of the unknown geometry, and the unit, mm or rad, of each of its numbers. A name that
         several observations use is one geometry."""
-        present = {name: one for name, one in self.parts.items() if not one.when or getattr(self, one.when)}
-        return {getattr(self, name): one.units_of(self) for name, one in present.items()}
+        present = {name: part for name, part in self.parts.items() if not part.when or getattr(self, part.when)}
+        return {getattr(self, name): part.units_of(self) for name, part in present.items()}
 
     @property
     def alike(self) -> Hashable | None:
@@ -135,14 +141,15 @@ class AbstractObservation(Declared):
         and evaluated together; None for one that is evaluated alone."""
         if not self.stacks:
             return None
-        choices = [*self.derived_fields, *(entry.name for entry in self.entries if entry.content == "truth")]
+        choices = [*self.derived, *(entry.name for entry in self.entries if entry.content == "truth")]
         absent = tuple(name for name in self.stated if getattr(self, name) is None)
         return (*(getattr(self, name) for name in choices), absent)
 
     @property
     def by_pose(self) -> tuple[str, ...]:
         """Fields with one row a pose."""
-        return tuple(name for name in self._of_poses if getattr(self, name) is not None)
+        names = (entry.name for entry in self.entries if entry.of_poses)
+        return tuple(name for name in names if getattr(self, name) is not None)
 
     @property
     def stated(self) -> tuple[str, ...]:
@@ -156,16 +163,18 @@ class AbstractObservation(Declared):
 
         Only its residual means something: names, certified values and starts are those of each observation.
         """
-        first, poses = observations[0], [one.q.shape[0] for one in observations]
-        fields = {}
-        for field in (*first.by_pose, *first.stated):
-            values = [getattr(one, field) for one in observations]
-            if field in first.stated and values[0] is not None:
+        first, fields = observations[0], {}
+        for field in (*first.by_pose, *first.stated, "shift"):
+            values = [getattr(observation, field) for observation in observations]
+            if values[0] is None:
+                continue
+            if isinstance(values[0], tuple):
+                fields[field] = tuple(itertools.chain(*values))
+                continue
+            if field in first.stated:
+                poses = [observation.q.shape[0] for observation in observations]
                 values = [namespace(value).broadcast_to(value, (m,)) for value, m in zip(values, poses, strict=True)]
-            fields[field] = _joined(values)
-        if first.shift is not None:
-            shifts = [one.shift for one in observations]
-            fields["shift"] = namespace(shifts).concatenate(shifts, axis=1)
+            fields[field] = namespace(values).concatenate(values, axis=1 if field == "shift" else 0)
         return first.changed(**fields)
 
     @classmethod
@@ -174,15 +183,12 @@ class AbstractObservation(Declared):
         poses belong to several."""
         made, stored = object.__new__(cls), dict(stored)
         for label in cls.entries:
-            if label.content == "text" and label.dimensions == ("pose",) and label.name in stored:
+            if label.content == "text" and label.of_poses and label.name in stored:
                 _, first, place = np.unique(stored[label.name], return_index=True, return_inverse=True)
                 order = np.argsort(first[place], kind="stable")
-                several = [entry.name for entry in cls.entries if entry.dimensions[:1] == ("pose",)]
-                stored |= {
-                    field: np.asarray(stored[field])[order]
-                    for field in several
-                    if field in stored and len(np.shape(stored[field])) and len(stored[field]) == len(order)
-                }
+                several = [entry.name for entry in cls.entries if entry.of_poses and entry.name in stored]
+                rows = {field: np.asarray(stored[field]) for field in several}
+                stored |= {field: values[order] for field, values in rows.items() if values.shape[:1] == order.shape}
         AbstractObservation.__init__(made, name, **stored)
         return made
 
@@ -213,14 +219,12 @@ class AbstractObservation(Declared):
 
     def select(self, poses: Sequence[int] | np.ndarray) -> "AbstractObservation":
         """The same observation with some of its poses, in their order."""
-        fields = {field: getattr(self, field) for field in self.by_pose}
         rows = np.asarray(poses)
-        return self.changed(
-            **{
-                field: tuple(values[i] for i in poses) if isinstance(values, tuple) else _taken(values, rows)
-                for field, values in fields.items()
-            }
-        )
+        taken, fields = numpy_if_known(lambda values: values[rows]), {}
+        for field in self.by_pose:
+            values = getattr(self, field)
+            fields[field] = tuple(values[i] for i in poses) if isinstance(values, tuple) else taken(values)
+        return self.changed(**fields)
 
     @property
     def places(self) -> Int[np.ndarray, " m"]:
@@ -232,28 +236,22 @@ class AbstractObservation(Declared):
         return np.array([numbers[row] for row in rows])
 
 
-@numpy_if_known
-def _taken(values: AnyArray, rows: Int[np.ndarray, " k"]) -> AnyArray:
-    return values[rows]
-
-
-def _joined(values: Sequence[Any]) -> Any:
-    """A field of several observations, arrays or tuples with an item for each pose, as that of one; None of None."""
-    if values[0] is None:
-        return None
-    if isinstance(values[0], tuple):
-        return tuple(itertools.chain(*values))
-    return namespace(values).concatenate(values)
-
-
 def quantities_by_unit(units: Sequence[str], values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
-    """Positions, rotations and frames, told by the units of their numbers; other numbers as they are, unit by unit."""
-    if tuple(units) == FRAME:
+    """Positions, rotations, frames, planes and axes, told by the units of their numbers; other numbers as they are,
+    unit by unit."""
+    units = tuple(units)
+    if units == FRAME:
         return (Quantity("position of the origin", values[3:], "mm"), Quantity("rotation vector", values[:3], "rad"))
-    if tuple(units) == POINT:
+    if units == POINT:
         return (Quantity("position", values, "mm"),)
-    if tuple(units) == FRAME[:3]:
+    if units == FRAME[:3]:
         return (Quantity("rotation vector", values, "rad"),)
+    if units in (PLANE, AXIS):
+        turned = np.asarray(rotation_matrix(np.append(values[:2], 0.0)))
+        if units == PLANE:
+            return (Quantity("normal", turned[:, 2], "1"), Quantity("distance from the origin", values[2:], "mm"))
+        point = turned[:, :2] @ values[2:]
+        return (Quantity("direction of the axis", turned[:, 2], "1"), Quantity("point of the axis", point, "mm"))
     kinds = dict.fromkeys(units)
     return tuple(Quantity("value", values[[one == unit for one in units]], unit) for unit in kinds)
 
@@ -290,18 +288,59 @@ def offset_of(target: str) -> str:
     return f"offset of {target}"
 
 
+class AbstractSimulated(Declared):
+    """An observation to simulate.
+
+    Every kind declares an entry ``poses``: the number of poses, of each place where there are several (points of an
+    artefact, two planes).
+    """
+
+    keyword_only: ClassVar[bool] = False
+    table: ClassVar[str]  # name of its tables in the file of a kit
+    poses: int
+    offset: Float[np.ndarray, " 3"] | None = None  # true place of the target in the last frame, mm; None: the probe
+
+    @abc.abstractmethod
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        """Where the tip is, mm, without the noise of the seat."""
+
+    @abc.abstractmethod
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> AbstractObservation:
+        """The observation from the readings, and from the true transforms of the tip."""
+
+    def placed(self, name: str, frame: Float[np.ndarray, " 6"]) -> "AbstractSimulated | None":
+        """The same thing under another name and moved rigidly: by a rotation vector (rad) about the base's origin, and
+        then by a translation (mm). None where there is nothing to place, such as for an instrument that sees all."""
+        turn, moved = np.asarray(rotation_matrix(frame[:3])), {}
+        for entry in (entry for entry in self.entries if entry.moves):
+            value = getattr(self, entry.name)
+            if entry.moves == "frame":
+                whole = turn @ np.asarray(rotation_matrix(value[:3]))
+                moved[entry.name] = np.concatenate([rotation_vector(whole), turn @ value[3:] + frame[3:]])
+            else:
+                moved[entry.name] = value @ turn.T + (frame[3:] if entry.moves == "point" else 0.0)
+        return self.changed(name=name, **moved) if moved else None
+
+    @property
+    def orientation(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation of its own frame in the base frame; the identity where it has none."""
+        frames = [getattr(self, entry.name) for entry in self.entries if entry.moves == "frame"]
+        return np.asarray(rotation_matrix(frames[0][:3])) if frames else np.eye(3)
+
+
+class AbstractOfTarget(AbstractSimulated):
+    """What may be recorded with a target in place of the arm's own probe."""
+
+    target: str = declared("name of the target", default="")
+    place: Float[np.ndarray, "3"] | None = declared("true place of the target in the last frame", "mm", default=None)
+
+    def completed(self, where: str) -> Mapping[str, Any]:
+        if bool(self.target) != (self.place is not None):
+            raise InputError(f"{where} needs both, a target and its place in the last frame, or neither.")
+        return {"offset": self.place}
+
+
 OTHER_KINDS: list[type[Declared]] = []  # observations and what simulates them, from elsewhere than this folder
-
-
-def kinds() -> dict[str, type[AbstractObservation]]:
-    """Every kind of observations by its name: those of the files of this folder, and others."""
-    by_class = {one.__name__: one for one in classes() if issubclass(one, AbstractObservation)}
-    return {by_class[name].kind: by_class[name] for name in sorted(by_class)}
-
-
-def classes() -> list[type[Declared]]:
-    """The classes of observations, and of what simulates them, that are not abstract."""
-    return [*_classes_of_files(), *OTHER_KINDS]
 
 
 @functools.cache
@@ -309,3 +348,18 @@ def _classes_of_files() -> list[type[Declared]]:
     names = [f"{__package__}.{module.name}" for module in pkgutil.iter_modules([str(Path(__file__).parent)])]
     members = [one for name in names for one in vars(importlib.import_module(name)).values() if isinstance(one, type)]
     return [one for one in dict.fromkeys(members) if issubclass(one, Declared) and not inspect.isabstract(one)]
+
+
+def _classes_by(base: type, label: str) -> dict[str, Any]:
+    classes = [one for one in (*_classes_of_files(), *OTHER_KINDS) if issubclass(one, base)]
+    return {getattr(one, label): one for one in sorted(classes, key=lambda one: one.__name__)}
+
+
+def kinds() -> dict[str, type[AbstractObservation]]:
+    """Every kind of observations by its name: those of the files of this folder, and others."""
+    return _classes_by(AbstractObservation, "kind")
+
+
+def simulated_kinds() -> dict[str, type[AbstractSimulated]]:
+    """Everything that can be simulated, by the name of its tables."""
+    return _classes_by(AbstractSimulated, "table")

@@ -1,4 +1,4 @@
-"""Artefacts of certified points, such as ball bars and plates, in their placements; also on an indexed platform."""
+"""The tip held in points: sockets, and artefacts of certified points, such as ball bars and plates."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,10 +11,59 @@ from ...core.errors import InputError, nearest
 from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace
 from ...core.rotations import fitted_frame, rotation_matrix
-from .declared import NAME, checked_readings, count, derived, is_exact, number, part, points, text
-from .frames import each_pose, no_covariance, placed
-from .observation import FRAME, POINT, AbstractObservation, Certified, Parts, Quantity, Rows, Tips, Unknowns
-from .simulated import AbstractSimulated, Readings, Transforms
+from .declared import NAME, Part, checked_readings, declared, is_exact
+from .geometry import each_pose, placed, rows_of_points
+from .observation import (
+    FRAME,
+    POINT,
+    AbstractObservation,
+    AbstractOfTarget,
+    AbstractSimulated,
+    Certified,
+    Parts,
+    Quantity,
+    Readings,
+    Rows,
+    Tips,
+    Transforms,
+    Unknowns,
+)
+
+
+class Socket(AbstractObservation):
+    """Poses with the tip at one point. The sockets of a `Capture` are the same, with their positions eliminated.
+
+    Raises:
+        InputError: Readings are not finite, or not ``(m, n)``.
+
+    Example:
+        >>> hole = aj.data.observations.Socket("hole", capture.sockets["A"])
+        >>> print(hole.q.shape, [*hole.unknowns])
+        (40, 6) ['position of hole']
+    """
+
+    kind, table, noun, rows, linear = "socket", "socket", "socket", 3, True
+    position = Part("position of {name}", *POINT)
+
+    def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
+        return {self.position: namespace(tips).mean(tips.position, axis=1)}
+
+    def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
+        position = unknowns[self.position]
+        identity = each_pose(namespace(tips, position).asarray(np.eye(3)), self.q.shape[0])
+        return rows_of_points(tips, position, {self.position: identity})
+
+
+def sockets_of(readings: Mapping[str, Float[AnyArray, "m n"]]) -> tuple[Socket, ...]:
+    """Sockets whose names and readings a capture has checked: each as a copy of the first, since there may be
+    thousands."""
+    first = [Socket(name, q) for name, q in [*readings.items()][:1]]
+    return tuple(first[0].changed(name=name, q=q) for name, q in readings.items())
+
+
+def position_of(socket: str) -> str:
+    """Name of the unknown position of a socket."""
+    return f"position of {socket}"
 
 
 class Artefact(AbstractObservation):
@@ -46,18 +95,19 @@ class Artefact(AbstractObservation):
     """
 
     kind, table, noun, rows = "artefact", "artefact", "artefact", 3
-    point: tuple[str, ...] = text("point of the artefact that held the tip", "pose")
-    names: tuple[str, ...] = text("point of the artefact", "names")
-    coordinates: Float[AnyArray, "c 3"] = number("certified coordinates", "mm", "names", "axis", uncertainty="u")
-    u: Float[AnyArray, ""] = number("standard uncertainty of a coordinate", "mm", default=0.0)
-    artefact: str = text("name of the artefact", default=NAME)
-    placement: str = text("name of its placement", default=NAME, of_session=True)
-    index: str | None = text("index of the platform that carries it", default=None, of_session=True)
-    free: bool = derived()  # whether the coordinates are unknowns with certified values
-    frame = part("placement {placement}", *FRAME)
-    platform = part("index {index}", *FRAME, when="index")
-    shape = part("coordinates of {artefact}", *POINT, when="free", repeated="coordinates")
+    point: tuple[str, ...] = declared("point of the artefact that held the tip", "", "pose")
+    names: tuple[str, ...] = declared("point of the artefact", "", "names")
+    coordinates: Float[AnyArray, "c 3"] = declared("certified coordinates", "mm", "names", "axis", uncertainty="u")
+    u: Float[AnyArray, ""] = declared("standard uncertainty of a coordinate", "mm", default=0.0)
+    artefact: str = declared("name of the artefact", default=NAME)
+    placement: str = declared("name of its placement", default=NAME, of_session=True)
+    index: str | None = declared("index of the platform that carries it", default=None, of_session=True)
+    derived = ("free",)  # whether the coordinates are unknowns with certified values
+    frame = Part("placement {placement}", *FRAME)
+    platform = Part("index {index}", *FRAME, when="index")
+    shape = Part("coordinates of {artefact}", *POINT, when="free", repeated="coordinates")
     stacks = False  # it has points of its own
+    free: bool
 
     def __init__(self, name: str, points: Mapping[str, Numbers], q: Mapping[str, Numbers], **options: Any):
         where = f"artefact '{name}'"
@@ -117,9 +167,7 @@ class Artefact(AbstractObservation):
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, owner, m = namespace(tips, unknowns, self.coordinates), self.owner, self.q.shape[0]
-        coordinates = self.coordinates.reshape(-1, 1)
-        if self.free:
-            coordinates = unknowns[self.shape]
+        coordinates = unknowns[self.shape] if self.free else self.coordinates.reshape(-1, 1)
         p = coordinates.shape[1]
         held = coordinates.reshape(-1, 3, p)[owner, :, np.arange(m) if p > 1 else 0].T
         # t - (R x + o) with the placement's R and o. On a platform, t - (R_i (R x + o) + o_i), so that derivatives by
@@ -127,16 +175,15 @@ class Artefact(AbstractObservation):
         points, by_frame, rotation = placed(unknowns[self.frame], held)
         by_unknowns = {}
         if self.index is not None:
-            points, by_platform, outer = placed(unknowns[self.platform], points)
+            points, by_unknowns[self.platform], outer = placed(unknowns[self.platform], points)
             by_frame = products_by_column(outer, by_frame.swapaxes(0, 1)).swapaxes(0, 1)
             rotation = products_by_column(outer, rotation)
-            by_unknowns[self.platform] = -by_platform
-        by_unknowns[self.frame] = -by_frame
+        by_unknowns[self.frame] = by_frame
         if self.free:
             chosen = xp.asarray((owner[None, :] == np.arange(len(self.names))[:, None]).astype(float))
-            by_point = -chosen[:, None, None, :] * rotation.swapaxes(0, 1)[None]
+            by_point = chosen[:, None, None, :] * rotation.swapaxes(0, 1)[None]
             by_unknowns[self.shape] = by_point.reshape(-1, 3, m)
-        return Rows(tips.position - points, each_pose(xp.asarray(np.eye(3)), m), by_unknowns, no_covariance(3, m))
+        return rows_of_points(tips, points, by_unknowns)
 
 
 Frame = Float[AnyArray, " 6"]
@@ -167,34 +214,50 @@ def platform_frames(observations: Sequence[AbstractObservation], tips: Sequence[
         }
         name = "" if "" in waiting else max(poses, key=lambda name: poses[name])
         held = waiting.pop(name)
-        placed_before = [(artefact, tip) for artefact, tip in held if artefact.frame in placements]
-        indices[name] = _index(placed_before, placements) if placed_before else np.zeros(6)
-        placements |= _new_placements([one for one in held if one[0].frame not in placements], indices[name])
+        before = [(artefact, position) for artefact, position in held if artefact.frame in placements]
+        index = np.zeros(6)
+        if before:
+            points = [placed(placements[artefact.frame], _coordinates(artefact))[0] for artefact, _ in before]
+            index = _fitted(points, [position for _, position in before])
+        indices[name] = index
+        rotation = rotation_matrix(index[:3])
+        for frame in dict.fromkeys(artefact.frame for artefact, _ in held if artefact.frame not in placements):
+            same = [(artefact, position) for artefact, position in held if artefact.frame == frame]
+            on_platform = [rotation.T @ (position - index[3:, None]) for _, position in same]
+            placements[frame] = _fitted([_coordinates(artefact) for artefact, _ in same], on_platform)
     del indices[""]
     return placements | indices
 
 
-def _index(held: Held, placements: dict[str, Frame]) -> Frame:
-    """In which points on the platform come closest to the tips."""
-    points = [placed(placements[artefact.frame], _coordinates(artefact))[0] for artefact, _ in held]
-    xp = namespace(points, held)
-    return fitted_frame(xp.concatenate(points, axis=1), xp.concatenate([tips for _, tips in held], axis=1))
-
-
-def _new_placements(held: Held, index: Frame) -> dict[str, Frame]:
-    """On the platform, by all that was held in each at this index."""
-    placements = {}
-    for name in dict.fromkeys(artefact.frame for artefact, _ in held):
-        same = [one for one in held if one[0].frame == name]
-        xp = namespace(same, index)
-        tips = xp.concatenate([position for _, position in same], axis=1)
-        coordinates = xp.concatenate([_coordinates(artefact) for artefact, _ in same], axis=1)
-        placements[name] = fitted_frame(coordinates, rotation_matrix(index[:3]).T @ (tips - index[3:, None]))
-    return placements
+def _fitted(points: Sequence[Float[AnyArray, "3 _"]], targets: Sequence[Float[AnyArray, "3 _"]]) -> Frame:
+    xp = namespace(points, targets)
+    return fitted_frame(xp.concatenate(points, axis=1), xp.concatenate(targets, axis=1))
 
 
 def _coordinates(artefact: Artefact) -> Float[AnyArray, "3 m"]:
     return artefact.coordinates[artefact.owner].T
+
+
+class SimulatedSocket(AbstractOfTarget):
+    """Poses with the tip in one socket.
+
+    Example:
+        >>> sockets_kind = aj.data.observations.SimulatedSocket
+        >>> cone = sockets_kind("cone", (400, 200, 300), 10, target="tool", place=(20, 0, 80))
+        >>> seated = aj.simulate(true, {}, observations=[cone]).observations[0]
+        >>> print(seated.q.shape, [*seated.unknowns])
+        (10, 6) ['position of cone']
+    """
+
+    table = "socket"
+    point: Float[np.ndarray, "3"] = declared("position in the base frame", "mm", moves="point")
+    poses: int = declared("number of poses")
+
+    def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        return np.tile(self.point, (self.poses, 1))
+
+    def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Socket:
+        return Socket(self.name, q, target=self.target)
 
 
 class SimulatedArtefact(AbstractSimulated):
@@ -209,18 +272,18 @@ class SimulatedArtefact(AbstractSimulated):
     """
 
     table = "artefact"
-    points: dict[str, Float[np.ndarray, "3"]] = points("true coordinates of each point")
-    poses: int = count("number of poses")
-    frame: Float[np.ndarray, "6"] = number(
+    points: dict[str, Float[np.ndarray, "3"]] = declared("true coordinates of each point", "mm")
+    poses: int = declared("number of poses")
+    frame: Float[np.ndarray, "6"] = declared(
         "its frame in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6, moves="frame"
     )
-    errors: Float[np.ndarray, "c 3"] | None = number(
+    errors: Float[np.ndarray, "c 3"] | None = declared(
         "errors of the certified coordinates", "mm", default=None, more="all placements share them"
     )
-    u: float = number("their standard uncertainty", "mm", default=0.0)
-    artefact: str = text("name of the artefact", default=NAME)
-    placement: str | None = text("name of the placement", default=None)
-    index: str | None = text("name of the index of a platform", default=None)
+    u: float = declared("their standard uncertainty", "mm", default=0.0)
+    artefact: str = declared("name of the artefact", default=NAME)
+    placement: str | None = declared("name of the placement", default=None)
+    index: str | None = declared("name of the index of a platform", default=None)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         coordinates = np.repeat(np.array(list(self.points.values())), self.poses, axis=0)

@@ -1,17 +1,18 @@
-"""Priors in text: the table ``[priors]`` of an arm file, and ``--prior``."""
+"""What the options ``--model`` and ``--prior`` say of an arm's joints and parameters."""
 
 import re
-from collections.abc import Mapping
 from typing import Any
 
-from pydantic import Field, FiniteFloat, PositiveFloat
+import numpy as np
 
 from ..core.errors import InputError
 from ..core.text import number
 from ..core.units import ARCSEC, DEG, UM, M
-from ..kinematics.arm import Arm
+from ..kinematics.arm import Arm, correction_names
+from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.parameters import ArmSpecification
 from ..kinematics.priors import MIXED, Prior, possible_names, unit_of_group
-from .toml import Strict
+from .urdf import link_masses, urdf_chain
 
 _UNITS = {
     "mm": {"mm": 1.0, "um": UM, "m": M},
@@ -25,46 +26,38 @@ _LEARN = "learn"
 _VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>[a-zKN/() ]*)")
 
 
-class PriorTable(Strict):
-    """The table ``[priors]`` of an arm file: by group, in the units of that file."""
-
-    sd: dict[str, PositiveFloat] = Field(default_factory=dict)
-    mean: dict[str, FiniteFloat] = Field(default_factory=dict)
-    learn: list[str] = Field(default_factory=list)
-
-    def prior(self, arm: Arm, length: float, angle: float) -> Prior:
-        """The prior; ``length`` and ``angle`` are the file's units in mm and rad."""
-        factors = {"mm": length, "rad": angle}  # others, such as rad/m, are the same in every file
-
-        def converted(values: Mapping[str, float]) -> dict[str, float]:
-            names = possible_names(arm)
-            return {group: value * factors.get(unit_of_group(group, names), 1.0) for group, value in values.items()}
-
-        prior = Prior(converted(self.sd), mean=converted(self.mean), learn=self.learn)
-        prior.check(arm)
-        return prior
+def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
+    """The specification with another model of its joints; masses are those of its URDF, where it has one. Raises
+    `InputError` where the model names an unknown kind."""
+    if not model.strip():
+        raise InputError("the model is empty; name dh alone for an arm without corrections.")
+    arm = with_corrections(specification.arm, model, **masses_of(specification))
+    gone = {*correction_names(specification.arm)} - {*correction_names(arm)}
+    held = specification.held
+    return specification._replace(
+        arm=arm,
+        held=None if held is None else tuple(name for name in held if name not in gone),
+        free=tuple(name for name in specification.free if name not in gone),
+        override={name: width for name, width in specification.override.items() if name not in gone},
+    )
 
 
-def prior_toml(prior: Prior) -> dict[str, Any]:
-    """The table ``[priors]`` of a prior, mm and rad; a group of which nothing is known cannot be in it."""
-    sd = {group: float(value) for group, value in prior.sd.items()}
-    learn = [group for group, learned in zip(prior.groups, prior.learned, strict=True) if learned]
-    tables = {"sd": sd, "mean": {group: float(value) for group, value in prior.mean.items()}, "learn": learn}
-    return {key: table for key, table in tables.items() if table}
+def masses_of(specification: ArmSpecification) -> dict[str, Any]:
+    """Mass and centre of mass of each link, as arguments of `with_corrections`; none where they are unknown."""
+    if specification.urdf is None:
+        return {}
+    masses = link_masses(urdf_chain(specification.urdf))
+    return masses._asdict() if np.any(masses.mass > 0) else {}
 
 
 def prior_of_text(text: str, arm: Arm) -> Prior | None:
     """The prior that ``--prior`` states, such as ``length=0.5mm,angle=0.05deg,alpha=learn,d_3=750.2+-0.1mm``.
 
-    "learn" alone learns the standard deviations of lengths and of angles; "none" is None, no prior.
-
-    Raises:
-        InputError: the text is not of this form, or names no parameter of the arm.
+    "learn" alone learns the standard deviations of lengths and of angles; "none" is None, no prior. Raises `InputError`
+    where the text is not of this form, or names no parameter of the arm.
     """
-    if text.strip() == "none":
-        return None
-    if text.strip() == _LEARN:
-        return Prior(learn=True)
+    if text.strip() in ("none", _LEARN):
+        return None if text.strip() == "none" else Prior(learn=True)
     sd, mean, learn = {}, {}, []
     for part in filter(None, (part.strip() for part in text.split(","))):
         group, _, value = (word.strip() for word in part.rpartition("="))  # harmonics=2-3=learn

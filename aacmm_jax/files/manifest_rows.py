@@ -1,0 +1,403 @@
+"""What the text tables of a manifest hold: joint readings or points, in rad and mm, and the entries of observations.
+
+Nothing here depends on a kind: `AbstractObservation.entries` says what each needs.
+"""
+
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.errors import InputError, nearest
+from ..core.text import quoted, shorten
+from ..core.units import ANGLE_UNITS, LENGTH_UNITS
+from ..data.capture import check_revolutions
+from ..data.observations.declared import Entry
+from ..data.observations.observation import AbstractObservation
+from ..kinematics.arm import Arm
+from .inputs import InputFile, fingerprint
+from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Angles, PointsTable, Preset, as_list
+from .patterns import check_name, fields_of, fill
+from .table_columns import LINE, TEMPERATURE, header_units, position_columns, proposed_columns, reading_columns
+from .text_lines import TABLE_SHARE, Column
+from .text_table import TextTable
+
+
+class Wanted(NamedTuple):
+    """What the manifest states of the readings, or points, in a table."""
+
+    columns: Sequence[Column] | None = None
+    unit: str | None = None
+    usual_unit: str | None = None  # of the preset, where neither the manifest nor the header states one
+    taken: Sequence[int] = ()  # columns, from 0, that hold something else
+    temperature: float | None = None
+
+
+def checked_unit(
+    where: object, what: str, header: str | None, stated: str | None, usual: str | None, units: Iterable[str]
+) -> str | None:
+    """The unit that the manifest states, or the header, or the preset. Raises `InputError` where the first two differ,
+    or it is none of ``units``."""
+    if header is not None and stated not in (None, header):
+        raise InputError(
+            f"{where}: the header of the {what} says {quoted(header)[1:-1]}, but the manifest {stated}; correct one of "
+            "them."
+        )
+    unit = stated or header or usual
+    if unit is not None and unit not in units:
+        raise InputError(f"{where}: the {what} are in {quoted(unit)}; give one of {', '.join(units)}.")
+    return unit
+
+
+class Readings:
+    """Joint readings of tables, in rad and mm, with the arm's temperature as a last column where there is one.
+
+    Raises `InputError` where columns are missing or not clear, units are missing or differ, or one table has
+    temperatures and another not.
+    """
+
+    def __init__(self, arm: Arm, angles: Angles | None):
+        self._arm, self._angles = arm, angles
+        self._first: tuple[int, str | os.PathLike] | None = None  # columns of readings of the first table, and its file
+        self.columns: list[int] = []  # of the joints in the first table, from 1
+        self.header: list[str] = []  # of the first table
+        self.angles: Angles | None = None  # with which the first table was read, its header and units considered
+
+    def __call__(self, text: TextTable, wanted: Wanted) -> Float[np.ndarray, "N n"]:
+        """The readings of one table."""
+        stated = wanted.columns
+        if stated is None and self._angles is not None and self._angles.columns is not None:
+            stated = as_list(self._angles.columns)
+        picked = reading_columns(text, self._arm.joints, wanted.taken, stated)
+        thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
+        if set(thermometer) & set(picked):
+            raise InputError(
+                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; leave it out of "
+                "columns."
+            )
+        numbers = text.numbers(picked, measured=True, stated=stated is not None)
+        angles = self._angles_of(text, picked, wanted)
+        q = angles.converted(numbers, self._arm)
+        check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
+        temperature = text.numbers(thermometer)[:, 0] if thermometer else None
+        readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
+        if self._first is None:
+            self._first, self.columns = (readings.shape[1], text.path), [i + 1 for i in picked]
+            self.header, self.angles = list(text.header), angles
+        if self._first[0] != readings.shape[1]:
+            (_, without), (_, other) = sorted((self._first, (readings.shape[1], text.path)), key=lambda table: table[0])
+            raise InputError(
+                f"{without} has no temperatures, but {other} has; give it a column {TEMPERATURE}, or state "
+                f"{TEMPERATURE} in its table."
+            )
+        return readings
+
+    def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted) -> Angles:
+        """How these readings are written: what the table states comes first, then [angles], the header, the preset.
+
+        What the manifest states must not contradict the header.
+        """
+        angles = self._angles
+        unit = wanted.unit or (None if angles is None else angles.unit)
+        angular, linear = header_units(text, picked, self._arm, unit)
+        if angular == "counts" and unit is None:
+            raise InputError(
+                f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'
+            )
+        possible = (*ANGLE_UNITS, "counts") if angles is not None and angles.unit == "counts" else ANGLE_UNITS
+        unit = checked_unit(text.path, "readings", angular, unit, wanted.usual_unit, possible)
+        if unit is None:
+            raise InputError(
+                "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" "
+                'or "rad", or state it in the header of the table, as J1 [deg].'
+            )
+        stated = {} if angles is None else angles.model_dump(exclude_unset=True)
+        if angles is None or unit != angles.unit:
+            stated.pop("counts_per_turn", None)
+        if linear is not None:
+            units = (*LENGTH_UNITS, "counts")
+            checked_unit(text.path, "prismatic joints", linear, stated.setdefault("linear_unit", linear), None, units)
+        if linear == "counts" and "counts_per_mm" not in stated:
+            raise InputError(
+                f'{text.path} has readings in counts; add linear_unit = "counts" and counts_per_mm = [...].'
+            )
+        return Angles(**{**stated, "unit": unit})
+
+
+def with_temperature(
+    q: Float[np.ndarray, "N n"], column: Float[np.ndarray, " N"] | None, stated: float | None, where: str
+) -> Float[np.ndarray, "N m"]:
+    """Readings with the temperature as a last column: of a table, or stated once for all, but not both; as they are
+    without either."""
+    if column is not None and stated is not None:
+        raise InputError(f"{where} has a column {TEMPERATURE}, and {TEMPERATURE} is stated besides; give one of them.")
+    if stated is not None:
+        column = np.full(len(q), float(stated))
+    return q if column is None else np.concatenate([q, column[:, None]], axis=1)
+
+
+def points_of(text: TextTable, wanted: Wanted, points: PointsTable) -> Float[np.ndarray, "N 3"]:
+    """The points of a table, mm."""
+    columns = wanted.columns
+    if columns is None and points.columns is not None:
+        columns = as_list(points.columns)
+    named = position_columns(text) if columns is None else None
+    if columns is not None:
+        picked = text.pick(columns)
+    elif named is not None:
+        picked = named[0]
+    else:
+        picked = [i for i in range(text.width) if i not in wanted.taken]
+        text.check_ascending(picked)
+    if len(picked) != 3:
+        line = LINE.format(", ".join(str(i + 1) for i in proposed_columns(text, 3, wanted.taken)) or "...")
+        raise InputError(
+            f"{text.path} has {text.shown()}, and it is not clear which of them are x, y and z; add {line} with these "
+            "three."
+        )
+    header = text.unit(picked, key="points") if named is None else named[1]
+    unit = checked_unit(text.path, "points", header, wanted.unit or points.unit, wanted.usual_unit, LENGTH_UNITS)
+    if unit is None:
+        raise InputError(f'{text.path} does not say the unit of its points; add unit = "mm" to [points].')
+    return text.numbers(picked, measured=True, stated=columns is not None) * LENGTH_UNITS[unit]
+
+
+class Source:
+    """The files of a manifest, in the order in which they are opened.
+
+    Args:
+        manifest: The manifest, to whose folder their paths are relative.
+        quantity: What a pose is: q (readings), or points.
+        rows: Makes the poses of a table, rad and mm.
+    """
+
+    def __init__(self, manifest: InputFile, quantity: str, rows: Callable[[TextTable, Wanted], np.ndarray]):
+        self.folder, self.quantity, self.rows, self._files = Path(manifest).parent, quantity, rows, [manifest]
+
+    def open(self, path: str) -> InputFile:
+        """Read another file."""
+        self._files.append(InputFile(self.folder / path, TABLE_SHARE))
+        return self._files[-1]
+
+    def fingerprints(self) -> tuple[str, ...]:
+        """The `fingerprint` of each file."""
+        return tuple(dict.fromkeys(fingerprint(file, self.folder) for file in self._files))
+
+
+class Part(NamedTuple):
+    """The poses of a table of a manifest that belong to one session and group, which may be empty."""
+
+    session: str
+    group: str
+    rows: dict[str, Any]  # of entries; the poses are `Source.quantity`
+    files: np.ndarray  # of each pose, the number of its file
+
+
+def name_of(table: Any, values: Mapping[str, str]) -> str:
+    """The name of a table: as stated, or its first file's."""
+    name = Path(fill(table.paths[0], values)).stem if table.name is None else fill(table.name, values)
+    check_name(name)
+    return name
+
+
+def parts(
+    source: Source, kind: type[AbstractObservation], table: Any, values: Mapping[str, str], where: str
+) -> Iterator[Part]:
+    """The parts of one table of a manifest, one for each session and group; ``where`` names it in messages, and
+    ``values`` are those of its fields in braces."""
+    reader = _Reader(source, kind, table, where)
+    session = _filled(getattr(table, "session", None) or "", values, f"{where}: session")
+    check_name(session)
+    labelled = table.files.items() if isinstance(table.files, dict) else [("", file) for file in table.paths]
+    files_read = [fill(file, values) for _, file in labelled]
+    try:
+        tables = [reader.read(label, file, session) for (label, _), file in zip(labelled, files_read, strict=True)]
+    except InputError as error:  # a line to add is one of this table
+        if where in str(error):
+            raise
+        raise InputError(f"{where}: {error}") from error
+    for file, rows in zip(files_read, tables, strict=True):
+        different = sorted(tables[0].keys() ^ rows.keys())
+        if different:
+            raise InputError(
+                f"{where}: only one of {files_read[0]} and {file} has '{different[0]}'; give it in all files of a "
+                "table, or make a table for each."
+            )
+    by_pose = {key: np.concatenate([rows[key] for rows in tables]) for key in tables[0]}
+    groups, sessions = by_pose.pop("group"), by_pose.pop("session")
+    files = np.repeat(np.arange(len(tables)), [len(rows["group"]) for rows in tables])
+    stated = reader.stated(values)
+    both = sorted(by_pose.keys() & stated.keys())
+    if both:
+        raise InputError(f"{where}: {both[0]} is given and also in columns; give it once.")
+    for name, entry in reader.entries.items():
+        if entry.required and name not in by_pose.keys() | stated.keys():
+            by_row = entry.dimensions[:1] == ("pose",)
+            todo = f"pick its columns with columns = {{ {name} = ... }}" if by_row else "state it"
+            raise InputError(f"{where} has no '{name}' ({entry.says}); {todo}.")
+    for session, group in dict.fromkeys(zip(sessions.tolist(), groups.tolist(), strict=True)):
+        chosen = (groups == group) & (sessions == session)
+        yield Part(session, group, {key: value[chosen] for key, value in by_pose.items()} | stated, files[chosen])
+
+
+def _filled(text: str, values: Mapping[str, str], what: str) -> str:
+    """A text whose fields in braces are filled in."""
+    unknown = fields_of(text) - values.keys()
+    if unknown:
+        raise InputError(f"{what} uses the unknown field {shorten(sorted(unknown))}.")
+    return fill(text, values)
+
+
+class _Reader:
+    """The entries of one table, from its files and from the manifest."""
+
+    def __init__(self, source: Source, kind: type[AbstractObservation], table: Any, where: str):
+        self._source, self._table, self._where = source, table, where
+        self._preset = PRESETS[table.preset] if table.preset is not None else Preset({})
+        # In a manifest of points, a point stands where a pose has its readings.
+        self.entries = {source.quantity if entry.name == "q" else entry.name: entry for entry in kind.entries}
+        columns = table.columns if isinstance(table.columns, dict) else {source.quantity: table.columns}
+        self._columns = {key: as_list(picked) for key, picked in columns.items()}
+        if getattr(table, "session", None) is not None and "session" in columns:
+            raise InputError(f"{where}: session is given and also in columns; give it once.")
+        may_have_sessions = source.quantity == "q" and hasattr(table, "session")
+        for key in (*columns, *table.units):
+            if key not in self.entries and not (key == "session" and key in columns and may_have_sessions):
+                raise InputError(f"{where} has no '{key}'{nearest(key, self.entries)}")
+        labels = [e.name for e in kind.entries if e.dimensions == ("pose",) and e.content == "text"]
+        self._label = labels[0] if labels else None
+        if isinstance(table.files, dict) and self._label is None:
+            raise InputError(f"{where} has files by name, but its poses have none; give files as a list.")
+        self._own_file = getattr(table, "readings", None)
+        if self._own_file is not None and len(table.paths) > 1:
+            raise InputError(f"{where} has readings in a file of their own, so it needs one file of values.")
+
+    def read(self, label: str, file: str, session: str) -> dict[str, Any]:
+        """Of each pose of a file what its columns hold, its group and its session."""
+        table, source = self._table, self._source
+        text = self._open(file, table.skip)
+        chosen = dict(self._columns)
+        for key, choices in self._preset.columns.items():
+            # A preset may name more than a kind needs, or than a table has.
+            if key not in self.entries or key in chosen or getattr(table, key, None) is not None:
+                continue
+            there = next((wanted for wanted in choices if text.has(wanted)), None)
+            if there is not None:
+                chosen[key] = list(there)
+        if label:
+            chosen.pop(self._label or "", None)
+        group = np.full(text.length, "") if table.group is None else text.texts(table.group)
+        if table.group is not None and "" in group:
+            raise InputError(
+                f"{self._where}: {file} row {group.tolist().index('') + 1} has an empty cell in column "
+                f"{quoted(str(table.group))}, which names its group; fill it, or leave out the row."
+            )
+        of_session, main = chosen.pop("session", None), chosen.pop(source.quantity, None)
+        others = [*chosen.values(), of_session or [], [] if table.group is None else [table.group]]
+        readings = text if self._own_file is None else self._open(self._own_file, 0)
+        wanted = Wanted(
+            main,
+            table.units.get(source.quantity),
+            self._preset.units.get(source.quantity),
+            [i for columns in others for i in text.pick(columns)] if readings is text else [],
+            table.temperature_C,
+        )
+        rows_of = {source.quantity: (rows := source.rows(readings, wanted))}
+        rows_of |= {key: self._column(text, self.entries[key], columns) for key, columns in chosen.items()}
+        if label and self._label is not None:
+            rows_of[self._label] = np.full(len(rows), label)
+        rows_of["session"] = np.full(len(rows), session) if of_session is None else text.texts(of_session[0])
+        rows_of["group"] = group
+        for key, values in rows_of.items():
+            if len(values) != len(rows):
+                raise InputError(
+                    f"{self._where}: {file} has {len(values)} rows of '{key}', but there are {len(rows)} readings; "
+                    "give a row of each for every pose."
+                )
+        return rows_of
+
+    def _open(self, file: str, skip: int) -> TextTable:
+        table = self._table
+        wanted = [*(column for columns in self._columns.values() for column in columns), table.group or 1]
+        return TextTable(
+            self._source.open(file),
+            delimiter=table.delimiter,
+            decimal=table.decimal,
+            skip=skip,
+            wanted=wanted if self._own_file is None else (),
+        )
+
+    def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
+        if entry.dimensions[:1] != ("pose",):
+            raise InputError(f"{self._where}: {entry.name} is one for all poses; state it outside columns.")
+        if entry.content == "text":
+            if len(wanted) != 1:
+                raise InputError(f"{self._where}: {entry.name} is in one column; pick one.")
+            return text.texts(wanted[0])
+        picked = text.pick(wanted)
+        numbers = text.numbers(picked)
+        header = text.unit(picked, self._table.units.get(entry.name) or self._preset.units.get(entry.name), entry.name)
+        if entry.unit == "1":
+            return self._rotations(entry, numbers, header)
+        shape = (3,) * (len(entry.dimensions) - 1)
+        count = math.prod(shape)
+        of_all_axes = entry.name == "u" and count == 3
+        self._check_count(entry.name, numbers.shape[1], (1, 3) if of_all_axes else (count,))
+        numbers = numbers * self._unit(entry, header)
+        if entry.name == "u":
+            numbers = numbers / (self._table.coverage_factor or self._preset.coverage_factor)
+        return np.broadcast_to(numbers, (len(numbers), count)).reshape(-1, *shape)
+
+    def _check_count(self, name: str, given: int, counts: Sequence[int]) -> None:
+        if given not in counts:
+            wanted = " or ".join(map(str, counts))
+            raise InputError(f"{self._where}: {name} is in {wanted} columns, but {given} are picked; pick {wanted}.")
+
+    def _unit(self, entry: Entry, header: str | None = None) -> float:
+        """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
+        units = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
+        name, usual = entry.name, self._preset.units.get(entry.name)
+        unit = checked_unit(self._where, name, header, self._table.units.get(name), usual, units)
+        if unit is None and entry.unit == "1":
+            raise InputError(f"{self._where} has angles without a unit; give units = {{ {name} = 'deg' }}.")
+        return 1.0 if unit is None else units[unit] ** (2 if entry.unit == "mm^2" else 1)
+
+    def _rotations(self, entry: Entry, numbers: np.ndarray, header: str | None) -> np.ndarray:
+        from scipy.spatial.transform import Rotation
+
+        convention = self._table.rotation or self._preset.rotation
+        if convention is None:
+            raise InputError(
+                f"{self._where} does not say how its rotations are written; give rotation = "
+                f"{', '.join(NUMBERS_OF_ROTATION)}, or three axes such as XYZ or xyz."
+            )
+        self._check_count(entry.name, numbers.shape[1], (NUMBERS_OF_ROTATION.get(convention, 3),))
+        if convention == "matrix":
+            return numbers.reshape(-1, 3, 3)
+        if convention.startswith("quaternion"):
+            if not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
+                raise InputError(f"{self._where} has quaternions that are not of length 1; pick their four columns.")
+            return Rotation.from_quat(numbers, scalar_first=convention.endswith("wxyz")).as_matrix()
+        numbers = numbers * self._unit(entry, header)
+        vector = convention == "vector"
+        return (Rotation.from_rotvec(numbers) if vector else Rotation.from_euler(convention, numbers)).as_matrix()
+
+    def stated(self, values: Mapping[str, str]) -> dict[str, Any]:
+        """What the manifest itself states, in mm and rad."""
+        stated: dict[str, Any] = {}
+        for entry in self.entries.values():
+            value = getattr(self._table, entry.name, None)
+            if value is None:
+                continue
+            if isinstance(value, dict):
+                stated[entry.dimensions[0]] = np.array(list(value))
+                stated[entry.name] = np.array(list(value.values()), dtype=float) * self._unit(entry)
+            elif entry.content == "text":
+                stated[entry.name] = _filled(value, values, f"{self._where}: {entry.name}")
+            else:
+                stated[entry.name] = value if entry.content == "truth" else value * self._unit(entry)
+        return stated

@@ -1,0 +1,435 @@
+"""What joints do besides their Denavit-Hartenberg motion: the kinds of corrections, and their coefficients by name.
+
+What a joint really does is its reading plus coefficients times known functions of all readings,
+
+    theta_i = q_i + theta_i0 + sum_b c_ib phi_b(q),
+
+so the derivative of the tip by a coefficient is the Jacobian column of the joint's theta (of a prismatic joint, of its
+d) times phi. Thermal expansion moves no joint: all lengths grow by 1 + c (T - 20 C). A new kind is one class in this
+file, or one that is made known by `register`: whatever else the package does with kinds, it asks them.
+"""
+
+import abc
+import functools
+import operator
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.errors import InputError, nearest
+from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.rotations import cross
+from .chain import ForwardPass, frame_axes
+
+REFERENCE_TEMPERATURE = 20.0  # C, by ISO 1
+_HIGHEST = 99  # order of a harmonic
+_STANDARD_GRAVITY = 9.80665  # m/s^2, by definition
+_METRE = 1e-3  # m/mm
+_KILONEWTON = 1e-3  # kN/N: with rad/(kN m), compliances are about as large as errors of angles
+# Short forms. An error function of each joint, whatever its cause: with a prior, 62 coefficients a joint are few enough
+# to be found in seconds from 500 poses, and orders to 63 were hardly better (`benchmarks/NOTES.md`).
+_SHORT_FORMS = {"functions": "harmonics=1-31"}
+_COEFFICIENT = re.compile(r"([a-z]+)([1-9][0-9]*)?(?:_([1-9][0-9]*))?")
+_KEPT = 4096  # results: every calibration asks for the same ones
+
+Readings = Float[AnyArray, "n ... 1 N"]
+Rows = Float[AnyArray, "rows ... 1 N"]
+
+
+class Loads(NamedTuple):
+    """What pulls at the arm, for functions of gravity."""
+
+    mass: tuple[float, ...]  # of each link, kg
+    centre: tuple[tuple[float, float, float], ...]  # of mass, in the link's own D-H frame, mm
+
+
+class Sought(NamedTuple):
+    """Functions of a kind that residuals are searched for, all those of one joint at once."""
+
+    name: str  # what results call it: "first harmonic"
+    option: str  # of the model with these functions: "1" of ``harmonics=1``
+    follows: str  # what residuals follow then, of joint {i}: "cos q_{i}"
+    cause: str  # what usually causes it, with its article: "an eccentric encoder"
+    of_slides: bool = False  # whether prismatic joints have it as well
+    relative: bool = False  # whether its size is the coefficient, a ratio, rather than what it adds over the poses
+
+
+@dataclass(frozen=True)
+class AbstractCorrection(abc.ABC):
+    """A kind of joint correction, without data of its own: every two of a class are equal, and static in a program."""
+
+    model: ClassVar[str]  # what a model calls it, as in ``--model dh,harmonics=1``
+    words: ClassVar[tuple[str, ...]]  # with which the names of its coefficients begin
+    description: ClassVar[str]  # what its coefficients are, in the plural: "errors of gear ratios"
+    unit: ClassVar[str]  # of a coefficient of a revolute joint; in place of rad, mm of a prismatic one
+    unit_alone: ClassVar[str] = ""  # where it differs: of a coefficient whose name has no number
+    usual_size: ClassVar[float]  # about how large coefficients usually are, in this unit
+    usual_of_slide: ClassVar[float | None] = None  # the same where a joint is prismatic, mm; None: as of others
+    rows: ClassVar[int] = 1  # of `values`: 3 for a function of gravity, one for each component of its direction
+    of_arm: ClassVar[bool] = False  # whether it scales all lengths of the arm: its terms are of joint 0
+    of_own_reading: ClassVar[bool] = False  # whether each function is of its joint's reading alone, and can be drawn
+    has_options: ClassVar[bool] = False  # whether a model may say more of it, as harmonics=1-3 does
+    sought: ClassVar[tuple[Sought, ...]] = ()  # what residuals of a calibration without it are searched for
+    shared: ClassVar[str | None] = None  # option of the model whose functions poses may share errors by; None: none
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple["Term", ...]:
+        """The terms of a model for an arm of so many joints; the option of ``harmonics=2`` is "2", by default empty."""
+        return tuple(Term(self, self.words[0], 0, joint) for joint in range(1, joints + 1))
+
+    def option_of(self, terms: Sequence["Term"]) -> str:
+        """The option of the model that has these terms, and as few others as can be: the inverse of `terms`."""
+        return ""
+
+    def wrong(self, term: "Term", joints: int) -> str:
+        """What is wrong with a term of this kind for an arm of so many joints, in a few words; empty if nothing is."""
+        return "has a number, and takes none" if term.number else ""
+
+    def usual(self, terms: Sequence["Term"]) -> dict[str, float]:
+        """The groups of the default prior with their standard deviations, for an arm with these terms of this kind."""
+        return {self.model: self.usual_size}
+
+    @abc.abstractmethod
+    def values(self, terms: Sequence["Term"], q: Readings, forward: ForwardPass) -> Rows:
+        """The functions of terms of this kind at N configurations, one after the other: `rows` of each.
+
+        ``q`` are the readings, rad (mm of prismatic joints), joints first, that of a thermometer (C) last; ``forward``
+        are the frames of the nominal arm there, mm.
+        """
+
+
+class Term(NamedTuple):
+    """One coefficient and its function: ``cos2_3`` has the word "cos", the number 2 and the joint 3."""
+
+    kind: AbstractCorrection
+    word: str  # which function
+    number: int  # which of them: an order, a link, another joint; 0 where there is only one
+    joint: int  # that it moves, from 1; 0 where it scales all lengths of the arm
+    loads: Loads | None = None  # masses of the arm, where the function needs them
+
+    @property
+    def name(self) -> str:
+        """The coefficient's name as a parameter."""
+        return f"{self.word}{self.number or ''}_{self.joint}" if self.joint else self.word
+
+    @property
+    def unit(self) -> str:
+        """Unit of the coefficient."""
+        return self.kind.unit if self.number else self.kind.unit_alone or self.kind.unit
+
+    def wrong(self, joints: int) -> str:
+        """What is wrong with it for an arm of so many joints, in a few words; empty if nothing is."""
+        if not (0 if self.kind.of_arm else 1) <= self.joint <= joints:
+            return f"is of a joint from 1 to {joints}"
+        return self.kind.wrong(self, joints)
+
+
+class Harmonics(AbstractCorrection):
+    """cos hq and sin hq of every joint; of orders 1 and 2 by default, or of an option's: ``harmonics=1-3+8``.
+
+    An encoder that is eccentric by e at the radius R errs by e / R times a sine of its reading (10 um at 50 mm: 41
+    arcsec); one that is oval or tilted errs by the second harmonic, and N evenly spaced read heads leave multiples of N
+    only.
+    """
+
+    model = "harmonics"
+    words = ("cos", "sin")
+    description = "harmonics of encoders"
+    unit = "rad"
+    usual_size = 5e-5  # 10 arcsec
+    usual_of_slide = 0.05
+    of_own_reading = True
+    has_options = True
+    sought = (
+        Sought("first harmonic", "1", "cos q_{i}", "an eccentric encoder or a bending link"),
+        Sought("second harmonic", "2", "cos 2 q_{i}", "a tilted or oval encoder"),
+    )
+    shared = "1-3"
+
+    @staticmethod
+    def orders_of(option: str) -> tuple[int, ...] | None:
+        """The orders that an option such as ``1-3+8`` names, each once; None where one is not from 1 to 99."""
+        orders: set[int] = set()
+        for part in option.split("+"):
+            ends = re.fullmatch(r"([1-9]\d?)(?:-([1-9]\d?))?", part)
+            if ends is None or int(ends[2] or ends[1]) < int(ends[1]):
+                return None
+            orders |= set(range(int(ends[1]), int(ends[2] or ends[1]) + 1))
+        return tuple(sorted(orders))
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
+        orders = self.orders_of(option or "1+2")
+        if orders is None:
+            raise InputError(
+                f"harmonics={option} has no orders from 1 to {_HIGHEST}; write harmonics=1, harmonics=1+2 or "
+                "harmonics=1-31."
+            )
+        numbers = range(1, joints + 1)
+        return tuple(Term(self, word, order, joint) for joint in numbers for order in orders for word in self.words)
+
+    def option_of(self, terms: Sequence[Term]) -> str:
+        orders = sorted({term.number for term in terms})
+        first = [order for order in orders if order - 1 not in orders]
+        last = [order for order in orders if order + 1 not in orders]
+        runs = [str(low) if low == high else f"{low}-{high}" for low, high in zip(first, last, strict=True)]
+        return "" if orders == [1, 2] else "+".join(runs)
+
+    def wrong(self, term: Term, joints: int) -> str:
+        return "" if 1 <= term.number <= _HIGHEST else f"has no order from 1 to {_HIGHEST}"
+
+    def usual(self, terms: Sequence[Term]) -> dict[str, float]:
+        octaves = [(2**k, min(2 ** (k + 1) - 1, _HIGHEST)) for k in range(_HIGHEST.bit_length())]
+        return {f"{self.model}={low}" + (f"-{high}" if high > low else ""): self.usual_size for low, high in octaves}
+
+    def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
+        xp, joints = namespace(q), sorted({term.joint for term in terms})
+        readings = q[np.array(joints) - 1]
+        cos, sin = xp.cos(readings)[None], xp.sin(readings)[None]
+        highest = max(term.number for term in terms)
+        while len(cos) < highest:
+            # Orders k + 1 to 2k from 1 to k by addition of angles: three times as fast as the cosine of every multiple,
+            # and as exact.
+            c, s, more = cos[-1:], sin[-1:], min(len(cos), highest - len(cos))
+            next_cos, next_sin = c * cos[:more] - s * sin[:more], s * cos[:more] + c * sin[:more]
+            cos, sin = xp.concatenate([cos, next_cos]), xp.concatenate([sin, next_sin])
+        order = np.array([term.number - 1 + highest * (term.word == "sin") for term in terms])
+        return xp.concatenate([cos, sin])[order, np.array([joints.index(term.joint) for term in terms])]
+
+
+class GearRatio(AbstractCorrection):
+    """The reading itself: a joint that turns, or a carriage that moves, by a little more or less than it reads."""
+
+    model = "gear"
+    words = ("gear",)
+    description = "relative errors of gear ratios"
+    unit = "1"
+    usual_size = 2e-4
+    of_own_reading = True
+    sought = (Sought("gear ratio", "", "q_{i} (gear ratio)", "a wrong gear ratio", of_slides=True, relative=True),)
+    shared = ""
+
+    def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
+        return q[np.array([term.joint - 1 for term in terms])]
+
+
+class Coupling(AbstractCorrection):
+    """The reading of another joint: a motor or a belt that turns one joint moves another a little, too.
+
+    ``coupled=2-3`` lets the reading of joint 2 move joint 3; by default each joint moves the next.
+    """
+
+    model = "coupled"
+    words = ("coupled",)
+    description = "parts of other joints' readings"
+    unit = "1"
+    usual_size = 2e-4
+    usual_of_slide = 0.05
+    has_options = True
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
+        if not option:
+            return tuple(Term(self, "coupled", joint - 1, joint) for joint in range(2, joints + 1))
+        pairs = [re.fullmatch(r"([1-9]\d*)-([1-9]\d*)", pair) for pair in option.split("+")]
+        if not all(pairs):
+            raise InputError(f"coupled={option} names no joints; coupled=2-3 lets the reading of joint 2 move joint 3.")
+        return tuple(Term(self, "coupled", int(pair[1]), int(pair[2])) for pair in pairs if pair)
+
+    def option_of(self, terms: Sequence[Term]) -> str:
+        return "+".join(dict.fromkeys(f"{term.number}-{term.joint}" for term in terms))
+
+    def wrong(self, term: Term, joints: int) -> str:
+        if not 1 <= term.number <= joints:
+            return f"is of the reading of another joint from 1 to {joints}, as coupled2_3 is"
+        return "is of its own reading, which gear is" if term.number == term.joint else ""
+
+    def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
+        return q[np.array([term.number - 1 for term in terms])]
+
+
+class Gravity(AbstractCorrection):
+    """Compliance: a joint, with the link before it, yields to the moment of gravity about its axis.
+
+    The moment of a mass m at c about the axis z through o is m g . (z x (c - o)): linear in the direction of gravity,
+    so that its three components are functions of the readings alone. With known masses, one coefficient a joint,
+    ``compliance_2``, rad/(kN m). Without, one for each link after it, ``compliance3_2``: compliance times the weight of
+    link 3 as if it were in the origin of its frame, of the last link in the tip, rad/m: only such products can be
+    found.
+    """
+
+    model = "gravity"
+    words = ("compliance",)
+    description = "compliances under the moment of gravity"
+    unit = "rad/m"
+    unit_alone = "rad/(kN m)"
+    usual_size = 1e-3  # 1 mrad for links with levers of 1 m
+    usual_of_slide = 0.05
+    rows = 3
+    sought = (Sought("gravity", "", "gravity about joint {i}", "a joint or link that bends under its load"),)
+    shared = ""
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
+        numbers, word = range(1, joints + 1), self.words[0]
+        if loads is not None:
+            return tuple(Term(self, word, 0, joint, loads) for joint in numbers)
+        return tuple(Term(self, word, link, joint) for joint in numbers for link in range(joint, joints + 1))
+
+    def wrong(self, term: Term, joints: int) -> str:
+        if term.number and not term.joint <= term.number <= joints:
+            return f"is of a link from {term.joint} to {joints}, as compliance{term.joint}_{term.joint} is"
+        return ""
+
+    def usual(self, terms: Sequence[Term]) -> dict[str, float]:
+        # With masses, 1 mrad for 100 N m.
+        return {self.model: self.usual_size if all(term.number for term in terms) else 1e-2}
+
+    def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
+        xp, moved = namespace(forward), np.array([term.joint - 1 for term in terms])
+        weights, points = zip(*[self._pull(term, forward) for term in terms], strict=True)
+        weight = np.array(weights).reshape(-1, *(1,) * forward.tip.ndim)
+        lever = xp.stack(points) - weight * forward.origin_before[moved]
+        moments = xp.moveaxis(_METRE * cross(forward.z_before[moved], lever), -2, 1)
+        count = moments.shape[0] * moments.shape[1]  # a -1 is undetermined where there are no poses
+        return moments.reshape(count, *moments.shape[2:])[..., None, :]
+
+    def _pull(self, term: Term, forward: ForwardPass) -> tuple[float, Float[AnyArray, "... 3 N"]]:
+        """The weight that pulls at a joint, and the sum of weights times where they are, mm: 1 of a single link, kN."""
+        if term.number:
+            return 1.0, forward.tip if term.number == len(forward.origin) else forward.origin[term.number - 1]
+        assert term.loads is not None
+        # A link's centre of mass is at its origin, and along its axes by the coordinates that are stated.
+        links, axes, centre = range(term.joint - 1, len(forward.origin)), frame_axes(forward), term.loads.centre
+        weights = {j: _KILONEWTON * _STANDARD_GRAVITY * term.loads.mass[j] for j in links}
+        pulls = [weights[j] * (forward.origin[j] + sum(centre[j][k] * axes[k][j] for k in range(3))) for j in links]
+        return sum(weights.values()), functools.reduce(operator.add, pulls)
+
+
+class Expansion(AbstractCorrection):
+    """Thermal expansion: the difference of the thermometer from 20 C; 0 for readings without one.
+
+    One coefficient for the whole arm: a, d and the probe, and the travel of carriages, whose scales expand with them.
+    Typical are 11.5e-6 / K for steel, 23e-6 for aluminium and about 1e-6 for carbon fibre along its fibres.
+    """
+
+    model = "expansion"
+    words = ("expansion",)
+    description = "thermal expansion of all lengths"
+    unit = "1/K"
+    usual_size = 2e-5
+    of_arm = True
+    sought = (Sought("thermal expansion", "", "temperature", "an arm that expands"),)
+
+    def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
+        return (Term(self, "expansion", 0, 0),)
+
+    def wrong(self, term: Term, joints: int) -> str:
+        return "is of the whole arm and has no number" if term.number or term.joint else ""
+
+    def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
+        measured = q.shape[0] > len(forward.x)
+        return q[-1:] - REFERENCE_TEMPERATURE if measured else 0.0 * q[:1]
+
+
+KINDS: dict[str, AbstractCorrection] = {  # by what a model calls them, in the order of these names
+    kind.model: kind for kind in (Coupling(), Expansion(), GearRatio(), Gravity(), Harmonics())
+}
+
+
+def register(kind: AbstractCorrection) -> None:
+    """Make a kind known that is not of this file.
+
+    Raises `InputError` where what a model calls it, or a word of its coefficients, is another kind's.
+    """
+    for name in (kind.model, *kind.words):
+        taken = any(name in (other.model, *other.words) for other in KINDS.values())
+        if taken or re.fullmatch("[a-z]+", name) is None or name in ("dh", *_SHORT_FORMS):
+            raise InputError(
+                f"'{name}' of {type(kind).__name__} is no name for a kind of joint correction; name it by lowercase "
+                "letters that no other kind has."
+            )
+    KINDS[kind.model] = kind
+    coefficient_of.cache_clear()
+    terms_of.cache_clear()
+
+
+@lru_cache(_KEPT)
+def coefficient_of(name: str) -> Term | None:
+    """The term that the name of a coefficient says, of whichever arm it is; None for every other parameter."""
+    parts = _COEFFICIENT.fullmatch(name)
+    kind = None if parts is None else next((kind for kind in KINDS.values() if parts[1] in kind.words), None)
+    if parts is None or kind is None:
+        return None
+    return Term(kind, parts[1], int(parts[2] or 0), int(parts[3] or 0))
+
+
+def unit_of_coefficient(name: str) -> str:
+    """Unit of a joint correction's coefficient, of a joint that rotates; empty for other parameters."""
+    term = coefficient_of(name)
+    return "" if term is None else term.unit
+
+
+def all_sought() -> dict[str, tuple[AbstractCorrection, Sought]]:
+    """What residuals are searched for, by name, with its kind."""
+    return {sought.name: (kind, sought) for kind in KINDS.values() for sought in kind.sought}
+
+
+def shared_model() -> str:
+    """The model of the functions by which poses may share errors."""
+    return ",".join(model_with(kind, kind.shared) for kind in KINDS.values() if kind.shared is not None)
+
+
+def model_of(terms: Iterable[Term]) -> str:
+    """The model that has all these terms: "dh,gear,harmonics=1-3"; "dh" alone for none."""
+    terms = tuple(terms)
+    by_kind = [(kind, [term for term in terms if term.kind.model == kind.model]) for kind in KINDS.values()]
+    return ",".join(["dh", *(model_with(kind, kind.option_of(chosen)) for kind, chosen in by_kind if chosen)])
+
+
+def model_with(kind: AbstractCorrection, option: str) -> str:
+    """A model of one kind with an option, or without where it is empty."""
+    return f"{kind.model}={option}" if option else kind.model
+
+
+def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
+    """The term that a coefficient belongs to, or None where this is no coefficient's name.
+
+    Raises `InputError` where it is one, but not of an arm with so many joints.
+    """
+    term = coefficient_of(name)
+    if term is None:
+        return None
+    if wrong := term.wrong(joints):
+        raise InputError(f"the coefficient '{name}' {wrong}; correct its name.")
+    return term._replace(loads=loads) if term.kind.rows == 3 and not term.number else term
+
+
+@lru_cache(_KEPT)
+def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term, ...]:
+    """The terms of a model: kinds with their options, separated by commas, such as "dh,gravity,harmonics=1".
+
+    Raises `InputError` where a kind is unknown or there twice, or an option means nothing. "dh" stands for the arm
+    itself, "functions" for harmonics=1-31; ``loads`` are the masses of the arm, where known.
+    """
+    terms: dict[Term, None] = {}
+    seen: set[str] = set()
+    for given in model.split(","):
+        part = _SHORT_FORMS.get(given.strip(), given.strip())
+        name, _, option = part.partition("=")
+        if name in seen:
+            raise InputError(f"the model names '{name}' twice; name it once, as in dh,gravity,harmonics=1+2.")
+        seen.add(name)
+        if name == "dh":
+            continue
+        kind = KINDS.get(name)
+        if kind is None:
+            raise InputError(f"unknown model '{name}'{nearest(name, ['dh', *KINDS, *_SHORT_FORMS])}")
+        if option and not kind.has_options:
+            raise InputError(f"{name} takes no option such as '{option}'; write {name} alone.")
+        for term in kind.terms(joints, option, loads):
+            if wrong := term.wrong(joints):
+                raise InputError(f"{part} {wrong}; correct it.")
+            terms[term] = None
+    return tuple(terms)
