@@ -81,7 +81,7 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
-        from ..core.backend import check_backend
+        from ..core.jax_setup import check_backend
 
         try:
             check_backend()

@@ -9,8 +9,7 @@ import numpy as np
 from .. import data, files, kinematics, plot
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord
-from ..core.errors import InputError
-from ..core.extras import MissingExtra, require
+from ..core.errors import InputError, MissingExtra, require
 from ..core.text import shorten
 from ..files.inputs import fingerprint
 from ..files.outputs import together
