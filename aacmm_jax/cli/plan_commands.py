@@ -218,7 +218,7 @@ def _check_options(context: Any, kit: bool, acceptance: bool) -> None:
 def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
     """The plan of a calibration as options say (``given``, by name), and what its summary states of its assumptions;
     what is not given follows from the class of the arm."""
-    from ..data.arm_classes import CLASSES
+    from ..data.noise import CLASSES
 
     if given["socket"] and given["sockets"] is not None:
         raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")

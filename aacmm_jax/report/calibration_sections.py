@@ -11,7 +11,7 @@ from ..core.units import DEG, people_read
 from ..diagnostics.pose_residuals import observation_residuals
 from ..diagnostics.tried_poses import TriedPoses, tried_poses
 from ..kinematics.arm import joint_limits, parameter_unit
-from ..model.metrics import pose_outliers
+from ..model.sockets import pose_outliers
 from ..plot.charts import Chart, Marks, Plot, linear, names, thinned
 from ..plot.lengths import tried_chart, volume_chart
 from ..plot.parameters import bounds_chart, change_chart, correlation_chart, functions_chart, singular_chart
