@@ -80,7 +80,8 @@ def parameter_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None
 
 
 def _changes_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
-    drift, ratio = trend.drifts[-1], _ratio(trend.change, trend.expanded)
+    drift = trend.drifts[-1]
+    ratio = np.divide(trend.change, trend.expanded, out=np.full_like(trend.change, np.nan), where=trend.expanded > 0)
     ratio[0] = 0.0
     last = np.abs(np.nan_to_num(ratio[-1]))
     named = [i for i in np.argsort(-last) if last[i] > 1][: len(SERIES)]
@@ -128,13 +129,10 @@ def _changes_of_two(drift: Drift) -> Plot:
     chosen = [
         i for i, name in enumerate(drift.names) if not drift.reasons[i] and (name in listed or bool(drift.moved[i]))
     ]
-    ratio, moved = _ratio(drift.change, drift.expanded)[chosen], drift.moved[chosen]
-    x = np.arange(len(chosen))
-    labels = [
-        drift.names[i] + (f" {in_words(drift.units[i], float(drift.change[i]))}" if drift.moved[i] else "")
-        for i in chosen
-    ]
-    axis = names("", labels)
+    change, expanded, moved = drift.change[chosen], drift.expanded[chosen], drift.moved[chosen]
+    ratio, x = np.divide(change, expanded, out=np.full_like(change, np.nan), where=expanded > 0), np.arange(len(chosen))
+    said = [f" {in_words(drift.units[i], float(drift.change[i]))}" if drift.moved[i] else "" for i in chosen]
+    axis = names("", [drift.names[i] + words for i, words in zip(chosen, said, strict=True)])
     marks = (
         _within(axis),
         Marks("", x, ratio, "bars", low=np.minimum(ratio, 0), high=np.maximum(ratio, 0), size=2),
@@ -163,11 +161,6 @@ def _lengths_of_two(drift: Drift) -> Plot:
             marks.append(Marks(name, x, [0, height, np.nan, height, 0], symbol, tone))
     title = f"change of {lengths.length:g} mm lengths over the volume [um]"
     return Plot(linear(title, edges, *(part.x for part in marks)), linear("lengths", counts, zero=True), tuple(marks))
-
-
-def _ratio(change: np.ndarray, expanded: np.ndarray) -> np.ndarray:
-    """Changes over their expanded uncertainty; NaN without one."""
-    return np.where(expanded > 0, change / np.where(expanded > 0, expanded, 1.0), np.nan)
 
 
 def _ratio_axis(ratio: np.ndarray) -> Axis:

@@ -63,6 +63,11 @@ class Groups(NamedTuple):
         return cls(names, sizes, kinds, "observation" if others else "socket")
 
     @property
+    def centre(self) -> str:
+        """What the distance of a pose is from."""
+        return "geometry" if self.word == "observation" else "socket's centroid"
+
+    @property
     def owner(self) -> np.ndarray:
         """Index of the group of each pose."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
@@ -124,9 +129,8 @@ def pose_chart(
     ticks, edges = groups.parts()
     x = linear("pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}",
                [0.0, len(last) + 1.0], margin=0.0)  # fmt: skip
-    centre = "geometry" if groups.word == "observation" else "socket's centroid"
     y = {"standard deviations": "residual", "deg": "angle between orientations"}.get(
-        unit, f"distance from the {centre}"
+        unit, f"distance from the {groups.centre}"
     )
     plot = Plot(
         x._replace(ticks=ticks, named=True) if ticks else x,
@@ -166,8 +170,8 @@ def distances_in(capture: Capture, evaluation: Evaluation) -> np.ndarray:
 
 def arms_chart(capture: Capture, arms: Mapping[str, np.ndarray], most: int | None = None) -> Chart:
     """Distances of all poses by the nominal and by the calibrated arm."""
-    what = "geometry" if capture.observations else "socket's centroid"
-    return pose_chart("stages", f"Distance of every pose from its {what}", Groups.of(capture), arms, most=most)
+    groups = Groups.of(capture)
+    return pose_chart("stages", f"Distance of every pose from its {groups.centre}", groups, arms, most=most)
 
 
 def distances_by_arm(record: CalibrationRecord) -> dict[str, np.ndarray]:
@@ -188,9 +192,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
-        >>> axes = aj.plot.pose_distances(record)
-        >>> print(axes.get_ylabel())
-        distance from the socket's centroid [mm]
+        >>> aj.plot.pose_distances(record).figure.savefig("figure.svg")
     """
     return draw(arms_chart(record.recording.capture, distances_by_arm(record)).plots[0], axes)
 

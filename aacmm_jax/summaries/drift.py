@@ -73,7 +73,7 @@ def lengths_summary(lengths: LengthChange) -> dict[str, Any]:
         "places": len(lengths.change),
         "rms_mm": lengths.rms,
         "rms_by_chance_mm": _finite(lengths.rms_by_chance),
-        "percentile_95_mm": lengths.percentile_95,
+        "percentile_95_mm": float(np.quantile(np.abs(lengths.change), 0.95)),
         "largest_mm": lengths.largest,
         "mean_mm": float(np.mean(lengths.change)),
         "mean_um_per_m": 1e6 * lengths.scale_change,

@@ -24,8 +24,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "uncertainty/identifiability.py": ("sentences", "_by_more_sockets"),
     "calibration/scale_anchor.py": ("warn_of_known_scale",),
     "acceptance/record.py": ("evaluation_of", "unstated_uncertainty_warning", "SIMULATED"),
-    "acceptance/procedure_items.py": ("socket_in_zone",),
-    "report/study.py": ("_warnings",),
+    "acceptance/procedure.py": ("_socket_in_zone",),
+    "report/studies.py": ("_warnings",),
     "solver/reason.py": ("Reason",),
     "core/compilation_cache.py": ("set_up",),
 }
