@@ -56,7 +56,7 @@ def planned_arm(
     """
     from ..data.arm_classes import CLASSES
     from ..files.cells import load_cell
-    from ..planning.options import PlanOptions
+    from ..planning.problem import PlanOptions
 
     assumed = assumed_noise(arm, links, noise)
     file, wanted, radius = cell

@@ -27,7 +27,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "acceptance/procedure.py": ("_socket_in_zone",),
     "report/studies.py": ("_warnings",),
     "solver/reason.py": ("Reason",),
-    "core/compilation_cache.py": ("set_up",),
+    "core/jax_setup.py": ("set_up",),
 }
 # Parts of sentences, by their beginning, and what is no warning.
 PARTS = (
