@@ -48,16 +48,17 @@ def optional(tag: str, words: str | None) -> Element | None:
     return None if words is None else element(tag, words)
 
 
-def english(tag: str, words: str) -> Element:
-    """A term or sentence of this package, in English."""
+def text(tag: str, words: str, lang: str | None = None) -> Element:
+    """A name or text given by people, in whatever language where none is stated."""
     content = element("content", words)
-    content.set("lang", "en")
+    if lang is not None:
+        content.set("lang", lang)
     return element(tag, content)
 
 
-def text(tag: str, words: str) -> Element:
-    """A name or text given by people, in whatever language."""
-    return element(tag, element("content", words))
+def english(tag: str, words: str) -> Element:
+    """A term or sentence of this package, in English."""
+    return text(tag, words, "en")
 
 
 def named(tag: str, name: str, *children: Child, says: str = "", ref_type: str | None = None) -> Element:
