@@ -21,8 +21,7 @@ from ..core.arguments import Range, checked, checked_arguments
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, names_in
-from ..data.recording import Recording
-from ..data.sphere import checked_sphere
+from ..data.recording import Recording, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
 from ..kinematics.parameters import ArmSpecification, Parameters
@@ -322,6 +321,7 @@ def evaluation_of(
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
             f"'{record.recording.nominal.name}'; check that it is the same arm."
         )
+    made_for = (*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres))
     evaluation = EvaluationRecord(
         recording._replace(nominal=record.recording.nominal),
         record.calibrated,
@@ -329,7 +329,7 @@ def evaluation_of(
         limits=checked_limits(limits or {}),
         u_test=u_test,
         maxima=dict(maxima or {}),
-        standards=checked_standards(_made_for(recording) if standards is None else standards),
+        standards=checked_standards(made_for if standards is None else standards),
         uncertainty=uncertainty_of(record),
         influences=influences,
         rule=rule,
@@ -364,11 +364,6 @@ def check_geometry(arm: Arm, capture: Capture) -> None:
     """Raise `InputError` where observations do not determine their own unknowns."""
     space = to_numpy(Parameters(arm, ("d_1",)))
     check_observed(Observed.of(capture, arm), space, np.asarray(space.vector()), 0)
-
-
-def _made_for(recording: Recording) -> tuple[str, ...]:
-    """Standards whose acceptance procedure a recording was made for: as it says, or as the spheres say it has."""
-    return (*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres))
 
 
 def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:

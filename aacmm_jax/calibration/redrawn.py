@@ -27,7 +27,7 @@ from ..kinematics.corrections import term_of
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
-from ..model.socket_sums import membership
+from ..model.sockets import membership
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS

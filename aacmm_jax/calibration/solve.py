@@ -22,8 +22,8 @@ from ..core.numpy_or_jax import AnyArray, added_to, namespace, set_at
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds
 from ..model.elimination import with_linear_geometry
-from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
+from ..model.sockets import Repeatability, no_repeatability, repeatability
 from ..uncertainty import linear_propagation as propagation
 from ..uncertainty.covariance import STATED, ParameterCovariance
 from ..uncertainty.degrees_of_freedom import Components

@@ -313,7 +313,9 @@ def _covariance(record: CalibrationRecord) -> Element | None:
     rows = []
     for i, values, unit in zip(index, covariance.tolist(), units, strict=True):
         products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
-        rows.append(xml.table_row(record.names[i], values, products))
+        numbers = xml.si("valueXMLList", " ".join(f"{value:.8g}" for value in values))
+        row = xml.si("realListXMLList", numbers, xml.si("unitXMLList", " ".join(products)))
+        rows.append(element("quantity", text("name", record.names[i]), row))
     return _result(
         "Covariance matrix",
         "Of the parameters with an uncertainty of their own, a row each, columns in the same order. The diagonal has "
