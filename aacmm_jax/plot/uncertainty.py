@@ -6,7 +6,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.units import DEG
-from ..diagnostics.tried_poses import TriedPoses
+from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.tables import decimals_for, format_number
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
