@@ -17,7 +17,7 @@ from ..data.capture import Capture
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.observed import Observed, ends_of
 from ..uncertainty.active_bounds import of_active_bounds
-from ..uncertainty.linear_propagation import covariance_with, rows_of_functions
+from ..uncertainty.linear_propagation import by_covariances, rows_of_functions
 from ..uncertainty.linearisation import Linearisation
 from .results import Calibration, Identification, ObservedMetrics
 from .scale_anchor import fixes_scale
@@ -197,7 +197,8 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
     can_scale = solution.identification.anchor.can_scale
     foot = xp.stack([xp.zeros(()), xp.zeros(()), linear.space.base.d[0]]) if can_scale else None
     variance = solution.covariance_of(measured.rows)[0, 0] + measured.added
-    _, with_k = covariance_with(solution.influence, measured.rows, solution.covariances)
+    answer = solution.influence.response(by_covariances(measured.rows, solution.covariances))
+    with_k = [part[..., 0] for part in answer[1]]  # covariance of private geometry with k, natural steps
     covariances = {}
     for name in observed.names:
         matrix = metrics.geometry_covariance[name]
