@@ -125,7 +125,8 @@ def contradicting_groups(
     number = 0
     for _ in range((len(grams) - 1) // 2):
         # Every group that is left against the others; not those that add no equation, or leave none to compare.
-        whole = _Gram(*(sum(parts) for parts in zip(*(gram for gram in grams.values() if gram.rows), strict=True)))
+        left = [gram for gram in grams.values() if gram.rows]
+        whole = _Gram(np.sum([gram.matrix for gram in left], axis=0), sum(gram.rows for gram in left))
         diagonal, tests = np.diag(whole.matrix)[:-1], []
         everything = whole.fit(diagonal)
         for group, gram in grams.items():

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.redrawn import covariance_of_lengths
-from ..calibration.scale_fix import ends_between, positions_at_ends
+from ..calibration.stages import ends_between, positions_at_ends
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..model.observed import Observed

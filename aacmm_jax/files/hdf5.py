@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..core.backend import check_backend, is_from_jax
 from ..core.errors import InputError
+from ..core.jax_setup import check_backend, is_from_jax
 from .inputs import STREAMED, largest_file, open_input, storable_name
 from .outputs import ELSEWHERE, storable, write_atomically
 from .reader_process import damaged, read_through, start, vouch_for

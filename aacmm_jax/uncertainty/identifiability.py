@@ -203,7 +203,7 @@ def _of_spectrum(spectrum: "_Spectrum", weak: tuple[TradeOff, ...], known: set[s
         groups.append((tuple(chief.tolist()), tuple(every.tolist())))
     # Of a trade-off, the parameter to fix, or its strongest partner where that is no coefficient.
     groups += [(trade_off.names[: 1 + (trade_off.names[0] not in functions)], trade_off.names) for trade_off in weak]
-    reasons, unexplained = why_undetermined(base, spectrum.agreeing.observed.q, groups)
+    reasons, unexplained = why_undetermined(base, np.asarray(spectrum.agreeing.observed.q), groups)
     return Observability(
         names=names,
         poses=len(spectrum.agreeing.observed.q),
