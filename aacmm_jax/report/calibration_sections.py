@@ -8,8 +8,8 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG, people_read
+from ..diagnostics.joint_travel import tried_poses
 from ..diagnostics.pose_residuals import observation_residuals
-from ..diagnostics.tried_poses import tried_poses
 from ..kinematics.arm import joint_limits, parameter_unit
 from ..model.sockets import pose_outliers
 from ..plot.charts import Chart, Marks, Plot, linear, names, thinned

@@ -20,7 +20,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "summaries/correction.py": ("correction_summary",),
     "cli/compare_commands.py": ("_compared",),
     "drift/comparison.py": ("_warnings",),
-    "data/copies.py": ("sentences",),
+    "data/capture_data.py": ("sentences",),
     "uncertainty/identifiability.py": ("sentences", "_by_more_sockets"),
     "calibration/scale_anchor.py": ("warn_of_known_scale",),
     "acceptance/record.py": ("evaluation_of", "unstated_uncertainty_warning", "SIMULATED"),
