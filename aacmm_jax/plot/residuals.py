@@ -299,6 +299,12 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
         (order, "pose, in the order of the capture", residuals.vector[:, i], f"along {axis}")
         for i, axis in enumerate("xyz")
     ]
+    values = residuals.normalised[np.isfinite(residuals.normalised)]
+    edges, fine = np.linspace(-4.5, 4.5, 31), np.linspace(-4.5, 4.5, 121)
+    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+    normal = len(values) * (edges[1] - edges[0]) * np.exp(-(fine**2) / 2) / math.sqrt(2 * math.pi)
+    marks = histogram(counts, edges, "residuals"), Marks("normal distribution", fine, normal, "line", "accent")
+    x = linear("residual [standard deviations]", edges, margin=0.0)
     rows = (
         (
             "by-joint",
@@ -318,20 +324,10 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
             "histogram",
             "Histogram of the residuals",
             "All coordinates of all poses; those beyond 4.5 standard deviations stand in the outermost boxes.",
-            (_histogram(residuals.normalised[np.isfinite(residuals.normalised)]),),
+            (Plot(x, linear("coordinates", counts, normal, zero=True), marks, height=220),),
         ),
     )
     return [Chart(*row) for row in rows]
-
-
-def _histogram(values: np.ndarray) -> Plot:
-    edges = np.linspace(-4.5, 4.5, 31)
-    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
-    fine = np.linspace(edges[0], edges[-1], 121)
-    normal = len(values) * (edges[1] - edges[0]) * np.exp(-(fine**2) / 2) / math.sqrt(2 * math.pi)
-    marks = histogram(counts, edges, "residuals"), Marks("normal distribution", fine, normal, "line", "accent")
-    x = linear("residual [standard deviations]", edges, margin=0.0)
-    return Plot(x, linear("coordinates", counts, normal, zero=True), marks, height=220)
 
 
 def _patterns(panels: Sequence[tuple[np.ndarray, str, np.ndarray, str]], most: int) -> tuple[Plot, ...]:
