@@ -48,6 +48,7 @@ PARTS = (
     "... is not a plausible scale",
     "k = ... is not a plausible scale",
     "No Reason",
+    "Fix one of each (--held).",
 )
 
 
