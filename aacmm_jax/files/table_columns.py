@@ -8,7 +8,7 @@ from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..kinematics.arm import Arm
-from .text_lines import Column, bare_name, stem_and_number
+from .text_lines import Column, are_numbered, bare_name, stem_and_number
 from .text_table import TextTable
 
 # Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...
@@ -106,7 +106,7 @@ def reading_columns(
     free = [i for i in range(table.width) if i not in taken and i not in temperature]
     names = [bare_name(table.header[i]) for i in free if table.header]
     foreign = any(_NO_JOINT.fullmatch(word) for name in names for word in _words(name)[:1])
-    if len(free) == joints and not foreign and not named and not table.misnumbered:
+    if len(free) == joints and not foreign and not named and not (table.misnamed and are_numbered(table.title)):
         table.check_ascending(free, line)
         if _Family(free, False, True) in families or joints == 1 or not any(names):
             return free
