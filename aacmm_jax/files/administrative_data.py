@@ -164,9 +164,6 @@ def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
     Returns:
         The data, checked.
 
-    Raises:
-        InputError: names the file, the key in it and what to do.
-
     Example:
         >>> from pathlib import Path
         >>> _ = Path("laboratory.toml").write_text('laboratory = { name = "Metrology", city = "Braunschweig" }')

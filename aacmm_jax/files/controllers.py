@@ -58,9 +58,6 @@ def dh_table(
         units: ``"mm-deg"`` or ``"m-rad"``.
         base: The first frame in a robot's base link, mm, where it is another one.
 
-    Raises:
-        InputError: The convention or the units are unknown, or the arm is a batch.
-
     Example:
         >>> for line in aj.files.dh_table(arm).splitlines()[-3:]:
         ...     print(line)
@@ -108,9 +105,6 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
         q: Readings, rad, or mm of prismatic joints: of the capture, or of the poses that matter.
-
-    Raises:
-        InputError: The arms or the readings have other numbers of joints.
 
     Example:
         >>> zeros = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))

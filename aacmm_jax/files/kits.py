@@ -71,9 +71,6 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
     Returns:
         The things, for `planning.plan_kit`; their ``simulated`` for `simulate`.
 
-    Raises:
-        InputError: Naming the file and the place in it.
-
     Example:
         >>> from pathlib import Path
         >>> _ = Path("kit.toml").write_text('''[[socket]]

@@ -34,45 +34,19 @@ def read_manifest(path: str | os.PathLike) -> Recording:
 
     A field in braces matches part of a path and makes one socket for each value found: with
     ``file = "run_1/{place}/hole_{hole}.csv"`` and ``name = "{place}/{hole}"``, the length ``from = "{place}/0"``,
-    ``to = "{place}/1"`` is measured at every place. A field that makes up a whole folder or file name, such as
-    ``{place}``, matches anything but "/"; next to other text in a name, as ``{hole}``, it matches letters, digits and
-    "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
-    files that match such a shell pattern. ``visits = "files"`` says that the tip was lifted between the ``files`` of a
-    socket. Angles: reading -> sign * (reading - offset), in the stated unit. Readings of
-    prismatic joints are in ``linear_unit`` of ``[angles]``, by default mm; sign and offset hold for them too.
-    A column temperature_C, by that name in the header of every table, is the temperature of the arm, C;
-    ``temperature_C = 22.5`` in a table of the manifest states it for all of its poses. In ``[[length]]`` it is that of
-    the artefact, with its ``expansion`` (1/K), where ``value`` holds at 20 C.
+    ``to = "{place}/1"`` is measured at every place. Angles: reading -> sign * (reading - offset), in the stated unit.
+    ``columns`` picks by header name, shell pattern or number; where nothing is stated, readings are the columns with
+    names of joints in the header, or all. Units in the header must agree with those stated. All keys are listed in the
+    reference of file formats, and explained in the guide to manifests.
 
-    ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
-    ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
-    holds readings and measured values (or ``readings`` is a file of readings with as many rows).
-
-    In all tables ``columns`` picks by header name, shell pattern or number, ``columns = { q = "q*_rad", points =
-    ["x", "y", "z"] }``, or those of the readings alone, ``columns = ["J1", "J2", "J3"]``. Where nothing is stated, they
-    are those with names of joints in the header, or all. ``units``, ``rotation``, ``coverage_factor``, ``delimiter``,
-    ``decimal`` and ``skip`` say how they are written, ``group`` names a column that divides the table into several
-    sockets or observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated. Units in the header
-    must agree with those stated.
-
-    ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
-    each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.
-    ``[sessions] probe = "same"`` says that the probe was not remounted between them.
-    ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken, and
-    ``measuring_range`` the diameter of the measuring volume that the arm's maker states, mm.
-
-    ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Of a URDF, ``base`` and ``tip``
-    name the links at the ends of the chain; ``probe`` is a tool's tip in the last frame, mm, of an arm that states
-    none. Where the arm's file names no free parameters, they are those that such observations determine.
+    ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Where the arm's file names no free
+    parameters, they are those that such observations determine.
 
     Args:
         path: the manifest (TOML).
 
     Returns:
         Capture and nominal arm, in mm and rad, with the SHA-256 of each file.
-
-    Raises:
-        InputError: names the file, the place in it and what to do.
 
     Example:
         >>> from pathlib import Path
@@ -144,9 +118,8 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
 def read_points(path: str | os.PathLike) -> Measured:
     """Read a manifest of points and every file that it names; paths are relative to the manifest.
 
-    ``[points]`` has ``unit`` (mm, m, um, inch; by default that of the header), optionally ``columns`` of x, y and z,
-    the ``measuring_range`` that the maker states (a diameter, mm), and, for the zones of ASME B89.4.22, the arm's
-    ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
+    ``[points]`` has ``unit`` (mm, m, um, inch; by default that of the header), and for the zones of ASME B89.4.22 the
+    arm's ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
     `read_manifest`, with files of x, y, z: columns of these names, or the only three.
 
     Args:
@@ -154,9 +127,6 @@ def read_points(path: str | os.PathLike) -> Measured:
 
     Returns:
         The measured points, mm.
-
-    Raises:
-        InputError: names the file, the place in it and what to do.
 
     Example:
         >>> from pathlib import Path

@@ -69,9 +69,6 @@ def ur_kinematics_yaml(arm: Arm) -> str:
     Args:
         arm: One arm; mm and rad become m and rad in the file.
 
-    Raises:
-        InputError: The arm does not have six joints.
-
     Example:
         >>> for line in aj.files.ur_kinematics_yaml(aj.load_arm("ur10e")).splitlines()[-3:]:
         ...     print(line)
