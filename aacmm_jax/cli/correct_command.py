@@ -76,8 +76,8 @@ def correct(
     """
     from ..core.numpy_or_jax import to_numpy
     from ..files.calibrations import load_calibration
-    from ..files.commanded_poses import corrected_csv, read_commanded_poses
     from ..files.outputs import write_text
+    from ..files.pose_tables import corrected_csv, read_poses
     from ..kinematics.correction import corrected_readings, readings_at_poses
     from ..summaries.correction import correction_summary
 
@@ -89,7 +89,7 @@ def correct(
         if probe is not None:
             tool = numbers_option("--probe", probe, "X,Y,Z in mm", 3)
             nominal, calibrated = nominal.replace(probe=tool), calibrated.replace(probe=tool)
-        commanded = read_commanded_poses(
+        commanded = read_poses(
             InputFile(poses), nominal, unit=unit, near=begin, columns=picked, length_unit=length_unit
         )
         q = _at_temperature(commanded, calibrated, temperature)

@@ -80,22 +80,23 @@ def _of_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any
     from ..data.observations.measured import MeasuredPoints
     from ..diagnostics.joint_travel import standing_rows
     from ..diagnostics.reading_check import check_readings
-    from ..files.commanded_poses import read_known_poses
+    from ..files.pose_tables import read_poses
 
-    table = read_known_poses(InputFile(path), specification.arm.joints, unit=unit)
-    positions, rotations = table.positions, table.rotations
+    table = read_poses(InputFile(path), specification.arm, unit=unit, recorded=True)
+    positions = None if table.poses is None else table.poses[:, :3, 3]
+    rotations = table.poses[:, :3, :3] if table.poses is not None and table.oriented else None
     if positions is not None and specification.urdf is not None:
         from ..files.urdf import urdf_chain
 
         frame = np.linalg.inv(urdf_chain(specification.urdf).base)
         positions = positions @ frame[:3, :3].T + frame[:3, 3]
         rotations = None if rotations is None else frame[:3, :3] @ rotations
-    tips = {"sockets": table.sockets, "positions": positions, "rotations": rotations}
+    tips = {"sockets": table.sockets if positions is None else None, "positions": positions, "rotations": rotations}
     check = with_spinner("Comparing", lambda: check_readings(specification.arm, table.q, **tips))
     if positions is not None:
         capture = Capture({}, observations=[MeasuredPoints("table", table.q, positions, station="table")])
     else:
-        owner = np.array(table.sockets or ())
+        owner = np.array(table.sockets)
         capture = Capture({name: table.q[owner == name] for name in dict.fromkeys(owner.tolist())})
     summary = _summary(specification, check, table.unit, table.length_unit, None)
     summary["standing"] = standing_rows(specification.arm, capture)
