@@ -66,13 +66,7 @@ class Content:
 
     Whatever leads out of the file is refused (soft and external links, external storage, virtual arrays), and so is
     what no file of this package has: groups within groups, compound and reference types, and arrays that claim to be
-    much larger than the file.
-
-    Args:
-        path: The file's name, for messages.
-        file: The open `h5py.File`.
-        size: Its size in bytes.
-        largest: The most bytes that may be read into memory.
+    much larger than the file, of ``size`` bytes; ``largest`` is the most bytes that may be read into memory.
     """
 
     def __init__(self, path: str | os.PathLike, file: Any, size: int, largest: int):
@@ -172,8 +166,9 @@ class Content:
         elif declared <= _BUFFER:
             _read(item, shape, kind)
         else:
-            for rows in _parts(shape, kind.itemsize):
-                h5py.Dataset(item)[rows]
+            step = max(1, _BUFFER * shape[0] // declared)
+            for first in range(0, shape[0], step):
+                h5py.Dataset(item)[first : first + step]
 
     def _check_attributes(self, item: Any, read: bool = True) -> None:
         for index in range(h5py.h5a.get_num_attrs(item)):
@@ -210,14 +205,3 @@ def _read(item: Any, shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
     if values.size:
         item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
     return values
-
-
-def _parts(shape: tuple[int, ...], itemsize: int) -> Iterator[tuple[slice, ...]]:
-    """Parts of an array, in the order of its elements, each of which fits into the buffer."""
-    row = math.prod(shape[1:]) * itemsize
-    if row <= _BUFFER:
-        step = _BUFFER // max(row, 1)
-        yield from ((slice(first, first + step),) for first in range(0, shape[0], step))
-        return
-    for first in range(shape[0]):
-        yield from ((slice(first, first + 1), *rest) for rest in _parts(shape[1:], itemsize))
