@@ -192,10 +192,30 @@ class TextTable:
                 f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; leave it "
                 "out if it is a comment, else write its first cell without #."
             )
-        self._check_end(picked)
+        # A file without a last line's end may be cut: then its last number has fewer decimals than the others.
+        decimals = [len(row[-1].partition(self._decimal)[2]) for row in self._rows]
+        if self.width - 1 in picked and not self._ended and len(decimals) >= _FEW and decimals[-1] < min(decimals[:-1]):
+            raise InputError(
+                f"{self.path} line {self._lines[-1]}: the last number, {quoted(self._rows[-1][-1])}, has fewer digits "
+                "than all above it and no end of the line after it, so the file may be cut; copy it again, or end that "
+                "line if it is complete."
+            )
         table = np.stack([self._column(i) for i in picked], axis=1)
-        if measured:
-            self._check_measured(picked, table, stated)
+        if not measured:
+            return table
+        cells, count = [self._rows[0][i] for i in picked], len(picked)
+        if count > 1 and any(sorted(cells) == sorted(map(str, range(i, i + count))) for i in (0, 1)):
+            order = ", ".join(str(picked[i] + 1) for i in np.argsort(table[0]))
+            raise InputError(
+                f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; add "
+                f"skip = {self._lines[0]} and columns = [{order}], or write it with decimal points if it was measured."
+            )
+        for (i, column), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
+            if not stated and self.length >= _FEW and np.ptp(column) > 0 and np.array_equal(column, other):
+                raise InputError(
+                    f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
+                    f"columns = [{', '.join(str(index + 1) for index in picked)}] if these are right."
+                )
         return table
 
     def _column(self, index: int) -> np.ndarray:
@@ -222,48 +242,12 @@ class TextTable:
             raise InputError(f"{place} is not finite, or larger than anything that is measured; correct it.")
         return value
 
-    def is_numeric(self, index: int) -> bool:
-        """Whether a column begins and ends with a number, also with a decimal comma."""
-        return all(is_number(row[index].replace(",", ".", 1)) for row in (self._rows[0], self._rows[-1]))
-
-    def ascends(self, index: int) -> bool:
-        """Whether every number of a column is larger than the one before it, as those of times and indices are."""
-        try:
-            values = [float(row[index].replace(",", ".")) for row in self._rows]
-        except ValueError:
-            return False
-        return len(values) > 1 and bool(np.all(np.diff(values) > 0))
+    def cells(self, index: int) -> list[str]:
+        """The cells of a column, from 0, with decimal points."""
+        return [row[index].replace(",", ".", 1) for row in self._rows]
 
     def texts(self, column: Column) -> np.ndarray:
         """The cells of one column."""
         (index,) = self.pick([column])
         self._hashes = self._hashes or index == 0  # "#2" is a text
         return np.array([row[index].strip("\"'") for row in self._rows])
-
-    def _check_measured(self, picked: Sequence[int], table: np.ndarray, stated: bool) -> None:
-        """Refuse numbers of columns as the first row, and a column that is there twice."""
-        cells = [self._rows[0][i] for i in picked]
-        count = len(cells)
-        if count > 1 and any(sorted(cells) == sorted(map(str, range(i, i + count))) for i in (0, 1)):
-            order = ", ".join(str(picked[i] + 1) for i in np.argsort(table[0]))
-            raise InputError(
-                f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; add "
-                f"skip = {self._lines[0]} and columns = [{order}], or write it with decimal points if it was measured."
-            )
-        for (i, one), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
-            if not stated and self.length >= _FEW and np.ptp(one) > 0 and np.array_equal(one, other):
-                raise InputError(
-                    f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
-                    f"columns = [{', '.join(str(column + 1) for column in picked)}] if these are right."
-                )
-
-    def _check_end(self, picked: Sequence[int]) -> None:
-        """Refuse a last number with fewer decimals than all others of its column, in a file without a last line's end,
-        which may be cut."""
-        decimals = [len(row[-1].partition(self._decimal)[2]) for row in self._rows]
-        if self.width - 1 in picked and not self._ended and len(decimals) >= _FEW and decimals[-1] < min(decimals[:-1]):
-            raise InputError(
-                f"{self.path} line {self._lines[-1]}: the last number, {quoted(self._rows[-1][-1])}, has fewer digits "
-                "than all above it and no end of the line after it, so the file may be cut; copy it again, or end that "
-                "line if it is complete."
-            )
