@@ -76,8 +76,8 @@ def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
         >>> print(aj.files.load_compared_models("models.h5")["recommended"])
         dh
     """
-    with undamaged(path), opened(path, (KIND,)) as content:
-        summary = json.loads(str(content.values(content.file.id, "summary")))
+    with undamaged(path), opened(path, (KIND,)) as file:
+        summary = json.loads(file["summary"].asstr()[()])
         _check(path, summary)
         return summary
 

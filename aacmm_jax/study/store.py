@@ -238,8 +238,8 @@ def check_results(path: Path, stored: StoredStudy) -> None:
     if stored.parts is not None:
         return
     layout = stored.layout
-    with opened(path, ("study",), verify=False) as content:
-        arrays = {name: content.dataset("trials", name) for name in VARIABLES}
+    with opened(path, ("study",), verify=False) as file:
+        arrays = {name: file["trials"][name] for name in VARIABLES}
         shapes = any(array.shape != layout.shape(name) for name, array in arrays.items())
         check_sense(path, {"its results have other shapes than its study": shapes})
         ran = stored.finished and (arrays["converged"][()] != fill_of("converged")).all()
@@ -252,8 +252,8 @@ def rows_of(
     """Results of one cell, some trials at a time: which trials, and their arrays."""
     layout = stored.layout
     if stored.parts is None:
-        with opened(path, ("study",), verify=False) as content:
-            trials = {name: content.dataset("trials", name) for name in names}
+        with opened(path, ("study",), verify=False) as file:
+            trials = {name: file["trials"][name] for name in names}
             for first in range(0, layout.trials, _TRIALS_IN_MEMORY):
                 part = slice(first, min(first + _TRIALS_IN_MEMORY, layout.trials))
                 yield part, {name: trials[name][cell, part] for name in names}
