@@ -15,7 +15,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from datetime import datetime
+from multiprocessing import get_context
 from pathlib import Path
 
 import h5py
@@ -110,15 +112,15 @@ def differs(one: Path, other: Path) -> float:
     return largest
 
 
-def run_into(path: str, trials: str, chunk: str, devices: str, dask: str) -> dict:
+def run_into(path: str, trials: str, chunk: str, devices: str, processes: str) -> dict:
     import jax
 
     jax.config.update("jax_num_cpu_devices", int(devices))
     import aacmm_jax as aj
 
-    if dask != "0":
-        with aj.study.dask_executor("local", int(dask)) as (executor, workers):
-            outcome = aj.study.run_study(sized(int(trials)), path, executor=executor, workers=workers, chunk=int(chunk))
+    if processes != "0":
+        with ProcessPoolExecutor(int(processes), mp_context=get_context("spawn")) as executor:
+            outcome = aj.study.run_study(sized(int(trials)), path, executor=executor, chunk=int(chunk))
     else:
         outcome = aj.study.run_study(sized(int(trials)), path, chunk=int(chunk))
     return {"finished": outcome.finished}
@@ -129,8 +131,8 @@ def same() -> dict:
         "chunk 256": (256, 1, 0),
         "2 devices": (1000, 2, 0),
         "2 devices, chunk 256": (256, 2, 0),
-        "2 Dask workers": (1000, 1, 2),
-        "2 Dask workers, chunk 256": (256, 1, 2),
+        "2 processes": (1000, 1, 2),
+        "2 processes, chunk 256": (256, 1, 2),
     }
     with tempfile.TemporaryDirectory() as folder:
         first = Path(folder) / "first.h5"

@@ -1,10 +1,10 @@
 """Calibrations: one and many of them, repeated on drawn data, evaluated on others; and their results.
 
-A calibration in the order of the data: `task` (one problem, checked), `weighted_least_squares` (its unknowns, box and
-weights), `solve` (parameters, geometry and covariance), `scale_fix` and `stages` (k, and the division by it). Beside
-that path: `prior_fit`, `scale_anchor`, `batch` with `batch_kernel`, `redrawn` with `sampling`, `evaluation` with
-`prediction`, `results` and `record`. Public calls are `pipeline.single`, `batch`, `sampling` and `evaluation`; the file
-of a calibration is in `files.calibrations`.
+A calibration in the order of the data: `task` (one problem, checked, and its weighted least squares), `solve`
+(parameters, geometry and covariance), and `stages` (k, and the division by it). Beside that path: `prior_fit`,
+`scale_anchor`, `batch` with `batch_kernel`, `redrawn` with `sampling`, `evaluation` with `prediction`, `results` and
+`record`. Public calls are `pipeline.single`, `batch`, `sampling` and `evaluation`; the file of a calibration is in
+`files.calibrations`.
 """
 
 import lazy_loader as _lazy_loader

@@ -32,7 +32,7 @@ from ..solver.reason import numbers_of, reasons
 from .batch_kernel import Form, Problems, selected, solve_chunk
 from .results import ManyCalibrations, ManyIdentifications
 from .scale_anchor import Method
-from .scale_fix import divided
+from .stages import divided
 from .task import (
     Solving,
     anchor_of,

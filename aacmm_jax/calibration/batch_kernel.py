@@ -7,7 +7,6 @@ to the bit whatever the chunk.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,17 +25,15 @@ from ..model.observed import Observed
 from ..model.robust import Loss
 from ..model.rows import PointRows, Whitening
 from ..model.scale import scale_and_weights
+from ..solver import levenberg_marquardt
 from ..solver.active_set import Box, choose
-from ..solver.levenberg_marquardt import Rules, advance
-from ..solver.levenberg_marquardt import begin as begin_steps
 from ..solver.reason import MAX_STEPS, RUNNING, numbers_of, reasons
 from ..uncertainty.covariance import NoiseModel
-from .prior_fit import OfPrior, fitted_with_prior, prior_of, weights
+from .prior_fit import fitted_with_prior, weights
 from .scale_anchor import ScaleAnchor
-from .scale_fix import ends_between
 from .solve import concluded, repeatability_of
-from .task import Task, without_lengths
-from .weighted_least_squares import Fit, State, args_of, begin, box_of, losses_of, rules_of, state_after, whitening_at
+from .stages import ends_between
+from .task import Fit, Task, args_of, begin, box_of, solves_of, state_after, whitening_at, without_lengths
 
 
 class Problems(NamedTuple):
@@ -61,9 +58,9 @@ class Form(NamedTuple):
     pose: tuple[int, ...]
     max_steps: int
     covariance: bool
-    slots: int
-    capacity: int
     axes: Problems  # trees of the axes, 0 or None
+    slots: int = 0
+    capacity: int = 0  # problems of a chunk
 
 
 class _Ended(NamedTuple):
@@ -82,14 +79,35 @@ class _Ended(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    """The problems of a chunk, prepared."""
+    """The problems of a chunk, with what is observed in each."""
 
     form: Form
     problems: Problems
-    observed: Observed
-    observed_axes: Any  # of its leaves; None where all problems share them
     noise: Noise | None
     prior: Prior | None
+    observed: Observed
+    observed_axes: Any  # of its leaves; None where all problems share them
+
+    @classmethod
+    def of(cls, form: Form, problems: Problems, noise: Noise | None, prior: Prior | None) -> "_Chunk":
+        """With what the poses do to the joints, which every evaluation needs and none changes."""
+        axes, arm = form.axes, problems.arm
+
+        def observed_of(arm: Arm, capture: Capture) -> Observed:
+            return Observed.of(capture if form.with_lengths else without_lengths(capture), arm)
+
+        if axes.capture is None and arm.corrections is None:
+            # The arm's values do not matter.
+            return cls(form, problems, noise, prior, observed_of(_pick(arm, axes.arm, 0), problems.capture), None)
+        mapped = jax.vmap(observed_of, in_axes=(axes.arm, axes.capture), axis_size=form.capacity)
+        observed = mapped(arm, problems.capture)
+        # The joints before the problems, as the chain takes them.
+        turned = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), observed.motion)
+        zeros, ones = jax.tree.map(lambda _: 0, observed), jax.tree.map(lambda _: 1, turned)
+        observed, observed_axes = (
+            eqx.tree_at(lambda tree: tree.motion, *pair) for pair in ((observed, turned), (zeros, ones))
+        )
+        return cls(form, problems, noise, prior, observed, observed_axes)
 
     def task(self, problem: Problems, observed: Observed) -> Task:
         """One problem, traced."""
@@ -99,13 +117,9 @@ class _Chunk(NamedTuple):
             bounds=Bounds(Parameters(problem.arm, form.names), problem.lower, problem.upper),
             start=jnp.clip(problem.start, problem.lower, problem.upper),
             noise=self.noise,
-            anchor=form.anchor,
-            noise_model=form.noise_model,
-            max_steps=form.max_steps,
-            loss=form.loss,
-            pose=form.pose,
-            differentiable=False,
             prior=self.prior,
+            differentiable=False,
+            **{name: getattr(form, name) for name in ("anchor", "noise_model", "max_steps", "loss", "pose")},
         )
 
     def selected(self, index: Any) -> tuple[Problems, Observed]:
@@ -115,12 +129,12 @@ class _Chunk(NamedTuple):
 
     def by_slot(self, work: Callable, extra: int) -> Callable:
         """``work(problem, task, *extra)`` for a problem in each slot, by ``(index, *extra)``."""
-        axes = (self.form.axes, self.observed_axes, *(0,) * extra)
 
-        def one(problem: Problems, observed: Observed, *extra: Any) -> Any:
+        def of_slot(problem: Problems, observed: Observed, *extra: Any) -> Any:
             return work(problem, self.task(problem, observed), *extra)
 
-        function = jax.vmap(one, in_axes=axes, axis_size=self.form.slots)
+        axes = (self.form.axes, self.observed_axes, *(0,) * extra)
+        function = jax.vmap(of_slot, in_axes=axes, axis_size=self.form.slots)
         return lambda index, *extra: function(*self.selected(index), *extra)
 
     def in_groups(self, work: Callable, *extra: Any) -> Any:
@@ -156,49 +170,28 @@ def solve_chunk(
     form: Form, problems: Problems, count: Int[Array, ""], noise: Noise | None, prior: Prior | None
 ) -> dict[str, Any]:
     """Solve the first ``count`` of the problems of a chunk: the fields of `ManyIdentifications`."""
-    chunk = _Chunk(form, problems, *_prepared(form, problems), noise, prior)
+    chunk = _Chunk.of(form, problems, noise, prior)
     first = chunk.task(*chunk.selected(jnp.asarray(0)))  # for what is the same for all
-    losses = losses_of(first)
+    solves = solves_of(first)
+    losses = [loss for loss, _ in solves]
     # With a prior the last least squares is part of what follows the loop (`_fields`).
-    solves = losses if prior_of(first) is None else losses[:-1]
+    solves = solves if first.free_prior is None else solves[:-1]
     z, whitening = chunk.in_groups(_beginning)
     ended = _Ended(z, whitening, z, *(jnp.zeros(form.capacity, dtype=kind) for kind in (jnp.int64, jnp.int32)))
-    for number, loss in enumerate(solves, 1):
-        y, steps, reason = _solve_all(chunk, loss, rules_of(number, len(losses)), ended, count)
+    for number, (loss, rules) in enumerate(solves, 1):
+
+        def again(_: Problems, task: Task, ended: _Ended, loss: Any = loss, number: int = number) -> Any:
+            # Where the next least squares begins, and its weights.
+            z, point = ended.unknowns(task, loss)
+            begun = begin(task)
+            return z, weights(task, begun, state_after(task, begun, z, point, False), losses[number])
+
+        y, steps, reason = _solve_all(chunk, loss, rules, ended, count)
         ended = ended._replace(y=y, steps=ended.steps + steps, reason=reason)
         if number < len(solves):
-            z, whitening = chunk.in_groups(partial(_again, losses[number - 1 : number + 1]), ended)
+            z, whitening = chunk.in_groups(again, ended)
             ended = ended._replace(z=z, whitening=whitening)
-    return chunk.in_groups(partial(_fields, form, losses), ended)
-
-
-def _again(
-    losses: list[Loss | None], problem: Problems, task: Task, ended: _Ended
-) -> tuple[Float[AnyArray, " z"], Whitening]:
-    """Where the next least squares begins, and its weights; of the losses, the last and the next."""
-    z, point = ended.unknowns(task, losses[0])
-    begun = begin(task)
-    return z, weights(task, begun, state_after(task, begun, z, point, False), losses[1])
-
-
-def _prepared(form: Form, problems: Problems) -> tuple[Observed, Any]:
-    """What is observed, with what the poses do to the joints, which every evaluation needs and none changes; and the
-    axes of its leaves."""
-    axes, arm = form.axes, problems.arm
-
-    def observed_of(arm: Arm, capture: Capture) -> Observed:
-        return Observed.of(capture if form.with_lengths else without_lengths(capture), arm)
-
-    if axes.capture is None and arm.corrections is None:
-        # The arm's values do not matter.
-        return observed_of(_pick(arm, axes.arm, 0), problems.capture), None
-    mapped = jax.vmap(observed_of, in_axes=(axes.arm, axes.capture), axis_size=form.capacity)
-    observed = mapped(arm, problems.capture)
-    # The joints before the problems, as the chain takes them.
-    turned = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), observed.motion)
-    zeros, ones = jax.tree.map(lambda _: 0, observed), jax.tree.map(lambda _: 1, turned)
-    of_motion = lambda tree: tree.motion  # noqa: E731
-    return eqx.tree_at(of_motion, observed, turned), eqx.tree_at(of_motion, zeros, ones)
+    return chunk.in_groups(lambda problem, task, ended: _fields(form, losses, problem, task, ended), ended)
 
 
 def _beginning(problem: Problems, task: Task) -> tuple[Float[AnyArray, " z"], Whitening]:
@@ -210,12 +203,12 @@ def _beginning(problem: Problems, task: Task) -> tuple[Float[AnyArray, " z"], Wh
         whitening = Whitening((None,) * len(task.observed.layout.groups), jnp.zeros(0), {})
         return jnp.concatenate([start[task.free], jnp.zeros(len(task.observed.steps))]), whitening
     begun = begin(task, near)
-    return begun.z, weights(task, begun, begun.state, losses_of(task)[0])
+    return begun.z, weights(task, begun, begun.state, solves_of(task)[0][0])
 
 
 def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task, ended: _Ended) -> dict[str, Any]:
     """The fields of one problem after its last least squares; that with a prior is still to come."""
-    begun, prior, of_prior = begin(task), prior_of(task), None
+    begun, prior, of_prior, free = begin(task), task.free_prior, None, task.free
     if prior is not None:
         z, point = ended.unknowns(task, losses[-2])
         z, state, last, of_prior = fitted_with_prior(task, prior, begun, state_after(task, begun, z, point, False), z)
@@ -225,7 +218,21 @@ def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task
         z, point = ended.unknowns(task, losses[-1], tips_alone or None)
         state = state_after(task, begun, z, point, True)
         last = Fit(z, ended.steps, reasons(ended.reason), jnp.zeros(()))
-    free, tips = task.free, repeatability_of(state, task.observed)
+    # Residuals in standard deviations, and k where lengths do not take part.
+    if task.needs_no_weights:
+        roots, sigma = (None,) * len(task.observed.layout.groups), state.sigma
+        whitening = Whitening(roots, jnp.zeros(0), {})
+        white = [rows.values / sigma for rows in state.point.rows]
+    else:
+        whitening, sigma = whitening_at(task, state, of_prior and of_prior.rows), 1.0
+        pairs = zip(whitening.roots, state.point.rows, strict=True)
+        white = [jnp.einsum("mab,bm->am", root, rows.values) for root, rows in pairs if root is not None]
+    spare = jnp.maximum(task.observed.equations - (z.shape[0] if of_prior is None else of_prior.effective), 1.0)
+    k = None
+    if problem.capture.lengths and not form.with_lengths:
+        own = [sigma**2 * matrices for matrices in own_covariances(task.observed, state.point, whitening)]
+        k = scale_and_weights(ends_between(task.observed, z[len(free) :], own, problem.capture))[0].value
+    tips = repeatability_of(state, task.observed)
     side = Bounds(begun.space, *(side[: len(free)] for side in begun.sides)).active(z[: len(free)])
     fields = {
         "parameters": set_at(task.start, free, z[: len(free)]),
@@ -235,37 +242,17 @@ def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task
         "steps": last.steps,
         "reason": numbers_of(last.result),
         "active": set_at(jnp.zeros(task.start.shape, dtype=side.dtype), free, side),
-        "prior": None if of_prior is None else of_prior.metrics,
-        **_agreement(form, problem, task, z, state, of_prior),
+        "prior": of_prior and of_prior.metrics,
+        "reduced_chi": jnp.sqrt(sum(jnp.sum(rows**2) for rows in white) / spare),
+        "k": k,
     }
     if form.covariance:
         fields["covariance"] = concluded(task, begun, z, state, last, of_prior).identification.covariance
     return fields
 
 
-def _agreement(
-    form: Form, problem: Problems, task: Task, z: AnyArray, state: State, of_prior: OfPrior | None
-) -> dict[str, Any]:
-    """Residuals in standard deviations, and k where lengths do not take part."""
-    if task.needs_no_weights:
-        roots = (None,) * len(task.observed.layout.groups)
-        whitening, sigma = Whitening(roots, jnp.zeros(0), {}), state.sigma
-        white = [rows.values / sigma for rows in state.point.rows]
-    else:
-        whitening, sigma = whitening_at(task, state, None if of_prior is None else of_prior.rows), 1.0
-        pairs = zip(whitening.roots, state.point.rows, strict=True)
-        white = [jnp.einsum("mab,bm->am", root, rows.values) for root, rows in pairs if root is not None]
-    spare = jnp.maximum(task.observed.equations - (z.shape[0] if of_prior is None else of_prior.effective), 1.0)
-    k = None
-    if problem.capture.lengths and not form.with_lengths:
-        own = [sigma**2 * matrices for matrices in own_covariances(task.observed, state.point, whitening)]
-        ends = ends_between(task.observed, z[len(task.free) :], own, problem.capture)
-        k = scale_and_weights(ends)[0].value
-    return {"reduced_chi": jnp.sqrt(sum(jnp.sum(rows**2) for rows in white) / spare), "k": k}
-
-
 def _solve_all(
-    chunk: _Chunk, loss: Loss | None, rules: Rules, begun: _Ended, count: Int[Array, ""]
+    chunk: _Chunk, loss: Loss | None, rules: levenberg_marquardt.Rules, begun: _Ended, count: Int[Array, ""]
 ) -> tuple[Float[AnyArray, "c n"], Int[Array, " c"], Int[Array, " c"]]:
     """One least squares of every problem: its unknowns, evaluations, and numbers of the reasons."""
     capacity, slots, most = chunk.form.capacity, chunk.form.slots, chunk.form.max_steps
@@ -273,18 +260,15 @@ def _solve_all(
     def of_slot(work: Callable, extra: int) -> Callable:
         """``work(task, args, unknowns of the solve, *extra)`` for each slot, by the number of its problem."""
 
-        def one(_: Problems, task: Task, z: AnyArray, whitening: Whitening, *extra: Any) -> Any:
+        def with_args(_: Problems, task: Task, z: AnyArray, whitening: Whitening, *extra: Any) -> Any:
             args, size = args_of(task, whitening, loss, z)
             return work(task, args._replace(batch=True), z[:size], *extra)
 
-        function = chunk.by_slot(one, 2 + extra)
+        function = chunk.by_slot(with_args, 2 + extra)
         begins = begun.z, begun.whitening
         return lambda index, *extra: function(index, *jax.tree.map(lambda leaf: leaf[index], begins), *extra)
 
-    def start_and_box(task: Task, _: Any, first: AnyArray) -> tuple[AnyArray, Box]:
-        return first, Box(*(side[: first.shape[0]] for side in box_of(task)))
-
-    starts = of_slot(start_and_box, 0)
+    starts = of_slot(lambda task, _, first: (first, Box(*(side[: len(first)] for side in box_of(task)))), 0)
     evaluate = of_slot(lambda task, args, first, trial: observed_model(trial, args), 1)
     slot = jnp.arange(slots)
     shapes = jax.eval_shape(lambda index: evaluate(index, starts(index)[0]).gram, slot)
@@ -292,13 +276,13 @@ def _solve_all(
 
     def fresh(index: Int[Array, " w"]) -> Any:
         first, box = starts(jnp.minimum(index, count - 1))
-        return begin_steps(first, box, zeros)
+        return levenberg_marquardt.begin(first, box, zeros)
 
     def once(carry: Any) -> Any:
         progress, index, upcoming, results = carry
         now = jnp.minimum(index, count - 1)  # a slot without a problem repeats the last problem; its result is dropped
         _, box = starts(now)
-        progress = advance(progress, evaluate(now, progress.step.trial), box, rules)
+        progress = levenberg_marquardt.advance(progress, evaluate(now, progress.step.trial), box, rules)
         late = progress.steps >= most
         done = (progress.reason != RUNNING) | late
         ended = jnp.where(late & (progress.reason == RUNNING), MAX_STEPS, progress.reason)
@@ -310,10 +294,6 @@ def _solve_all(
         return choose(done, fresh(index), progress), index, upcoming, results
 
     progress = fresh(slot)
-    empty = (
-        jnp.zeros((capacity, progress.y.shape[-1])),
-        jnp.zeros(capacity, dtype=jnp.int64),
-        jnp.zeros(capacity, dtype=jnp.int32),
-    )
-    start = (progress, slot, jnp.asarray(slots), empty)
+    numbers = (jnp.zeros(capacity, dtype=kind) for kind in (jnp.int64, jnp.int32))
+    start = (progress, slot, jnp.asarray(slots), (jnp.zeros((capacity, progress.y.shape[-1])), *numbers))
     return jax.lax.while_loop(lambda carry: jnp.any(carry[1] < count), once, start)[3]

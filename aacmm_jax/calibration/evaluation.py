@@ -24,18 +24,14 @@ from ..data.noise import Noise
 from ..data.observations.held import position_of
 from ..kinematics.arm import Arm, check_columns
 from ..kinematics.parameters import Bounds, Parameters
-from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
-from ..model.socket_sums import to_poses
+from ..model.sockets import Repeatability, no_repeatability, repeatability, to_poses
 from ..uncertainty.linear_propagation import variances_of_functions
 from ..uncertainty.linearisation import Linearisation
-from .scale_anchor import ScaleAnchor
 from .solve import minimised
-from .task import Task
-from .weighted_least_squares import begin, whitening_at
+from .task import Task, begin, whitening_at
 
-_MAX_STEPS = 300
-_POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
+POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 
 
 class ObservedEvaluation(eqx.Module):
@@ -134,11 +130,12 @@ def _evaluated(
     """`evaluate` with the observations of a capture, of which the first are its sockets of so many poses; and with the
     residuals of all of them, where these are wanted (``whole``)."""
     fitted = fit_geometry(arm, observed, kept, noise)
-    xp, geometry = namespace(fitted.linear.z), fitted.geometry
+    linear, geometry = fitted.linear, fitted.geometry
+    xp = namespace(linear.z)
     metrics, distances, measured, u = no_repeatability(fitted.sigma), xp.zeros(0), xp.zeros(0), xp.zeros(0)
     nominal = xp.stack([length.value for length in lengths]) if lengths else xp.zeros(0)
     if sizes:
-        tips = fitted.linear.point.forward.tip[:, : sum(sizes)]
+        tips = linear.point.forward.tip[:, : sum(sizes)]
         metrics = repeatability(tips.T, sizes)
         sockets = observed.observations[: len(sizes)]
         index = np.array([observed.positions[position_of(socket.name)] for socket in sockets])
@@ -148,8 +145,27 @@ def _evaluated(
         measured, pull = observed.distances(geometry, ends)
         scatter = fitted.variances_of(pull) if fitted.redundant or noise is not None else np.nan
         u = xp.sqrt(scatter + xp.stack([length.u for length in lengths]) ** 2)
-    of_observations = _described(fitted) if whole else None
-    return Evaluation(metrics, measured, measured - nominal, u, distances, of_observations)
+    described = None
+    if whole:
+        parts, normalised = observed.split(geometry), linear.white()
+        residuals = observed.by_observation([part.values for part in linear.point.rows])
+        described = ObservedEvaluation(
+            names=tuple(observation.name for observation in observed.observations),
+            kinds=tuple(observation.kind for observation in observed.observations),
+            residuals=tuple(residuals),
+            normalised=tuple(normalised),
+            rms=xp.stack([_rms(xp, values[:POSITION_ROWS]) for values in residuals]),
+            rms_angle=xp.stack([_rms(xp, values[POSITION_ROWS:]) for values in residuals]),
+            reduced_chi=xp.stack([xp.sqrt(xp.mean(white**2)) for white in normalised]),
+            sigma=fitted.sigma,
+            geometry={name: parts[name] for name in observed.names},
+        )
+    return Evaluation(metrics, measured, measured - nominal, u, distances, described)
+
+
+def _rms(xp: Any, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, ""]:
+    """Root mean square length of the columns; NaN where they have no rows."""
+    return xp.sqrt(xp.mean(xp.sum(rows**2, axis=0))) if rows.shape[0] else xp.asarray(np.nan)
 
 
 class GeometryFit(NamedTuple):
@@ -179,18 +195,8 @@ def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noi
     """
     space = Parameters(arm, ("d_1",))
     vector = namespace(arm, observed, kept, noise).asarray(space.vector())
-    task = Task(
-        observed=observed,
-        bounds=Bounds(space, vector, vector),
-        start=vector,
-        noise=noise,
-        anchor=ScaleAnchor(),
-        noise_model="estimated" if noise is None else "given",
-        max_steps=_MAX_STEPS,
-        loss=None,
-        pose=(),
-        kept=kept,
-    )
+    noise_model = "estimated" if noise is None else "given"
+    task = Task(observed, Bounds(space, vector, vector), vector, noise, noise_model, kept=kept)
     z, state, _, _ = minimised(task, begin(task))
     linear = Linearisation.of(observed, space, z, state.point, state.errors, whitening_at(task, state), None)
     return GeometryFit(linear, task.fitted[1:], state.sigma, observed.equations > task.fitted.sum())
@@ -214,26 +220,3 @@ def _checked_geometry(observed: Observed, geometry: Mapping[str, Numbers] | None
             f"the capture has no '{first}' or other part of this geometry{nearest(first, observed.blocks)}"
         )
     return parts
-
-
-def _described(fitted: GeometryFit) -> ObservedEvaluation:
-    """Residuals of all observations by an arm whose geometry is fitted."""
-    linear, observed = fitted.linear, fitted.linear.observed
-    xp, parts = namespace(linear.z), observed.split(fitted.geometry)
-    residuals, normalised = observed.by_observation([part.values for part in linear.point.rows]), linear.white()
-    return ObservedEvaluation(
-        names=tuple(observation.name for observation in observed.observations),
-        kinds=tuple(observation.kind for observation in observed.observations),
-        residuals=tuple(residuals),
-        normalised=tuple(normalised),
-        rms=xp.stack([_rms(xp, values[:_POSITION_ROWS]) for values in residuals]),
-        rms_angle=xp.stack([_rms(xp, values[_POSITION_ROWS:]) for values in residuals]),
-        reduced_chi=xp.stack([xp.sqrt(xp.mean(white**2)) for white in normalised]),
-        sigma=fitted.sigma,
-        geometry={name: parts[name] for name in observed.names},
-    )
-
-
-def _rms(xp: Any, rows: Float[AnyArray, "r m"]) -> Float[AnyArray, ""]:
-    """Root mean square length of the columns; NaN where they have no rows."""
-    return xp.sqrt(xp.mean(xp.sum(rows**2, axis=0))) if rows.shape[0] else xp.asarray(np.nan)

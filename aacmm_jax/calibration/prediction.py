@@ -17,8 +17,7 @@ from jaxtyping import Float
 
 from ..core.distributions import chance
 from ..core.numpy_or_jax import AnyArray, to_numpy
-from ..data.capture import Capture
-from ..data.copies import visits_of
+from ..data.capture import Capture, visits_of
 from ..data.observations.held import position_of
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of

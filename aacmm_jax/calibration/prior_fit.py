@@ -30,8 +30,7 @@ from ..uncertainty.evidence import (
     slope_of_expectation,
 )
 from .results import PriorMetrics
-from .task import Task
-from .weighted_least_squares import NEAR, Begun, Fit, State, fit, state_at, whitening_at
+from .task import NEAR, Begun, Fit, State, Task, fit, state_at, whitening_at
 
 _ROUNDS = 60  # least squares with new standard deviations; usually 4 to 8
 # Largest change of the log of a variance that no further round is worth, where derivatives pass through, and elsewhere.
@@ -56,19 +55,11 @@ class OfPrior(NamedTuple):
     by_scales: "ByScales | None"
 
 
-def prior_of(task: Task) -> ParameterPrior | None:
-    """The prior of the parameters that are free; None where nothing is known of any."""
-    if task.prior is None:
-        return None
-    return task.prior.of(task.space.names, task.bounds.space.vector()[task.free])
-
-
 def weights(task: Task, begun: Begun, state: State, loss: Loss | None) -> Whitening:
     """Of the next least squares; scales of a prior are those before anything is learned."""
     if task.needs_no_weights:
         return Whitening((None,) * len(task.observed.layout.groups), np.zeros(0), {})
-    prior = prior_of(task)
-    if prior is None:
+    if (prior := task.free_prior) is None:
         return whitening_at(task, state)
     problem = PriorProblem(task, begun, prior, loss, state)
     return whitening_at(task, state, problem.rows(problem.first_scales()))
@@ -139,8 +130,8 @@ class PriorProblem(NamedTuple):
         """The unknowns with these scales."""
         index, steps = self.prior.index, self.begun.steps
         tight = namespace(scales, z).clip(stop_gradient(self.sd(scales)), _LEAST_SCALE, 1.0)
-        steps, args = set_at(steps, index, steps[index] * tight), self.args(scales, self.rows(scales))
-        return fit(self.task, args, z, self.begun, NEAR, steps=steps, differentiable=differentiable)
+        begun = self.begun._replace(steps=set_at(steps, index, steps[index] * tight))
+        return fit(self.task, self.args(scales, self.rows(scales)), z, begun, NEAR, differentiable)
 
     def model(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> PriorModel:
         """The model of the parameters that have a prior, linear at a point."""

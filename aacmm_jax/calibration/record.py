@@ -5,14 +5,17 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from ..core._compat import member_numbers
 from ..core.arguments import checked_arguments
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture
+from ..data.capture import Capture, names_in
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..kinematics.arm import Arm, parameter_names, value_of
+from ..kinematics.arm import Arm, joint_limits, parameter_names, value_of
+from ..kinematics.corrected_arm import function_values
+from ..kinematics.corrections import Term
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -29,9 +32,10 @@ from .results import (
     largest_plausible_residual,
     plausible,
 )
-from .scale_fix import against_division
+from .stages import against_division
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
+_BEYOND = 0.15  # of a joint's travel, on either side of it, where its corrections are given
 _CORRELATED = 0.1  # smallest eigenvalue of correlations, below which parameters slide along each other
 _MOST_NAMED, _LEAST_SHARE = 4, 0.3  # of the parameters that do, and of the largest share
 
@@ -181,7 +185,7 @@ class CalibrationRecord(NamedTuple):
     def evaluations(self) -> dict[str, Evaluation]:
         """The three arms on the capture that was identified from."""
         capture, calibrated = self.recording.capture, evaluate(self.calibrated.arm, self.recording.capture)
-        leaves = [jax.tree.leaves(arm.arm) for arm in (self.stage1, self.calibrated)]
+        leaves = [jax.tree.leaves(specification.arm) for specification in (self.stage1, self.calibrated)]
         alike = len(leaves[0]) == len(leaves[1]) and all(map(np.array_equal, *leaves))
         stage1 = calibrated if alike else evaluate(self.stage1.arm, capture)
         return {"nominal": evaluate(self.recording.nominal.arm, capture), "stage1": stage1, "calibrated": calibrated}
@@ -214,11 +218,19 @@ def record_of(
     nominal, stage1, scale = recording.nominal, calibration.stage1, calibration.scale
     single = isinstance(calibration, Identification)
     # What files hold is NumPy's.
-    shared = None if single else calibration.shared
-    covariance, observed, prior, shared = jax.tree.map(
-        np.asarray,
-        (calibration.parameter_covariance, calibration.observed, calibration.prior, shared),
-    )
+    kept = (calibration.parameter_covariance, calibration.observed, calibration.prior)
+    covariance, observed, prior, shared = jax.tree.map(np.asarray, (*kept, None if single else calibration.shared))
+    tested = None
+    if others is not None:
+        # What another observation alone determined is fitted; the rest of the geometry is as it was found.
+        geometry = calibration.observed.geometry if others.observations else None
+        evaluation = evaluate(calibration.arm, others, geometry=geometry)
+        poses = np.array([*others.sizes, *(observation.q.shape[0] for observation in others.observations)])
+        rms, rms_angle = evaluation.repeatability.socket_rms, np.full(len(poses), np.nan)
+        if evaluation.observed is not None:
+            rms, rms_angle = evaluation.observed.rms, evaluation.observed.rms_angle
+        names = tuple(names_in(others))
+        tested = OtherPoses(names, poses, np.asarray(rms), np.asarray(rms_angle))
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -253,20 +265,8 @@ def record_of(
         shared=shared,
         components=covariance.components,
         surplus_k=0.0 if scale is None else float(scale.surplus),
-        others=None if others is None else _other_poses(calibration.arm, others, calibration.observed),
+        others=tested,
     )
-
-
-def _other_poses(arm: Arm, capture: Capture, observed: ObservedMetrics) -> OtherPoses:
-    """Of an arm, with the geometry found; what another observation alone determined is fitted."""
-    if not capture.observations:
-        rms = np.asarray(evaluate(arm, capture).repeatability.socket_rms)
-        return OtherPoses(capture.names, np.array(capture.sizes), rms, np.full(len(rms), np.nan))
-    evaluation = evaluate(arm, capture, geometry=observed.geometry).observed
-    assert evaluation is not None
-    poses = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
-    rms, rms_angle = np.asarray(evaluation.rms), np.asarray(evaluation.rms_angle)
-    return OtherPoses(evaluation.names, np.array(poses), rms, rms_angle)
 
 
 def _reason(calibration: Calibration | Identification) -> str:
@@ -313,11 +313,10 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         u_k, surplus_k = None if np.isnan(result.u_k) else np.asarray(result.u_k), np.asarray(result.surplus_k)
         lengths = len(result.recording.capture.lengths)
     else:
-        arm, noise, scale, names = result.arm, result.noise, result.scale, result.space.names
-        covariance, _, is_open, _, components = result.parameter_covariance
+        arm, scale, names = result.arm, result.scale, result.space.names
+        covariance, _, is_open, noise, components = result.parameter_covariance
         shared = None if isinstance(result, Identification) else result.shared
-        u_k, surplus_k = (None, None) if scale is None else (scale.u, scale.surplus)
-        lengths = 0 if scale is None else len(scale.nominal)
+        u_k, surplus_k, lengths = (None, None, 0) if scale is None else (scale.u, scale.surplus, len(scale.nominal))
     # Parts of the covariance of the parameters, with errors of the tip that poses share.
     of_tips = None if shared is None else shared.of_tips
     return Uncertainty(
@@ -333,3 +332,54 @@ def uncertainty_of(result: Calibration | Identification | CalibrationRecord) -> 
         scatter_degrees_of_freedom=float(result.degrees_of_freedom),
         lengths=lengths,
     )
+
+
+class JointFunction(NamedTuple):
+    """Corrections of one joint by its own reading, less their mean over the poses; rad, or mm of a prismatic joint."""
+
+    reading: Float[np.ndarray, " points"]  # the travel of the poses and a little beyond, within the joint's limits
+    value: Float[np.ndarray, " points"]
+    expanded: Float[np.ndarray, " points"]  # expanded uncertainty, 95 %
+    at_poses: Float[np.ndarray, " poses"]
+
+
+def function_of_joint(
+    record: CalibrationRecord, joint: int, q: Float[np.ndarray, "poses joints"], points: int = 400
+) -> JointFunction | None:
+    """The functions of its own reading that correct a joint (harmonics, gear ratio), with their uncertainty.
+
+    The mean over the poses is taken away: a zero offset takes it up.
+
+    Args:
+        record: A calibration.
+        joint: Number of the joint, from 1.
+        q: Readings of the poses, rad and mm.
+        points: Number of readings, evenly spaced, at which the function is given.
+
+    Returns:
+        The function; None if the joint has no such corrections.
+    """
+    arm: Arm = to_numpy(record.calibrated.arm)
+    if arm.corrections is None:
+        return None
+    every = [(i, term) for i, term in enumerate(arm.corrections.functions.terms) if isinstance(term, Term)]
+    chosen = [(i, term) for i, term in every if term.joint == joint and term.kind.of_own_reading]
+    if not chosen:
+        return None
+    terms, coefficients = [term for _, term in chosen], np.asarray(arm.coefficients)[[i for i, _ in chosen]]
+    travel = q[:, joint - 1]
+    low, high = joint_limits(arm, None)[joint - 1] if arm.limits is not None or not arm.prismatic else (-np.inf, np.inf)
+    beyond = _BEYOND * np.ptp(travel)
+    at = np.linspace(max(travel.min() - beyond, low), min(travel.max() + beyond, high), points)
+    rows = np.zeros((points, q.shape[1]))
+    rows[:, joint - 1] = at
+    gravity = np.asarray(arm.gravity)
+    at_poses = function_values(arm.corrections.nominal, terms, q, gravity)
+    mean = at_poses.mean(axis=1, keepdims=True)
+    functions = function_values(arm.corrections.nominal, terms, rows, gravity) - mean
+    names = [term.name for term in terms]
+    free = [i for i, name in enumerate(names) if name in record.names]
+    slopes = np.zeros((points, len(record.names)))
+    slopes[:, [record.names.index(names[i]) for i in free]] = functions[free].T
+    expanded = uncertainty_of(record).expanded_of(slopes)
+    return JointFunction(at, coefficients @ functions, expanded, coefficients @ (at_poses - mean))

@@ -1,8 +1,9 @@
-"""Captures drawn anew, for Monte Carlo, the bootstrap and studies: observations of every kind in the same way.
+"""Captures drawn anew, for Monte Carlo, the bootstrap and studies, about a truth: an arm that meets its data exactly.
 
-An error of what was measured, or of the seat, changes a residual and hardly its derivatives. So the data of a trial are
-those of the capture with readings drawn anew, and with a constant added to every residual that replaces the errors of
-the capture by others. No kind has to say how it is drawn. Errors that poses share are drawn along.
+Of sockets and lengths (`SocketTruth`), readings are drawn about poses in which the arm holds its sockets. Of other
+observations (`ObservedTruth`), an error of what was measured, or of the seat, changes a residual and hardly its
+derivatives. So the data of a trial are those of the capture with readings drawn anew, and with a constant added to
+every residual that replaces the errors of the capture by others. No kind has to say how it is drawn.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,7 +27,7 @@ from ..kinematics.corrections import term_of
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
-from ..model.socket_sums import membership
+from ..model.sockets import membership
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
@@ -42,6 +43,9 @@ class DrawnErrors(NamedTuple):
     coefficients: Float[np.ndarray, "t k"]  # of the functions that the model lacks
 
 
+DrawShared = Callable[[int, np.random.Generator], DrawnErrors | None]  # of so many trials
+
+
 def draw_shared(
     shared: SharedErrors | None, arm: Arm, capture: Capture, count: int, random: np.random.Generator
 ) -> DrawnErrors | None:
@@ -49,15 +53,13 @@ def draw_shared(
     if shared is None:
         return None
     q, law = np.asarray(capture.readings), shared.law.in_numpy
-    tips = np.zeros((count, len(q), 3))
+    tips, turned = np.zeros((count, len(q), 3)), np.zeros((count, *q.shape))
     for i, root in enumerate(_roots(shared, capture)):
         # A variance that few places show is itself uncertain, so it is drawn too (JCGM 101, 6.4.9).
         sd = np.sqrt(random.choice(law.ratios[i], size=(count, 1, 1), p=law.weights[i] / law.weights[i].sum()))
         tips += np.einsum("Mc,tcd->tMd", root, sd * random.normal(size=(count, root.shape[1], 3)))
     values, joints = functions_of(shared.names, arm, q)
-    factor = _square_roots(np.asarray(shared.moments))
-    coefficients = random.normal(size=(count, len(shared.names))) @ factor.T
-    turned = np.zeros((count, *q.shape))
+    coefficients = random.normal(size=(count, len(shared.names))) @ _square_roots(np.asarray(shared.moments)).T
     for k, joint in enumerate(joints):
         turned[:, :, joint] += coefficients[:, k, None] * values[:, k]
     return DrawnErrors(tips, turned, coefficients)
@@ -86,14 +88,10 @@ def places_of(capture: Capture) -> Float[np.ndarray, "M p"]:
 def covariance_of_lengths(
     shared: SharedErrors, arm: Arm, names: tuple[str, ...], capture: Capture
 ) -> Float[np.ndarray, "l l"]:
-    """Covariance of the distances between ends of the reference lengths, as an arm measures them, by errors that poses
-    share, mm^2. Errors of the tip move the mean of an end; how parameters follow these is left out, as it is small.
+    """Covariance of reference lengths as a calibrated arm measures them, by errors that poses share, mm^2; ``names``
+    are its parameters that were free.
 
-    Args:
-        shared: The errors.
-        arm: The calibrated arm.
-        names: Its parameters that were free.
-        capture: What it was calibrated from.
+    Errors of the tip move the mean of an end; how parameters follow these is left out, as it is small.
     """
     q, (of_names, belongs) = np.asarray(capture.readings), _by_name(capture)
     means = dict(zip(of_names, belongs / belongs.sum(axis=1, keepdims=True), strict=True))
@@ -147,61 +145,63 @@ def _square_roots(covariances: Float[np.ndarray, "*m r r"]) -> Float[np.ndarray,
     return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
 
 
-class Trials(NamedTuple):
-    """Captures of a calibrated arm with new errors."""
-
-    size: int  # numbers in one of them
-    # So many of them, by random numbers, with a level (t, 1, 1) that multiplies the noise of readings and seat; and the
-    # coefficients of functions that the model lacks, where errors that poses share were found.
-    drawn: Callable[[int, np.random.Generator, Any], tuple[Capture, Float[np.ndarray, "t k"] | None]]
-
-
-def trials_of(result: Calibration, capture: Capture, noise: Noise, u: Float[np.ndarray, " l"]) -> Trials:
-    """Of a calibration; ``u`` are those of its reference lengths, mm."""
-    shared, arm = to_numpy(result.shared), result.arm
-
-    if result.method == "joint":
-        truth = truth_of(result, capture)
-
-        def drawn_observations(count: int, random: np.random.Generator, level: Any) -> Any:
-            errors = draw_shared(shared, arm, capture, count, random)
-            return truth.drawn(count, noise, random, level, errors), errors and errors.coefficients
-
-        return Trials(truth.size, drawn_observations)
-    # Poses that hold their socket exactly, and the least change of the joints for each mm that the tip shall move.
-    exact = project_to_centroids(arm, capture)
-    by_joints = np.asarray(arm.jacobian(exact, [f"q_{i}" for i in range(1, arm.joints + 1)]))
-    units = reading_units(arm.geometry)
-    moves = units[:, None] * np.linalg.pinv(by_joints * units, rcond=1e-8)
-    first, ends, tips = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]]), capture.ends(), arm.position(exact)
-    true_lengths = np.linalg.norm(np.asarray(tips)[first[ends[:, 0]]] - np.asarray(tips)[first[ends[:, 1]]], axis=1)
-
-    def drawn(count: int, random: np.random.Generator, level: Any) -> Any:
-        seats = float(noise.seating) * level * random.normal(size=(count, len(exact), 3))
-        errors = draw_shared(shared, arm, capture, count, random)
-        seats = seats if errors is None else seats + errors.tips
-        read = noise.of_columns(arm.geometry.kinds, arm.joints, exact.shape[1])
-        readings = exact + read * level * random.normal(size=(count, *exact.shape))
-        readings[..., : arm.joints] += np.einsum("Nic,tNc->tNi", moves, seats)
-        readings += 0.0 if errors is None else errors.joints
-        return batch_of_captures(
-            capture, readings, _around(true_lengths, u, count, random)
-        ), errors and errors.coefficients
-
-    return Trials(exact.size, drawn)
-
-
 def _around(
     centre: Float[np.ndarray, " k"], u: Float[np.ndarray, " k"], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "t k"]:
     return centre + u * random.normal(size=(count, len(u)))
 
 
-class DrawnLengths(NamedTuple):
-    """Reference lengths of a batch: certified values and their standard uncertainties, mm."""
+class SocketTruth(NamedTuple):
+    """A calibrated arm, and poses in which it holds the sockets of a capture exactly, about which data are drawn."""
 
-    value: Float[np.ndarray, "t l"]
-    u: Float[np.ndarray, "t l"]
+    arm: Arm
+    capture: Capture
+    exact: Float[np.ndarray, "M n"]
+    moves: Float[np.ndarray, "M n 3"]  # the least change of the joints for each mm that the tip shall move
+    lengths: Float[np.ndarray, " l"]  # between the tips, mm
+
+    @classmethod
+    def of(cls, arm: Arm, capture: Capture) -> "SocketTruth":
+        """By a calibrated arm."""
+        exact, units = project_to_centroids(arm, capture), reading_units(arm.geometry)
+        by_joints = np.asarray(arm.jacobian(exact, [f"q_{i}" for i in range(1, arm.joints + 1)]))
+        moves = units[:, None] * np.linalg.pinv(by_joints * units, rcond=1e-8)
+        first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+        ends = np.asarray(arm.position(exact))[first[capture.ends()]]
+        return cls(arm, capture, exact, moves, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
+
+    @property
+    def size(self) -> int:
+        """Numbers in the data of one trial."""
+        return self.exact.size
+
+    def drawn(
+        self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0, shared: DrawShared | None = None
+    ) -> tuple[Capture, DrawnErrors | None]:
+        """As `ObservedTruth.drawn`."""
+        arm, exact = self.arm, self.exact
+        seats = float(noise.seating) * level * random.normal(size=(count, len(exact), 3))
+        alike = None if shared is None else shared(count, random)
+        seats = seats if alike is None else seats + alike.tips
+        read = noise.of_columns(arm.geometry.kinds, arm.joints, exact.shape[1])
+        readings = exact + read * level * random.normal(size=(count, *exact.shape))
+        readings[..., : arm.joints] += np.einsum("Nic,tNc->tNi", self.moves, seats)
+        readings += 0.0 if alike is None else alike.joints
+        return self._batch(readings, self.lengths, random), alike
+
+    def resampled(self, count: int, random: np.random.Generator) -> Capture:
+        """As `ObservedTruth.resampled`, of each socket."""
+        first, q = 0, np.asarray(self.capture.q)
+        rows = []
+        for size in self.capture.sizes:
+            rows.append(first + random.integers(size, size=(count, size)))
+            first += size
+        nominal = np.array([float(length.value) for length in self.capture.lengths])
+        return self._batch(q[np.concatenate(rows, axis=1)], nominal, random)
+
+    def _batch(self, q: Float[np.ndarray, "t M n"], centre: np.ndarray, random: np.random.Generator) -> Capture:
+        u = np.array([float(length.u) for length in self.capture.lengths])
+        return batch_of_captures(self.capture, q, _around(centre, u, len(q), random))
 
 
 class ObservedTruth(NamedTuple):
@@ -218,39 +218,23 @@ class ObservedTruth(NamedTuple):
     def at(cls, capture: Capture, space: Parameters, vector: Any, geometry: Mapping[str, Any]) -> "ObservedTruth":
         """By the arm with these parameters, and the geometry by the names of its parts."""
         observed, space = to_numpy((Observed.of(capture, space.base), space))
-        numbers = [np.asarray(geometry[name]) for name in observed.blocks]
-        linear = Linearisation.at(observed, space, np.concatenate([np.asarray(vector), *numbers]), least=1.0)
+        numbers = {name: np.asarray(geometry[name]) for name in observed.blocks}
+        linear = Linearisation.at(observed, space, np.concatenate([np.asarray(vector), *numbers.values()]), least=1.0)
         parts = linear.parts()
-        return cls(
-            observed,
-            parts,
-            linear.errors[0].kinds,
-            [_square_roots(np.asarray(part.measured)) for part in parts],
-            dict(zip(observed.blocks, numbers, strict=True)),
-            np.array(configurations(observed.q)),
-        )
+        roots = [_square_roots(np.asarray(part.measured)) for part in parts]
+        return cls(observed, parts, linear.errors[0].kinds, roots, numbers, np.array(configurations(observed.q)))
 
     @property
     def size(self) -> int:
         """Numbers in the data of one trial."""
         return sum(part.observation.q.size + part.values.size for part in self.parts)
 
-    @property
-    def ends(self) -> list[tuple[str, str]]:
-        """Names of the positions at the ends of the reference lengths."""
-        return list(self.observed.ends)
-
     def drawn(
-        self,
-        count: int,
-        noise: Noise,
-        random: np.random.Generator,
-        level: Any = 1.0,
-        alike: DrawnErrors | None = None,
-    ) -> Capture:
-        """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat, ``alike``
-        are errors that poses share."""
-        q = np.asarray(self.observed.q)
+        self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0, shared: DrawShared | None = None
+    ) -> tuple[Capture, DrawnErrors | None]:
+        """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat. Also the
+        errors that poses share, as ``shared`` draws them."""
+        alike, q = None if shared is None else shared(count, random), np.asarray(self.observed.q)
         encoder = noise.of_columns(self.kinds, self.parts[0].by_readings.shape[1], q.shape[1])
         read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
         values = self.values(count, random)
@@ -262,7 +246,7 @@ class ObservedTruth(NamedTuple):
                 shift = shift + np.einsum("rcm,tmc->trm", np.asarray(part.by_tip), alike.tips[:, part.poses])
                 readings = readings + alike.joints[:, part.poses]
             observations.append(shifted(part.observation, readings, shift, values))
-        return batch_of_observations(observations, self.ends, self.lengths(count, random))
+        return self.batch(observations, self.lengths(count, random)), alike
 
     def errors_of_rows(self, count: int, seating: Any, random: np.random.Generator) -> list[Float[np.ndarray, "t r m"]]:
         """Errors of the seat (of this standard deviation, mm) and of what was measured, in each observation's rows."""
@@ -274,19 +258,18 @@ class ObservedTruth(NamedTuple):
             errors.append(measured + np.einsum("rcm,tcm->trm", part.by_seat, seat))
         return errors
 
-    def values(self, count: int, random: np.random.Generator) -> dict[str, Float[np.ndarray, "t k"]]:
-        """Certified values of the parts that have them."""
+    def values(
+        self, count: int, random: np.random.Generator, centre: Mapping[str, Any] | None = None
+    ) -> dict[str, Float[np.ndarray, "t k"]]:
+        """Certified values of the parts that have them, about the geometry or other numbers."""
+        centre = self.geometry if centre is None else centre
         certified = self.observed.certified().items()
-        return {name: _around(self.geometry[name], np.asarray(u), count, random) for name, (_, u) in certified}
+        return {name: _around(np.asarray(centre[name]), np.asarray(u), count, random) for name, (_, u) in certified}
 
-    def lengths(self, count: int, random: np.random.Generator) -> DrawnLengths:
-        """Certified values of the reference lengths."""
-        true = [np.linalg.norm(self.geometry[end] - self.geometry[start]) for start, end in self.ends]
-        return self._lengths(np.array(true), count, random)
-
-    def _lengths(self, centre: Float[np.ndarray, " l"], count: int, random: np.random.Generator) -> DrawnLengths:
-        u = np.asarray(self.observed.u)
-        return DrawnLengths(_around(centre, u, count, random), np.broadcast_to(u, (count, len(u))))
+    def lengths(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "t l"]:
+        """Certified values of the reference lengths, mm."""
+        true = [np.linalg.norm(self.geometry[end] - self.geometry[start]) for start, end in self.observed.ends]
+        return _around(np.array(true), np.asarray(self.observed.u), count, random)
 
     def resampled(self, count: int, random: np.random.Generator) -> Capture:
         """A batch of captures with poses drawn with replacement, and certified values with their uncertainty.
@@ -301,11 +284,10 @@ class ObservedTruth(NamedTuple):
                 "some poses have exactly the readings of others, such as two targets seen at once, so they cannot be "
                 "drawn one by one; use monte_carlo."
             )
-        certified = self.observed.certified().items()
-        values = {name: _around(np.asarray(value), np.asarray(u), count, random) for name, (value, u) in certified}
+        values = self.values(count, random, {name: value for name, (value, _) in self.observed.certified().items()})
         observations = []
         for part in self.parts:
-            observation, none = part.observation, np.zeros((count, *part.values.shape))
+            observation = part.observation
             if np.bincount(observation.places).max() < 2:
                 raise InputError(
                     f"observation '{observation.name}' has one pose in each point, so none can be drawn in the place "
@@ -322,14 +304,32 @@ class ObservedTruth(NamedTuple):
                 _repeated(observation, count),
                 chosen,
             )
-            own = {name: values[name] for name in observation.certified}
-            observations.append(batch.with_errors(batch.q, none, own))
-        lengths = self._lengths(np.asarray(self.observed.nominal), count, random)
-        return batch_of_observations(observations, self.ends, lengths)
+            certified = {name: values[name] for name in observation.certified}
+            observations.append(batch.with_errors(batch.q, np.zeros((count, *part.values.shape)), certified))
+        lengths = _around(np.asarray(self.observed.nominal), np.asarray(self.observed.u), count, random)
+        return self.batch(observations, lengths)
+
+    def batch(self, observations: list[AbstractObservation], lengths: Float[np.ndarray, "t l"]) -> Capture:
+        """A batch of captures, as `identify_many` takes it, with these certified values of the reference lengths."""
+        count, _, joints = observations[0].q.shape
+        template = Capture({}, (), [jax.tree.map(lambda leaf: leaf[0], batch) for batch in observations])
+        references = []
+        for pair, value, u in zip(self.observed.ends, lengths.T, np.asarray(self.observed.u), strict=True):
+            start, end = (position.removeprefix("position of ") for position in pair)
+            length = ReferenceLength(start, end, 1.0)
+            values = (value, np.broadcast_to(u, value.shape))
+            references.append(eqx.tree_at(lambda length: (length.value, length.u), length, values))
+        return eqx.tree_at(
+            lambda capture: (capture.q, capture.lengths, capture.observations),
+            template,
+            (np.zeros((count, 0, joints)), tuple(references), tuple(observations)),
+        )
 
 
-def truth_of(result: Calibration, capture: Capture) -> ObservedTruth:
+def truth_of(result: Calibration, capture: Capture) -> SocketTruth | ObservedTruth:
     """The arm and the geometry of a calibration. Raises `InputError` where it is of another capture."""
+    if result.method != "joint":
+        return SocketTruth.of(result.arm, capture)
     geometry = result.observed.geometry
     missing = [name for name in Observed.of(capture, None).blocks if name not in geometry]
     if missing:
@@ -346,30 +346,12 @@ def shifted(
     values: Mapping[str, Float[np.ndarray, "t k"]],
 ) -> AbstractObservation:
     """A batch of one observation, whose own data are the same in all trials."""
-    own = {name: values[name] for name in observation.certified}
-    return _repeated(observation, len(q)).with_errors(q, shift, own)
+    certified = {name: values[name] for name in observation.certified}
+    return _repeated(observation, len(q)).with_errors(q, shift, certified)
 
 
 def _repeated(observation: AbstractObservation, count: int) -> AbstractObservation:
     return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, *np.shape(leaf))), observation)
-
-
-def batch_of_observations(
-    observations: list[AbstractObservation], ends: list[tuple[str, str]], lengths: DrawnLengths
-) -> Capture:
-    """A batch of captures, as `identify_many` takes it; ``ends`` are names of the positions at the lengths' ends."""
-    count, _, joints = observations[0].q.shape
-    template = Capture({}, (), [jax.tree.map(lambda leaf: leaf[0], batch) for batch in observations])
-    references = []
-    for pair, value, u in zip(ends, lengths.value.T, lengths.u.T, strict=True):
-        start, end = (position.removeprefix("position of ") for position in pair)
-        length = ReferenceLength(start, end, 1.0)
-        references.append(eqx.tree_at(lambda length: (length.value, length.u), length, (value, u)))
-    return eqx.tree_at(
-        lambda capture: (capture.q, capture.lengths, capture.observations),
-        template,
-        (np.zeros((count, 0, joints)), tuple(references), tuple(observations)),
-    )
 
 
 def batch_of_captures(capture: Capture, q: Numbers, values: Numbers, u: Numbers | None = None) -> Capture:

@@ -1,6 +1,7 @@
 """Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses."""
 
 import math
+from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from ..core.arguments import OneOf, Range, checked_arguments
 from ..core.arrays import Numbers
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.random_keys import random_generator
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -23,8 +24,8 @@ from ..model.loss_names import LossName
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
 from .record import uncertainty_of
-from .redrawn import batch_of_captures, trials_of, truth_of
-from .results import Calibration, ManyCalibrations
+from .redrawn import draw_shared, truth_of
+from .results import Calibration
 
 Level = Annotated[float, Range(above=0, most=0.9999)]  # coverage probability
 
@@ -73,11 +74,9 @@ class Sampled(NamedTuple):
 
     def sentences(self) -> list[str]:
         """Whether the linear result may be used, and where not."""
-        sentences = []
-        if not self.stable:
-            sentences.append(f"After {self.trials} trials the intervals are not yet stable; allow more.")
-        if self.failed:
-            sentences.append(f"{self.failed} of {self.trials} trials did not converge and are left out.")
+        unstable = f"After {self.trials} trials the intervals are not yet stable; allow more."
+        failed = f"{self.failed} of {self.trials} trials did not converge and are left out."
+        sentences = [unstable] * (not self.stable) + [failed] * (self.failed > 0)
         apart = [name for name, good in zip(self.quantities, self.agrees, strict=True) if not good]
         says = (
             f"agree with those of {self.trials} Monte Carlo trials within the tolerance of JCGM 101, for every "
@@ -145,33 +144,31 @@ def monte_carlo(
     block = max(math.ceil(100 / (1 - level)), 10_000)
     if most < block:
         raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
-    task = _RepeatedTask.of(result, capture, lengths)
-    trials, freedom = trials_of(result, capture, noise, task.u), result.degrees_of_freedom
-    values, failed, blocks = [], 0, []
-    stable = False
+    repeated, truth = Repeated.of(result, capture, lengths), truth_of(result, capture)
+    freedom, shared = result.degrees_of_freedom, partial(draw_shared, to_numpy(result.shared), result.arm, capture)
+    values, failed, blocks, stable = [], 0, [], False
     while sum(map(len, values)) + failed < most and not stable:
-        random = np.random.default_rng([seed, len(values)])
-        parts = []
+        random, parts = np.random.default_rng([seed, len(values)]), []
         # So many at a time that the readings of each take 200 MB at most.
-        slices = max(int(2.5e7 / trials.size), 1)
+        slices = max(int(2.5e7 / truth.size), 1)
         for count in (min(slices, block - first) for first in range(0, block, slices)):
             # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives
             # Student's t (JCGM 101, 6.4.9).
             scale = 1.0 if math.isinf(freedom) else np.sqrt(freedom / random.chisquare(freedom, size=(count, 1, 1)))
-            captures, coefficients = trials.drawn(count, random, scale)
-            means = task.prior_means(count, random, np.asarray(result.parameters))
-            solved, lost = task.solved(captures, means, coefficients)
+            captures, errors = truth.drawn(count, noise, random, scale, shared)
+            means = repeated.prior_means(count, random, np.asarray(result.parameters))
+            solved, lost = repeated.solved(captures, means, errors and errors.coefficients)
             parts.append(solved)
             failed += lost
         values.append(np.concatenate(parts))
         _check_some(values[-1], block, "Monte Carlo", "check the calibration or widen the bounds")
-        low, high = np.quantile(values[-1], [(1 - level) / 2, (1 + level) / 2], axis=0)
-        blocks.append(np.stack([values[-1].mean(axis=0), values[-1].std(axis=0, ddof=1), low, high]))
+        ends = np.quantile(values[-1], [(1 - level) / 2, (1 + level) / 2], axis=0)
+        blocks.append(np.stack([values[-1].mean(axis=0), values[-1].std(axis=0, ddof=1), *ends]))
         # Twice the standard deviation of the averages over blocks, of the worst of mean, u and both ends (7.9.4).
         spread = 2 * np.std(blocks, axis=0, ddof=1).max(axis=0) / math.sqrt(len(blocks)) if blocks[1:] else np.inf
         u = np.concatenate(values).std(axis=0, ddof=1)
         stable = bool(np.all(spread <= numerical_tolerance(u, digits) / _REFINED))
-    return task.sampled(np.concatenate(values), failed, level, digits, stable=stable)
+    return repeated.sampled(np.concatenate(values), failed, level, digits, stable=stable)
 
 
 @checked_arguments
@@ -211,21 +208,13 @@ def bootstrap(
         >>> print(sampled.trials, f"trials: probe_z from {sampled.low[at]:.3f} to {sampled.high[at]:.3f} mm")
         100 trials: probe_z from 102.497 to 102.503 mm
     """
-    random = random_generator(seed)
-    task = _RepeatedTask.of(result, capture, None, robust)
-    if result.method == "joint":
-        captures = truth_of(result, capture).resampled(trials, random)
-        means = None if result.prior is None else task.in_order(np.asarray(result.prior.mean), result.parameters)
-        values, failed = task.solved(captures, task.prior_means(trials, random, means))
-    else:
-        starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-        sizes = zip(starts, capture.sizes, strict=True)
-        rows = np.concatenate([start + random.integers(size, size=(trials, size)) for start, size in sizes], axis=1)
-        nominal = np.array([float(length.value) for length in capture.lengths])
-        lengths = nominal + task.u * random.normal(size=(trials, len(nominal)))
-        values, failed = task.solved(batch_of_captures(capture, np.asarray(capture.q)[rows], lengths))
+    random, repeated = random_generator(seed), Repeated.of(result, capture, None, robust)
+    captures = truth_of(result, capture).resampled(trials, random)
+    prior = result.prior
+    means = None if prior is None else repeated.in_order(np.asarray(prior.mean), result.parameters)
+    values, failed = repeated.solved(captures, repeated.prior_means(trials, random, means))
     _check_some(values, trials, "bootstrap", "there are too few poses a socket for this, so record more")
-    return task.sampled(values, failed, level, 1)
+    return repeated.sampled(values, failed, level, 1)
 
 
 def _check_some(values: np.ndarray, trials: int, what: str, remedy: str) -> None:
@@ -242,23 +231,17 @@ def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.nda
     return np.where(u > 0, 0.5 * 10**exponent, 0.0)
 
 
-class _RepeatedTask(NamedTuple):
-    """What is the same in all trials."""
+class Repeated(NamedTuple):
+    """A calibration that is repeated on other data, and the lengths whose distribution is followed."""
 
     result: Calibration
-    start: Float[np.ndarray, "v n"]
-    end: Float[np.ndarray, "v n"]
-    u: Float[np.ndarray, " l"]
+    ends: tuple[Float[np.ndarray, "v n"], Float[np.ndarray, "v n"]]
     robust: LossName | None
 
     @classmethod
     def of(
-        cls,
-        result: Calibration,
-        capture: Capture,
-        lengths: tuple[np.ndarray, np.ndarray] | None,
-        robust: LossName | None = None,
-    ) -> "_RepeatedTask":
+        cls, result: Calibration, capture: Capture, lengths: tuple[Any, Any] | None, robust: LossName | None = None
+    ) -> "Repeated":
         """Refuses trials that would be solved with another loss than the calibration, or of another capture."""
         joint = result.method == "joint"
         if not joint and (capture.observations or robust is not None):
@@ -271,22 +254,20 @@ class _RepeatedTask(NamedTuple):
                 "a robust loss took weight from poses of this calibration; name it for the bootstrap (robust='huber'), "
                 "which keeps such poses, or calibrate without it."
             )
-        two = isinstance(lengths, tuple | list) and len(lengths) == 2
-        shapes = [np.shape(poses) for poses in lengths] if lengths is not None and two else []
-        if lengths is not None and (not two or len(shapes[0]) != 2 or shapes[0] != shapes[1]):
+        if lengths is None:
+            lengths = sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
+        shapes = [np.shape(poses) for poses in lengths] if isinstance(lengths, tuple | list) else []
+        if len(shapes) != 2 or len(shapes[0]) != 2 or shapes[0] != shapes[1]:
             raise InputError(
                 "lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends."
             )
-        start, end = lengths or sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
-        u = np.array([float(length.u) for length in capture.lengths])
-        return cls(result, np.asarray(start), np.asarray(end), u, robust)
+        return cls(result, (np.asarray(lengths[0]), np.asarray(lengths[1])), robust)
 
     def in_order(self, values: Float[np.ndarray, " q"], others: Numbers) -> Float[np.ndarray, " p"]:
         """Numbers of the parameters of a prior in the order of all, with others for those that it leaves out."""
-        names = self.result.space.names
+        prior, names = self.result.prior, self.result.space.names
         ordered = np.array(np.broadcast_to(np.asarray(others), (len(names),)))
-        assert self.result.prior is not None
-        ordered[[names.index(name) for name in self.result.prior.names]] = values
+        ordered[[names.index(name) for name in prior.names] if prior else []] = values
         return ordered
 
     def prior_means(
@@ -299,21 +280,6 @@ class _RepeatedTask(NamedTuple):
         sd = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
         return centre + sd * random.normal(size=(count, len(sd)))
 
-    def _many(self, captures: Capture, means: Float[np.ndarray, "t p"] | None) -> ManyCalibrations:
-        result = self.result
-        stage1, bounds = result.stage1, result.bounds
-        # What sets the scale, and the noise that weights the poses, are the calibration's own.
-        options: dict[str, Any] = {"noise": result.weighting_noise, "robust": self.robust, "method": result.method}
-        if result.method == "two-stage":
-            return calibrate_many(stage1.arm, captures, bounds, start=stage1.parameters, hold=result.hold, **options)
-        arm = result.arm
-        if means is not None:
-            assert result.prior is not None
-            arm = Parameters(result.arm, result.space.names).arm(means)
-            weights = zip(result.prior.names, np.asarray(result.prior.weight).tolist(), strict=True)
-            options["prior"] = Prior({name: 1 / weight for name, weight in weights if weight > 0})
-        return calibrate_many(arm, captures, bounds, start=result.parameters, **options)
-
     def solved(
         self,
         captures: Capture,
@@ -325,15 +291,24 @@ class _RepeatedTask(NamedTuple):
         ``means`` are those of the prior; ``coefficients`` those of functions that the model lacks: with them lengths
         are off by more than follows from the parameters.
         """
-        result, many = self.result, self._many(captures, means)
-        ends = (jnp.asarray(self.start), jnp.asarray(self.end))
-        lengths = _lengths_of(Parameters(result.arm, result.space.names), jnp.asarray(many.parameters), ends)
-        shared = result.shared
+        result, prior, shared = self.result, self.result.prior, self.result.shared
+        # What sets the scale, and the noise that weights the poses, are the calibration's own.
+        options: dict[str, Any] = {"noise": result.weighting_noise, "robust": self.robust, "method": result.method}
+        first, space = result, Parameters(result.arm, result.space.names)
+        arm = result.arm
+        if result.method == "two-stage":
+            first, arm, options["hold"] = result.stage1, result.stage1.arm, result.hold
+        elif prior is not None and means is not None:
+            arm = space.arm(means)
+            weights = zip(prior.names, np.asarray(prior.weight).tolist(), strict=True)
+            options["prior"] = Prior({name: 1 / weight for name, weight in weights if weight > 0})
+        many = calibrate_many(arm, captures, result.bounds, start=first.parameters, **options)
+        lengths = _lengths_of(space, jnp.asarray(many.parameters), jax.tree.map(jnp.asarray, self.ends))
         if coefficients is not None and shared is not None and shared.names:
             # Derivatives of the lengths by the coefficients of functions that the model lacks.
             whole = uncertainty_of(result).complete
-            by_tips = [np.asarray(whole.derivatives(q))[..., -len(shared.names) :] for q in (self.start, self.end)]
-            between = np.subtract(*(np.asarray(whole.arm.position(q)) for q in (self.end, self.start)))
+            by_tips = [np.asarray(whole.derivatives(q))[..., -len(shared.names) :] for q in self.ends]
+            between = np.subtract(*(np.asarray(whole.arm.position(q)) for q in reversed(self.ends)))
             direction = between / np.linalg.norm(between, axis=1, keepdims=True)
             by_functions = np.einsum("vc,vck->vk", direction, by_tips[1] - by_tips[0])
             lengths = np.asarray(lengths) + coefficients @ by_functions.T
@@ -344,22 +319,20 @@ class _RepeatedTask(NamedTuple):
     def sampled(self, values: np.ndarray, failed: int, level: float, digits: int, stable: bool = True) -> Sampled:
         """The trials' distribution, with the linear result to compare it with."""
         result, linear = self.result, uncertainty_of(self.result)
-        u_length = np.asarray(linear.length(self.start, self.end))
-        expanded = linear.expanded_length(self.start, self.end, level=level)
-        factor_length = expanded / np.where(u_length > 0, u_length, 1.0)
+        u_length, expanded = np.asarray(linear.length(*self.ends)), linear.expanded_length(*self.ends, level=level)
         low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
-        u, lengths = values.std(axis=0, ddof=1), _lengths_by(result.arm, (self.start, self.end))
+        u, lengths = values.std(axis=0, ddof=1), _lengths_by(result.arm, self.ends)
         scale = result.scale if result.method == "two-stage" else None  # a joint solve divides by no k
         k, u_k = ([], []) if scale is None else ([float(scale.value)], [float(scale.u)])
-        factor_k = [linear.expanded_k(level) / own for own in u_k]
+        factor_k = [linear.expanded_k(level) / u_of_k for u_of_k in u_k]
         return Sampled(
-            quantities=(*result.space.names, *("k" for _ in k), *(f"length {i + 1}" for i in range(len(self.start)))),
+            quantities=(*result.space.names, *("k" for _ in k), *(f"length {i + 1}" for i in range(len(lengths)))),
             estimate=np.concatenate([result.parameters, k, np.asarray(lengths)]),
             u=u,
             low=low,
             high=high,
             linear_u=np.concatenate([linear.u, u_k, u_length]),
-            factor=np.concatenate([linear.factor(level), factor_k, factor_length]),
+            factor=np.concatenate([linear.factor(level), factor_k, expanded / np.where(u_length > 0, u_length, 1.0)]),
             tolerance=numerical_tolerance(u, digits),
             stable=stable,
             trials=len(values) + failed,

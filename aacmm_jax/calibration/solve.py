@@ -1,8 +1,8 @@
 """The engine's solve: the parameters and every unknown geometry that agree best with all that was observed.
 
-`solve` runs the least squares of a task in turn (`weighted_least_squares`; with a prior the last of them is repeated
-until the weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with
-whitened rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, where G is the inverse of the
+`solve` runs the least squares of a task in turn (`task.solves_of`; with a prior the last of them is repeated until the
+weights agree with what it leads to, `prior_fit`), and concludes: at the solution the problem is linear, with whitened
+rows w = w0 + A dx, so errors e of the rows move the unknowns by dx = -G A^T W e, where G is the inverse of the
 information A^T W A (`uncertainty.linear_propagation`). The covariance of the unknowns follows from that of the rows,
 which is that of the given noise, or of noise estimated from the residuals.
 
@@ -16,44 +16,22 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..core.numpy_or_jax import AnyArray, added_to, namespace, set_at
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds
 from ..model.elimination import with_linear_geometry
-from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
+from ..model.sockets import Repeatability, no_repeatability, repeatability
+from ..uncertainty import linear_propagation as propagation
 from ..uncertainty.covariance import STATED, ParameterCovariance
 from ..uncertainty.degrees_of_freedom import Components
-from ..uncertainty.linear_propagation import (
-    Influence,
-    UnknownsCovariance,
-    alone,
-    covariance_of_rows,
-    of_shared_readings,
-    of_stated,
-    propagated,
-    row_covariances,
-    rows_of_functions,
-)
 from ..uncertainty.linearisation import Linearisation
 from ..uncertainty.variance_components import Moments, moments, noise_from
-from .prior_fit import OfPrior, fitted_with_prior, prior_of, weights
+from .prior_fit import OfPrior, fitted_with_prior, weights
 from .results import Identification, ObservedMetrics
-from .task import Task
-from .weighted_least_squares import (
-    Begun,
-    Fit,
-    State,
-    args_of,
-    begin,
-    fit,
-    losses_of,
-    rules_of,
-    state_after,
-    whitening_at,
-)
+from .task import Begun, Fit, State, Task, args_of, begin, fit, solves_of, state_after, whitening_at
 
 
 class Solution(NamedTuple):
@@ -61,18 +39,18 @@ class Solution(NamedTuple):
 
     identification: Identification
     linear: Linearisation
-    influence: Influence
+    influence: propagation.Influence
     covariances: list[Float[AnyArray, "_ _ _"]]  # of the whitened rows of every group
     reading: list[np.ndarray]  # number of the reading of each pose of each group; equal ones were read at once
     state: State
 
     def covariance_of(self, rows: list[Float[AnyArray, "q _ _"]]) -> Float[AnyArray, "q q"]:
         """Of functions that follow the rows of every block so."""
-        identification = self.identification
-        total = covariance_of_rows(rows, self.covariances)
-        if identification.noise_model == "robust":
+        noise, linear = self.identification.noise, self.linear
+        total = propagation.covariance_of_rows(rows, self.covariances)
+        if self.identification.noise_model == "robust":
             return total
-        shared = of_shared_readings(rows, self.state.errors, self.linear.whitening, identification.noise, self.reading)
+        shared = propagation.of_shared_readings(rows, self.state.errors, linear.whitening, noise, self.reading)
         return total if shared is None else total + shared
 
     def rows_of_parameters(self) -> list[Float[AnyArray, "p _ _"]]:
@@ -82,8 +60,9 @@ class Solution(NamedTuple):
         steps = xp.where(influence.fixed[: len(names)], 0.0, linear.steps[: len(names)])
         head = xp.concatenate([xp.diag(steps), xp.zeros((len(names), height - len(names)))], axis=1)
         components = [xp.zeros((len(names), *own.shape[:2])) for own in influence.own]
-        of_free, index = rows_of_functions(influence, head, components), [space.names.index(name) for name in names]
-        return [set_at(xp.zeros((len(space.names), *rows.shape[1:])), np.array(index), rows) for rows in of_free]
+        index = np.array([space.names.index(name) for name in names])
+        of_free = propagation.rows_of_functions(influence, head, components)
+        return [set_at(xp.zeros((len(space.names), *rows.shape[1:])), index, rows) for rows in of_free]
 
 
 def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
@@ -95,20 +74,19 @@ def solve(task: Task, near: Float[AnyArray, " p"] | None = None) -> Solution:
 
 def minimised(task: Task, begun: Begun) -> tuple[Float[AnyArray, " z"], State, Fit, OfPrior | None]:
     """The unknowns after all least squares, the state there, and the last result with the evaluations of all."""
-    z, state, evaluations, losses = begun.z, begun.state, namespace(task).zeros((), dtype=int), losses_of(task)
+    z, state, evaluations, solves = begun.z, begun.state, namespace(task).zeros((), dtype=int), solves_of(task)
     solution = of_prior = None
     # The covariance of the rows depends on the arm, so each least squares has the weights of the last one's solution.
-    for number, loss in enumerate(losses, 1):
-        last = number == len(losses)
-        prior = prior_of(task) if last else None
+    for number, (loss, rules) in enumerate(solves, 1):
+        prior = task.free_prior if number == len(solves) else None
         if prior is not None:
             z, state, solution, of_prior = fitted_with_prior(task, prior, begun, state, z)
         else:
             # Positions of sockets are eliminated: given the head, they are means of the tips (`model.elimination`).
             args, count = args_of(task, weights(task, begun, state, loss), loss, z)
-            solution = fit(task, args, z[:count], begun, rules_of(number, len(losses)))
+            solution = fit(task, args, z[:count], begun, rules, task.differentiable)
             z, point = with_linear_geometry(solution.parameters, args)
-            state = state_after(task, begun, z, point, last)
+            state = state_after(task, begun, z, point, number == len(solves))
         evaluations = evaluations + solution.steps
     assert solution is not None
     return z, state, solution._replace(steps=evaluations), of_prior
@@ -118,29 +96,31 @@ def concluded(
     task: Task, begun: Begun, z: Float[AnyArray, " z"], state: State, last: Fit, of_prior: OfPrior | None
 ) -> Solution:
     """The identification whose unknowns are ``z``; ``last`` is the last least squares, with the evaluations of all."""
-    xp, names, free, space = namespace(task, z), task.bounds.space.names, task.free, begun.space
+    xp, names, free, observed = namespace(task, z), task.bounds.space.names, task.free, task.observed
     p, count = len(free), z.shape[0] - len(free)
-    prior_rows = None if of_prior is None else of_prior.rows
-    whitening = whitening_at(task, state, prior_rows)
-    active = Bounds(space, *(side[:p] for side in begun.sides)).active(z[:p])
-    linear = Linearisation.of(task.observed, space, z, state.point, state.errors, whitening, task.loss)
+    active = Bounds(begun.space, *(side[:p] for side in begun.sides)).active(z[:p])
+    whitening = whitening_at(task, state, of_prior and of_prior.rows)
+    linear = Linearisation.of(observed, begun.space, z, state.point, state.errors, whitening, task.loss)
     # A parameter on a bound follows no row; `stages` adds the chance that it is not on its bound.
     influence = linear.influence(xp.concatenate([active != 0, xp.zeros(count, dtype=bool)]))
-    noise = _noise_of(task, linear, influence, state)
+    noise, groups = _noise_of(task, linear, influence, state), observed.layout.groups
     # Cov z = G (sum over poses of A W Cov(w) W A^T) G (JCGM 100, section 5), plus what poses with one reading share.
-    covariances, shared, reading = _of_rows(task, linear, influence, noise)
-    by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales.added(influence.inverse)
-    unknowns = propagated(influence, covariances, shared, by_scales)
-    parameters = set_at(task.start, free, z[:p])
-    spent = p + count if of_prior is None else of_prior.effective
-    observed = observed_metrics(
-        task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent
-    )
-    after = repeatability_of(state, task.observed, state.sigma)
-    # Of all equations, or of poses where each has a variance of its own.
-    spare = float(task.observed.equations - p - count)
+    reading, shared = [np.array(task.pose)[group.index] for group in groups], None
     if task.noise_model == "robust":
-        spare *= task.observed.q.shape[0] / task.observed.equations
+        covariances = propagation.alone(influence, len(groups))
+    else:
+        covariances = propagation.row_covariances(linear.point.rows, linear.errors, whitening, noise)
+        rows = [influence.weighted_rows(number) for number in range(len(groups))]
+        shared = propagation.of_shared_readings(rows, linear.errors, whitening, noise, reading)
+    by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales.added(influence.inverse)
+    unknowns = propagation.propagated(influence, covariances, shared, by_scales)
+    spent = p + count if of_prior is None else of_prior.effective
+    metrics = _metrics(task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent)
+    parameters, after = set_at(task.start, free, z[:p]), repeatability_of(state, observed, state.sigma)
+    # Of all equations, or of poses where each has a variance of its own.
+    spare = float(observed.equations - p - count)
+    if task.noise_model == "robust":
+        spare *= observed.q.shape[0] / observed.equations
     identification = Identification(  # pyright: ignore[reportCallIssue] - `stage1` is itself
         arm=task.bounds.space.arm(parameters),
         parameters=parameters,
@@ -152,28 +132,27 @@ def concluded(
         optimality=last.optimality,
         scale=None,
         parameter_covariance=_of_parameters(task, linear, influence, unknowns, noise),
-        before=repeatability_of(begun.before, task.observed),
+        before=repeatability_of(begun.before, observed),
         after=after,
-        reduced_chi=observed.reduced_chi_of_all if task.noise is not None else None,
+        reduced_chi=metrics.reduced_chi_of_all if task.noise is not None else None,
         bounds=task.bounds,
         anchor=task.anchor,
         noise_model=task.noise_model,
         fitted_degrees_of_freedom=math.inf if task.noise_model == "given" else max(spare, 1.0),
-        observed=observed,
-        prior_metrics=None if of_prior is None else of_prior.metrics,
+        observed=metrics,
+        prior_metrics=of_prior and of_prior.metrics,
     )
     return Solution(identification, linear, influence, covariances, reading, state)
 
 
-def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: State) -> Noise:
+def _noise_of(task: Task, linear: Linearisation, influence: propagation.Influence, state: State) -> Noise:
     """The noise of the tips' errors by the noise model: given, or estimated."""
-    xp, whitening = namespace(linear.z), linear.whitening
+    xp, whitening, prior = namespace(linear.z), linear.whitening, None
     if task.noise_model == "given":
         assert task.noise is not None
         return task.noise
     if task.noise_model != "estimated":
         return noise_from(Moments(xp.zeros(()), state.sigma**2))
-    prior = None
     if whitening.prior is not None:
         # The prior's rows are weight (x - mean), so that its information is weight^2; in natural steps.
         own = np.arange(whitening.prior.mean.shape[0])
@@ -183,29 +162,19 @@ def _noise_of(task: Task, linear: Linearisation, influence: Influence, state: St
     return noise_from(moments(influence, state.point.rows, state.errors, whitening, state.sigma, robust, prior))
 
 
-def _of_rows(
-    task: Task, linear: Linearisation, influence: Influence, noise: Noise
-) -> tuple[list[Float[AnyArray, "_ _ _"]], Float[AnyArray, "h h"] | None, list[np.ndarray]]:
-    """Covariances of the whitened rows of every pose, what shared readings add to the information that these make, and
-    the number of the reading of each pose."""
-    number, groups = np.array(task.pose), task.observed.layout.groups
-    reading = [number[group.index] for group in groups]
-    if task.noise_model == "robust":
-        return alone(influence, len(groups)), None, reading
-    covariances = row_covariances(linear.point.rows, linear.errors, linear.whitening, noise)
-    rows = [influence.weighted_rows(number) for number in range(len(groups))]
-    return covariances, of_shared_readings(rows, linear.errors, linear.whitening, noise, reading), reading
-
-
 def _of_parameters(
-    task: Task, linear: Linearisation, influence: Influence, unknowns: UnknownsCovariance, noise: Noise
+    task: Task,
+    linear: Linearisation,
+    influence: propagation.Influence,
+    unknowns: propagation.UnknownsCovariance,
+    noise: Noise,
 ) -> ParameterCovariance:
     """Of all parameters, of which the scale anchor is exact."""
     xp, free, size = namespace(linear.z), task.free, len(task.bounds.space.names)
     p, grid = len(free), np.ix_(free, free)
     # x_i is a number of natural steps s_i: Cov(x_i s_i, x_j s_j) = s_i s_j Cov(x_i, x_j).
     scale = linear.steps[:p, None] * linear.steps[None, :p]
-    stated = of_stated(influence, linear.point.rows, linear.whitening)[:p, :p] * scale
+    stated = propagation.of_stated(influence, linear.point.rows, linear.whitening)[:p, :p] * scale
     parts = Components.of({STATED: (stated, np.inf)})
     return ParameterCovariance(
         set_at(xp.zeros((size, size)), grid, unknowns.head[:p, :p] * scale),
@@ -217,35 +186,22 @@ def _of_parameters(
 
 
 def _of_geometry(
-    linear: Linearisation, influence: Influence, covariance: UnknownsCovariance
+    linear: Linearisation, influence: propagation.Influence, covariance: propagation.UnknownsCovariance
 ) -> dict[str, Float[AnyArray, "_ _"]]:
-    """Of each part; NaN for what the data leave open, such as the turn of a ball bar about itself."""
-    observed, p = linear.observed, len(linear.space.names)
-    layout, steps, height = observed.layout, observed.steps, linear.height
-    shared = slice(p, height)
-    by_class = [_known(covariance.head[shared, shared], influence.determined[shared], steps[: layout.shared])[None]]
-    first = layout.shared
-    for (count, size), matrices, opened in zip(layout.classes, covariance.components, influence.open, strict=True):
-        of_class = steps[first : first + count * size].reshape(count, size)
-        by_class.append(_known(matrices, ~opened, of_class))
-        first += count * size
+    """Of each part, mm and rad; NaN for what the data leave open, such as the turn of a ball bar about itself."""
+    xp, observed, p = namespace(linear.z), linear.observed, len(linear.space.names)
+    by_class = [(covariance.head[None, p:, p:], influence.determined[None, p:])]
+    by_class += [(matrix, ~is_open) for matrix, is_open in zip(covariance.components, influence.open, strict=True)]
+    known = [xp.where(seen[:, :, None] & seen[:, None, :], matrix, np.nan) for matrix, seen in by_class]
     matrices = {}
     for name, rows in observed.positions.items():
-        number, component, first = layout.component_of(int(rows[0]))
-        own = slice(first, first + len(rows))
-        matrices[name] = by_class[1 + number][component, own, own]
+        number, component, first = observed.layout.component_of(int(rows[0]))
+        own, steps = slice(first, first + len(rows)), observed.steps[rows]
+        matrices[name] = known[1 + number][component, own, own] * (steps[:, None] * steps[None, :])
     return matrices
 
 
-def _known(
-    matrix: Float[AnyArray, "*k g g"], known: Bool[AnyArray, "*k g"], steps: Float[np.ndarray, "*k g"]
-) -> Float[AnyArray, "*k g g"]:
-    """A covariance in natural steps as one in mm and rad, NaN for what is not known."""
-    scaled = matrix * (steps[..., None] * steps[..., None, :])
-    return namespace(matrix).where(known[..., None] & known[..., None, :], scaled, np.nan)
-
-
-def observed_metrics(
+def _metrics(
     task: Task,
     before: State,
     linear: Linearisation,
@@ -256,10 +212,8 @@ def observed_metrics(
     """How far each observation is from its geometry; ``spent`` is how many unknowns the data determine."""
     xp, observed = namespace(sigma), task.observed
     squares = [xp.sum(block.white**2, axis=0) for block in linear.blocks[: len(observed.layout.groups)]]
-    weights = [
-        xp.ones(square.shape) if weight is None else weight
-        for square, weight in zip(squares, linear.weights, strict=False)
-    ]
+    pairs = zip(squares, linear.weights, strict=False)
+    weights = [xp.ones(square.shape) if weight is None else weight for square, weight in pairs]
     rows = np.array([observation.rows for observation in observed.observations], dtype=float)
     # Whitened rows have variance 1, so the mean of their squares is about 1 where the noise is as the weights say.
     total = sum(xp.sum(square) for square in squares)

@@ -1,7 +1,14 @@
 """The stages of a calibration: the identification, its division by k, and the solve of everything at once.
 
-`identified` is stage 1; `in_two_stages` divides it by k (`scale_fix`), and `jointly` solves everything that a capture
-holds in one least squares. Both return a `Calibration`, and on demand how its parameters follow errors of its poses.
+`identified` is stage 1. It leaves the scale to its anchor, a length kept at its start, and k = measured / nominal is
+its error. If no bound acts on a length, repeatability does not change with the scale, so the arm divided by k is the
+result (`in_two_stages`); fixed lengths that free ones replace exactly (d_n by a probe along the same axis) can stay.
+Where a bound or another fixed length stands against the division, everything that a capture holds is solved in one
+least squares instead (`jointly`). Where fixed lengths set the scale by themselves, nothing is changed and k only
+compares them with the reference lengths.
+
+The division is a linear map of what stage 1 found, so its covariance is mapped along, with that of k, which follows the
+certified lengths, and the same poses as the parameters do.
 """
 
 import dataclasses
@@ -10,23 +17,25 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from ..data.capture import Capture
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.observed import Observed, ends_of
+from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
 from ..uncertainty.active_bounds import of_active_bounds
+from ..uncertainty.covariance import DISAGREEMENT, STATED
+from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.linear_propagation import covariance_with, rows_of_functions
 from ..uncertainty.linearisation import Linearisation
 from .results import Calibration, Identification, ObservedMetrics
-from .scale_anchor import fixes_scale
-from .scale_fix import MeasuredScale, divided, divided_uncertainty, measured_scale
+from .scale_anchor import ScaleAnchor, fixed_lengths, fixes_scale
 from .solve import Solution, repeatability_of, solve
-from .task import Task
-from .weighted_least_squares import state_at
+from .task import Task, state_at
 
 _LEAST_U = 1e-9  # mm: an exact certified value would be a row of infinite weight
+_ROUNDING = 1e-9  # mm: how far from a bound the division may leave a length by rounding
 
 
 class Sensitivities(NamedTuple):
@@ -38,33 +47,31 @@ class Sensitivities(NamedTuple):
     lengths: Float[np.ndarray, "l 3 M"]  # of measured lengths by the tips, where positions of sockets are means
 
     @classmethod
-    def of(
-        cls, linear: Linearisation, rows: Sequence[Float[AnyArray, "p _ _"]], lengths: Float[np.ndarray, "l 3 M"]
-    ) -> "Sensitivities":
-        """Of parameters that follow the whitened rows of every group so."""
-        by_readings = [error.by_readings for error in linear.errors]
-        return cls(_by_tips(linear, rows), _through(linear, rows, by_readings), lengths)
+    def of(cls, linear: Linearisation, rows: Sequence[AnyArray], of_lengths: Sequence[AnyArray] | None = None) -> Any:
+        """Of parameters, and of lengths, that follow the whitened rows of every group so."""
+        by_tips = [part.by_tip for part in linear.point.rows]
+
+        def through(rows: Sequence[AnyArray], by: Sequence[AnyArray]) -> Float[np.ndarray, "q c M"]:
+            # What follows the whitened rows, by what the residuals follow: dy = Y R dr, dr = B dc.
+            groups = zip(rows, linear.whitening.roots, by, strict=False)
+            products = [np.einsum("qam,mab,bcm->qcm", y, np.asarray(root), part) for y, root, part in groups]
+            return np.concatenate(linear.observed.by_observation(products), axis=2)
+
+        tips, joints = through(rows, by_tips), through(rows, [error.by_readings for error in linear.errors])
+        return cls(tips, joints, tips[:0] if of_lengths is None else through(of_lengths, by_tips))
 
 
-def _by_tips(linear: Linearisation, rows: Sequence[Float[AnyArray, "q _ _"]]) -> Float[np.ndarray, "q 3 M"]:
-    return _through(linear, rows, [part.by_tip for part in linear.point.rows])
+class MeasuredScale(NamedTuple):
+    """k of stage 1, and how it follows the data."""
 
+    scale: Scale
+    rows: list[Float[AnyArray, "1 _ _"]]  # its derivatives by the whitened rows of every block
+    stated: Float[AnyArray, ""]  # variance by the certified lengths; `Scale.surplus` is what their disagreement adds
 
-def _through(
-    linear: Linearisation, rows: Sequence[Float[AnyArray, "q _ _"]], by: Sequence[Float[AnyArray, "_ _ _"]]
-) -> Float[np.ndarray, "q c M"]:
-    """What follows the whitened rows so, by what the residuals follow ``by``: dy = Y R dr, dr = B dc."""
-    groups = zip(rows, linear.whitening.roots, by, strict=False)
-    products = [np.einsum("qam,mab,bcm->qcm", one, np.asarray(root), part) for one, root, part in groups]
-    return np.concatenate(linear.observed.by_observation(products), axis=2)
-
-
-class Stages(NamedTuple):
-    """A calibration, and how its parameters follow the data."""
-
-    calibration: Calibration
-    sensitivities: Callable[[], Sensitivities]
-    stands_against: Bool[AnyArray, ""] | None = None  # whether something stands against the division by k
+    @property
+    def added(self) -> Float[AnyArray, ""]:
+        """What is added to the variance that follows from the poses."""
+        return self.stated + self.scale.surplus
 
 
 class Identified(NamedTuple):
@@ -75,36 +82,35 @@ class Identified(NamedTuple):
     measured: MeasuredScale | None  # k, where the capture has reference lengths
     of_bounds: Float[AnyArray, "p p"]  # part of the covariance by active bounds
 
-    @property
-    def identification(self) -> Identification:
-        """Stage 1 as users see it."""
-        return self.solution.identification
+
+class Stages(NamedTuple):
+    """A calibration, and how its parameters follow the data."""
+
+    calibration: Calibration
+    sensitivities: Callable[[], Sensitivities]
+    stands_against: Bool[AnyArray, ""] | None = None  # whether something stands against the division by k
 
 
 def identified(task: Task, capture: Capture) -> Identified:
     """Stage 1 of a capture, whose lengths take no part in ``task``; with k where there are any."""
-    solution = solve(task)
+    solution, of_bounds = _solved(task, capture)
     measured = measured_scale(solution, capture) if capture.lengths else None
-    of_bounds = _of_bounds(task, solution, capture)
-    identification = _with_bounds(solution.identification, of_bounds)
     scale = None if measured is None else measured.scale
-    identification = dataclasses.replace(identification, scale=scale)
+    identification = dataclasses.replace(solution.identification, scale=scale)
     return Identified(task, solution._replace(identification=identification), measured, of_bounds)
 
 
-def _with_bounds(identification: Identification, of_bounds: Float[AnyArray, "p p"]) -> Identification:
-    matrix = identification.parameter_covariance.matrix + of_bounds
-    return eqx.tree_at(lambda result: result.parameter_covariance.matrix, identification, matrix)
-
-
-def _of_bounds(task: Task, solution: Solution, capture: Capture) -> Float[AnyArray, "p p"]:
-    """What active bounds add to the covariance of stage 1, in which reference lengths say what the scale is."""
-    free, size = task.free, len(task.bounds.space.names)
-    xp, linear = namespace(solution.linear.z), solution.linear
+def _solved(
+    task: Task, capture: Capture, near: Float[AnyArray, " p"] | None = None
+) -> tuple[Solution, Float[AnyArray, "p p"]]:
+    """A solve, with what active bounds add to the covariance, in which reference lengths say what the scale is."""
+    solution = solve(task, near)
+    linear, free, size = solution.linear, task.free, len(task.bounds.space.names)
+    xp, active = namespace(linear.z), solution.identification.active[free]
+    of_bounds = xp.zeros((size, size))
     if task.anchor.hold is None and not fixes_scale(capture) and task.prior is None:
         # Nothing determines the scale: it cannot be distinguished from a near-degenerate direction.
-        return xp.zeros((size, size))
-    active = solution.identification.active[free]
+        return solution, of_bounds
     if capture.lengths and not (xp is np and not np.any(active)):
         # The linearisation of stage 1 with reference lengths besides.
         observed, p = Observed.of(capture, task.bounds.space.base), len(free)
@@ -114,75 +120,148 @@ def _of_bounds(task: Task, solution: Solution, capture: Capture) -> Float[AnyArr
         linear = Linearisation.at(observed, linear.space, z, least=_LEAST_U, **weighing)
     box = Bounds(task.space, task.bounds.lower[free], task.bounds.upper[free])
     added = of_active_bounds(linear, active, box, solution.state.sigma)
-    return set_at(xp.zeros((size, size)), np.ix_(free, free), added)
+    of_bounds = set_at(of_bounds, np.ix_(free, free), added)
+    matrix = solution.identification.parameter_covariance.matrix + of_bounds
+    where = lambda result: result.parameter_covariance.matrix  # noqa: E731
+    return solution._replace(identification=eqx.tree_at(where, solution.identification, matrix)), of_bounds
+
+
+def measured_scale(solution: Solution, capture: Capture) -> MeasuredScale:
+    """k by the reference lengths of a capture, between positions that an identification has found.
+
+    Its standard uncertainty includes that of the identified parameters, and takes those on a bound as exact.
+    """
+    linear, influence, p = solution.linear, solution.influence, len(solution.linear.space.names)
+    geometry = linear.z[p:]
+    xp, ends = namespace(linear.z), ends_between(linear.observed, geometry, influence.own, capture)
+    scale, relative = scale_and_weights(ends)
+    _, pull = linear.observed.distances(geometry, ends_of(capture))
+    rows = rows_of_functions(influence, *linear.observed.by_unknowns((relative @ pull)[None], p))
+    # k = sum of weights m_i / n_i, with m_i measured and n_i certified: dk/dn_i = - (weight / n_i) m_i / n_i.
+    of_lengths = xp.sum((-relative * scale.measured / scale.nominal * ends.u) ** 2)
+    u = xp.sqrt(solution.covariance_of(rows)[0, 0] + of_lengths + scale.surplus)
+    return MeasuredScale(eqx.tree_at(lambda s: s.u, scale, u), rows, of_lengths)
+
+
+def positions_at_ends(capture: Capture) -> list[str]:
+    """Names of the positions at the ends of reference lengths."""
+    return list(dict.fromkeys(name for pair in ends_of(capture) for name in pair))
+
+
+def ends_between(
+    observed: Observed, geometry: Float[AnyArray, " g"], own: Sequence[Float[AnyArray, "_ _ _"]], capture: Capture
+) -> MeasuredEnds:
+    """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
+    xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
+    for name in used:
+        number, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        covariances.append(own[number][component, first : first + 3, first : first + 3])
+    return MeasuredEnds(
+        positions=xp.stack([geometry[observed.positions[name]] for name in used]),
+        covariances=xp.stack(covariances),
+        ends=np.array([[used.index(name) for name in pair] for pair in ends_of(capture)]),
+        nominal=xp.stack([length.value for length in capture.lengths]),
+        u=xp.stack([length.u for length in capture.lengths]),
+    )
+
+
+def divided(
+    anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], parameters: Any, k: Any
+) -> tuple[Float[AnyArray, "*batch p"], Bool[AnyArray, "*batch"]]:
+    """The parameters of stage 1 divided by k, of one problem or of a batch, and whether a bound or a fixed length
+    stands against that; ``active`` is what was on a bound in stage 1."""
+    space = bounds.space
+    if not anchor.can_scale:
+        return parameters, namespace(parameters).zeros(parameters.shape[:-1], dtype=bool)
+    xp, scaled = namespace(parameters, k), divide_lengths(space, parameters, k, anchor.partners)
+    lengths = np.broadcast_to(divisible(space), scaled.shape)
+    below, above = _on_bounds(anchor, bounds, active, scaled)
+    concerned = xp.ones_like(below) if anchor.partners is None else below | above
+    against = xp.any(concerned & lengths, axis=-1) & xp.all(xp.isfinite(scaled), axis=-1)
+    # Within the bounds, and on a bound that only rounding separates a length from: so short a step would not bring a
+    # solve onto the bound, which then counts as inactive, in derivatives too.
+    lower, upper = bounds.lower, bounds.upper
+    inside = xp.clip(scaled, lower, upper)
+    inside = xp.where(inside - lower <= _ROUNDING, lower, xp.where(upper - inside <= _ROUNDING, upper, inside))
+    return xp.where(np.broadcast_to(space.lengths, scaled.shape), inside, scaled), against
+
+
+def _on_bounds(
+    anchor: ScaleAnchor, bounds: Bounds, active: Int[AnyArray, "... p"], scaled: Float[AnyArray, "... p"]
+) -> tuple[Bool[AnyArray, "... p"], Bool[AnyArray, "... p"]]:
+    """Which divided parameters are below their bounds, or were on the lower one in stage 1; and likewise above."""
+    below, above = scaled < bounds.lower - _ROUNDING, scaled > bounds.upper + _ROUNDING
+    if anchor.hold is None:  # without an anchor it is the active bounds that set the scale of stage 1
+        return below, above
+    return below | (active < 0), above | (active > 0)
+
+
+def against_division(calibration: Calibration) -> tuple[str, ...]:
+    """What stood against the division by k of a calibration in two stages, in words; nothing where it was divided."""
+    if calibration.method != "two-stage" or bool(calibration.divided) or calibration.scale is None:
+        return ()
+    stage1, bounds = to_numpy((calibration.stage1, calibration.bounds))
+    space, anchor = bounds.space, stage1.anchor
+    scaled = divide_lengths(space, stage1.parameters, np.asarray(calibration.scale.value), anchor.partners)
+    below, above = _on_bounds(anchor, bounds, stage1.active, scaled)
+    concerned = np.flatnonzero((below | above) & divisible(space))
+    names = [f"{space.names[i]} ({'upper' if above[i] else 'lower'} bound)" for i in concerned]
+    if anchor.partners is None:
+        names += [f"{name} (fixed length)" for name in fixed_lengths(space.base, space)]
+        names += [f"q_{joint} (slide)" for joint in space.base.prismatic]
+    return tuple(names)
 
 
 def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     """Stage 1 divided by k; where something stands against that, it is not the result."""
     task, solution, measured, of_bounds = stage1
     assert measured is not None
-    identification, bounds = solution.identification, task.bounds
-    k = measured.scale.value
-    parameters, against = divided(task.anchor, bounds, identification.active, identification.parameters, k)
-    covariance, components, rows = divided_uncertainty(solution, measured, parameters)
-    linear = _at_divided(task, solution, parameters)
-    state = state_at(task, linear.space, linear.z)
+    identification, bounds, k = solution.identification, task.bounds, measured.scale.value
+    anchor, space = task.anchor, bounds.space
+    parameters, against = divided(anchor, bounds, identification.active, identification.parameters, k)
+    # x' = (x + r) / k - r for lengths, where r are the fixed lengths that x replaces (`model.scale.divide_lengths`), so
+    # dx' = dx / k - (x' + r) / k dk; a parameter that stage 1 held or that was on a bound moves with k too.
+    xp = namespace(parameters, k)
+    divides = xp.asarray(divisible(space) & anchor.can_scale)
+    by_k = xp.where(divides, (parameters + replaced_lengths(space, anchor.partners)) / k, 0.0)
+    change = xp.where(divides, 1 / k, 1.0)[:, None, None]
+    pairs = zip(solution.rows_of_parameters(), measured.rows, strict=True)
+    rows = [change * of_parameters - by_k[:, None, None] * of_k for of_parameters, of_k in pairs]
+    of_k = by_k[:, None] * by_k[None, :]
+    disagreement = (measured.scale.surplus * of_k, max(len(measured.scale.nominal) - 1, 1))
+    covariance = identification.parameter_covariance._replace(
+        matrix=solution.covariance_of(rows) + measured.added * of_k + of_bounds,
+        components=Components.of({STATED: (measured.stated * of_k, np.inf), DISAGREEMENT: disagreement}),
+    )
+    # At the divided arm, with the geometry that fits it; weights are those of the last solve. Rows are linear in the
+    # positions, so that one step takes these to where they fit the divided arm.
+    vector, at = parameters[task.free], Parameters(space.arm(parameters), solution.linear.space.names)
+    z = xp.concatenate([vector, task.observed.start(at, vector)])
+    weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "least": _LEAST_U}
+    z = Linearisation.at(task.observed, at, z, **weighing).with_fitted_geometry()
+    state = state_at(task, at, z)
     after = repeatability_of(state, task.observed, state.sigma)
     result = dataclasses.replace(
         identification,
-        arm=bounds.space.arm(parameters),
+        arm=space.arm(parameters),
         parameters=parameters,
         de=after.de,
         deltam=after.deltam,
         active=bounds.active(parameters),
-        parameter_covariance=identification.parameter_covariance._replace(
-            matrix=covariance + of_bounds, components=components
-        ),
+        parameter_covariance=covariance,
         after=after,
-        observed=_divided_metrics(solution, measured, linear),
+        observed=_divided_metrics(solution, measured, Linearisation.at(task.observed, at, z, **weighing)),
     )
-    calibration = _calibration(task, capture, identification, result, "two-stage", True)
 
     def sensitivities() -> Sensitivities:
         # Of measured lengths by the tips, where the arm is given and positions are means: with the inverse of the
         # head's information 0, the parameters follow nothing, and only the positions do.
         influence = solution.influence._replace(inverse=np.zeros_like(solution.influence.inverse))
-        found, observed, p = solution.linear, solution.linear.observed, len(solution.linear.space.names)
-        _, pull = observed.distances(np.asarray(found.z)[p:], ends_of(capture))
-        of_lengths = _by_tips(found, rows_of_functions(influence, *observed.by_unknowns(pull, p)))
-        return Sensitivities.of(linear, rows, of_lengths)
+        linear, observed, p = solution.linear, solution.linear.observed, len(solution.linear.space.names)
+        _, pull = observed.distances(np.asarray(linear.z)[p:], ends_of(capture))
+        return Sensitivities.of(linear, rows, rows_of_functions(influence, *observed.by_unknowns(pull, p)))
 
-    return Stages(calibration, sensitivities, against)
-
-
-def _calibration(
-    task: Task, capture: Capture, stage1: Identification, result: Identification, method: str, divided: bool
-) -> Calibration:
-    """With the fields of the last stage's result, and the measured lengths before and after."""
-    observed, ends = task.observed, ends_of(capture)
-    start = observed.start(task.space, task.start[task.free])
-    geometry = namespace(start).concatenate([result.observed.geometry[name] for name in observed.blocks])
-    names = ("arm", "parameters", "de", "deltam", "active", "steps", "result", "parameter_covariance")
-    return Calibration(
-        **{name: getattr(result, name) for name in (*names, "before", "after", "observed")},
-        scale=stage1.scale,
-        length_before=observed.distances(start, ends)[0],
-        length_after=observed.distances(geometry, ends)[0],
-        stage1=stage1,
-        method=method,
-        divided=namespace(result.parameters).asarray(divided),
-    )
-
-
-def _at_divided(task: Task, solution: Solution, parameters: Float[AnyArray, " p"]) -> Linearisation:
-    """At the divided arm, with the geometry that fits it; weights are those of the last solve."""
-    names, vector = solution.linear.space.names, parameters[task.free]
-    space = Parameters(task.bounds.space.arm(parameters), names)
-    z = namespace(parameters).concatenate([vector, task.observed.start(space, vector)])
-    weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "least": _LEAST_U}
-    # Rows are linear in the positions, so that one step takes these to where they fit the divided arm.
-    z = Linearisation.at(task.observed, space, z, **weighing).with_fitted_geometry()
-    return Linearisation.at(task.observed, space, z, **weighing)
+    return Stages(_calibration(task, capture, identification, result, "two-stage", True), sensitivities, against)
 
 
 def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linearisation) -> ObservedMetrics:
@@ -221,20 +300,32 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
 def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str) -> Stages:
     """Everything that the capture holds in one least squares; ``stage1`` is where lengths alone fix the scale."""
     # The divided arm is near the solution, and saves most of the steps.
-    near = None
-    if stage1 is not None and stage1.measured is not None:
-        first, k = stage1.identification, stage1.measured.scale.value
+    near, first = None, stage1 and stage1.solution.identification
+    if stage1 is not None and first is not None and stage1.measured is not None:
+        k = stage1.measured.scale.value
         near = divided(stage1.task.anchor, task.bounds, first.active, first.parameters, k)[0]
-    solution = solve(task, near)
-    result = _with_bounds(solution.identification, _of_bounds(task, solution, capture))
-    first = result
-    if stage1 is not None:
-        first = stage1.identification
+    solution, _ = _solved(task, capture, near)
+    result = solution.identification
+    if first is not None:
         result = dataclasses.replace(result, steps=first.steps + result.steps)
-    calibration = _calibration(task, capture, first, result, method, False)
+    calibration = _calibration(task, capture, first or solution.identification, result, method, False)
+    return Stages(calibration, lambda: Sensitivities.of(solution.linear, solution.rows_of_parameters()))
 
-    def sensitivities() -> Sensitivities:
-        none = np.zeros((0, 3, task.observed.q.shape[0]))
-        return Sensitivities.of(solution.linear, solution.rows_of_parameters(), none)
 
-    return Stages(calibration, sensitivities)
+def _calibration(
+    task: Task, capture: Capture, stage1: Identification, result: Identification, method: str, divided: bool
+) -> Calibration:
+    """With the fields of the last stage's result, and the measured lengths before and after."""
+    observed, ends = task.observed, ends_of(capture)
+    start = observed.start(task.space, task.start[task.free])
+    geometry = namespace(start).concatenate([result.observed.geometry[name] for name in observed.blocks])
+    names = ("arm", "parameters", "de", "deltam", "active", "steps", "result", "parameter_covariance")
+    return Calibration(
+        **{name: getattr(result, name) for name in (*names, "before", "after", "observed")},
+        scale=stage1.scale,
+        length_before=observed.distances(start, ends)[0],
+        length_after=observed.distances(geometry, ends)[0],
+        stage1=stage1,
+        method=method,
+        divided=namespace(result.parameters).asarray(divided),
+    )

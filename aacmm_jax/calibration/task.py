@@ -1,41 +1,55 @@
-"""One identification, checked: what is free, what was observed, and whether it can be determined.
+"""One identification, checked, and its weighted least squares.
 
 `Solving` holds the options of a solve; `task_of` makes a `Task` of an arm, a capture and a box. Everything that can be
 known to be wrong is refused here, before anything is solved.
+
+The unknowns z of a least squares are the free parameters, then the unknown geometry. Rows are whitened by the
+covariance of what was measured plus that of the tips' errors, which depends on the arm (`state_at`, `whitening_at`). So
+a problem is solved at least twice: with the weights of the start, and with those of that solution. Where the noise is
+not given, tips are taken to scatter as much as the residuals of the last solve do (`tip_errors.scatter_of`).
 """
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from ..core._compat import inside_trace
 from ..core.arguments import Count
 from ..core.arrays import Numbers, as_array, is_concrete
-from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.numpy_or_jax import AnyArray, to_numpy
+from ..core.errors import InputError
+from ..core.numpy_or_jax import AnyArray, namespace, stop_gradient, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..kinematics.arm import Arm, check_columns, is_single
-from ..kinematics.chain import forward_pass
+from ..data.observations.observation import Rows
+from ..kinematics.arm import Arm, check_columns
+from ..kinematics.chain import ForwardPass, forward_pass
 from ..kinematics.parameters import Bounds, Parameters, based_on
-from ..kinematics.priors import Prior
+from ..kinematics.priors import ParameterPrior, Prior
+from ..model.elimination import Args, observed_model, observed_rows
 from ..model.loss_names import LossName
 from ..model.observed import Observed
 from ..model.robust import Loss
+from ..model.rows import PointRows, PriorRows, Whitening, rows_at, whitening_of
+from ..solver.levenberg_marquardt import Rules, minimise
+from ..solver.reason import GRADIENT, Reason, reasons
+from ..uncertainty import tip_errors
 from ..uncertainty.covariance import NoiseModel
-from ..uncertainty.identifiability import observability
 from .scale_anchor import Method, ScaleAnchor, default_method, fixes_scale, scale_anchor, scale_from_slides
 
 _LEAST_TURN = 0.05  # of a component of the last frame's axes, with which a target's place can be told
+# The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
+RULES = Rules(rtol=1e-13, initial_damping=1e-8)
+# Of solves that begin where one with nearly the same weights ended: damping would shorten steps that are right.
+NEAR = RULES._replace(initial_damping=1e-11)
+_ROUGH = 1e-7  # tolerance of solves whose result only gives the weights of the next, or its start
+_LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
 
 
 class Solving(NamedTuple):
-    """How a problem is solved, as the arguments of `pipeline.single.identify` say."""
+    """How a problem is solved: the keyword arguments of `pipeline.single.identify`, described there."""
 
     hold: str | None = "longest"
     start: Numbers | None = None
@@ -43,7 +57,13 @@ class Solving(NamedTuple):
     noise_model: NoiseModel | None = None
     robust: LossName | None = None
     prior: Prior | None = None
+    replace_noise: bool = True
     max_steps: Count = 300
+
+    @property
+    def may_replace_noise(self) -> bool:
+        """Whether the noise of noisy encoders may be replaced: a robust loss and other models of noise have none."""
+        return self.replace_noise and self.noise_model not in ("common", "robust") and self.robust is None
 
 
 class Task(NamedTuple):
@@ -53,11 +73,11 @@ class Task(NamedTuple):
     bounds: Bounds
     start: Float[AnyArray, " p"]
     noise: Noise | None
-    anchor: ScaleAnchor
     noise_model: NoiseModel
-    max_steps: int
-    loss: Loss | None
-    pose: tuple[int, ...]  # number of the configuration of each row; equal ones were read at once
+    anchor: ScaleAnchor = ScaleAnchor()
+    max_steps: int = 300
+    loss: Loss | None = None
+    pose: tuple[int, ...] = ()  # number of the configuration of each row; equal ones were read at once
     differentiable: bool = True  # whether derivatives pass through the solve
     prior: Prior | None = None
     # Parts of the geometry that are given, where only the rest of it is fitted, to the tips of a given arm.
@@ -77,11 +97,15 @@ class Task(NamedTuple):
     @property
     def fitted(self) -> np.ndarray:
         """Which of the unknowns (free parameters, then the geometry) are fitted: all, unless the arm is given."""
-        kept, blocks = self.kept, self.observed.blocks
-        if kept is None:
+        if self.kept is None:
             return np.ones(len(self.free) + len(self.observed.steps), dtype=bool)
-        of_parts = (np.full(len(units), name not in kept) for name, units in blocks.items())
+        of_parts = (np.full(len(units), name not in self.kept) for name, units in self.observed.blocks.items())
         return np.concatenate([np.zeros(len(self.free), dtype=bool), *of_parts])
+
+    @property
+    def free_prior(self) -> ParameterPrior | None:
+        """The prior of the parameters that are free; None where nothing is known of any."""
+        return None if self.prior is None else self.prior.of(self.space.names, self.bounds.space.vector()[self.free])
 
     @property
     def needs_no_weights(self) -> bool:
@@ -97,7 +121,18 @@ def task_of(arm: Arm, capture: Capture, bounds: Bounds, solving: Solving) -> Tas
     bounds = Bounds(space, bounds.lower, bounds.upper)
     vector = space.vector() if solving.start is None else as_array(solving.start, "the start")
     check_columns(space.base, capture.columns)
-    _check_start(bounds, vector, "the start" if solving.start is not None else "the arm")
+    what = "the arm" if solving.start is None else "the start"
+    if vector.shape != (len(space.names),):
+        raise InputError(
+            f"{what} has shape {vector.shape}, but {len(space.names)} parameters are free; give one value each."
+        )
+    if is_concrete(vector, bounds.lower, bounds.upper):
+        values, lower, upper = (np.asarray(x) for x in (vector, bounds.lower, bounds.upper))
+        for i in np.flatnonzero(~((values >= lower) & (values <= upper))):
+            raise InputError(
+                f"{what} is outside the bounds: {space.names[i]} is {values[i]:g}, not within {lower[i]:g} to "
+                f"{upper[i]:g}; move the start or widen the bounds."
+            )
     anchor = anchor_of(space, capture, capture, solving.hold, noise)
     noise_model = checked_noise_model(solving.noise_model, noise, arm.joints)
     observed = Observed.of(capture, space.base)
@@ -111,18 +146,8 @@ def task_of(arm: Arm, capture: Capture, bounds: Bounds, solving: Solving) -> Tas
                 f"the prior's mean of {space.names[stated.index[i]]} is {mean[i]:g}, outside its bounds {low[i]:g} to "
                 f"{high[i]:g} (mm or rad); correct the mean or widen the bounds."
             )
-    return Task(
-        observed=observed,
-        bounds=bounds,
-        start=vector,
-        noise=noise,
-        anchor=anchor,
-        noise_model=noise_model,
-        max_steps=solving.max_steps,
-        loss=None if solving.robust is None else Loss(solving.robust),
-        pose=configurations(observed.q),
-        prior=prior,
-    )
+    loss, pose = None if solving.robust is None else Loss(solving.robust), configurations(observed.q)
+    return Task(observed, bounds, vector, noise, noise_model, anchor, solving.max_steps, loss, pose, prior=prior)
 
 
 def anchor_of(
@@ -146,8 +171,8 @@ def method_of(
     """The method of a calibration, and whether everything is solved at once from the beginning: where more than sockets
     and lengths take part, or ``at_once``. Raises `InputError` for another method, and where nothing fixes the scale."""
     by_slides = scale_from_slides(arm, capture, space, solving.noise)
-    general = at_once or bool(capture.observations) or solving.robust is not None or solving.prior is not None
-    general = general or by_slides
+    more = (at_once, capture.observations, solving.robust is not None, solving.prior is not None, by_slides)
+    general = any(map(bool, more))
     method = default_method(arm, general) if method is None else method
     if method == "two-stage" and general:
         raise InputError(
@@ -160,32 +185,6 @@ def method_of(
             "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
         )
     return method, general
-
-
-def check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None:
-    """Raise `InputError` where an arm, a capture or bounds are a batch; ``many`` is the function that takes batches."""
-    wide = max(bounds.lower.ndim, bounds.upper.ndim) > 1
-    is_batch = {"arm": not is_single(arm), "capture": capture.q.ndim > 2, "bounds": wide}
-    if batches := [what for what, batch in is_batch.items() if batch]:
-        raise InputError(
-            f"the {' and the '.join(batches)} given are a batch, but one problem is solved here; use {many}."
-        )
-
-
-def _check_start(bounds: Bounds, vector: AnyArray, what: str) -> None:
-    """Raise `InputError` where a start is not one value a parameter, inside the box."""
-    if vector.shape != (len(bounds.space.names),):
-        raise InputError(
-            f"{what} has shape {vector.shape}, but {len(bounds.space.names)} parameters are free; give one value each."
-        )
-    if not is_concrete(vector, bounds.lower, bounds.upper):
-        return
-    values, lower, upper = (np.asarray(x) for x in (vector, bounds.lower, bounds.upper))
-    for i in np.flatnonzero(~((values >= lower) & (values <= upper))):
-        raise InputError(
-            f"{what} is outside the bounds: {bounds.space.names[i]} is {values[i]:g}, not within {lower[i]:g} to "
-            f"{upper[i]:g}; move the start or widen the bounds."
-        )
 
 
 def checked_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joints: int) -> NoiseModel:
@@ -209,15 +208,10 @@ def configurations(q: Any) -> tuple[int, ...]:
 
 
 def check_data(
-    capture: Capture,
-    observed: Observed,
-    space: Parameters,
-    vector: Float[AnyArray, " p"],
-    anchor: ScaleAnchor,
-    solving: Solving,
+    capture: Capture, observed: Observed, space: Parameters, vector: AnyArray, anchor: ScaleAnchor, solving: Solving
 ) -> None:
     """Raise `InputError` where a capture cannot determine what is unknown."""
-    prior, noise = solving.prior, solving.noise
+    prior = solving.prior
     if prior is None and not capture.observations and not capture.lengths:
         # Repeatability does not determine the scale: where lengths are free, it determines one parameter less.
         check_enough(capture.sizes, len(space.names) - int(space.lengths.any()))
@@ -227,7 +221,7 @@ def check_data(
         prior.check(space.base)
         # The prior determines its parameters, unless the noise has to be estimated: fewer equations than unknowns would
         # leave nothing to do that from.
-        stated = None if noise is None else prior.of(free, np.zeros(len(free)))
+        stated = None if solving.noise is None else prior.of(free, np.zeros(len(free)))
         unknowns -= 0 if stated is None else len(stated.index)
     check_observed(observed, space, vector, unknowns)
 
@@ -248,15 +242,14 @@ def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
 def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray, " p"], count: int) -> None:
     """Raise `InputError` where the observations cannot determine their own unknowns, or ``count`` parameters."""
     forward = forward_pass(space.geometry(vector), observed.motion)
+    poses: dict[str, list[np.ndarray]] = {}
     for observation, rows in zip(observed.observations, observed.slices, strict=True):
         # Through the class: a bound method of Equinox is a module made anew.
         type(observation).check_determined(observation, np.asarray(forward.tip[:, rows]))
+        if observation.target:
+            poses.setdefault(observation.target, []).append(np.arange(rows.start, rows.stop))
     # A target at t in the last frame (x, y, z) is seen at F (p + R t): where R is one matrix, t and the translation of
     # the station's frame F cannot be told apart.
-    poses: dict[str, list[np.ndarray]] = {}
-    for observation, part in zip(observed.observations, observed.slices, strict=True):
-        if observation.target:
-            poses.setdefault(observation.target, []).append(np.arange(part.start, part.stop))
     for target, parts in poses.items():
         axes = [np.asarray(forward.frame[i])[:, np.concatenate(parts)] for i in (0, 2)]
         if max(np.ptp(axis, axis=1).max() for axis in axes) < _LEAST_TURN:
@@ -273,16 +266,153 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
         )
 
 
-def check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, strict: bool) -> None:
-    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
-    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, bounds))):
-        return
-    space = bounds.space
-    stated = None if prior is None else prior.of(space.names, space.vector())
-    names = () if stated is None else tuple(space.names[i] for i in stated.index)
-    seen = observability(space.base, capture, space, known=names)
-    lost = seen._replace(by_prior=()).sentences()
-    if lost and strict:
-        raise InputError(" ".join(lost))
-    for sentence in seen.sentences():
-        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
+class State(NamedTuple):
+    """Everything at one point of a solve."""
+
+    point: PointRows
+    errors: list[tip_errors.ArmErrors]
+    sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
+
+
+class Begun(NamedTuple):
+    """Where a solve begins."""
+
+    space: Parameters
+    sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]]  # bounds of all unknowns
+    steps: Float[AnyArray, " z"]  # natural steps
+    before: State  # at the start
+    z: Float[AnyArray, " z"]  # where it begins: there, or near the solution
+    state: State  # there
+
+
+class Fit(NamedTuple):
+    """Result of one least squares."""
+
+    parameters: Float[AnyArray, " n"]
+    steps: Int[AnyArray, ""]  # evaluations
+    result: Reason
+    optimality: Float[AnyArray, ""]
+
+
+def begin(task: Task, near: Float[AnyArray, " p"] | None = None) -> Begun:
+    """At the start, or at parameters near the solution."""
+    xp, observed, space = namespace(task), task.observed, task.space
+
+    def unknowns(vector: Float[AnyArray, " p"]) -> Float[AnyArray, " z"]:
+        geometry = observed.start(space, vector)
+        if task.kept:
+            parts = observed.split(geometry) | dict(task.kept)
+            geometry = xp.concatenate([parts[name] for name in observed.blocks])
+        return xp.concatenate([vector, geometry])
+
+    z = unknowns(task.start[task.free])
+    point = rows_at(space, observed, z)
+    before = state = state_at(task, space, z, _root_mean_square(point.rows), point=point)
+    if near is not None:
+        z = unknowns(xp.clip(near, task.bounds.lower, task.bounds.upper)[task.free])
+        state = state_at(task, space, z)
+    lower, upper, steps = box_of(task)
+    return Begun(space, (lower, upper), steps, before, z, state)
+
+
+def box_of(task: Task) -> tuple[Float[AnyArray, " z"], Float[AnyArray, " z"], Float[AnyArray, " z"]]:
+    """Lower and upper bounds of all unknowns, of which the geometry has none unless it is kept; natural steps."""
+    xp, kept, sides = namespace(task), task.kept or {}, []
+    for side, endless in ((task.bounds.lower, -np.inf), (task.bounds.upper, np.inf)):
+        geometry = [kept.get(name, np.full(len(units), endless)) for name, units in task.observed.blocks.items()]
+        sides.append(xp.concatenate([side[task.free], *geometry]))
+    return *sides, xp.concatenate([task.space.scale, xp.asarray(task.observed.steps)])
+
+
+def solves_of(task: Task) -> list[tuple[Loss | None, Rules]]:
+    """The losses of the solves one after the other, and when each of them ends.
+
+    Far from the solution a robust loss would see nothing but bad poses, so it begins where least squares ends, and one
+    with several minima where Huber's, which has one, ends.
+    """
+    losses = [None] if task.needs_no_weights else [None, None]
+    if task.loss is not None:
+        losses = [None, Loss("huber"), task.loss, task.loss]
+    rules = [RULES, *(NEAR for _ in losses[1:])]
+    rules = [*(rule._replace(rtol=_ROUGH) for rule in rules[:-1]), rules[-1]]
+    return list(zip(losses, rules, strict=True))
+
+
+def state_at(
+    task: Task,
+    space: Parameters,
+    z: Float[AnyArray, " z"],
+    sigma: Any = None,
+    effective: Float[AnyArray, ""] | int | None = None,
+    point: PointRows | None = None,
+) -> State:
+    """The state at a point, whose rows may be known (``point``); ``sigma`` is estimated unless it is given, and
+    ``effective`` is how many unknowns the data determine, by default all that are fitted."""
+    point = rows_at(space, task.observed, z) if point is None else point
+    # Where a batch needs no weights, nobody asks for errors.
+    errors = tip_errors.arm_errors(point, task.observed) if isinstance(point.forward, ForwardPass) else []
+    if sigma is None:
+        xp, spent = namespace(z, effective), task.fitted.sum() if effective is None else effective
+        degrees_of_freedom = xp.maximum(xp.asarray(task.observed.equations - spent, dtype=float), 1.0)
+        if task.needs_no_weights:
+            squares: Any = sum(xp.sum(part.values**2) for part in point.rows)
+            sigma = tip_errors.root_of_sum(squares / degrees_of_freedom)
+        else:
+            scatter = tip_errors.scatter_of if task.loss is None else tip_errors.robust_scatter_of
+            sigma = scatter(point.rows, errors, degrees_of_freedom)
+    return State(point, errors, sigma)
+
+
+def state_after(task: Task, begun: Begun, z: Float[AnyArray, " z"], point: PointRows, last: bool) -> State:
+    """At the solution of a least squares; where the noise is given, only the last scatter matters, and its iteration
+    costs as much as a few steps."""
+    sigma = _root_mean_square(point.rows) if task.noise is not None and not last else None
+    return state_at(task, begun.space, z, sigma, point=point)
+
+
+def _root_mean_square(rows: list[Rows]) -> Any:
+    """Of the residuals in mm, for the first weights."""
+    xp = namespace([part.values for part in rows])
+    return xp.sqrt(xp.mean(xp.concatenate([xp.reshape(part.values[:3], (-1,)) for part in rows]) ** 2)) + 1e-9
+
+
+def whitening_at(task: Task, state: State, prior: PriorRows | None = None) -> Whitening:
+    """The weights of everything by the state of a nearly right arm."""
+    if task.noise is None:
+        of_arm = [tip_errors.covariance_of_sigma(errors, state.sigma) for errors in state.errors]
+    else:
+        of_arm = [tip_errors.covariance_of_noise(errors, task.noise) for errors in state.errors]
+    least = namespace(state.sigma).maximum(_LEAST * state.sigma, 1e-12)
+    return whitening_of(state.point.rows, task.observed, of_arm, least)._replace(prior=prior)
+
+
+def args_of(task: Task, whitening: Whitening, loss: Loss | None, z: Float[AnyArray, " z"]) -> tuple[Args, int]:
+    """What one least squares is of, and how many unknowns it has: of z, those of components that rows are linear in
+    come last and are none, but for a robust loss, or where some of them are kept."""
+    layout = task.observed.layout
+    linear = sum(count * size for count, size in layout.classes[len(layout.classes) - layout.linear :])
+    args = Args(task.space, task.observed, whitening, loss)
+    first = z.shape[0] - linear
+    if loss is not None or not linear or not task.fitted[first:].all():
+        return args, z.shape[0]
+    return args._replace(linear=stop_gradient(z[first:])), first
+
+
+def fit(task: Task, args: Args, z: Float[AnyArray, " n"], begun: Begun, rules: Rules, differentiable: bool) -> Fit:
+    """A least squares within bounds: by Optimistix for arrays of JAX, unless no derivative is needed; else by its bare
+    steps. The steps of what is begun scale the unknowns."""
+    xp, count = namespace(z, args, begun.sides), z.shape[0]
+    if not task.fitted[:count].any():
+        return Fit(z, xp.zeros((), dtype=int), reasons(xp.asarray(GRADIENT)), xp.zeros(()))
+    (lower, upper), scale = (side[:count] for side in begun.sides), begun.steps[:count]
+    box: dict[str, Any] = {"lower": lower, "upper": upper, "scale": scale, "max_steps": task.max_steps}
+    if xp is np or not differentiable:
+        last = minimise(observed_model, z, args, rules=rules, **box)
+        return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
+    # Optimistix takes 0.2 s to import, and NumPy needs none of it.
+    from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
+
+    solver = BoundedLevenbergMarquardt(**rules._asdict())
+    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=solver, throw=False, **box)
+    stats = solution.stats
+    return Fit(solution.value, stats["num_steps"], stats["reason"], stats["optimality"])

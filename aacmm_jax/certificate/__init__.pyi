@@ -1,3 +1,3 @@
 from .document import dcc_xml as dcc_xml
-from .parsing import CertifiedValue as CertifiedValue
-from .parsing import parse_dcc as parse_dcc
+from .xml_elements import CertifiedValue as CertifiedValue
+from .xml_elements import parse_dcc as parse_dcc

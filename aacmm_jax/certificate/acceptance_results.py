@@ -78,13 +78,18 @@ def _artefacts(record: EvaluationRecord) -> Element | None:
 def _test(test: AcceptanceTest, judged: bool) -> Element:
     """One test; ``judged``: with the conformity of values with limits, which no simulated arm has."""
     lacking = f"Not the full procedure. {' '.join(test.missing)}" if test.missing else "The full procedure."
-    lists = []
-    for metric in test.metrics:
-        values = (
-            _value(test, metric, f"{number}: {value.where}", value, judged)
-            for number, value in enumerate(metric.values, start=1)
+    lists = (
+        named(
+            "list",
+            test.symbol(metric),
+            (
+                _value(test, metric, f"{number}: {value.where}", value, judged)
+                for number, value in enumerate(metric.values, start=1)
+            ),
+            says=METRICS[metric.name],
         )
-        lists.append(named("list", test.symbol(metric), values, says=METRICS[metric.name]))
+        for metric in test.metrics
+    )
     says = f"{lacking} Expanded uncertainties have the coverage factor {COVERAGE_FACTOR:g}."
     return named("result", f"{test.called}: {test.title}", element("data", lists), says=says)
 
@@ -99,7 +104,7 @@ def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, 
             f"Conformity of {test.symbol(metric)}",
             element("norm", RULES[test.rule]),
             english("declaration", f"|value| against the maximum permissible error: {value.decision}."),
-            element("conformity", _conformity(value, value.limit)),
+            element("conformity", _conformity(value)),
             element("data", limit),
         )
     measured = real(value.value, MILLIMETRE, u or None, COVERAGE_FACTOR, _DECIMALS)
@@ -107,8 +112,8 @@ def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, 
     return element("quantity", text("name", name), measured, meta, ref_type="basic_measurementError")
 
 
-def _conformity(found: MetricValue, limit: float) -> str:
+def _conformity(value: MetricValue) -> str:
     """The DCC's word. What is undecided passes or fails conditionally, by its side of the limit (ILAC-G8:09/2019)."""
-    if found.decision == "undecided":
-        return "conditionalPass" if abs(found.value) <= limit else "conditionalFail"
-    return "pass" if found.decision == "conforms" else "fail"
+    if value.decision == "undecided":
+        return "conditionalPass" if abs(value.value) <= (value.limit or 0.0) else "conditionalFail"
+    return "pass" if value.decision == "conforms" else "fail"

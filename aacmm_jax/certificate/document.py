@@ -32,7 +32,10 @@ def dcc_xml(
 ) -> str:
     """Make the Digital Calibration Certificate of a calibration.
 
-    The same input gives the same text: without a stated number, the unique identifier is a UUID of the content.
+    The same input gives the same text: without a stated number, the unique identifier is a UUID of the content. Returns
+    the text of an XML file in UTF-8. `InputError` if the calibration did not converge, its scale is impossible or the
+    nominal arm's, a name has characters that XML does not allow, the dates are out of order, the evaluation is of
+    another arm, or a conformity is stated that no result supports.
 
     Args:
         record: The calibration.
@@ -42,14 +45,6 @@ def dcc_xml(
         command: The command that computed it.
         evaluation: An evaluation of the same calibration, whose acceptance tests are added. A statement of conformity
             rests on them, and is refused without them.
-
-    Returns:
-        The text of an XML file in UTF-8.
-
-    Raises:
-        InputError: If the calibration did not converge, its scale is impossible or the nominal arm's, a name has
-            characters that XML does not allow, the dates are out of order, the evaluation is of another arm, or a
-            conformity is stated that no result supports.
 
     Example:
         >>> data = aj.files.AdministrativeData(laboratory={"name": "Metrology Laboratory"})
@@ -75,7 +70,12 @@ def dcc_xml(
     _check_evaluation(record, administrative_data, evaluation)
     for what, words in _given_texts(record, evaluation, sources, command):
         held_by_xml(words, what if what == "the command" else f"the name of {what} {words!r}")
-    day = _day(record.recording.measured or created)
+    try:
+        day = datetime.datetime.fromisoformat(record.recording.measured or created).date()
+    except ValueError as error:
+        raise InputError(
+            f"created is '{created}'; give a date and time after ISO 8601, such as 2026-01-31T12:00:00."
+        ) from error
     root = element(
         "digitalCalibrationCertificate",
         _administrative(record, administrative_data, day, sources),
@@ -129,15 +129,6 @@ def _given_texts(
     yield "arm", record.recording.nominal.name
     yield from (("file", source) for source in sources)
     yield "the command", command
-
-
-def _day(created: str) -> datetime.date:
-    try:
-        return datetime.datetime.fromisoformat(created).date()
-    except ValueError as error:
-        raise InputError(
-            f"created is '{created}'; give a date and time after ISO 8601, such as 2026-01-31T12:00:00."
-        ) from error
 
 
 def _administrative(
@@ -211,7 +202,13 @@ def _core(administrative_data: AdministrativeData, day: datetime.date) -> Elemen
 def _statements(record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str]) -> Iterator[Element]:
     if record.recording.true is not None:
         yield _statement("Simulation", "The readings are simulated, so this is no certificate of a real arm.")
-    yield _statement("Scale", _scale(record))
+    scale = "the reference lengths alone: its measurements are traceable as far as these lengths are"
+    if record.recording.capture.observations:
+        scale = (
+            f"{', '.join(scale_sources(record))}: its measurements are traceable as far as the certified values of "
+            "these artefacts, and the instruments that measured, are"
+        )
+    yield _statement("Scale", f"The scale of the arm comes from {scale}, and have no other connection to the metre.")
     yield _statement("Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
@@ -229,19 +226,6 @@ def _statements(record: CalibrationRecord, given: AdministrativeData, sources: S
         yield _statement("Conformity", stated.decision_rule, verdict, norm=stated.specification)
     if given.certificate.remarks is not None:
         yield named("statement", "Remarks", text("declaration", given.certificate.remarks))
-
-
-def _scale(record: CalibrationRecord) -> str:
-    if not record.recording.capture.observations:
-        return (
-            "The scale of the arm comes from the reference lengths alone: its measurements are traceable as far as "
-            "these lengths are, and have no other connection to the metre."
-        )
-    return (
-        f"The scale of the arm comes from {', '.join(scale_sources(record))}: its measurements are traceable as far as "
-        "the certified values of these artefacts, and the instruments that measured, are, and have no other connection "
-        "to the metre."
-    )
 
 
 def _statement(name: str, words: str, verdict: Element | None = None, *, norm: str | None = None) -> Element:

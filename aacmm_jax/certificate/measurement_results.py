@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -13,7 +12,7 @@ from ..data.capture import ReferenceLength
 from ..data.observations.observation import Quantity, certified_quantities
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
-from ..kinematics.arm import Arm, parameter_names, parameter_unit
+from ..kinematics.arm import parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
 from ..summaries.calibration import prior_rows, prior_sentence
 from ..summaries.observations import less_weight
@@ -36,34 +35,30 @@ _SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared
 _D_SI = {"mm": MILLIMETRE, "rad": RADIAN, "m": r"\metre", "kN": r"\kilo\newton", "K": r"\kelvin"}
 
 
-class _Stage(NamedTuple):
-    name: str
-    status: str
-    description: str
-    arm: Arm
-    evaluation: Evaluation
-    left: bool  # of the calibrated arm
-
-
 def results_of(record: CalibrationRecord, given: AdministrativeData, command: str) -> Iterator[Element]:
     """Both measurement results of a calibration."""
-    evaluations, residuals = record.evaluations(), observation_residuals(record)
-    before = "The readings, evaluated with the nominal parameters, those before the calibration."
-    after = "The same readings, evaluated with the calibrated parameters, which were identified from them."
-    nominal, calibrated = record.recording.nominal.arm, record.calibrated.arm
-    for stage in (
-        _Stage("Nominal parameters", "beforeAdjustment", before, nominal, evaluations["nominal"], False),
-        _Stage("Calibrated parameters", "afterAdjustment", after, calibrated, evaluations["calibrated"], True),
+    residuals, temperature = observation_residuals(record), english("text", NOT_STATED)
+    if given.certificate.temperature_celsius is not None:
+        celsius = real(given.certificate.temperature_celsius, xml.CELSIUS, given.certificate.temperature_u_celsius)
+        temperature = named("quantity", "Ambient temperature", celsius)
+    for stage, status, says in (
+        ("nominal", "before", "The readings, evaluated with the nominal parameters, those before the calibration."),
+        (
+            "calibrated",
+            "after",
+            "The same readings, evaluated with the calibrated parameters, which were identified from them.",
+        ),
     ):
+        status, data = element("status", f"{status}Adjustment"), element("data", temperature)
         yield named(
             "measurementResult",
-            stage.name,
+            f"{stage.capitalize()} parameters",
             _methods(record, residuals),
             xml.software("usedSoftware", command),
             element("measuringEquipments", _equipment(record, given.reference, residuals)),
-            element("influenceConditions", _temperature(given, stage)),
-            element("results", _results(record, stage, residuals)),
-            says=stage.description,
+            element("influenceConditions", named("influenceCondition", "Ambient temperature", status, data)),
+            element("results", _results(record, stage == "calibrated", residuals)),
+            says=says,
         )
 
 
@@ -157,8 +152,13 @@ def _equipment(
     # Observations with the same certified values are of one artefact in several placements, which is named once.
     equipment: dict[tuple, tuple[list[str], str, list[Quantity]]] = {}
     for part in residuals:
-        observation, measured = part.observation, _measured(part)
-        certified = list(certified_quantities(observation))
+        observation, certified = part.observation, list(certified_quantities(part.observation))
+        # As they were given.
+        stated = {
+            "standard uncertainty of a measured coordinate or distance": (part.u or None, "mm"),
+            "standard uncertainty of a measured orientation about each axis": (part.u_angle, "rad"),
+        }
+        measured = [Quantity(what, np.array([u]), unit) for what, (u, unit) in stated.items() if u is not None]
         key = tuple((quantity.says, *np.asarray(quantity.values).tolist(), quantity.u) for quantity in certified)
         if certified or measured:
             where = (observation.kind, *(key if certified and not measured else (observation.name,)))
@@ -166,75 +166,56 @@ def _equipment(
             names.append(observation.name)
     unknown = "" if references else f"; artefact or instrument: {NOT_STATED}"
     for names, kind, quantities in equipment.values():
+        numbers = []
+        for quantity in quantities:
+            count = len(quantity.values)
+            labels = [""] if count == 1 else [f", {axis}" for axis in ("xyz" if count == 3 else range(1, count + 1))]
+            for label, value in zip(labels, quantity.values, strict=True):
+                unit = _in_d_si(quantity.unit)
+                numbers.append(xml.equipment_quantity(quantity.says + label, float(value), unit, quantity.u))
         yield element(
             "measuringEquipment",
             text("name", ", ".join(names)),
             english("description", f"Kind of observation: {kind}{unknown}"),
-            element("measuringEquipmentQuantities", map(_numbers_of, quantities)),
+            element("measuringEquipmentQuantities", numbers),
         )
-
-
-def _measured(part: ObservationResiduals) -> list[Quantity]:
-    """The standard uncertainties of what an instrument measured, as they were given."""
-    stated = {
-        "standard uncertainty of a measured coordinate or distance": (part.u or None, "mm"),
-        "standard uncertainty of a measured orientation about each axis": (part.u_angle, "rad"),
-    }
-    return [Quantity(says, np.array([u]), unit) for says, (u, unit) in stated.items() if u is not None]
-
-
-def _numbers_of(quantity: Quantity) -> list[Element]:
-    """A quantity, with each of its numbers on its own."""
-    count = len(quantity.values)
-    labels = [""] if count == 1 else [f", {axis}" for axis in ("xyz" if count == 3 else range(1, count + 1))]
-    return [
-        xml.equipment_quantity(quantity.says + label, float(value), _in_d_si(quantity.unit), quantity.u)
-        for label, value in zip(labels, quantity.values, strict=True)
-    ]
-
-
-def _temperature(given: AdministrativeData, stage: _Stage) -> Element:
-    name, celsius = "Ambient temperature", given.certificate.temperature_celsius
-    data = english("text", NOT_STATED)
-    if celsius is not None:
-        data = named("quantity", name, real(celsius, xml.CELSIUS, given.certificate.temperature_u_celsius))
-    return named("influenceCondition", name, element("status", stage.status), element("data", data))
 
 
 def _results(
-    record: CalibrationRecord, stage: _Stage, residuals: tuple[ObservationResiduals, ...]
+    record: CalibrationRecord, calibrated: bool, residuals: tuple[ObservationResiduals, ...]
 ) -> Iterator[Element | None]:
-    uncertainty = uncertainty_of(record)
-    yield _repeatability(stage)
+    evaluation, uncertainty = record.evaluations()["calibrated" if calibrated else "nominal"], uncertainty_of(record)
+    values = {name: float(getattr(evaluation.repeatability, key)) for name, (key, _) in _METRICS.items()}
+    if all(map(math.isfinite, values.values())):  # not where every socket has one pose
+        quantities = (
+            named("quantity", name, real(value, MILLIMETRE, decimals=_DECIMALS[MILLIMETRE]), says=_METRICS[name][1])
+            for name, value in values.items()
+        )
+        yield _result("Repeatability", "Over all sockets with more than one pose.", quantities)
     if record.recording.capture.lengths:
-        yield _lengths(record, stage, uncertainty)
+        yield _lengths(record, evaluation, calibrated, uncertainty)
     if not record.sockets_alone:
-        distances = distances_of(record.recording.capture, stage.evaluation)
+        distances = distances_of(record.recording.capture, evaluation)
         rows = (
-            _observation(number, part, of_arm, stage.left)
+            _observation(number, part, of_arm, calibrated)
             for number, (part, of_arm) in enumerate(zip(residuals, distances, strict=True), start=1)
         )
         yield _result("Observations", "Distances of the tip from the geometry of each observation.", rows)
-    yield _parameters(record, stage, uncertainty)
-    if stage.left:
+    yield _parameters(record, calibrated, uncertainty)
+    if calibrated:
         yield _covariance(record)
-        yield None if math.isnan(record.k) else _scale(record, uncertainty)
+    if calibrated and not math.isnan(record.k):
+        u = record.u_k if _is_known(record.u_k) else None
+        k = real(record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
+        yield _result(
+            "Scale",
+            "Reference lengths as the arm measured them before its scale was set, over their calibrated values.",
+            named("quantity", "k", k),
+        )
 
 
 def _result(name: str, description: str, *data: Element | Iterator[Element]) -> Element:
     return named("result", name, element("data", *data), says=description)
-
-
-def _repeatability(stage: _Stage) -> Element | None:
-    """Metrics of repeatability; none where every socket has one pose."""
-    values = {name: float(getattr(stage.evaluation.repeatability, key)) for name, (key, _) in _METRICS.items()}
-    if not all(map(math.isfinite, values.values())):
-        return None
-    quantities = (
-        named("quantity", name, real(value, MILLIMETRE, decimals=_DECIMALS[MILLIMETRE]), says=_METRICS[name][1])
-        for name, value in values.items()
-    )
-    return _result("Repeatability", "Over all sockets with more than one pose.", quantities)
 
 
 def _length_name(number: int, length: ReferenceLength) -> str:
@@ -242,10 +223,10 @@ def _length_name(number: int, length: ReferenceLength) -> str:
     return f"{number}: {length.start} - {length.end}"
 
 
-def _lengths(record: CalibrationRecord, stage: _Stage, uncertainty: Uncertainty) -> Element:
+def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool, uncertainty: Uncertainty) -> Element:
     """Value, measured value and error of each length; of one that fixed the scale the value alone."""
-    lengths, fixed_scale = record.recording.capture.lengths, stage.left and record.fixed_by_one_length
-    columns = [np.asarray(column) for column in (stage.evaluation.measured, stage.evaluation.error, stage.evaluation.u)]
+    lengths, fixed_scale = record.recording.capture.lengths, calibrated and record.fixed_by_one_length
+    columns = [np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u)]
     stated = np.array([float(length.u) for length in lengths])
     columns.append(uncertainty.expanded_by_scatter(columns[2], stated, LEVEL))
     rows = []
@@ -275,10 +256,10 @@ def _lengths(record: CalibrationRecord, stage: _Stage, uncertainty: Uncertainty)
     )
 
 
-def _observation(number: int, part: ObservationResiduals, distances: np.ndarray, left: bool) -> Element:
-    """Residuals of an observation: in mm, and of the calibrated arm (``left``) in standard deviations too."""
-    values = [("RMS residual", rms(part.distance if left else distances), MILLIMETRE)]
-    if left:
+def _observation(number: int, part: ObservationResiduals, distances: np.ndarray, calibrated: bool) -> Element:
+    """Residuals of an observation: in mm, and of the calibrated arm in standard deviations too."""
+    values = [("RMS residual", rms(part.distance if calibrated else distances), MILLIMETRE)]
+    if calibrated:
         values.append(("RMS residual in standard deviations", rms(part.normalised), ONE))
         if part.angle is not None:
             values.append(("RMS residual of the orientation", rms(part.angle), RADIAN))
@@ -295,12 +276,13 @@ def _observation(number: int, part: ObservationResiduals, distances: np.ndarray,
     )
 
 
-def _parameters(record: CalibrationRecord, stage: _Stage, uncertainty: Uncertainty) -> Element:
+def _parameters(record: CalibrationRecord, calibrated: bool, uncertainty: Uncertainty) -> Element:
     factors = dict(zip(record.names, map(float, uncertainty.factor(LEVEL)), strict=True))
-    quantities = []
-    for name, value in _values(stage.arm).items():
-        note, u = _note_and_uncertainty(record, name) if stage.left else ("", None)
-        measured = real(value, _in_d_si(parameter_unit(stage.arm, name)), u, factors.get(name))
+    arm = (record.calibrated if calibrated else record.recording.nominal).arm
+    names, quantities = parameter_names(arm), []
+    for name, value in zip(names, np.asarray(Parameters(arm, names).vector()).tolist(), strict=True):
+        note, u = _note_and_uncertainty(record, name) if calibrated else ("", None)
+        measured = real(value, _in_d_si(parameter_unit(arm, name)), u, factors.get(name))
         quantities.append(named("quantity", name, measured, says=note))
     corrections = (
         " To theta (d of a prismatic joint) each joint correction adds its coefficient times a known function of the "
@@ -309,7 +291,7 @@ def _parameters(record: CalibrationRecord, stage: _Stage, uncertainty: Uncertain
     return _result(
         "Denavit-Hartenberg parameters",
         "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
-        "last frame." + ("" if stage.arm.corrections is None else corrections),
+        "last frame." + ("" if arm.corrections is None else corrections),
         *quantities,
     )
 
@@ -341,12 +323,6 @@ def _covariance(record: CalibrationRecord) -> Element | None:
     )
 
 
-def _values(arm: Arm) -> dict[str, float]:
-    """All parameters of an arm by name, mm and rad."""
-    names = parameter_names(arm)
-    return dict(zip(names, map(float, np.asarray(Parameters(arm, names).vector())), strict=True))
-
-
 def _note_and_uncertainty(record: CalibrationRecord, name: str) -> tuple[str, float | None]:
     """A note on a calibrated parameter, and its standard uncertainty if it has one of its own."""
     if name not in record.names:
@@ -359,13 +335,6 @@ def _note_and_uncertainty(record: CalibrationRecord, name: str) -> tuple[str, fl
     if not (record.determined[i] and _is_known(u)):
         return "Determined only together with other parameters, so it has no uncertainty of its own", None
     return "", u
-
-
-def _scale(record: CalibrationRecord, uncertainty: Uncertainty) -> Element:
-    u = record.u_k if _is_known(record.u_k) else None
-    k = real(record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
-    description = "Reference lengths as the arm measured them before its scale was set, over their calibrated values."
-    return _result("Scale", description, named("quantity", "k", k))
 
 
 def _is_known(u: float) -> bool:

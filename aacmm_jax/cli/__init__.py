@@ -91,7 +91,7 @@ def main() -> None:
 
 
 def _fail_without_jax() -> None:
-    from ..core.backend import check_backend
+    from ..core.jax_setup import check_backend
 
     try:
         check_backend()

@@ -11,8 +11,8 @@ from typing import Any, get_args, get_type_hints
 import typer
 import typer.core
 
-from ..core.backend import prepare_command
 from ..core.errors import InputError
+from ..core.jax_setup import prepare_command
 from ..core.text import in_short, is_number, printable, quoted
 
 

@@ -111,8 +111,7 @@ def simulate(
                 poses=_poses_option(poses or (), points),
                 lengths=[length_option(text) for text in length or ()],
                 noise=noise,
-                resolution_arcsec=resolution_arcsec,
-                linear_resolution=linear_resolution_mm,
+                resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
                 temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
                 seed=seed,
             ))  # fmt: skip

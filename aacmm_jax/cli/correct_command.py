@@ -78,7 +78,7 @@ def correct(
     from ..files.calibrations import load_calibration
     from ..files.outputs import write_text
     from ..files.pose_tables import corrected_csv, read_poses
-    from ..kinematics.correction import corrected_readings, readings_at_poses
+    from ..kinematics.inverse_kinematics import corrected_readings, readings_at_poses
     from ..summaries.correction import correction_summary
 
     begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with a reading for each joint")
@@ -115,7 +115,7 @@ def correct(
 
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
-    from ..data.reference_length import check_temperatures
+    from ..data.capture_data import check_temperatures
     from ..files.manifest_rows import with_temperature
     from ..kinematics.arm import correction_names
     from ..kinematics.corrections import Expansion

@@ -8,8 +8,7 @@ import numpy as np
 
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord
-from ..core.errors import InputError
-from ..core.extras import MissingExtra, require
+from ..core.errors import InputError, MissingExtra, require
 from ..core.text import shorten
 from ..data.noise import Noise
 from ..data.recording import Recording

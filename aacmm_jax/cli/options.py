@@ -8,8 +8,8 @@ from typing import Any, NoReturn
 import typer
 
 from ..core.errors import InputError
+from ..core.jax_setup import LARGEST_INTEGER
 from ..core.text import is_control, number, quoted
-from ..core.x64 import LARGEST_INTEGER
 
 
 def argument(metavar: str, help: str, default: Any = ...) -> Any:

@@ -54,9 +54,9 @@ def planned_arm(
     --cone-deg and --normal. ``cell``: its file, whether collisions are checked, and the radius of the links.
     ``sockets``: names that may be named.
     """
-    from ..data.arm_classes import CLASSES
+    from ..data.noise import CLASSES
     from ..files.cells import load_cell
-    from ..planning.options import PlanOptions
+    from ..planning.problem import PlanOptions
 
     assumed = assumed_noise(arm, links, noise)
     file, wanted, radius = cell
@@ -76,7 +76,7 @@ def planned_arm(
 
 def _cones(angles: Sequence[str] | None, normals: Sequence[str] | None, default: float, sockets: Sequence[str]) -> Any:
     """One cone for all sockets, or one for each where some are named."""
-    from ..kinematics.cones import Cone
+    from ..kinematics.workspace import Cone
 
     half_angles = {name: math.radians(value[0]) for name, value in _by_socket("--cone-deg", angles, 1).items()}
     directions = {name: (x, y, z) for name, (x, y, z) in _by_socket("--normal", normals, 3).items()}

@@ -55,7 +55,7 @@ def _summary(specification: Any, check: Any, unit: str | None, positions: str, m
 
     best = check.best
     summary = reading_check_summary(check, specification.name, unit=unit, positions=positions)
-    angles = check.explained and (best.hypothesis.changes or best.angle != 1)
+    angles = check.explained and best.hypothesis._replace(length=1.0).changes
     summary["angles"] = angles_toml(best, unit, manifest) if angles else None
     summary["units"] = units_toml(best, positions) if check.explained else None
     return summary | {"standing": [], "reading_sets": [], "reading_sets_sentence": ""}

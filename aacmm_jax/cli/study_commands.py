@@ -38,10 +38,9 @@ def study(
     dask: str | None = option(
         "ADDRESS",
         "Run on a Dask cluster: the address of its scheduler. tcp:// trusts everybody who can reach its port, who can "
-        "run programs with your rights; tls:// asks for certificates (see docs/scaling.md). 'local' is for processes "
-        "on this machine, which open no port.",
+        "run programs with your rights; tls:// asks for certificates (see docs/scaling.md).",
     ),
-    workers: int | None = option("N", "Threads, or processes of --dask local. Default: one a core.", min=1),
+    workers: int | None = option("N", "Threads of this process. Default: one a core.", min=1),
     shards: bool = flag(
         "--shards", "Dask workers write their trials themselves, to the output's folder, which they share."
     ),
@@ -71,6 +70,8 @@ def study(
             asked = _asked(specification, trials, seed)
     if shards and dask is None:
         raise InputError("--shards is for the workers of --dask; leave it out, or name a cluster.")
+    if workers is not None and dask is not None:
+        raise InputError("a running Dask cluster has its own workers; leave --workers out.")
 
     settings = {"chunk": chunk, "shards": shards, "keep_parts": keep_parts}
     with _leaving_threads():
@@ -107,13 +108,12 @@ def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
 
 
 def _run(asked: Any, output: Path, dask: str | None, workers: int | None, settings: dict[str, Any]) -> Any:
-    from ..study.executors import dask_executor
-    from ..study.runner import run_study
+    from ..study.runner import dask_executor, run_study
 
     here = nullcontext((None, workers))
     with (
         _progress_display() as show,
-        here if dask is None else dask_executor(dask, workers) as (executor, count),
+        here if dask is None else dask_executor(dask) as (executor, count),
     ):
         return run_study(asked, output, executor=executor, workers=count, watch=show, **settings)
 
@@ -125,7 +125,7 @@ def _leaving_threads() -> Iterator[None]:
         yield
     except (KeyboardInterrupt, Stopped) as interrupt:
         from ..core._compat import end_process
-        from ..study.executors import THREADS
+        from ..study.runner import THREADS
 
         if not any(thread.name.startswith(THREADS) for thread in threading.enumerate()):
             raise
@@ -182,8 +182,8 @@ def _ended(summary: dict[str, Any]) -> list[str]:
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
     """Print a study's results, and draw its figures."""
     from ..plot import save_study_figures
-    from ..study.results import Results
-    from ..study.statistics import study_summary
+    from ..study.results import study_summary
+    from ..study.store import Results
 
     results = Results.of(file)
     if cell is not None and cell > len(results.study.cells):

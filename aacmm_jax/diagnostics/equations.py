@@ -77,8 +77,57 @@ def equations_of(record: CalibrationRecord) -> Equations:
     """The equations of a calibration, linear at its solution; as weighted by its robust loss."""
     kinds = by_joint(record.calibrated.arm, "theta", "d")  # where a reading is added
     extra = (*(f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)), *PROBE)
-    steps = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
-    return Equations(*_rows_and_relations(record, extra), extra, steps)
+    in_solve = lengths_in_solve(record)
+    # The length that the equations keep: none where anything but repeatability says what the scale is.
+    scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)
+    anchor = None if in_solve else record.hold if scaled else scale_anchor_of(record)
+    names = tuple(name for name in record.names if name != anchor)
+    every = (*names, *(name for name in extra if name not in names))
+    linear = linearisation_of(record, every, noise=record.noise, lengths=in_solve)
+    observed, p, free = linear.observed, len(every), len(names)
+    steps, columns = np.asarray(linear.steps), np.array([every.index(name) for name in extra])
+    # The geometry that several observations, reference lengths or certified values depend on.
+    related = {end for ends in observed.ends for end in ends} | observed.certified().keys()
+    private = [observed.positions[part] for part in observed.blocks if part in related]
+    common = np.unique(np.concatenate([np.arange(observed.layout.shared), *private]).astype(int))
+    rows = []
+    for part in linear.parts():
+        weight = np.sqrt(np.asarray(part.weight))
+        root = weight[:, None, None] * np.asarray(part.root)
+        by = np.moveaxis(np.asarray(part.by_head) * weight, (0, 1, 2), (2, 1, 0)) * steps[: linear.height]
+        own = np.moveaxis(np.asarray(part.by_private) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + part.private]
+        among = np.isin(part.private, common)
+        # A socket with one pose shows no scatter; only lengths in the solve need it.
+        if not in_solve and len(weight) == 1 and np.sum(~among) == 3:
+            continue
+        shared = np.zeros((*by.shape[:2], free + len(common)))
+        shared[..., :free] = by[..., :free]
+        shared[..., free : free + observed.layout.shared] = by[..., p:]
+        shared[..., free + np.searchsorted(common, part.private[among])] = own[..., among]
+        rows.append(
+            Rows(
+                part.observation.name,
+                (np.asarray(part.white) * weight).T,
+                shared,
+                own[..., ~among],
+                by[..., columns],
+                np.linalg.pinv(root)[:, :3],
+                root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
+                np.arange(part.poses.start, part.poses.stop),
+            )
+        )
+    derivatives, residual, u = linear.relations()
+    u = np.maximum(u, LEAST_U)
+    chosen = np.concatenate([np.arange(free), p + common])
+    relations = [Block("", None, residual / u, (derivatives * steps)[:, chosen] / u[:, None], np.zeros((len(u), 0)))]
+    if record.prior is not None:
+        mean, weight = np.asarray(record.prior.mean), np.asarray(record.prior.weight)
+        stated = np.flatnonzero(weight)
+        residual = weight[stated] * (np.asarray(linear.z)[:free] - mean)[stated]
+        by = np.eye(len(chosen))[stated] * (weight * steps[:free])[stated][:, None]
+        relations.append(Block(PRIOR, None, residual, by, np.zeros((len(stated), 0))))
+    natural = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
+    return Equations(rows, relations if len(u) else relations[1:], extra, natural)
 
 
 def in_chunks(equations: Equations) -> tuple[list[Rows], list[Block]]:
@@ -135,66 +184,6 @@ def linearisation_of(
 def lengths_in_solve(record: CalibrationRecord) -> bool:
     """Whether reference lengths took part in the least squares, and not only as the scale afterwards."""
     return record.final_method == "joint" and bool(record.recording.capture.lengths)
-
-
-def _rows_and_relations(record: CalibrationRecord, extra: tuple[str, ...]) -> tuple[list[Rows], list[Block]]:
-    in_solve = lengths_in_solve(record)
-    # The length that the equations keep: none where anything but repeatability says what the scale is.
-    scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)
-    anchor = None if in_solve else record.hold if scaled else scale_anchor_of(record)
-    names = tuple(name for name in record.names if name != anchor)
-    every = (*names, *(name for name in extra if name not in names))
-    linear = linearisation_of(record, every, noise=record.noise, lengths=in_solve)
-    observed, p, free = linear.observed, len(every), len(names)
-    steps, columns = np.asarray(linear.steps), np.array([every.index(name) for name in extra])
-    # The geometry that several observations, reference lengths or certified values depend on.
-    related = {end for ends in observed.ends for end in ends} | observed.certified().keys()
-    private = [observed.positions[part] for part in observed.blocks if part in related]
-    common = np.unique(np.concatenate([np.arange(observed.layout.shared), *private]).astype(int))
-    rows = []
-    parts = zip(linear.parts(), linear.white(), linear.by_head(), linear.by_private(), linear.private(), strict=True)
-    for part, white, head, by_own, index in parts:
-        weight = np.sqrt(np.asarray(part.weight))
-        root = weight[:, None, None] * np.asarray(part.root)
-        by = np.moveaxis(np.asarray(head) * weight, (0, 1, 2), (2, 1, 0)) * steps[: linear.height]
-        own = np.moveaxis(np.asarray(by_own) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + index]
-        among = np.isin(index, common)
-        shared = np.zeros((*by.shape[:2], free + len(common)))
-        shared[..., :free] = by[..., :free]
-        shared[..., free : free + observed.layout.shared] = by[..., p:]
-        shared[..., free + np.searchsorted(common, index[among])] = own[..., among]
-        rows.append(
-            Rows(
-                part.observation.name,
-                (np.asarray(white) * weight).T,
-                shared,
-                own[..., ~among],
-                by[..., columns],
-                np.linalg.pinv(root)[:, :3],
-                root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
-                np.arange(part.poses.start, part.poses.stop),
-            )
-        )
-    # A socket with one pose shows no scatter; only lengths in the solve need it.
-    rows = [part for part in rows if in_solve or len(part.poses) > 1 or part.own.shape[2] != 3]
-    derivatives, residual, u = linear.relations()
-    u = np.maximum(u, LEAST_U)
-    chosen = np.concatenate([np.arange(free), p + common])
-    block = Block("", None, residual / u, (derivatives * steps)[:, chosen] / u[:, None], np.zeros((len(u), 0)))
-    prior = _of_prior(record, np.asarray(linear.z), steps[:free], len(chosen))
-    return rows, [*([block] if len(u) else []), *prior]
-
-
-def _of_prior(record: CalibrationRecord, z: np.ndarray, steps: np.ndarray, shared: int) -> list[Block]:
-    """The rows of the prior, which belong to no group."""
-    prior = record.prior
-    if prior is None:
-        return []
-    mean, weight = np.asarray(prior.mean), np.asarray(prior.weight)
-    with_prior = np.flatnonzero(weight)
-    residual = weight[with_prior] * (z[: len(steps)] - mean)[with_prior]
-    derivatives = np.eye(shared)[with_prior] * (weight * steps)[with_prior][:, None]
-    return [Block(PRIOR, None, residual, derivatives, np.zeros((len(with_prior), 0)))]
 
 
 def scale_anchor_of(record: CalibrationRecord) -> str | None:

@@ -8,18 +8,17 @@ from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.redrawn import covariance_of_lengths
-from ..calibration.scale_fix import ends_between, positions_at_ends
+from ..calibration.stages import ends_between, positions_at_ends
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..model.observed import Observed
 from ..uncertainty.shared_kinds import PLACES
-from .equations import LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
+from .equations import EXACT, LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
 from .findings import Case, Finding, chance_text
 from .group_test import Block
 from .residual_tests import LEVEL, consistency
 
 ORDER, NEEDS = 66, "fit"
-_EXACT = 1e-6  # mm: smaller errors are rounding errors of a simulation without noise
 # A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
 _CLEAR, _AGREE = 9.0, 0.05
 
@@ -59,6 +58,16 @@ def test(case: Case) -> list[Finding]:
     ]
 
 
+class Related(NamedTuple):
+    """Lengths and certified values, and the equations of the poses that say what they should be."""
+
+    units: Float[np.ndarray, " l"]  # of their residuals, mm
+    poses: list[Block]
+    relations: Block
+    covariance: Float[np.ndarray, "l l"]
+    scale: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None  # derivatives by the scale anchor
+
+
 def lengths_of(case: Case) -> Lengths | None:
     """Lengths and certified values against the arm as the poses alone determine it, but for its scale; None where there
     are too few to contradict each other.
@@ -69,26 +78,30 @@ def lengths_of(case: Case) -> Lengths | None:
     if not case.testable:
         return None
     record, (rows, relations), freedom = case.record, case.chunks, case.left.degrees_of_freedom
-    afterwards = bool(record.recording.capture.lengths) and not lengths_in_solve(record)
+    capture = record.recording.capture
+    afterwards = bool(capture.lengths) and not lengths_in_solve(record)
     related = lengths_of_sockets(record, rows) if afterwards else _of_observations(record, rows, relations)
     if related is None:
         return None
-    plain = _tested(record, related, related.covariance, freedom)
-    if plain is None or plain.odd or record.shared is None or not record.recording.capture.lengths:
+    names, covariance = [f"{length.start} - {length.end}" for length in capture.lengths], related.covariance
+    if not afterwards:
+        certified = Observed.of(capture, None).certified()
+        names += [part for part, (value, _) in certified.items() for _ in np.asarray(value)]
+    plain = _tested(record, related, covariance, freedom, names)
+    if plain is None or plain.odd or record.shared is None or not capture.lengths:
         return plain
-    arm = to_numpy(record.calibrated.arm)
-    by_shared = covariance_of_lengths(record.shared, arm, record.names, record.recording.capture)
+    by_shared = covariance_of_lengths(record.shared, to_numpy(record.calibrated.arm), record.names, capture)
     number = len(by_shared)  # they come before certified values
     by_shared = by_shared / (related.units[:number, None] * related.units[:number])
-    others = len(related.names) - number
-    return _tested(record, related, related.covariance + np.pad(by_shared, (0, others)), freedom)
+    return _tested(record, related, covariance + np.pad(by_shared, (0, len(names) - number)), freedom, names)
 
 
 def _tested(
-    record: CalibrationRecord, related: "Related", covariance: Float[np.ndarray, "l l"], freedom: int
+    record: CalibrationRecord, related: Related, covariance: Float[np.ndarray, "l l"], freedom: int, names: list[str]
 ) -> Lengths | None:
     tested = consistency(related.poses, related.relations, covariance, related.scale)
-    if tested.degrees_of_freedom < 1:
+    number, square = tested.degrees_of_freedom, max(tested.square, 0.0)
+    if number < 1:
         return None
 
     def probability(square: float, number: int) -> float:
@@ -96,42 +109,23 @@ def _tested(
             return chi_square_tail(square, number)
         return f_tail(square / number, number, freedom)
 
-    worst, number = int(np.argmax(tested.gains)), tested.degrees_of_freedom
-    square = max(tested.square, 0.0)
+    worst = int(np.argmax(tested.gains))
     rest = max(square - tested.gains[worst], 0.0)
-    clear = number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square
-    return Lengths(
-        birge_ratio=float(np.sqrt(square / number)),
-        degrees_of_freedom=number,
-        probability=probability(square, number),
-        number=len(related.names),
-        odd=related.names[worst] if clear else "",
-        difference=float(tested.shifts[worst] * related.units[worst]) if clear else 0.0,
-    )
-
-
-class Related(NamedTuple):
-    """Lengths and certified values, and the equations of the poses that say what they should be."""
-
-    names: list[str]
-    units: Float[np.ndarray, " l"]  # of their residuals, mm
-    poses: list[Block]
-    relations: Block
-    covariance: Float[np.ndarray, "l l"]
-    scale: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None  # derivatives by the scale anchor
+    lengths = Lengths(float(np.sqrt(square / number)), number, probability(square, number), len(names))
+    if number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square:
+        return lengths._replace(odd=names[worst], difference=float(tested.shifts[worst] * related.units[worst]))
+    return lengths
 
 
 def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Related | None:
     """The positions of sockets are eliminated: a length has the scatter of its ends besides its own u."""
-    names, anchor = _names_of_lengths(record), scale_anchor_of(record)
-    if not names:
-        return None
-    capture, kept = record.recording.capture, np.array([name != anchor for name in record.names])
+    capture, anchor = record.recording.capture, scale_anchor_of(record)
+    kept, p = np.array([name != anchor for name in record.names]), len(record.names)
     linear = linearisation_of(record, record.names, noise=record.noise, lengths=False)
-    influence, observed, p = linear.influence(), linear.observed, len(record.names)
+    influence, observed = linear.influence(), linear.observed
     ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.own, capture)
     error = np.asarray(ends.measured - ends.nominal)
-    if np.max(np.abs(error)) < _EXACT:
+    if np.max(np.abs(error)) < EXACT:
         return None
     # Positions follow the arm as the means of their tips do.
     followers = []
@@ -139,37 +133,28 @@ def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Relat
         of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
         followers.append(-influence.follow[of][component, first : first + 3])
     slopes = np.einsum("lec,ech->lh", ends.by_positions, np.stack(followers))[:, :p]
-    covariance, scale = np.asarray(ends.covariance(np.ones(()))), None
+    scale = None
     if anchor is not None:
         by_anchor = np.asarray(record.calibrated.arm.jacobian(capture.readings, (anchor,)))
         scale = np.concatenate([(p.by_tip @ by_anchor[p.poses]).ravel() for p in rows]), slopes[:, ~kept][:, 0]
     further = rows[0].shared.shape[2] - int(kept.sum())  # unknowns of sockets with very many poses
     relations = Block("", None, error, np.pad(slopes[:, kept], ((0, 0), (0, further))), np.zeros((len(error), 0)))
-    return Related(names, np.ones(len(names)), [part.block("") for part in rows], relations, covariance, scale)
+    poses, covariance = [part.block("") for part in rows], np.asarray(ends.covariance(np.ones(())))
+    return Related(np.ones(len(error)), poses, relations, covariance, scale)
 
 
 def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> Related | None:
     lengths = [block for block in relations if block.fixture != PRIOR]
     if not lengths:
         return None
-    capture, anchor = record.recording.capture, scale_anchor_of(record)
-    certified = Observed.of(capture, None).certified()
-    names = [*_names_of_lengths(record), *(part for part, (value, _) in certified.items() for _ in np.asarray(value))]
-    u = [
-        *(length.u for length in capture.lengths),
-        *(x for _, stated in certified.values() for x in np.asarray(stated)),
-    ]
-    units = np.maximum(np.array(u, dtype=float), LEAST_U)
+    capture, anchor, (related,), scale = record.recording.capture, scale_anchor_of(record), lengths, None
+    stated = [np.asarray(u) for _, u in Observed.of(capture, None).certified().values()]
+    units = np.maximum(np.concatenate([[float(length.u) for length in capture.lengths], *stated]), LEAST_U)
     # What a prior says counts as the poses do: lengths are compared with all else.
-    poses, (related,), scale = [part.block("") for part in rows], lengths, None
-    poses += [block for block in relations if block.fixture == PRIOR]
+    poses = [*(part.block("") for part in rows), *(block for block in relations if block.fixture == PRIOR)]
     measured = any(o.fixes_scale and not o.certified for o in capture.observations)
     if anchor is not None and (record.hold is None or lengths_in_solve(record)) and not measured:
         column = record.names.index(anchor)
         scale = np.concatenate([block.shared[:, column] for block in poses]), related.shared[:, column]
         *poses, related = (b._replace(shared=np.delete(b.shared, column, axis=1)) for b in (*poses, related))
-    return Related(names, units, poses, related, np.eye(len(units)), scale)
-
-
-def _names_of_lengths(record: CalibrationRecord) -> list[str]:
-    return [f"{length.start} - {length.end}" for length in record.recording.capture.lengths]
+    return Related(units, poses, related, np.eye(len(units)), scale)

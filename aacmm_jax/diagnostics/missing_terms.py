@@ -41,84 +41,6 @@ _OTHERS: dict[str, tuple[str, str]] = {
 }
 
 
-def test(case: Case) -> list[Finding]:
-    """Terms that the model lacks, in one finding: each explains what those before it leave."""
-    terms = case.once(missing)
-    if not terms:
-        return []
-    kinds = dict.fromkeys(term.kind for term in terms)
-    named = {(term.kind, term.joint) for term in terms}
-    others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in named)
-    likely = [_words(kind)[0].format(i=joint) for kind, joint in others]
-    model = wider_model(terms, case.record.calibrated.arm)
-    probability = max(term.probability for term in terms)
-    texts = [f"{_words(term.kind)[0].format(i=term.joint)} ({_amplitude_text(term)})" for term in terms]
-    shared = set() if case.record.shared is None else set(case.record.shared.kinds)
-    in_uncertainty = bool(shared - {PLACES, VISITS, SUCCESSIVE})
-    return [
-        Finding(
-            "missing-terms",
-            f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model lacks: "
-            f"{', '.join(_words(kind)[1] for kind in kinds)}{f'; try --model {model}' if model else ''}."
-            + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
-            "The stated uncertainties include these errors as estimated from the residuals."
-            if in_uncertainty
-            else "Every stated uncertainty is too small.",
-            severity="doubt",
-            probability=probability,
-            concerns=tuple(dict.fromkeys("tip" if t.joint is None else f"joint {t.joint}" for t in terms)),
-        )
-    ]
-
-
-def missing(case: Case) -> "tuple[FoundTerm, ...]":
-    """The terms that the model of a calibration lacks."""
-    if not case.scatters:
-        return ()
-    return found_terms(case.record.calibrated.arm, np.asarray(case.record.recording.capture.readings), *case.chunks)
-
-
-def explained(case: Case) -> tuple[list[Rows], list[Block]]:
-    """The equations of a calibration, with these terms as further unknowns."""
-    (rows, relations), terms = case.chunks, case.once(missing)
-    if not terms:
-        return rows, relations
-    joints = case.record.calibrated.arm.joints
-    columns = np.concatenate(columns_of([term.term for term in terms], rows, joints), axis=1)
-    parts = np.split(columns, np.cumsum([part.residual.size for part in rows])[:-1])
-    extended = [
-        part._replace(shared=np.concatenate([part.shared, added.reshape(*part.residual.shape, -1)], axis=2))
-        for part, added in zip(rows, parts, strict=True)
-    ]
-    return extended, wider(relations, columns.shape[1])
-
-
-def _words(name: str) -> tuple[str, str]:
-    """What residuals follow, of joint {i}, and what causes that."""
-    sought = all_sought().get(name)
-    return _OTHERS[name] if sought is None else (sought[1].follows, sought[1].cause)
-
-
-def _amplitude_text(term: "FoundTerm") -> str:
-    if term.term.relative and term.kind != "zero":
-        return f"{rounded(100 * term.amplitude)} %"
-    return f"{rounded(term.amplitude)} mm" if term.joint is None else f"{rounded(term.amplitude / ARCSEC)} arcsec"
-
-
-def wider_model(terms: "Sequence[FoundTerm]", arm: Arm | None) -> str:
-    """The model that the arm has, with the terms that were found besides; empty where that is no other model."""
-    functions = () if arm is None or arm.corrections is None else arm.corrections.functions.terms
-    present = [term for term in functions if isinstance(term, Term)]
-    sought, added = all_sought(), []
-    for kind, one in (sought[term.kind] for term in terms if term.kind in sought):
-        # All of its default functions where the model has none yet, as a first harmonic is seldom alone.
-        option = one.option if any(term.kind.model == kind.model for term in present) else ""
-        joints = 1 if arm is None else arm.joints
-        added += kind.terms(max(joints, *(term.joint or 1 for term in terms)), option, None)
-    wider = model_of([*present, *added]) if added else ""
-    return "" if present and wider == model_of(present) else wider
-
-
 class MissingTerm(NamedTuple):
     """A term that the model may lack: of one joint, in mrad, or of the tip, in mm."""
 
@@ -140,25 +62,94 @@ class FoundTerm(NamedTuple):
     term: MissingTerm
 
 
-def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows], joints: int) -> list[Float[np.ndarray, "R _"]]:
-    """The columns of each term in the rows of all poses; those of the tip last."""
-    of_joints = [term for term in terms if term.joint is not None]
-    of_tip = [term for term in terms if term.joint is None]
-    owner = np.array([term.joint for term in of_joints for _ in range(term.values.shape[1])], dtype=int) - 1
-    poses = len(terms[0].values)
-    factors = np.concatenate([np.zeros((poses, 0)), *(term.values for term in of_joints)], axis=1)
-    moves = np.concatenate([np.zeros((poses, 3, 0)), *(term.values for term in of_tip)], axis=2)
-    blocks = []
-    for part in rows:
-        by_joints = part.extra[..., :joints][..., owner] * factors[part.poses][:, None]
-        both = np.concatenate([by_joints, part.by_tip @ moves[part.poses]], axis=2)
-        blocks.append(both.reshape(-1, both.shape[2]))
-    ends = np.cumsum([term.values.shape[-1] for term in (*of_joints, *of_tip)])
-    return np.split(np.concatenate(blocks), ends[:-1], axis=1)
+def test(case: Case) -> list[Finding]:
+    """Terms that the model lacks, in one finding: each explains what those before it leave."""
+    terms = case.once(missing)
+    if not terms:
+        return []
+    sought, texts, causes = all_sought(), [], []
+    words = {name: (kind.follows, kind.cause) for name, (_, kind) in sought.items()} | _OTHERS
+    for term in terms:
+        if term.term.relative and term.kind != "zero":
+            amplitude = f"{rounded(100 * term.amplitude)} %"
+        else:
+            unit, size = ("mm", 1.0) if term.joint is None else ("arcsec", ARCSEC)
+            amplitude = f"{rounded(term.amplitude / size)} {unit}"
+        follows, cause = words[term.kind]
+        texts.append(f"{follows.format(i=term.joint)} ({amplitude})")
+        causes.append(cause)
+    named = {(term.kind, term.joint) for term in terms}
+    others = dict.fromkeys(other for term in terms for other in term.alternatives if other not in named)
+    likely = [words[kind][0].format(i=joint) for kind, joint in others]
+    model = wider_model(terms, case.record.calibrated.arm)
+    probability = max(term.probability for term in terms)
+    shared = set() if case.record.shared is None else set(case.record.shared.kinds)
+    return [
+        Finding(
+            "missing-terms",
+            f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model lacks: "
+            f"{', '.join(dict.fromkeys(causes))}{f'; try --model {model}' if model else ''}."
+            + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
+            "The stated uncertainties include these errors as estimated from the residuals."
+            if shared - {PLACES, VISITS, SUCCESSIVE}
+            else "Every stated uncertainty is too small.",
+            severity="doubt",
+            probability=probability,
+            concerns=tuple(dict.fromkeys("tip" if t.joint is None else f"joint {t.joint}" for t in terms)),
+        )
+    ]
+
+
+def missing(case: Case) -> tuple[FoundTerm, ...]:
+    """The terms that the model of a calibration lacks."""
+    if not case.scatters:
+        return ()
+    return found_terms(case.record.calibrated.arm, np.asarray(case.record.recording.capture.readings), *case.chunks)
+
+
+def explained(case: Case) -> tuple[list[Rows], list[Block]]:
+    """The equations of a calibration, with these terms as further unknowns."""
+    (rows, relations), terms = case.chunks, case.once(missing)
+    if not terms:
+        return rows, relations
+    columns = np.concatenate(columns_of([term.term for term in terms], rows), axis=1)
+    parts = np.split(columns, np.cumsum([part.residual.size for part in rows])[:-1])
+    extended = [
+        part._replace(shared=np.concatenate([part.shared, added.reshape(*part.residual.shape, -1)], axis=2))
+        for part, added in zip(rows, parts, strict=True)
+    ]
+    return extended, wider(relations, columns.shape[1])
+
+
+def wider_model(terms: Sequence[FoundTerm], arm: Arm | None) -> str:
+    """The model that the arm has, with the terms that were found besides; empty where that is no other model."""
+    functions = () if arm is None or arm.corrections is None else arm.corrections.functions.terms
+    present = [term for term in functions if isinstance(term, Term)]
+    sought, added = all_sought(), []
+    joints = max(1 if arm is None else arm.joints, *(term.joint or 1 for term in terms))
+    for kind, default in (sought[term.kind] for term in terms if term.kind in sought):
+        # All of its default functions where the model has none yet, as a first harmonic is seldom alone.
+        option = default.option if any(term.kind.model == kind.model for term in present) else ""
+        added += kind.terms(joints, option, None)
+    wider = model_of([*present, *added]) if added else ""
+    return "" if present and wider == model_of(present) else wider
+
+
+def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows]) -> list[Float[np.ndarray, "R _"]]:
+    """The columns of each term in the rows of all poses."""
+    columns = []
+    for term in terms:
+        blocks = []
+        for part in rows:
+            values = term.values[part.poses]
+            moved = part.by_tip @ values if term.joint is None else part.extra[..., [term.joint - 1]] * values[:, None]
+            blocks.append(moved.reshape(part.residual.size, -1))
+        columns.append(np.concatenate(blocks))
+    return columns
 
 
 def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
-    """Everything that is looked for.
+    """Everything that is looked for. Masses are not known, so each link that bends a joint has its own coefficient.
 
     Args:
         arm: The calibrated arm.
@@ -166,34 +157,31 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
     """
     arm = to_numpy(arm)
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
-    tip = np.moveaxis(np.asarray(forward_pass(arm.geometry, joint_motion(arm.geometry, q)).tip), -1, 0)
-    of_joints, of_arm = [], []
+    tip = np.moveaxis(np.asarray(forward_pass(arm.geometry, joint_motion(arm.geometry, q)).tip), -1, 0)[:, :, None]
+    of_joints, of_tip = (
+        [],
+        [
+            MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
+            MissingTerm("growing arm", None, order[:, :, None] * tip / 1e3),  # by 1 mm a m
+        ],
+    )
     for joint in range(1, arm.joints + 1):
-        zeros = MissingTerm("zero", joint, np.ones_like(order), relative=True)
-        of_joints += [zeros, MissingTerm("drifting zero", joint, order)]
-    for name, (kind, sought) in all_sought().items():
-        functions = _functions(arm, q, model_with(kind, sought.option))
-        if kind.of_arm:
-            growth = [values for values in functions[0].T if np.ptp(values) > 0]
-            of_arm += [MissingTerm(name, None, values[:, None, None] * tip[:, :, None] / 1e3) for values in growth]
-        # A scale has no revolution to repeat, and carries what it moves.
-        joints = [joint for joint in functions if joint and (joint not in arm.prismatic or sought.of_slides)]
-        of_joints += [MissingTerm(name, joint, functions[joint], sought.relative) for joint in joints]
-    return [
-        *of_joints,
-        MissingTerm("drifting base", None, order[:, :, None] * np.eye(3)),
-        MissingTerm("growing arm", None, order[:, :, None] * tip[:, :, None] / 1e3),  # by 1 mm a m
-        *of_arm,
-    ]
-
-
-def _functions(arm: Arm, q: Float[np.ndarray, "N n"], model: str) -> dict[int, Float[np.ndarray, "N _k"]]:
-    """The functions of a model, joint by joint. Masses are not known, so each link has a coefficient of its own."""
+        of_joints.append(MissingTerm("zero", joint, np.ones_like(order), relative=True))
+        of_joints.append(MissingTerm("drifting zero", joint, order))
     nominal = arm.geometry if arm.corrections is None else arm.corrections.nominal
     gravity = np.asarray(DOWN if arm.gravity is None else arm.gravity)
-    terms = terms_of(model, arm.joints)
-    values = function_values(nominal, terms, q, gravity)
-    return {joint: values[[term.joint == joint for term in terms]].T for joint in sorted({t.joint for t in terms})}
+    for name, (kind, sought) in all_sought().items():
+        terms = terms_of(model_with(kind, sought.option), arm.joints)
+        values = function_values(nominal, terms, q, gravity)
+        if kind.of_arm:
+            growth = [row for row, term in zip(values, terms, strict=True) if not term.joint and np.ptp(row) > 0]
+            of_tip += [MissingTerm(name, None, row[:, None, None] * tip / 1e3) for row in growth]
+        for joint in sorted({term.joint for term in terms if term.joint}):
+            # A scale has no revolution to repeat, and carries what it moves.
+            if joint not in arm.prismatic or sought.of_slides:
+                of_joint = values[[term.joint == joint for term in terms]].T
+                of_joints.append(MissingTerm(name, joint, of_joint, sought.relative))
+    return [*of_joints, *of_tip]
 
 
 def found_terms(
@@ -209,7 +197,7 @@ def found_terms(
     """
     left = Residuals.of([*(part.block("") for part in rows), *relations])
     candidates, others_rows = missing_terms(arm, q), sum(len(block.residual) for block in relations)
-    columns = [np.pad(values, ((0, others_rows), (0, 0))) for values in columns_of(candidates, rows, arm.joints)]
+    columns = [np.pad(values, ((0, others_rows), (0, 0))) for values in columns_of(candidates, rows)]
     chosen: list[tuple[int, ScoreTest, float, list[int]]] = []
     rest, least = left, _SECOND_ORDER * float(np.sqrt(left.cost))
     for _ in range(MOST_TERMS):
@@ -218,36 +206,24 @@ def found_terms(
         significant = [i for i, test in enumerate(tests) if test.probability * number < LEVEL]
         if not significant:
             break
-        criterion = [_criterion(rest, test) for test in tests]
-        best = min(significant, key=lambda i: criterion[i])
-        others = [i for i in significant if i != best and criterion[i] < criterion[best] + _AS_WELL]
-        others.sort(key=lambda i: criterion[i])
+        criterion = {}  # Akaike's, less what is common to all
+        for i in significant:
+            remaining = max(rest.cost - tests[i].gain, 1e-300) / rest.cost
+            criterion[i] = len(rest.values) * float(np.log(remaining)) + 2 * tests[i].degrees_of_freedom[0]
+        best, *others = sorted(significant, key=criterion.__getitem__)
+        others = [i for i in others if criterion[i] < criterion[best] + _AS_WELL]
         chosen.append((best, tests[best], min(tests[best].probability * number, 1.0), others))
         rest = rest.extended(columns[best])
     if not chosen:
         return ()
     (together,) = score_tests(left, [np.concatenate([columns[i] for i, *_ in chosen], axis=1)], least)
     coefficients = np.split(together.coefficients, np.cumsum([columns[i].shape[1] for i, *_ in chosen])[:-1])
-    return tuple(
-        FoundTerm(
-            *(candidates[i].kind, candidates[i].joint, test, probability),
-            amplitude=_amplitude(candidates[i], coefficient),
-            alternatives=tuple((candidates[j].kind, candidates[j].joint) for j in others),
-            term=candidates[i],
-        )
-        for (i, test, probability, others), coefficient in zip(chosen, coefficients, strict=True)
-    )
-
-
-def _criterion(left: Residuals, test: ScoreTest) -> float:
-    """Akaike's, less what is common to all."""
-    rows, (added, _) = len(left.values), test.degrees_of_freedom
-    return rows * float(np.log(max(left.cost - test.gain, 1e-300) / left.cost)) + 2 * added if added else np.inf
-
-
-def _amplitude(term: MissingTerm, coefficients: Float[np.ndarray, " k"]) -> float:
-    if term.relative:
-        return float(abs(coefficients[0])) * 1e-3
-    added = term.values @ coefficients
-    half = float(np.linalg.norm(np.ptp(added.reshape(len(added), -1), axis=0))) / 2
-    return half if term.joint is None else half * 1e-3
+    terms = []
+    for (i, test, probability, others), coefficient in zip(chosen, coefficients, strict=True):
+        term = candidates[i]
+        added = (term.values @ coefficient).reshape(len(q), -1)
+        size = abs(coefficient[0]) if term.relative else np.linalg.norm(np.ptp(added, axis=0)) / 2
+        amplitude = float(size) * (1.0 if term.joint is None else 1e-3)
+        alternatives = tuple((candidates[j].kind, candidates[j].joint) for j in others)
+        terms.append(FoundTerm(term.kind, term.joint, test, probability, amplitude, alternatives, term))
+    return tuple(terms)

@@ -23,7 +23,7 @@ from .findings import Case, Finding, case_of, chance_text
 from .length_consistency import Lengths, lengths_of
 from .missing_terms import FoundTerm, explained, missing
 from .noisy_encoders import NoisyJoint, noisiest_joint
-from .residual_tests import LEVEL, FormTest, Residuals, alike, form_test, in_succession
+from .residual_tests import LEVEL, Residuals, alike, form_test, in_succession
 
 ORDER, NEEDS = 62, "fit"
 # Of the noise of a class: its members differ by a quarter or so, which is what 8 degrees of freedom say (JCGM 100,
@@ -44,7 +44,7 @@ class NoisyObservation(NamedTuple):
     """An observation whose residuals are larger than its noise."""
 
     name: str
-    test: FormTest
+    ratio: float  # of the sum of their squares to its expectation
     probability: float
 
 
@@ -57,9 +57,9 @@ class Successive(NamedTuple):
 
 def test(case: Case) -> list[Finding]:
     """Of all residuals together, of single observations, and of successive poses."""
-    misfit = case.once(misfit_of)
-    findings = [] if misfit is None or misfit.probability >= LEVEL else [_misfit(misfit)]
-    successive = case.once(successive_of)
+    findings, misfit, successive = [], case.once(misfit_of), case.once(successive_of)
+    if misfit is not None and misfit.probability < LEVEL:
+        findings.append(_misfit(misfit))
     if successive is not None and successive.probability < LEVEL:
         shared = set() if case.record.shared is None else set(case.record.shared.kinds)
         findings.append(
@@ -77,7 +77,7 @@ def test(case: Case) -> list[Finding]:
         )
     noisy = case.once(noisy_observations)
     if noisy:
-        texts = [f"{part.name} ({math.sqrt(max(part.test.ratio, 0)):.2g} times)" for part in noisy]
+        texts = [f"{part.name} ({math.sqrt(max(part.ratio, 0)):.2g} times)" for part in noisy]
         findings.append(
             Finding(
                 "noisy-observations",
@@ -92,7 +92,7 @@ def test(case: Case) -> list[Finding]:
 
 
 def _misfit(misfit: Misfit) -> Finding:
-    chance = chance_text(misfit.probability)
+    chance, small = chance_text(misfit.probability), misfit.ratio > 1
     if misfit.usual:
         return Finding(
             "residuals-unusual",
@@ -101,7 +101,6 @@ def _misfit(misfit: Misfit) -> Finding:
             severity="doubt",
             probability=misfit.probability,
         )
-    small = misfit.ratio > 1
     return Finding(
         "residuals-not-as-given",
         f"Residuals are {misfit.ratio:.3g} times what the given noise predicts ({chance}).",
@@ -116,17 +115,16 @@ def _misfit(misfit: Misfit) -> Finding:
 
 def misfit_of(case: Case) -> Misfit | None:
     """Residuals against the noise that was given, or that of the arm's class; None where neither is known."""
-    if not case.shows_noise:
+    usual, given = case.usual, case.record.given_noise is not None
+    if not case.shows_noise or not (given or usual is not None):
         return None
-    if case.record.given_noise is not None:
-        freedom = case.left.degrees_of_freedom
-        upper = chi_square_tail(case.left.cost, freedom)
-        return Misfit(float(np.sqrt(case.left.cost / freedom)), freedom, min(2 * min(upper, 1 - upper), 1.0))
-    usual = case.usual
-    if usual is None:
-        return None
-    left = Case(case.record._replace(noise=usual.noise)).left
+    left = case.left
+    if usual is not None and not given:
+        left = Case(case.record._replace(noise=usual.noise)).left
     freedom, ratio = left.degrees_of_freedom, left.cost / left.degrees_of_freedom
+    if usual is None or given:
+        upper = chi_square_tail(left.cost, freedom)
+        return Misfit(float(np.sqrt(ratio)), freedom, min(2 * min(upper, 1 - upper), 1.0))
     probability = f_tail(ratio, freedom, CLASS_DEGREES_OF_FREEDOM)
     return Misfit(float(np.sqrt(ratio)), freedom, probability, usual.source or usual.arm_class)
 
@@ -136,7 +134,7 @@ def noisy_observations(case: Case) -> tuple[NoisyObservation, ...]:
     given = case.record.given_noise is not None
     if not case.shows_noise or not case.record.recording.capture.observations:
         return ()
-    rows, left = case.chunks[0], case.left
+    rows = case.chunks[0]
     names = list(dict.fromkeys(part.name for part in rows))
     if len(names) < 2 and not given:
         return ()
@@ -144,13 +142,14 @@ def noisy_observations(case: Case) -> tuple[NoisyObservation, ...]:
     for name in names:
         sizes = [part.residual.shape if part.name == name else None for part in rows]
         kernels = [None if size is None else np.broadcast_to(np.eye(size[1]), (*size, size[1])) for size in sizes]
-        tests.append((form_test(left, kernels, not given), name))
-    noisy, tests = [], sorted(tests, key=lambda pair: pair[0].probability)
-    for number, (form, name) in enumerate(tests):
-        probability = min(form.probability * (len(tests) - number), 1.0)
+        form = form_test(case.left, kernels, not given)
+        tests.append(NoisyObservation(name, form.ratio, form.probability))
+    noisy, tests = [], sorted(tests, key=lambda test: test.probability)
+    for number, test in enumerate(tests):
+        probability = min(test.probability * (len(tests) - number), 1.0)
         if probability >= LEVEL:
             break
-        noisy.append(NoisyObservation(name, form, probability))
+        noisy.append(test._replace(probability=probability))
     return tuple(noisy)
 
 
@@ -158,22 +157,20 @@ def successive_of(case: Case) -> Successive | None:
     """Errors of the tip that successive poses of one observation share (a score test of their covariance)."""
     if not case.shows_noise:
         return None
-    rows = case.chunks[0]
+    rows, left = case.chunks[0], case.left
     # The derivative of the covariance by a correlation with the pose before, and the one after.
     kernels = [alike(part.by_tip, in_succession(len(part.poses))) for part in rows]
     if not any(np.any(kernel) for kernel in kernels):
         return None
-    left = case.left
     if case.once(missing):
         with_terms, relations = case.once(explained)
         left = Residuals.of([*(part.block("") for part in with_terms), *relations])
-    form = form_test(left, kernels, relative=True)
     product = total = 0.0
     for part, own in zip(rows, left.slices, strict=False):
         tips = np.einsum("mrc,mr->mc", part.by_tip, left.values[own].reshape(part.residual.shape))
         product += float(np.sum(tips[1:] * tips[:-1]))
         total += float(np.sum(tips[1:] ** 2) + np.sum(tips[:-1] ** 2)) / 2
-    return Successive(product / total if total else 0.0, form.probability)
+    return Successive(product / total if total else 0.0, form_test(left, kernels, relative=True).probability)
 
 
 class ModelTests(NamedTuple):
@@ -232,19 +229,23 @@ def model_tests(
 
 def rows_of_tests(tests: ModelTests) -> dict[str, Any]:
     """The tests as JSON has them: probabilities where nothing is wrong, and what was found; mm, rad."""
-    misfit = _values(tests.misfit, "ratio", "degrees_of_freedom", "probability")
+
+    def values(test: Any, *names: str) -> dict[str, Any] | None:
+        return None if test is None else {name: getattr(test, name) for name in names}
+
+    misfit = values(tests.misfit, "ratio", "degrees_of_freedom", "probability")
     if misfit is not None and tests.misfit is not None:
         misfit["against"] = tests.misfit.usual or "given noise"
-    lengths = _values(tests.lengths, "birge_ratio", "degrees_of_freedom", "probability", "odd")
+    lengths = values(tests.lengths, "birge_ratio", "degrees_of_freedom", "probability", "odd")
     if lengths is not None:
         lengths["odd"] = lengths["odd"] or None
     return {
         "level": LEVEL,
         "misfit": misfit,
         "lengths": lengths,
-        "noisy_joint": _values(tests.noisy_joint, "joint", "probability"),
-        "successive_poses": _values(tests.successive, "correlation", "probability"),
-        "noisy_observations": [{"name": one.name, "probability": one.probability} for one in tests.noisy_observations],
+        "noisy_joint": values(tests.noisy_joint, "joint", "probability"),
+        "successive_poses": values(tests.successive, "correlation", "probability"),
+        "noisy_observations": [values(test, "name", "probability") for test in tests.noisy_observations],
         "missing_terms": [
             {
                 "term": term.kind,
@@ -258,7 +259,3 @@ def rows_of_tests(tests: ModelTests) -> dict[str, Any]:
             for term in tests.terms
         ],
     }
-
-
-def _values(test: Any, *names: str) -> dict[str, Any] | None:
-    return None if test is None else {name: getattr(test, name) for name in names}

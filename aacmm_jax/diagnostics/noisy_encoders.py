@@ -110,25 +110,47 @@ class _Equations(NamedTuple):
         stated = np.broadcast_to(to_numpy(record.noise.of_readings(kinds)), (joints,)) / unit
         return cls(rows, relations, unit / steps, np.append(stated, float(record.noise.seating)) ** 2)
 
-    def readings(self, rows: Rows) -> Float[np.ndarray, "m r n"]:
-        """The columns z_j."""
-        return rows.extra[..., : len(self.unit)] * self.unit
-
     def left(self) -> Residuals:
         return Residuals.of([*(rows.block("") for rows in self.rows), *self.relations])
 
     def columns(self, rows: Rows, group: Sequence[int]) -> Float[np.ndarray, "m r _"]:
-        """Those of a variance that some joints have in common, or of the seat, whose number is that of the joints."""
-        return rows.by_tip if len(self.unit) in group else self.readings(rows)[..., list(group)]
+        """The z_j of a variance that some joints have in common, or T, whose number is that of the joints."""
+        joints = len(self.unit)
+        return rows.by_tip if joints in group else (rows.extra[..., :joints] * self.unit)[..., list(group)]
+
+    def poses(self, left: Residuals) -> list[tuple[Rows, Float[np.ndarray, "m r"], Float[np.ndarray, "m r r"]]]:
+        """The rows of each part, their residuals, and the blocks of M that belong to single poses."""
+        parts = []
+        for rows, part, own in zip(self.rows, left.slices, left.own, strict=False):
+            explained = np.concatenate([own, left.basis[part]], axis=1).reshape(*rows.residual.shape, -1)
+            block = np.eye(explained.shape[1]) - explained @ explained.swapaxes(1, 2)
+            parts.append((rows, left.values[part].reshape(rows.residual.shape), block))
+        return parts
+
+    def moments(
+        self, left: Residuals, groups: Sequence[Sequence[int]]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """r'K r, tr MK and tr MKML of the K of some groups, by the blocks of single poses."""
+        count = len(groups)
+        values, traces, products = np.zeros(count), np.zeros(count), np.zeros((count, count))
+        for rows, r, block in self.poses(left):
+            columns = [self.columns(rows, group) for group in groups]
+            projected = [block @ column for column in columns]
+            for k, column in enumerate(columns):
+                values[k] += float(np.sum(np.einsum("mac,ma->mc", column, r) ** 2))
+                traces[k] += float(np.sum(column * projected[k]))
+                for other in range(count):
+                    products[k, other] += float(np.sum((column.swapaxes(1, 2) @ projected[other]) ** 2))
+        return values, traces, products
 
     def weighted(self, groups: Sequence[Sequence[int]], variances: Float[np.ndarray, " k"]) -> "_Equations":
         """The same rows, whitened by other variances of some groups."""
         weighted, new = [], self.variances.copy()
         for group, variance in zip(groups, variances, strict=True):
             new[list(group)] = variance
-        more = new - self.variances
+        more, every = new - self.variances, range(len(self.unit))
         for rows in self.rows:
-            z, t = self.readings(rows), rows.by_tip
+            z, t = self.columns(rows, every), rows.by_tip
             covariance = (z * more[:-1]) @ z.swapaxes(1, 2) + more[-1] * t @ t.swapaxes(1, 2)
             # Some noise of its own: where nothing else errs, poses with fewer than three errors would be singular.
             covariance += (1 + 1e-9) * np.eye(z.shape[1])
@@ -138,14 +160,6 @@ class _Equations(NamedTuple):
             residual = np.einsum("mab,mb->ma", root, rows.residual)
             weighted.append(rows._replace(residual=residual, in_mm=rows.in_mm @ factor, **whitened))
         return self._replace(rows=weighted, variances=new)
-
-    def projectors(self, left: Residuals) -> list[Float[np.ndarray, "_ _ _"]]:
-        """The blocks of M that belong to single poses."""
-        blocks = []
-        for rows, part, own in zip(self.rows, left.slices, left.own, strict=False):
-            columns = np.concatenate([own, left.basis[part]], axis=1).reshape(*rows.residual.shape, -1)
-            blocks.append(np.eye(columns.shape[1]) - columns @ columns.swapaxes(1, 2))
-        return blocks
 
     def estimated(self, groups: Sequence[Sequence[int]]) -> tuple["_Equations", Float[np.ndarray, " k"]]:
         """With one variance for each group of joints, the seat being the last group, by restricted maximum likelihood.
@@ -157,16 +171,15 @@ class _Equations(NamedTuple):
         log = np.array([np.log(max(np.mean(self.variances[list(group)]), 1e-6)) for group in groups])
         if len(self.unit) in groups[-1]:  # from nothing it would not rise
             left = self.left()
-            projected = zip(self.rows, self.projectors(left), strict=True)
-            trace = sum(float(np.sum(rows.by_tip * (block @ rows.by_tip))) for rows, block in projected)
+            trace = self.moments(left, groups[-1:])[1][0]
             log[-1] = np.log(max(self.variances[-1], 0.05 * left.degrees_of_freedom / max(trace, 1e-300)))
             now = self.weighted(groups, np.exp(log))
         for _ in range(_ROUNDS):
-            left = now.left()
-            slope, information, traces = now._scores(left, groups)
-            variances = np.exp(log)
+            left, variances = now.left(), np.exp(log)
+            values, traces, products = now.moments(left, groups)
             # By the logarithms: d/d(log v) = v d/dv.
-            slope, information = slope * variances, information * variances * variances[:, None]
+            slope = 0.5 * (values - traces) * variances
+            information = 0.5 * products * variances * variances[:, None]
             u = np.sqrt(np.diag(np.linalg.pinv(information)))
             # One that explains nothing, and would have to be negative, stays where it is.
             moving = (variances * traces > _LEAST * left.degrees_of_freedom) | (slope > 0)
@@ -179,66 +192,30 @@ class _Equations(NamedTuple):
                 break
         return now, u
 
-    def _scores(
-        self, left: Residuals, groups: Sequence[Sequence[int]]
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
-        """Derivatives of the log likelihood by the variances, their information, and tr MK."""
-        count = len(groups)
-        slope, information, traces = np.zeros(count), np.zeros((count, count)), np.zeros(count)
-        for rows, part, block in zip(self.rows, left.slices, self.projectors(left), strict=False):
-            r, columns = left.values[part].reshape(rows.residual.shape), [self.columns(rows, group) for group in groups]
-            projected = [block @ column for column in columns]
-            for k, column in enumerate(columns):
-                trace = float(np.sum(column * projected[k]))
-                traces[k] += trace
-                slope[k] += 0.5 * (float(np.sum(np.einsum("mac,ma->mc", column, r) ** 2)) - trace)
-                for other in range(count):
-                    information[k, other] += 0.5 * float(np.sum((column.swapaxes(1, 2) @ projected[other]) ** 2))
-        return slope, information, traces
-
     def noisiest(self, joints: Sequence[int]) -> NoisyJoint | None:
         """The joint (from 0) of some whose readings are the noisiest; its probability is Holm's, of all."""
         left = self.left()
-        blocks = self.projectors(left)
-        poses = [
-            left.values[part].reshape(rows.residual.shape) for rows, part in zip(self.rows, left.slices, strict=False)
-        ]
+        values, traces, products = self.moments(left, [*([joint] for joint in joints), [len(self.unit)]])
+        poses, tests = self.poses(left), []
         # Rows of priors, which may be far wider than what they say, are not what the others are compared with.
-        cost = float(sum(np.sum(r**2) for r in poses))
-        freedom = float(sum(np.sum(np.einsum("maa->m", block)) for block in blocks))
-        tips = [rows.by_tip @ rows.by_tip.swapaxes(1, 2) for rows in self.rows]
-        trace_t, trace_tt = _traces(blocks, tips, tips)
-        tests = []
-        for joint in joints:
-            columns = [self.columns(rows, [joint]) for rows in self.rows]
-            kernels = [column @ column.swapaxes(1, 2) for column in columns]
-            trace, trace_both = _traces(blocks, kernels, tips)
-            if trace <= 0:
+        cost = max(float(sum(np.sum(r**2) for _, r, _ in poses)), 1e-300)
+        freedom = float(sum(np.sum(np.einsum("maa->m", block)) for *_, block in poses))
+        below = freedom * products[-1, -1] - traces[-1] ** 2
+        seated = self.variances[-1] * traces[-1] > _LEAST * freedom and below > 1e-9 * traces[-1] ** 2
+        for k, joint in enumerate(joints):
+            if traces[k] <= 0:
                 continue
-            ratio = _value(kernels, poses) * freedom / max(trace * cost, 1e-300)
-            below = freedom * trace_tt - trace_t**2
-            seated = self.variances[-1] * trace_t > _LEAST * freedom and below > 1e-9 * trace_t**2
-            c = (freedom * trace_both - trace * trace_t) / below if seated else 0.0
-            kernels = [kernel - c * tip for kernel, tip in zip(kernels, tips, strict=True)]
-            x = _value(kernels, poses) / max(cost, 1e-300)
-            chance = chance_above_zero(left, [kernel - x * np.eye(kernel.shape[1]) for kernel in kernels])
-            tests.append(NoisyJoint(joint + 1, ratio, chance))
+            ratio = values[k] * freedom / max(traces[k] * cost, 1e-300)
+            c = (freedom * products[k, -1] - traces[k] * traces[-1]) / below if seated else 0.0
+            x, kernels = (values[k] - c * values[-1]) / cost, []
+            for rows in self.rows:
+                z, t = self.columns(rows, [joint]), rows.by_tip
+                kernels.append(z @ z.swapaxes(1, 2) - c * (t @ t.swapaxes(1, 2)) - x * np.eye(z.shape[1]))
+            tests.append(NoisyJoint(joint + 1, ratio, chance_above_zero(left, kernels)))
         if not tests:
             return None
         worst = min(tests, key=lambda test: (test.probability, -test.ratio))
         return worst._replace(probability=min(worst.probability * len(tests), 1.0))
-
-
-def _value(kernels: Sequence[np.ndarray], residuals: Sequence[np.ndarray]) -> float:
-    pairs = zip(kernels, residuals, strict=True)
-    return float(sum(np.einsum("ma,mab,mb->", r, kernel, r) for kernel, r in pairs))
-
-
-def _traces(blocks: Sequence[np.ndarray], one: Sequence[np.ndarray], other: Sequence[np.ndarray]):
-    """tr MK, and tr MKML by the blocks of single poses."""
-    first = sum(np.einsum("mab,mba->", block, k) for block, k in zip(blocks, one, strict=True))
-    products = ((block @ k, block @ n) for block, k, n in zip(blocks, one, other, strict=True))
-    return first, sum(np.einsum("mab,mba->", left, right) for left, right in products)
 
 
 def noisiest_joint(case: Case) -> NoisyJoint | None:

@@ -8,7 +8,6 @@ function) times coefficients of variance v_g. The likelihood of r depends on the
 shared error as they follow any other error of the tips, z = K c, so its covariance grows by K v K^T.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +24,7 @@ from .residual_tests import Residuals
 _ROUNDS = 40  # of the variance of independent errors; usually 5
 _TOLERANCE = 1e-6
 _EXPLAINED = 1e-3  # part of a column that the model leaves, below which it counts as the model's own
-NULL = 1e-6  # eigenvalues of an effect's information below this, of the largest, are zero
+_NULL = 1e-6  # eigenvalues of an effect's information below this, of the largest, are zero
 # Standard deviations at which the likelihood of one effect is computed: how many, and between which parts of the usual.
 _GRID, _RANGE = 80, (0.01, 100.0)
 _LEAST_LOG = 2 * np.log(1e-4)  # smallest log variance of a learned group, in natural steps
@@ -49,12 +48,20 @@ class Effects(NamedTuple):
         variance = 1.0 if given else left.cost / left.degrees_of_freedom
         return cls(left, given, np.zeros((len(left.values), 0)), np.zeros(0), variance)
 
-    def product(self, one: Float[np.ndarray, "R a"], other: Float[np.ndarray, "R b"]) -> Float[np.ndarray, "a b"]:
-        """one^T (I + D diag(variances / variance) D^T)^-1 other."""
+    def product(self, a: Float[np.ndarray, "R a"], b: Float[np.ndarray, "R b"]) -> Float[np.ndarray, "a b"]:
+        """a^T (I + D diag(variances / variance) D^T)^-1 b."""
         if not len(self.variances):
-            return one.T @ other
+            return a.T @ b
         d = self.columns * np.sqrt(self.variances / self.variance)
-        return one.T @ other - (one.T @ d) @ np.linalg.solve(np.eye(d.shape[1]) + d.T @ d, d.T @ other)
+        return a.T @ b - (a.T @ d) @ np.linalg.solve(np.eye(d.shape[1]) + d.T @ d, d.T @ b)
+
+    def spectrum(self, columns: Float[np.ndarray, "R c"], errors: Float[np.ndarray, " R"]) -> np.ndarray:
+        """What some errors show of a further effect: eigenvalues of its information that are not 0, and in the second
+        row the squared projections of the errors on their vectors."""
+        values, vectors = np.linalg.eigh(self.product(columns, columns))
+        present = values > _NULL * max(values.max(initial=0.0), 1e-300)
+        seen = vectors[:, present].T @ self.product(columns, errors[:, None])[:, 0]
+        return np.stack([values[present], seen**2])
 
     def joined(self, columns: Float[np.ndarray, "R c"], variances: Float[np.ndarray, " c"]) -> "Effects":
         """With a further effect, whose columns the model has not explained; the variance of independent errors is the
@@ -65,13 +72,13 @@ class Effects(NamedTuple):
         )
         if self.given:
             return effects
-        d, r = effects.columns * np.sqrt(effects.variances), self.left.values
+        d, r, cost = effects.columns * np.sqrt(effects.variances), self.left.values, self.left.cost
         values, vectors = np.linalg.eigh(d.T @ d)
         seen, values = (vectors.T @ (d.T @ r)) ** 2, np.maximum(values, 0.0)
         variance = self.variance
         for _ in range(_ROUNDS):
             explained = float(np.sum(seen / (variance + values)))
-            new = max(self.left.cost - explained, 1e-12 * self.left.cost) / self.left.degrees_of_freedom
+            new = max(cost - explained, 1e-12 * cost) / self.left.degrees_of_freedom
             change, variance = abs(np.log(new / variance)), new
             if change < _TOLERANCE:
                 break
@@ -98,15 +105,11 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: flo
 
     ``columns`` are those of the effect, as far as the model does not explain them; ``usual`` is in mm.
     """
-    information = effects.product(columns, columns)
-    values, vectors = np.linalg.eigh(information)
-    present = values > NULL * max(values.max(initial=0.0), 1e-300)
-    values, r = values[present], effects.left.values[:, None]
-    squares = (vectors[:, present].T @ effects.product(columns, r)[:, 0]) ** 2
-    total, freedom = float(effects.product(r, r)[0, 0]), effects.left.degrees_of_freedom
+    r, freedom = effects.left.values, effects.left.degrees_of_freedom
+    values, squares = effects.spectrum(columns, r)
+    total = float(effects.product(r[:, None], r[:, None])[0, 0])
     ratio = (usual * np.geomspace(*_RANGE, _GRID)) ** 2 / effects.variance
-    explained = np.sum(ratio[:, None] * squares / (1 + ratio[:, None] * values), axis=1)
-    cost = total - explained
+    cost = total - np.sum(ratio[:, None] * squares / (1 + ratio[:, None] * values), axis=1)
     log_sum = np.sum(np.log1p(ratio[:, None] * values), axis=1)
     # Of the effect, and of what independent errors add to the mean of a coefficient's tips.
     variance = ratio if effects.given else ratio * cost / freedom
@@ -149,8 +152,7 @@ def group_deviations(
         change, variance = abs(np.log(new / variance)), new
         if change < _TOLERANCE:
             break
-    curved = covariance_of_log_variances(model, groups, logs, logs > _LEAST_LOG + 1e-9)
-    spread = np.diag(curved)
+    spread = np.diag(covariance_of_log_variances(model, groups, logs, logs > _LEAST_LOG + 1e-9))
     return np.exp(0.5 * logs), 2 / np.where(spread > 0, spread, 1e-9)
 
 
@@ -162,14 +164,14 @@ def second_moments(
 
     A calibration without the effect has the error that these coefficients make, whose mean square is this.
     """
-    variance, r = effects.variance, effects.left.values[:, None]
     weights = members / sd[:, None] ** 2
-    inner = effects.product(columns, columns) / variance + np.diag(weights.sum(axis=0))
+    inner = effects.product(columns, columns) / effects.variance + np.diag(weights.sum(axis=0))
     covariance = np.linalg.inv(inner)
-    mean = covariance @ effects.product(columns, r) / variance
-    grown = [covariance @ (weight[:, None] * covariance) for weight in weights]
-    moved = [covariance @ (weight[:, None] * mean) for weight in weights]
-    by_group = [spread + step @ mean.T + mean @ step.T for spread, step in zip(grown, moved, strict=True)]
+    mean = covariance @ effects.product(columns, effects.left.values[:, None]) / effects.variance
+    by_group = []
+    for weight in weights:
+        moved = covariance @ (weight[:, None] * mean) @ mean.T
+        by_group.append(covariance @ (weight[:, None] * covariance) + moved + moved.T)
     return covariance + mean @ mean.T, np.array(by_group)
 
 
@@ -184,11 +186,11 @@ class SharedProblem(NamedTuple):
 
     def moved(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "R k"]:
         """Columns of tips that move by a pattern over the poses, along x, y and z each."""
-        blocks = [
+        of_poses = [
             np.einsum("mra,mc->mrca", part.by_tip, patterns[part.poses]).reshape(part.residual.size, -1)
             for part in self.rows
         ]
-        return self._columns(blocks, np.einsum("laN,Nc->lca", self.sensitivities.lengths, patterns))
+        return self._columns(of_poses, np.einsum("laN,Nc->lca", self.sensitivities.lengths, patterns))
 
     def turned(
         self, values: Float[np.ndarray, "M k"], joints: np.ndarray, steps: Float[np.ndarray, " k"]
@@ -197,7 +199,7 @@ class SharedProblem(NamedTuple):
         arm, q = self.record.calibrated.arm, np.asarray(self.record.recording.capture.readings)
         natural = np.array([1.0 if i + 1 in arm.prismatic else 1e-3 for i in range(arm.joints)])
         factors = values * (steps / natural[joints])
-        blocks = [
+        of_poses = [
             (part.extra[..., joints] * factors[part.poses][:, None]).reshape(part.residual.size, -1)
             for part in self.rows
         ]
@@ -206,32 +208,14 @@ class SharedProblem(NamedTuple):
             names = [f"{'d' if i + 1 in arm.prismatic else 'theta'}_{i + 1}" for i in range(arm.joints)]
             slopes = np.einsum("laN,Naj->ljN", self.sensitivities.lengths, np.asarray(arm.jacobian(q, names)))
             of_lengths = np.einsum("lkN,Nk->lk", slopes[:, joints], values * steps)
-        return self._columns(blocks, of_lengths)
+        return self._columns(of_poses, of_lengths)
 
-    def _columns(self, blocks: list[np.ndarray], of_lengths: np.ndarray) -> np.ndarray:
-        whole = np.zeros((len(self.left.values), blocks[0].shape[1]))
-        poses = np.concatenate(blocks)
-        whole[: len(poses)] = poses
+    def _columns(self, of_poses: list[np.ndarray], of_lengths: np.ndarray) -> np.ndarray:
+        poses = np.concatenate(of_poses)
+        whole = np.pad(poses, ((0, len(self.left.values) - len(poses)), (0, 0)))
         if self.lengths is not None:
             whole[-len(self.lengths) :] = self.lengths @ of_lengths.reshape(len(of_lengths), -1)
         return self.left.unexplained(whole)
-
-    def by_patterns(self, patterns: Float[np.ndarray, "M c"]) -> Float[np.ndarray, "p k"]:
-        """How the parameters follow `moved`."""
-        by_tips = np.einsum("paN,Nc->pca", self.sensitivities.tips, patterns)
-        return by_tips.reshape(len(by_tips), -1)
-
-    def by_functions(self, values: Float[np.ndarray, "M k"], joints: np.ndarray) -> Float[np.ndarray, "p k"]:
-        """How the parameters follow `turned`, by coefficients in their own units."""
-        return np.einsum("pkN,Nk->pk", self.sensitivities.joints[:, joints], values)
-
-
-def problem_of_poses(
-    record: CalibrationRecord, rows: list[Rows], prior: list[Block], sensitivities: Callable[[], Sensitivities]
-) -> SharedProblem:
-    """The equations of the poses, and of a prior."""
-    left = Residuals.of([*(part.block("") for part in rows), *prior])
-    return SharedProblem(record, rows, left, sensitivities(), None)
 
 
 def scale_of_lengths(record: CalibrationRecord, relations: list[Block]) -> Block:
@@ -251,37 +235,31 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
 
     Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
     """
-    record, rows = problem.record, problem.rows
-    blocks, size = [*(part.block("") for part in rows), *relations], sum(part.residual.size for part in rows)
-    values = np.array([float(length.value) for length in record.recording.capture.lengths])
-    if lengths_in_solve(record) or not len(values):
-        u = np.maximum([float(length.u) for length in record.recording.capture.lengths], LEAST_U)
-        return problem._replace(left=_without_scale(Residuals.of(blocks), size, values / u))
-    related = lengths_of_sockets(record, rows)
-    if related is None:
-        return problem
-    whitening = np.linalg.inv(np.linalg.cholesky(related.covariance))
-    residual, shared = whitening @ related.relations.residual, whitening @ related.relations.shared
-    blocks.append(related.relations._replace(residual=residual, shared=shared))
-    if related.scale is not None:
-        # Residuals are in proportion to the arm: where every length is free, a shorter scale anchor, and all else in
-        # proportion, takes them away. That is no error of the anchor, so its column is taken at right angles to them.
-        of_rows, r = related.scale[0], problem.left.values[: len(related.scale[0])]
-        of_rows = of_rows - r * (r @ of_rows) / max(float(r @ r), 1e-300)
-        blocks = _with_column(blocks, of_rows, whitening @ related.scale[1])
-    left = _without_scale(Residuals.of(blocks), size, whitening @ values)
-    return problem._replace(left=left, lengths=whitening)
-
-
-def _without_scale(left: Residuals, first: int, by_scale: Float[np.ndarray, " l"]) -> Residuals:
-    """With the scale of the lengths, which begin at a row, as one more unknown."""
+    record, lengths, whitening = problem.record, problem.record.recording.capture.lengths, None
+    blocks = [*(part.block("") for part in problem.rows), *relations]
+    first = sum(part.residual.size for part in problem.rows)
+    by_scale = np.array([float(length.value) / max(float(length.u), LEAST_U) for length in lengths])
+    if lengths and not lengths_in_solve(record):
+        related = lengths_of_sockets(record, problem.rows)
+        if related is None:
+            return problem
+        whitening = np.linalg.inv(np.linalg.cholesky(related.covariance))
+        block = related.relations
+        blocks.append(block._replace(residual=whitening @ block.residual, shared=whitening @ block.shared))
+        by_scale = whitening @ np.array([float(length.value) for length in lengths])
+        if related.scale is not None:
+            # The scale anchor, which the lengths determine, is one more unknown. Residuals are in proportion to the
+            # arm: where every length is free, a shorter anchor, and all else in proportion, takes them away. That is
+            # no error of the anchor, so its column is taken at right angles to them.
+            of_rows, r = related.scale[0], problem.left.values[: len(related.scale[0])]
+            of_rows = of_rows - r * (r @ of_rows) / max(float(r @ r), 1e-300)
+            column = np.concatenate([of_rows, whitening @ related.scale[1]])
+            parts = np.split(column, np.cumsum([len(block.residual) for block in blocks])[:-1])
+            pairs = zip(blocks, parts, strict=True)
+            blocks = [block._replace(shared=np.column_stack([block.shared, part])) for block, part in pairs]
+    left = Residuals.of(blocks)
     column = np.zeros((len(left.values), 1))
     column[first : first + len(by_scale), 0] = by_scale
-    unknown = np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column)
-    return left.extended(column) if unknown else left
-
-
-def _with_column(blocks: list[Block], of_rows: np.ndarray, of_lengths: np.ndarray) -> list[Block]:
-    """With the scale anchor, which the lengths determine, as one more unknown."""
-    parts = np.split(np.concatenate([of_rows, of_lengths]), np.cumsum([len(b.residual) for b in blocks])[:-1])
-    return [b._replace(shared=np.column_stack([b.shared, part])) for b, part in zip(blocks, parts, strict=True)]
+    if np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column):
+        left = left.extended(column)
+    return problem._replace(left=left, lengths=whitening)

@@ -25,10 +25,9 @@ from ..kinematics.jacobian import tip_position
 from ..kinematics.workspace import total_link_length
 from .joint_travel import standing_joints
 from .reading_fit import Explanation, ReadingFit
-from .reading_search import Evidence, Hypothesis, Searched, as_recorded, search
+from .reading_search import Evidence, Hypothesis, search
 
 _EXPLAINED = 0.003  # of the arm's size: a smaller residual is left by a nominal arm, once its parameters are adjusted
-_AS_GOOD = 2.0  # the factor by which residuals of two explanations must differ to tell them apart
 _REFITTED = 24  # hypotheses
 _EQUAL = 1e-6, 2e-4  # of a residual, and mm: the same cost but for rounding
 _LISTED = 200  # hypotheses of equal cost that are looked at
@@ -56,7 +55,6 @@ class ReadingCheck(NamedTuple):
     others: tuple[Explanation, ...]  # as good on these data, but not everywhere
     equal: int  # further ones that have the tip in the same positions everywhere, whatever the readings
     explained: bool  # whether the best leaves residuals that an arm of this kind has
-    size: float  # of the arm, mm: its links together
     poses: int
     known_positions: bool  # in the base frame
     tried: int  # hypotheses
@@ -109,32 +107,63 @@ def check_readings(
         False (1, 0, 2, 3, 4, 5)
     """
     arm = to_numpy(arm)
-    evidence = _evidence(arm, q, positions, rotations, sockets, own_frame)
-    size = max(total_link_length(arm), 1e-9)
-    fit = ReadingFit(arm, evidence, size, free_tip)
-    given = fit.explanation(as_recorded(arm.joints), 1.0, 1.0)
+    if not is_single(arm):
+        raise InputError("check_readings takes one arm, not a batch; give one of its arms.")
+    q = np.asarray(q)
+    if q.shape[1] != arm.joints or not len(q):
+        raise InputError(f"q has shape {q.shape}; give a row for each pose and {arm.joints} columns.")
+    if (sockets is None) == (positions is None):
+        raise InputError("give either the sockets of the poses or the positions of the tip.")
+    if positions is not None:
+        if own_frame and (len(q) < 4 or rotations is not None):
+            raise InputError("in an instrument's own frame, give at least four positions, and no orientations.")
+        turned = None if rotations is None else np.asarray(rotations)
+        evidence = Evidence(q, np.zeros(len(q), dtype=int), np.asarray(positions), turned, own_frame)
+    else:
+        names, owner = np.unique(np.asarray(sockets), return_inverse=True)
+        if owner.shape != (len(q),):
+            raise InputError(f"sockets has shape {owner.shape}; give one number or name for each of {len(q)} poses.")
+        if np.bincount(owner, minlength=len(names)).max() < 2:
+            raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
+        order = np.argsort(owner, kind="stable")
+        evidence = Evidence(q[order], owner[order])
+    return _checked(ReadingFit(arm, evidence, max(total_link_length(arm), 1e-9), free_tip), free_tip)
+
+
+def _checked(fit: ReadingFit, free_tip: bool) -> ReadingCheck:
+    """The hypotheses that the search finds, refitted and compared."""
+    arm, evidence, n = fit.arm, fit.evidence, fit.arm.joints
+    given = fit.explanation(Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n))
     candidates, tried = [], 0
-    for angle, length in _units(arm, evidence, size):
-        searched = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
-        tried += searched.tried
-        for members in _groups(searched, size):
-            members.sort(key=lambda hypothesis: (fit.outside(hypothesis, angle) > 0, hypothesis.changes))
-            candidates.append((members, angle, length, *fit.with_free_zeros(members[0], angle, length)))
+    for angle, length in _units(fit):
+        rms, hypotheses, count = search(arm, evidence.scaled(angle, length).thinned(), fit.lever)
+        tried += count
+        groups: list[list[Hypothesis]] = []  # those of equal residual together
+        before = -np.inf
+        for residual, hypothesis in zip(rms, hypotheses, strict=True):
+            if residual - before > _EQUAL[0] * residual + _EQUAL[1] * fit.size / M:
+                if len(groups) == _REFITTED:
+                    break
+                groups.append([])
+                before = residual
+            groups[-1].append(hypothesis._replace(angle=angle, length=length))
+        for members in groups:
+            members.sort(key=lambda hypothesis: (fit.outside(hypothesis) > 0, hypothesis.changes))
+            candidates.append((members, *fit.with_free_zeros(members[0])))
     possible = float(np.abs(evidence.q).max()) <= _NEVER
-    bound = _bound(min([rms for *_, rms in candidates] + [given.rms_fitted] * possible), fit)
-    good = [
-        (members, fit.needed_zeros(members[0], angle, length, zeros, rms))
-        for members, angle, length, zeros, rms in candidates
-        if rms <= bound
-    ]
-    explanations = [one for _, one in good] + [given] * (possible and given.rms_fitted <= bound)
-    explained = min(one.rms_fitted for one in explanations) <= _EXPLAINED * size
-    simplest = min(explanations, key=lambda one: (one.outside > 0, one.changes, one.rms_fitted))
-    best = simplest if explained else min(explanations, key=lambda one: one.rms_fitted)
-    others, equal = _others(fit, best, good) if explained else ((), 0)
+    bound = fit.as_good_as(min([rms for *_, rms in candidates] + [given.rms_fitted] * possible))
+    good = [(members, fit.needed_zeros(members[0], zeros, rms)) for members, zeros, rms in candidates if rms <= bound]
+    explanations = [explanation for _, explanation in good] + [given] * (possible and given.rms_fitted <= bound)
+    closest = min(explanations, key=lambda explanation: explanation.rms_fitted)
+    explained, best, others, equal = closest.rms_fitted <= _EXPLAINED * fit.size, closest, (), 0
+    if explained:
+        best = min(explanations, key=lambda x: (x.outside > 0, x.changes, x.rms_fitted))
+        others, equal = _others(fit, best, good)
     best = best if best == given else fit.within_limits(best)
-    check = ReadingCheck(given, best, others, equal, explained, size, len(evidence.q), evidence.in_base, tried)
-    return check._replace(rms_with_tip=fit.with_tip_found(best) if own_frame else None, free_tip=free_tip)
+    with_tip = fit.with_tip_found(best) if evidence.own_frame else None
+    return ReadingCheck(
+        given, best, others, equal, explained, len(evidence.q), evidence.in_base, tried, with_tip, free_tip
+    )
 
 
 def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
@@ -161,43 +190,9 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     )
 
 
-def _bound(rms: float, fit: ReadingFit) -> float:
-    """Residuals up to here are as good as these."""
-    return _AS_GOOD * rms + fit.typical
-
-
-def _evidence(
-    arm: Arm,
-    q: AnyArray,
-    positions: AnyArray | None,
-    rotations: AnyArray | None,
-    sockets: Numbers | None,
-    own_frame: bool,
-) -> Evidence:
-    """What was recorded, checked; poses sorted by socket."""
-    if not is_single(arm):
-        raise InputError("check_readings takes one arm, not a batch; give one of its arms.")
-    q = np.asarray(q)
-    if q.shape[1] != arm.joints or not len(q):
-        raise InputError(f"q has shape {q.shape}; give a row for each pose and {arm.joints} columns.")
-    if (sockets is None) == (positions is None):
-        raise InputError("give either the sockets of the poses or the positions of the tip.")
-    if positions is not None:
-        if own_frame and (len(q) < 4 or rotations is not None):
-            raise InputError("in an instrument's own frame, give at least four positions, and no orientations.")
-        turned = None if rotations is None else np.asarray(rotations)
-        return Evidence(q, np.zeros(len(q), dtype=int), np.asarray(positions), turned, own_frame)
-    names, owner = np.unique(np.asarray(sockets), return_inverse=True)
-    if owner.shape != (len(q),):
-        raise InputError(f"sockets has shape {owner.shape}; give one number or name for each of {len(q)} poses.")
-    if np.bincount(owner, minlength=len(names)).max() < 2:
-        raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
-    order = np.argsort(owner, kind="stable")
-    return Evidence(q[order], owner[order])
-
-
-def _units(arm: Arm, evidence: Evidence, size: float) -> Iterator[tuple[float, float]]:
+def _units(fit: ReadingFit) -> Iterator[tuple[float, float]]:
     """Factors of readings and of positions that are possible: 1, and others where the numbers look like them."""
+    evidence, size = fit.evidence, fit.size
     largest = float(np.abs(evidence.q).max())
     angles = [1.0] if largest <= _NEVER else []
     angles += [DEG] if largest > _TURN else [1 / DEG] if 0 < largest < _TURN * DEG else []
@@ -205,25 +200,11 @@ def _units(arm: Arm, evidence: Evidence, size: float) -> Iterator[tuple[float, f
     if evidence.points is not None:
         points = evidence.points
         distances = np.linalg.norm(points - (points.mean(axis=0) if evidence.own_frame else 0.0), axis=1)
-        farthest, span = float(distances.max()), size + abs(float(np.asarray(arm.d)[0]))
+        farthest, span = float(distances.max()), size + abs(float(np.asarray(fit.arm.d)[0]))
         if not _NEAREST * span <= farthest <= _FARTHEST * span:
             possible = [x for x in _LENGTHS if _NEAREST * span <= x * farthest <= _FARTHEST * span]
             lengths = [1.0] * (farthest < _FARTHEST * span or not possible) + possible  # small ones are possible, too
     yield from itertools.product(angles, lengths)
-
-
-def _groups(searched: Searched, size: float) -> list[list[Hypothesis]]:
-    """The first hypotheses by residual, those of equal residual together."""
-    groups: list[list[Hypothesis]] = []
-    before = -np.inf
-    for rms, hypothesis in zip(searched.rms, searched.hypotheses, strict=True):
-        if rms - before > _EQUAL[0] * rms + _EQUAL[1] * size / M:
-            if len(groups) == _REFITTED:
-                break
-            groups.append([])
-            before = rms
-        groups[-1].append(hypothesis)
-    return groups
 
 
 def _others(
@@ -233,7 +214,7 @@ def _others(
 
     Hypotheses of equal cost are compared as they were tried, with zeros at multiples of 45 degrees.
     """
-    bound, others, equal, best_seen = _bound(best.rms_fitted, fit), [], 0, False
+    bound, others, equal, best_seen = fit.as_good_as(best.rms_fitted), [], 0, False
     for members, explanation in good:
         of_best = not best_seen and (best.hypothesis in members or best == explanation)
         best_seen = best_seen or of_best
@@ -241,9 +222,9 @@ def _others(
         for member in members[:_LISTED] if of_best else [explanation.hypothesis]:
             same, mirrored = _compared(fit, member, base)
             if same or any(_compared(fit, member, other)[0] for other, _ in others):
-                equal += same and member != base
+                equal += same and member[:3] != base[:3]
                 continue
-            other = fit.refitted(member, explanation.angle, explanation.length) if of_best else explanation
+            other = fit.needed_zeros(member, *fit.with_free_zeros(member)) if of_best else explanation
             if other.rms_fitted <= bound and (best.outside > 0 or not other.outside) and _distinct(other, best):
                 others.append((member, other._replace(mirrored=mirrored)))
     # Of a joint that stands still, unless there is a single pose, nothing that an alternative says could be tested.
@@ -251,37 +232,31 @@ def _others(
     still = still if len(still) < fit.arm.joints else []
     kept: list[Explanation] = []
     for _, other in others:
-        moved = other.angle == best.angle and any(_of_joint(other, i) != _of_joint(best, i) for i in still)
-        if not moved and all(_distinct(other, one, _SAME) for one in kept):
+        differs = any(a[i] != b[i] for a, b in zip(other[:3], best[:3], strict=True) for i in still)
+        if not (other.angle == best.angle and differs) and all(_distinct(other, before, _SAME) for before in kept):
             kept.append(other)
     return tuple(sorted(kept, key=lambda other: (other.changes, other.rms_fitted))), equal
 
 
-def _of_joint(one: Explanation, i: int) -> tuple[int, int, float]:
-    """What an explanation says of joint i, from 0."""
-    return one.order[i], one.signs[i], one.offsets[i]
-
-
-def _distinct(one: Explanation, other: Explanation, apart: float = _APART) -> bool:
+def _distinct(first: Explanation, other: Explanation, apart: float = _APART) -> bool:
     """Whether two explanations differ by more than zeros that are hardly determined."""
-    if one[:2] != other[:2] or (one.angle, one.length) != (other.angle, other.length):
+    if first[:2] != other[:2] or first[3:5] != other[3:5]:
         return True
-    return any(abs(math.remainder(x - y, 2 * math.pi)) > apart for x, y in zip(one.offsets, other.offsets, strict=True))
+    pairs = zip(first.offsets, other.offsets, strict=True)
+    return any(abs(math.remainder(x - y, 2 * math.pi)) > apart for x, y in pairs)
 
 
-def _compared(fit: ReadingFit, one: Hypothesis, other: Hypothesis) -> tuple[bool, bool]:
+def _compared(fit: ReadingFit, first: Hypothesis, other: Hypothesis) -> tuple[bool, bool]:
     """Whether two hypotheses have the tip in the same positions for all readings, but for the place of the base where
     that is unknown; and whether in mirror images of them."""
     limits = np.asarray(joint_limits(fit.arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_COMMON, fit.arm.joints))
     geometry = to_numpy(fit.arm.geometry)
-    tips = [np.asarray(tip_position(geometry, hypothesis.readings(q))) for hypothesis in (one, other)]
+    a, b = (np.asarray(tip_position(geometry, x._replace(angle=1.0).readings(q))) for x in (first, other))
     if fit.evidence.in_base:
-        return bool(np.abs(tips[0] - tips[1]).max() < _ALIKE * fit.size), False
-    first, second = (tip - tip.mean(axis=0) for tip in tips)
-    u, _, v = np.linalg.svd(first.T @ second)
-    far = {}
-    for sign in (1.0, -1.0):
-        turn = u @ np.diag([1.0, 1.0, sign * np.linalg.det(u @ v)]) @ v
-        far[sign] = float(np.abs(first @ turn - second).max())
-    return far[1.0] < _ALIKE * fit.size, far[-1.0] < _ALIKE * fit.size
+        return bool(np.abs(a - b).max() < _ALIKE * fit.size), False
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    u, _, v = np.linalg.svd(a.T @ b)
+    turns = (u @ np.diag([1.0, 1.0, sign * np.linalg.det(u @ v)]) @ v for sign in (1.0, -1.0))
+    same, mirrored = (bool(np.abs(a @ turn - b).max() < _ALIKE * fit.size) for turn in turns)
+    return same, mirrored

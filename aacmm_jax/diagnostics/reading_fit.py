@@ -25,6 +25,7 @@ _FITTED = 120, 24  # poses of a fit, in all and in one socket
 _MARGIN = 3 * DEG  # of readings beyond their limits
 _EXACT = 1e-5  # of the arm's size: residuals below it do not differ
 _NEARLY = 1.5  # the factor up to which residuals with fewer changed zeros are as good
+_AS_GOOD = 2.0  # the factor by which residuals of two explanations must differ to tell them apart
 
 
 class Explanation(NamedTuple):
@@ -52,13 +53,13 @@ class Explanation(NamedTuple):
 
     @property
     def hypothesis(self) -> Hypothesis:
-        """Order, signs and zeros."""
-        return Hypothesis(self.order, self.signs, self.offsets)
+        """Order, signs, zeros and units."""
+        return Hypothesis(*self[:5])
 
     @property
     def changes(self) -> int:
         """Number of mistakes that it names."""
-        return self.hypothesis.changes + (self.angle != 1) + (self.length != 1)
+        return self.hypothesis.changes
 
 
 class ReadingFit:
@@ -70,8 +71,7 @@ class ReadingFit:
         names = parameter_names(arm)
         self._nominal = np.array([value_of(arm, name) for name in names], dtype=float)
         self._indices = tuple(locate(arm, name) for name in names)
-        lengths = [is_length(name) for name in names]
-        self._deviations = np.where(lengths, _LENGTH * size, _TWIST)
+        self._deviations = np.where([is_length(name) for name in names], _LENGTH * size, _TWIST)
         self._zeros = np.array([name.startswith("theta") for name in names])
         self._tip = np.array([name.startswith("probe") for name in names])
         self._deviations[self._tip] = size / 2 if free_tip else _PROBE * size
@@ -79,55 +79,53 @@ class ReadingFit:
         unknown = 0 if evidence.in_base else 6 if evidence.own_frame else 3 * (1 + int(self._few.owner.max()))
         self._enough = rows - unknown >= 3 * arm.joints
         # The residual of parameters that deviate from nominal ones by as much as those of real arms do.
-        self.typical = _TIP * size * math.sqrt(min(rows, len(names)) / len(self._few.q))
+        self._typical = _TIP * size * math.sqrt(min(rows, len(names)) / len(self._few.q))
+        self._low, self._high = (np.full(arm.joints, x) for x in (-np.inf, np.inf))
+        if arm.limits is not None:
+            self._low, self._high = np.asarray(joint_limits(arm, None)).T
 
-    def explanation(self, hypothesis: Hypothesis, angle: float, length: float) -> Explanation:
+    def as_good_as(self, rms: float) -> float:
+        """Residuals up to here are as good as these."""
+        return _AS_GOOD * rms + self._typical
+
+    def explanation(self, hypothesis: Hypothesis) -> Explanation:
         """With the zeros as they are in the hypothesis."""
-        whole = self.evidence.scaled(angle, length)
-        residual = self._residual(whole, self._nominal, hypothesis.readings(whole.q))[0]
-        fitted, _ = self._adjusted(hypothesis, angle, length, _TIGHT)
-        outside = self.outside(hypothesis, angle)
-        return Explanation(*hypothesis, angle, length, _rms(residual, len(whole.q)), fitted, outside)
+        rms = _rms(self._residual(self.evidence, self._nominal, hypothesis)[0], len(self.evidence.q))
+        return Explanation(*hypothesis, rms, self._adjusted(hypothesis, _TIGHT)[1], self.outside(hypothesis))
 
-    def outside(self, hypothesis: Hypothesis, angle: float) -> int:
+    def _outside(self, readings: Float[np.ndarray, "m n"]) -> np.ndarray:
+        return (readings < self._low - _MARGIN) | (readings > self._high + _MARGIN)
+
+    def outside(self, hypothesis: Hypothesis) -> int:
         """Readings beyond the arm's limits, where it has some."""
         if self.arm.limits is None:
             return 0
-        low, high = np.asarray(joint_limits(self.arm, None)).T
-        readings = hypothesis.readings(angle * self.evidence.q)
+        readings = hypothesis.readings(self.evidence.q)
         # A reading may be whole revolutions away.
-        readings = readings - 2 * np.pi * np.round((readings - (low + high) / 2) / (2 * np.pi))
-        return int(np.sum((readings < low - _MARGIN) | (readings > high + _MARGIN)))
+        middle = (self._low + self._high) / 2
+        return int(np.sum(self._outside(readings - 2 * np.pi * np.round((readings - middle) / (2 * np.pi)))))
 
-    def within_limits(self, one: Explanation) -> Explanation:
+    def within_limits(self, explanation: Explanation) -> Explanation:
         """The same with zeros whole revolutions away: as many readings as can be are then within the joint limits, and
         of these the zeros are the smallest."""
-        low, high = (np.full(self.arm.joints, x) for x in (-np.inf, np.inf))
-        if self.arm.limits is not None:
-            low, high = np.asarray(joint_limits(self.arm, None)).T
-        readings, offsets = one.hypothesis.readings(one.angle * self.evidence.q), np.array(one.offsets)
+        readings, offsets = explanation.hypothesis.readings(self.evidence.q), np.array(explanation.offsets)
+        turns = 2 * np.pi * (np.arange(-2, 3)[:, None] - np.round(offsets / (2 * np.pi)))  # (5, n)
+        outside = np.array([np.sum(self._outside(readings + turn), axis=0) for turn in turns])
         for i in np.flatnonzero(by_joint(self.arm, True, False)):
-            turns = 2 * np.pi * (np.arange(-2, 3) - round(offsets[i] / (2 * np.pi)))
-            moved = readings[:, i] + turns[:, None]
-            outside = np.sum((moved < low[i] - _MARGIN) | (moved > high[i] + _MARGIN), axis=1)
-            offsets[i] += turns[np.lexsort((np.abs(offsets[i] + turns), outside))[0]]
-        return one._replace(offsets=tuple(offsets.tolist()))
+            offsets[i] += turns[np.lexsort((np.abs(offsets[i] + turns[:, i]), outside[:, i]))[0], i]
+        return explanation._replace(offsets=tuple(offsets.tolist()))
 
-    def with_free_zeros(
-        self, hypothesis: Hypothesis, angle: float, length: float
-    ) -> tuple[Float[np.ndarray, " n"], float]:
+    def with_free_zeros(self, hypothesis: Hypothesis) -> tuple[Float[np.ndarray, " n"], float]:
         """Changes of the zeros that fit best, rad, and the residual with them; none where there are too few poses."""
-        fitted, zeros = self._adjusted(hypothesis, angle, length, _FREE if self._enough else _TIGHT)
-        return zeros if self._enough else 0 * zeros, fitted
+        zeros, rms = self._adjusted(hypothesis, _FREE if self._enough else _TIGHT)
+        return self._enough * zeros, rms
 
-    def needed_zeros(
-        self, hypothesis: Hypothesis, angle: float, length: float, zeros: Float[np.ndarray, " n"], rms: float
-    ) -> Explanation:
+    def needed_zeros(self, hypothesis: Hypothesis, zeros: Float[np.ndarray, " n"], rms: float) -> Explanation:
         """The explanation with as few changed zeros as are needed, the largest first."""
         offsets = np.array(hypothesis.offsets)
         waiting = [i for i in np.argsort(-np.abs(zeros)).tolist() if abs(zeros[i]) > _ZERO]
         while True:
-            changed = self.explanation(hypothesis._replace(offsets=tuple(offsets.tolist())), angle, length)
+            changed = self.explanation(hypothesis._replace(offsets=tuple(offsets.tolist())))
             if changed.rms_fitted <= _NEARLY * rms + _EXACT * self.size or not waiting:
                 return changed
             joint = waiting.pop(0)
@@ -135,44 +133,34 @@ class ReadingFit:
             quarter = round(offset / (math.pi / 2)) * (math.pi / 2)
             offsets[joint] = quarter if abs(offset - quarter) < _ZERO else offset
 
-    def refitted(self, hypothesis: Hypothesis, angle: float, length: float) -> Explanation:
-        """The explanation with the zeros that fit best, as few of them changed as are needed."""
-        return self.needed_zeros(hypothesis, angle, length, *self.with_free_zeros(hypothesis, angle, length))
-
-    def with_tip_found(self, one: Explanation) -> float:
+    def with_tip_found(self, explanation: Explanation) -> float:
         """The residual of the nominal arm with the tip where it fits best in the last frame, mm."""
-        evidence, vector = self.evidence.scaled(one.angle, one.length), self._nominal.copy()
-        readings, tip = one.hypothesis.readings(evidence.q), np.flatnonzero(self._tip)
-        residual, columns = self._residual(evidence, vector, readings)
-        best = _rms(residual, len(readings))
+        vector, tip, poses = self._nominal.copy(), np.flatnonzero(self._tip), len(self.evidence.q)
+        residual, columns = self._residual(self.evidence, vector, explanation.hypothesis)
+        best = _rms(residual, poses)
         for _ in range(_STEPS):
             vector[tip] -= np.linalg.lstsq(columns[:, tip], residual, rcond=1e-10)[0]
-            residual, columns = self._residual(evidence, vector, readings)
-            before, best = best, min(best, _rms(residual, len(readings)))
+            residual, columns = self._residual(self.evidence, vector, explanation.hypothesis)
+            before, best = best, min(best, _rms(residual, poses))
             if best > 0.99 * before:
                 break
         return best
 
-    def _adjusted(
-        self, hypothesis: Hypothesis, angle: float, length: float, zero: float
-    ) -> tuple[float, Float[np.ndarray, " n"]]:
-        """The most probable arm, whose zeros have this standard deviation: its residual and the changes of its zeros.
+    def _adjusted(self, hypothesis: Hypothesis, zero: float) -> tuple[Float[np.ndarray, " n"], float]:
+        """The most probable arm, whose zeros have this standard deviation: the changes of its zeros and its residual.
 
         The residual counts how improbable the change of each parameter is, too: with changes that no real arm has,
         many wrong readings can be fitted. The method of Levenberg and Marquardt.
         """
-        evidence = self._few.scaled(angle, length)
-        readings = hypothesis.readings(evidence.q)
-        nominal = self._nominal
         deviations = np.where(self._zeros, zero, self._deviations)
-        sigma, change, damping = _TIP * self.size, np.zeros(len(nominal)), 1e-3
-        residual, columns = self._residual(evidence, nominal, readings)
+        sigma, change, damping = _TIP * self.size, np.zeros(len(self._nominal)), 1e-3
+        residual, columns = self._residual(self._few, self._nominal, hypothesis)
         cost = np.sum(residual**2) / sigma**2
         for _ in range(_STEPS):
             rows = np.concatenate([columns * deviations / sigma, np.eye(len(change)), damping * np.eye(len(change))])
             right = np.concatenate([-residual / sigma, -change, np.zeros(len(change))])
             new = change + np.linalg.lstsq(rows, right, rcond=None)[0]
-            tried = self._residual(evidence, nominal + new * deviations, readings)
+            tried = self._residual(self._few, self._nominal + new * deviations, hypothesis)
             new_cost = np.sum(tried[0] ** 2) / sigma**2 + np.sum(new**2)
             if not new_cost < cost:
                 damping *= 10
@@ -181,15 +169,15 @@ class ReadingFit:
             change, cost, (residual, columns), damping = new, new_cost, tried, damping / 10
             if done:
                 break
-        return sigma * math.sqrt(cost / len(readings)), (change * deviations)[self._zeros]
+        return (change * deviations)[self._zeros], sigma * math.sqrt(cost / len(self._few.q))
 
     def _residual(
-        self, evidence: Evidence, vector: Float[np.ndarray, " p"], readings: Float[np.ndarray, "m n"]
+        self, recorded: Evidence, vector: Float[np.ndarray, " p"], hypothesis: Hypothesis
     ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"]]:
         """Residuals, mm, and their derivatives, with the unknown geometry eliminated."""
-        geometry = to_numpy(self.arm.geometry)
+        evidence, geometry = recorded.scaled(1.0, hypothesis.length), to_numpy(self.arm.geometry)
         geometry = geometry._replace(**with_values(geometry, vector, self._indices))
-        forward = forward_pass(geometry, joint_motion(geometry, readings))
+        forward = forward_pass(geometry, joint_motion(geometry, hypothesis.readings(recorded.q)))
         tips = np.asarray(forward.tip).T
         columns = np.moveaxis(np.asarray(stacked_jacobian_columns(forward, self._indices)), -1, 0).swapaxes(1, 2)
         if evidence.points is None:

@@ -24,7 +24,37 @@ def reading_check_summary(
         unit: Unit of the readings that was stated, or taken; None where the file says it for itself.
         positions: Unit that positions were taken to be in.
     """
-    best = check.best
+    given, best, tip = check.given, check.best, ""
+    improved = f"from {given.rms:.3g} to {best.rms:.3g} mm RMS ({best.rms_fitted:.3g} mm"
+    words = explanation_words(best, positions)
+    if not check.explained:
+        sentence = (
+            f"No permutation, sign or zero offset of the columns explains these readings: {given.rms:.3g} mm RMS as "
+            f"they are, {best.rms:.3g} mm at best. Is it the right arm, do the rows belong to these sockets or "
+            "positions, and was the tip where it is said to have been?"
+        )
+    elif check.fits:
+        sentence = (
+            f"The readings fit as they are: {given.rms:.3g} mm RMS by the nominal arm, {given.rms_fitted:.3g} mm with "
+            "parameters as real arms have them."
+        )
+    else:
+        sentence = (
+            f"{words[0].upper()}{words[1:]}. Correcting it reduces the residuals (nominal arm) {improved} with "
+            "parameters as real arms have them)."
+        )
+    # How much of the residual is due to the place of the tip, which a calibration finds.
+    if check.explained and check.rms_with_tip is not None and _MUCH * check.rms_with_tip <= best.rms:
+        place = (
+            "what was seen is taken to be where the arm's probe is. A calibration finds its place"
+            if check.free_tip
+            else "what was seen is not where the arm's probe is. In its table of the manifest write target = "
+            '"reflector", and a calibration finds its place'
+        )
+        tip = (
+            f"Most of the {best.rms:.3g} mm is an offset of the tip: {place} in the last frame; with it the nominal "
+            f"arm leaves {check.rms_with_tip:.3g} mm RMS."
+        )
     return {
         "kind": "reading check",
         "arm": arm,
@@ -32,11 +62,11 @@ def reading_check_summary(
         "unit": unit,
         "fits": check.fits,
         "explained": check.explained,
-        "sentence": _sentence(check, positions),
-        "tip": _tip(check),
-        "given": _row(check.given, positions),
+        "sentence": sentence,
+        "tip": tip,
+        "given": _row(given, positions),
         "found": _row(best, positions) if check.explained else None,
-        "alternatives": [_row(one, positions) for one in check.others],
+        "alternatives": [_row(other, positions) for other in check.others],
         "equivalent": check.equal,
         "known_positions": check.known_positions,
         "rms_with_tip_mm": check.rms_with_tip,
@@ -44,105 +74,53 @@ def reading_check_summary(
     }
 
 
-def _row(one: Explanation, positions: str) -> dict[str, Any]:
+def _row(explanation: Explanation, positions: str) -> dict[str, Any]:
     return {
-        "says": explanation_words(one, positions),
-        "columns": [column + 1 for column in one.order],
-        "signs": list(one.signs),
-        "zeros_deg": [offset / DEG for offset in one.offsets],
-        "angle_factor": one.angle,
-        "length_factor": one.length,
-        "rms_mm": one.rms,
-        "rms_fitted_mm": one.rms_fitted,
-        "readings_outside_limits": one.outside,
-        "mirror_image": one.mirrored,
+        "says": explanation_words(explanation, positions),
+        "columns": [column + 1 for column in explanation.order],
+        "signs": list(explanation.signs),
+        "zeros_deg": [offset / DEG for offset in explanation.offsets],
+        "angle_factor": explanation.angle,
+        "length_factor": explanation.length,
+        "rms_mm": explanation.rms,
+        "rms_fitted_mm": explanation.rms_fitted,
+        "readings_outside_limits": explanation.outside,
+        "mirror_image": explanation.mirrored,
     }
 
 
-def _sentence(check: ReadingCheck, positions: str) -> str:
-    given, best = check.given, check.best
-    if not check.explained:
-        return (
-            f"No permutation, sign or zero offset of the columns explains these readings: {given.rms:.3g} mm RMS as "
-            f"they are, {best.rms:.3g} mm at best. Is it the right arm, do the rows belong to these sockets or "
-            "positions, and was the tip where it is said to have been?"
-        )
-    if check.fits:
-        return (
-            f"The readings fit as they are: {given.rms:.3g} mm RMS by the nominal arm, {given.rms_fitted:.3g} mm with "
-            "parameters as real arms have them."
-        )
-    words = explanation_words(best, positions)
-    return (
-        f"{words[0].upper()}{words[1:]}. Correcting it reduces the residuals (nominal arm) from {given.rms:.3g} to "
-        f"{best.rms:.3g} mm RMS ({best.rms_fitted:.3g} mm with parameters as real arms have them)."
-    )
-
-
-def _tip(check: ReadingCheck) -> str:
-    """How much of the residual is due to the place of the tip, which a calibration finds; empty where it is little."""
-    rms = check.best.rms
-    if not check.explained or check.rms_with_tip is None or _MUCH * check.rms_with_tip > rms:
-        return ""
-    known = (
-        "what was seen is taken to be where the arm's probe is. A calibration finds its place"
-        if check.free_tip
-        else "what was seen is not where the arm's probe is. In its table of the manifest write target = "
-        '"reflector", and a calibration finds its place'
-    )
-    return (
-        f"Most of the {rms:.3g} mm is an offset of the tip: {known} in the last frame; with it the nominal arm leaves "
-        f"{check.rms_with_tip:.3g} mm RMS."
-    )
-
-
-def explanation_words(one: Explanation, positions: str = "mm") -> str:
-    """What an explanation changes, in one sentence without its end; empty where nothing.
-
-    Args:
-        one: The explanation.
-        positions: Unit that positions were taken to be in.
-    """
-    words = []
-    if one.angle != 1:
+def explanation_words(explanation: Explanation, positions: str = "mm") -> str:
+    """What an explanation changes, in one sentence without its end; empty where nothing. ``positions`` is the unit
+    that positions were taken to be in."""
+    words, (order, signs, offsets, angle, length) = [], explanation[:5]
+    if angle != 1:
+        units = ("degrees", "radians") if angle < 1 else ("radians", "degrees")
+        words.append("the readings are in {}, and were taken for {}".format(*units))
+    if length != 1:
+        unit = length_unit(length * LENGTH_UNITS[positions])
         words.append(
-            "the readings are in degrees, and were taken for radians"
-            if one.angle < 1
-            else "the readings are in radians, and were taken for degrees"
-        )
-    if one.length != 1:
-        unit = length_unit(one.length * LENGTH_UNITS[positions])
-        factor = f"{one.length:.4g} times as large as they were taken to be"
-        words.append(
-            f"the positions are {factor}"
+            f"the positions are {length:.4g} times as large as they were taken to be"
             if unit is None
             else f"the positions are in {unit}, and were taken for {positions}"
         )
-    words += _order(one.order)
-    wrong = [f"{column + 1}" for column, sign in sorted(zip(one.order, one.signs, strict=True)) if sign < 0]
+    moved = [joint for joint, column in enumerate(order) if column != joint]
+    if order == tuple(reversed(range(len(order)))) and len(order) > 3:
+        words.append("the columns are in reverse order")
+    elif all(order[order[joint]] == joint for joint in moved):
+        pairs = [(joint, order[joint]) for joint in moved if joint < order[joint]]
+        words += [f"columns {first + 1} and {second + 1} are exchanged" for first, second in pairs]
+    else:
+        columns = listed([str(order[joint] + 1) for joint in moved])
+        words.append(f"joints {listed([str(joint + 1) for joint in moved])} are in columns {columns}")
+    wrong = [f"{column + 1}" for column, sign in sorted(zip(order, signs, strict=True)) if sign < 0]
     if wrong:
         words.append(f"column{'s' * (len(wrong) > 1)} {listed(wrong)} run{'s' * (len(wrong) == 1)} the other way")
-    offsets = [math.remainder(offset, 2 * math.pi) for offset in one.offsets]
-    for joint, offset in enumerate(offsets, start=1):
+    for joint, zero in enumerate(offsets, start=1):
+        offset = math.remainder(zero, 2 * math.pi)
         if abs(offset) > _QUARTERS:
             value = abs(offset) if abs(abs(offset) - math.pi) < _QUARTERS else offset
             words.append(f"the zero of joint {joint} is {value / DEG:.4g} deg off")
     return "; ".join(words)
-
-
-def _order(order: tuple[int, ...]) -> list[str]:
-    """Columns that are exchanged, as people say it."""
-    n = len(order)
-    if order == tuple(range(n)):
-        return []
-    moved = [joint for joint in range(n) if order[joint] != joint]
-    if all(order[order[joint]] == joint for joint in moved):
-        if order == tuple(reversed(range(n))) and n > 3:
-            return ["the columns are in reverse order"]
-        pairs = [(joint, order[joint]) for joint in moved if joint < order[joint]]
-        return [f"columns {one + 1} and {other + 1} are exchanged" for one, other in pairs]
-    joints, columns = (listed([str(i + 1) for i in part]) for part in (moved, [order[joint] for joint in moved]))
-    return [f"joints {joints} are in columns {columns}"]
 
 
 def alternatives_sentence(rows: list[dict[str, Any]], known_positions: bool) -> str:

@@ -89,52 +89,6 @@ def _of_full_rank(columns: Float[np.ndarray, "R c"]) -> Float[np.ndarray, "R c"]
     return columns
 
 
-class Consistency(NamedTuple):
-    """Relations between unknowns (reference lengths) against what the other equations and each other say of them."""
-
-    square: float  # chi-square
-    degrees_of_freedom: int
-    shifts: Float[np.ndarray, " l"]  # of each from what all others say
-    gains: Float[np.ndarray, " l"]  # drop of the square without it; 0 where nothing else says anything of it
-
-
-def consistency(
-    parts: Sequence[Block],
-    relations: Block,
-    covariance: Float[np.ndarray, "l l"],
-    open_direction: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None = None,
-) -> Consistency:
-    """Relations predicted by a least squares of the other equations, with the uncertainty of that prediction.
-
-    ``covariance`` is that of the relations' own errors, and ``open_direction`` the derivatives of the equations and of
-    the relations by an unknown that only the relations determine, such as the scale. Whatever else the equations leave
-    open, the relations determine too.
-    """
-    plain = Residuals.of([part._replace(shared=part.shared[:, :0]) for part in parts])
-    slopes = plain.unexplained(np.concatenate([part.shared for part in parts]))
-    lengths = np.linalg.norm(slopes, axis=0)
-    scale = np.where(lengths > 0, lengths, 1.0)
-    vectors, values, turned = np.linalg.svd(slopes / scale, full_matrices=False)
-    seen = values > _NULL * values.max(initial=0.0)
-    by_rows = relations.shared @ ((turned[seen].T / values[seen]) / scale[:, None])
-    vectors = vectors[:, seen]
-    residual = relations.residual - by_rows @ (vectors.T @ plain.values)
-    free = [relations.shared @ (turned[~seen].T / scale[:, None])]
-    if open_direction is not None:
-        rows, of_relations = open_direction
-        free.append((of_relations - by_rows @ (vectors.T @ plain.unexplained(rows[:, None])[:, 0]))[:, None])
-    root = np.linalg.inv(np.linalg.cholesky(covariance + by_rows @ by_rows.T))
-    white = root @ np.concatenate(free, axis=1)
-    sizes = np.linalg.norm(root @ relations.shared, axis=0).max(initial=0.0)
-    opened = white[:, np.linalg.norm(white, axis=0) > _NULL * sizes]
-    left = Residuals.of([Block("", None, root @ residual, opened, np.zeros((len(root), 0)))])
-    tests = score_tests(left, list(root.T[:, :, None]))  # an error of each, which explains all that it alone says
-    shifts, gains = (np.array([float(np.sum(x)) for x in part]) for part in zip(
-        *((test.coefficients, test.gain) for test in tests), strict=True
-    ))  # fmt: skip
-    return Consistency(left.cost, left.degrees_of_freedom, shifts, gains)
-
-
 class ScoreTest(NamedTuple):
     """Whether further unknowns explain residuals."""
 
@@ -158,27 +112,59 @@ def score_tests(left: Residuals, candidates: Sequence[Float[np.ndarray, "R _"]],
     lengths = np.where(lengths > 0, lengths, 1.0)
     projected = left.unexplained(columns / lengths)
     projected = np.where(lengths * np.linalg.norm(projected, axis=0) > least, projected, 0.0)
-    gram, score = projected.T @ projected, projected.T @ left.values
-    ends = np.cumsum([candidate.shape[1] for candidate in candidates])
-    return [
-        _score_test(left, gram[start:end, start:end], score[start:end], lengths[start:end])
-        for start, end in zip([0, *ends[:-1]], ends, strict=True)
-    ]
+    gram, score, tests, end = projected.T @ projected, projected.T @ left.values, [], 0
+    for candidate in candidates:
+        part = slice(end, end := end + candidate.shape[1])
+        values, vectors = np.linalg.eigh(gram[part, part])
+        present = values > _EXPLAINED
+        along, added = vectors[:, present].T @ score[part], int(present.sum())
+        gain, freedom = float(np.sum(along**2 / values[present])), left.degrees_of_freedom - added
+        step = vectors[:, present] @ (along / values[present]) / lengths[part]
+        test = ScoreTest(0.0, 0.0, (added, freedom), 1.0, step)
+        if added and freedom > 0:
+            ratio = gain / added / max((left.cost - gain) / freedom, 1e-300)
+            test = ScoreTest(gain, ratio, (added, freedom), f_tail(ratio, added, freedom), step)
+        tests.append(test)
+    return tests
 
 
-def _score_test(
-    left: Residuals, gram: Float[np.ndarray, "c c"], score: Float[np.ndarray, " c"], lengths: Float[np.ndarray, " c"]
-) -> ScoreTest:
-    """Of one candidate, by the Gram matrix of its scaled columns and their products with the residuals."""
-    values, vectors = np.linalg.eigh(gram)
-    present = values > _EXPLAINED
-    along, added = vectors[:, present].T @ score, int(present.sum())
-    gain, freedom = float(np.sum(along**2 / values[present])), left.degrees_of_freedom - added
-    step = vectors[:, present] @ (along / values[present]) / lengths
-    if not added or freedom < 1:
-        return ScoreTest(0.0, 0.0, (added, freedom), 1.0, step)
-    ratio = gain / added / max((left.cost - gain) / freedom, 1e-300)
-    return ScoreTest(gain, ratio, (added, freedom), f_tail(ratio, added, freedom), step)
+class Consistency(NamedTuple):
+    """Relations between unknowns (reference lengths) against what the other equations and each other say of them."""
+
+    square: float  # chi-square
+    degrees_of_freedom: int
+    shifts: Float[np.ndarray, " l"]  # of each from what all others say
+    gains: Float[np.ndarray, " l"]  # drop of the square without it; 0 where nothing else says anything of it
+
+
+def consistency(
+    parts: Sequence[Block],
+    relations: Block,
+    covariance: Float[np.ndarray, "l l"],
+    open_direction: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None = None,
+) -> Consistency:
+    """What relations add to a least squares of other equations; whatever those leave open, the relations determine.
+
+    ``covariance`` is that of the relations' own errors, and ``open_direction`` the derivatives of the equations and of
+    the relations by an unknown that only the relations determine, such as the scale.
+    """
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    whitened = relations._replace(residual=root @ relations.residual, shared=root @ relations.shared)
+    without, whole = Residuals.of(parts), Residuals.of([*parts, whitened])
+    if open_direction is not None:
+        # Of the equations, what their other unknowns imitate: of the rest they must say nothing.
+        of_equations, of_relations = open_direction[0][:, None], root @ open_direction[1]
+        column = np.concatenate([of_equations - without.unexplained(of_equations), of_relations[:, None]])
+        if np.linalg.norm(whole.unexplained(column)) > _NULL * np.linalg.norm(of_relations):
+            whole = whole.extended(column)
+    # An error of each, which explains all that it alone says.
+    tests = score_tests(whole, [np.pad(column, (len(without.values), 0))[:, None] for column in root.T])
+    return Consistency(
+        whole.cost - without.cost,
+        whole.degrees_of_freedom - without.degrees_of_freedom,
+        np.array([float(np.sum(test.coefficients)) for test in tests]),
+        np.array([test.gain for test in tests]),
+    )
 
 
 class FormTest(NamedTuple):
@@ -259,15 +245,11 @@ def _value_and_traces(left: Residuals, kernels: Kernels) -> tuple[float, tuple[f
         three += 3 * float(np.sum(d1 * d2)) + 6 * float(np.sum(e1 * e2))
         three -= float(np.trace(d1 @ d1 @ d1)) + 3 * float(np.sum((d1 @ e1) * e1))
     g1, g2, g3 = shared
-    return value, (
-        one - float(np.trace(g1)),
-        two - 2 * float(np.trace(g2)) + float(np.sum(g1**2)),
-        three
-        - 3 * float(np.trace(g3))
-        + 3 * float(np.sum(g1 * g2))
-        - float(np.trace(g1 @ g1 @ g1))
-        - 3 * float(np.sum(mixed * g1)),
-    )
+    one -= float(np.trace(g1))
+    two += float(np.sum(g1**2)) - 2 * float(np.trace(g2))
+    three += 3 * float(np.sum(g1 * g2)) - 3 * float(np.trace(g3))
+    three -= float(np.trace(g1 @ g1 @ g1)) + 3 * float(np.sum(mixed * g1))
+    return value, (one, two, three)
 
 
 def _tail(value: float, traces: tuple[float, float, float]) -> float:

@@ -8,6 +8,7 @@ where three lengths or more compare them, as far as these leave them possible. A
 weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -32,18 +33,16 @@ from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import EXACT, PRIOR, Rows, lengths_in_solve, residual_rms
 from .findings import Case
 from .random_effects import (
-    NULL,
     Effects,
     OneVariance,
     SharedProblem,
     group_deviations,
     one_variance,
-    problem_of_poses,
     scale_of_lengths,
     second_moments,
     with_lengths,
 )
-from .residual_tests import alike, form_test, in_succession, score_tests
+from .residual_tests import Residuals, alike, form_test, in_succession, score_tests
 
 _GATE = 0.1  # probability of a test below which an effect is looked at
 # Poses over which successive errors may be alike. Over a third of the poses of a socket and more they are as good as
@@ -94,6 +93,52 @@ def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivi
     )
 
 
+class _Tips(NamedTuple):
+    """Errors of the tip that poses share: patterns over all poses, x, y and z each."""
+
+    kind: str
+    learned: OneVariance
+    patterns: Float[np.ndarray, "M c"]
+    length: float  # of correlation
+
+    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
+        """Effects with this one."""
+        columns = problem.moved(self.patterns)
+        return effects.joined(columns, np.full(columns.shape[1], self.learned.variance))
+
+
+def _tips(
+    problem: SharedProblem, effects: Effects, kind: str, candidates: dict[float, Float[np.ndarray, "M c"]]
+) -> _Tips:
+    """The most likely of some patterns, with their variance; usually it is about as large as that of single poses."""
+    usual = _USUAL * residual_rms(problem.rows)
+    fits = [one_variance(effects, problem.moved(patterns), usual) for patterns in candidates.values()]
+    best = int(np.argmax([fit.log_likelihood for fit in fits]))
+    length = list(candidates)[best]
+    return _Tips(kind, fits[best], candidates[length], length)
+
+
+class _Functions(NamedTuple):
+    """Functions of the readings that the model lacks, in groups."""
+
+    names: tuple[str, ...]
+    values: Float[np.ndarray, "M k"]
+    joints: np.ndarray  # from 0
+    steps: Float[np.ndarray, " k"]
+    groups: dict[str, str]  # with their units
+    members: Float[np.ndarray, "g k"]
+    sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
+    degrees_of_freedom: Float[np.ndarray, " g"] = np.zeros(0)
+
+    def columns(self, problem: SharedProblem) -> Float[np.ndarray, "R k"]:
+        """How they move the rows, in natural steps."""
+        return problem.turned(self.values, self.joints, self.steps)
+
+    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
+        """Effects with these."""
+        return effects.joined(self.columns(problem), self.sd**2 @ self.members)
+
+
 def _addition(
     case: Case, sensitivities: Callable[[], Sensitivities]
 ) -> tuple[SharedErrors, Float[np.ndarray, "p p"], float] | None:
@@ -105,103 +150,84 @@ def _addition(
     rows = [part for part in trusted if len(part.poses)]
     if not rows or residual_rms(rows) < EXACT:
         return None
-    prior = [block for block in relations if block.fixture == PRIOR]
-    of_poses = problem_of_poses(record, rows, prior, sensitivities)
-    whole = sum(float(np.sum(part.residual**2)) for part in rows)
-    if lengths_in_solve(record) and of_poses.left.cost < _MOST_OF_POSES * whole:
+    blocks = [*(part.block("") for part in rows), *(block for block in relations if block.fixture == PRIOR)]
+    left, whole = Residuals.of(blocks), sum(float(np.sum(part.residual**2)) for part in rows)
+    if lengths_in_solve(record) and left.cost < _MOST_OF_POSES * whole:
         relations = [*relations, scale_of_lengths(record, relations)]
-        of_poses = problem_of_poses(record, rows, [*prior, relations[-1]], sensitivities)
-    if of_poses.left.degrees_of_freedom < _FEWEST:
+        left = Residuals.of([*blocks, relations[-1]])
+    if left.degrees_of_freedom < _FEWEST:
         return None
-    problem = with_lengths(of_poses, relations)
-    tips, functions = _visits(of_poses), _functions(of_poses)
+    of_poses = SharedProblem(record, rows, left, sensitivities(), None)
+    problem, given = with_lengths(of_poses, relations), record.given_noise is not None
+    chance_of_tips, kind, candidates = _visits(of_poses)
+    chance_of_functions, functions = _functions(of_poses)
     # All but places by the poses alone: lengths that contradict each other would be put down to whatever moves them.
-    effects = Effects.none(of_poses.left, record.given_noise is not None)
-    chances = [(tips.probability, True)] + ([] if functions is None else [(functions.probability, False)])
-    for probability, of_tips in sorted(chances):  # the clearer effect first: it may explain the other
+    effects, visits, lacking = Effects.none(left, given), None, None
+    for probability, of_tips in sorted([(chance_of_tips, True), (chance_of_functions, False)]):
+        # The clearer effect first: it may explain the other.
         if probability >= _GATE:
             continue
         if of_tips:
-            tips = tips.of(of_poses, effects)
-            effects = tips.joined(of_poses, effects)
+            visits = _tips(of_poses, effects, kind, candidates)
+            effects = visits.joined(of_poses, effects)
         elif functions is not None:
-            functions = functions.of(effects)
-            effects = effects.joined(functions.columns, functions.sd**2 @ functions.members)
-    functions = None if functions is None or not len(functions.sd) else functions
-    with_tips = tips.joined(problem, Effects.none(problem.left, effects.given))
-    every = with_tips if functions is None else functions.joined(problem, with_tips)
+            sd, freedom = group_deviations(effects, functions.columns(of_poses), functions.members)
+            lacking = functions._replace(sd=sd, degrees_of_freedom=freedom)
+            effects = lacking.joined(of_poses, effects)
+    without = Effects.none(problem.left, given)
+    without = without if visits is None else visits.joined(problem, without)
+    every = without if lacking is None else lacking.joined(problem, without)
     places = _places(problem, every)
-    if tips.learned is None and places.learned is None and functions is None:
+    if places is not None:
+        without, every = (places.joined(problem, known_effects) for known_effects in (without, every))
+    tips = [effect for effect in (visits, places) if effect is not None]
+    if not tips and lacking is None:
         return None
-    return _summed(problem, (tips, places), functions, places.joined(problem, with_tips), places.joined(problem, every))
+    shared = _summed(problem, tips, lacking, without)
+    added = np.asarray(shared.added.sum(axis=0) + shared.follow @ shared.moments @ shared.follow.T)
+    return shared, added, every.variance
 
 
-def _summed(
-    problem: SharedProblem, tips: "tuple[_Tips, ...]", functions: "_Functions | None", without: Effects, every: Effects
-) -> tuple[SharedErrors, Float[np.ndarray, "p p"], float]:
-    """What all effects add; ``without`` knows those of the tips, and ``every`` all."""
-    learned = [(effect, effect.learned) for effect in tips if effect.learned is not None]
-    kinds, units = [effect.kind for effect, _ in learned], ["mm" for _ in learned]
-    laws, p = [law for _, law in learned], len(problem.record.names)
-    sds, added = [np.sqrt(law.variance) for law in laws], np.zeros((len(laws), p, p))
-    for whole, (effect, law) in zip(added, learned, strict=True):
-        by_effect = problem.by_patterns(effect.patterns[0])
-        whole += law.variance * by_effect @ by_effect.T
+def _summed(problem: SharedProblem, tips: list[_Tips], functions: _Functions | None, without: Effects) -> SharedErrors:
+    """What all effects add; ``without`` has those of the tips."""
+    p, laws = len(problem.record.names), [effect.learned for effect in tips]
+    added = np.zeros((len(tips), p, p))
+    for whole, effect in zip(added, tips, strict=True):
+        by_effect = np.einsum("paN,Nc->pca", problem.sensitivities.tips, effect.patterns).reshape(p, -1)
+        whole += effect.learned.variance * by_effect @ by_effect.T
     law = Law(
         np.full(len(laws), np.inf), np.array([law.ratios for law in laws]), np.array([law.weights for law in laws])
     )
-    follow, moments, by_group, names = np.zeros((p, 0)), np.zeros((0, 0)), np.zeros((0, 0, 0)), ()
-    if functions is not None:
-        names, follow, steps = functions.names, functions.follow, functions.steps
-        columns = problem.turned(*functions.turned)
-        moments, by_group = second_moments(without, columns, functions.sd, functions.members)
-        moments, by_group = (part * steps[:, None] * steps for part in (moments, by_group))
-        kinds, units = [*kinds, *functions.kinds], [*units, *functions.units]
-        sds += [sd * steps[np.argmax(group)] for sd, group in zip(functions.sd, functions.members, strict=True)]
-        of_functions = Law.of(functions.degrees_of_freedom)
-        law = law.joined(of_functions) if laws else of_functions
-    lengths = [effect.length for effect, _ in learned if np.isfinite(effect.length)]
+    lengths = [effect.length for effect in tips if np.isfinite(effect.length)]
     shared = SharedErrors(
-        kinds=tuple(kinds),
-        units=tuple(units),
-        names=names,
-        sd=np.array(sds),
-        moments=moments,
-        follow=follow,
+        kinds=tuple(effect.kind for effect in tips),
+        units=("mm",) * len(tips),
+        names=(),
+        sd=np.array([np.sqrt(law.variance) for law in laws]),
+        moments=np.zeros((0, 0)),
+        follow=np.zeros((p, 0)),
         correlation_length=np.asarray(lengths[0] if lengths else np.nan),
         added=added,
-        by_group=by_group,
+        by_group=np.zeros((0, 0, 0)),
         law=law,
     )
-    return shared, added.sum(axis=0) + follow @ moments @ follow.T, every.variance
-
-
-class _Tips(NamedTuple):
-    """Errors of the tip that poses share: patterns over all poses, of which the most likely ones are taken."""
-
-    kind: str
-    probability: float
-    patterns: list[Float[np.ndarray, "M c"]]
-    lengths: tuple[float, ...] = (np.nan,)  # of correlation, for each of the patterns
-    learned: OneVariance | None = None
-    length: float = np.nan
-
-    def of(self, problem: SharedProblem, effects: Effects) -> "_Tips":
-        """With the variance of the most likely patterns.
-
-        Errors that poses share are about as large as those of single poses.
-        """
-        usual = _USUAL * residual_rms(problem.rows)
-        fits = [one_variance(effects, problem.moved(patterns), usual) for patterns in self.patterns]
-        best = int(np.argmax([fit.log_likelihood for fit in fits]))
-        return self._replace(patterns=[self.patterns[best]], learned=fits[best], length=self.lengths[best])
-
-    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
-        """Effects with this one."""
-        if self.learned is None:
-            return effects
-        columns = problem.moved(self.patterns[0])
-        return effects.joined(columns, np.full(columns.shape[1], self.learned.variance))
+    if functions is None:
+        return shared
+    steps, sd, members = functions.steps, functions.sd, functions.members
+    moments, by_group = second_moments(without, functions.columns(problem), sd, members)
+    of_functions = Law.of(functions.degrees_of_freedom)
+    return dataclasses.replace(
+        shared,
+        kinds=(*shared.kinds, *functions.groups),
+        units=(*shared.units, *functions.groups.values()),
+        names=functions.names,
+        sd=np.concatenate([shared.sd, sd * steps[np.argmax(members, axis=1)]]),
+        moments=moments * steps[:, None] * steps,
+        # By coefficients in their own units.
+        follow=np.einsum("pkN,Nk->pk", problem.sensitivities.joints[:, functions.joints], functions.values),
+        by_group=by_group * steps[:, None] * steps,
+        law=law.joined(of_functions) if laws else of_functions,
+    )
 
 
 def _chance_of_alike(problem: SharedProblem, pairs: Callable[[Rows], np.ndarray]) -> float:
@@ -213,9 +239,11 @@ def _chance_of_alike(problem: SharedProblem, pairs: Callable[[Rows], np.ndarray]
     return form_test(problem.left, kernels, problem.record.given_noise is None).probability
 
 
-def _visits(problem: SharedProblem) -> _Tips:
-    """Of visits as they are marked, or of successive poses."""
-    capture, total = problem.record.recording.capture, len(np.asarray(problem.record.recording.capture.readings))
+def _visits(problem: SharedProblem) -> tuple[float, str, dict[float, Float[np.ndarray, "M c"]]]:
+    """Of visits as they are marked, or of successive poses: the probability by chance, the kind, and patterns by the
+    length over which they are alike."""
+    capture, rows = problem.record.recording.capture, problem.rows
+    total = len(np.asarray(capture.readings))
     if capture.visits is not None:
         marked = np.full(total, -1)
         marked[: len(capture.visits)] = capture.visits
@@ -225,83 +253,45 @@ def _visits(problem: SharedProblem) -> _Tips:
             return (visits[:, None] == visits) & (visits >= 0)[:, None] & ~np.eye(len(visits), dtype=bool)
 
         numbers = [number for number in np.unique(marked) if number >= 0]
-        return _Tips(VISITS, _chance_of_alike(problem, same_visit), [(marked[:, None] == numbers).astype(float)])
-    probability = _chance_of_alike(problem, lambda part: in_succession(len(part.poses)))
-    if not probability < _GATE:
-        return _Tips(SUCCESSIVE, 1.0, [])
-    most = max(float(np.median([len(part.poses) for part in problem.rows])) / _PART, _LENGTHS[0])
-    lengths = tuple(length for length in _LENGTHS if length <= most)
-    patterns = [
-        np.concatenate([_smooth_patterns(part, length, total) for part in problem.rows], axis=1) for length in lengths
-    ]
-    return _Tips(SUCCESSIVE, probability, patterns, lengths)
+        return _chance_of_alike(problem, same_visit), VISITS, {np.nan: (marked[:, None] == numbers).astype(float)}
+    probability, candidates = _chance_of_alike(problem, lambda part: in_succession(len(part.poses))), {}
+    most = max(float(np.median([len(part.poses) for part in rows])) / _PART, _LENGTHS[0])
+    for length in _LENGTHS:
+        if probability < _GATE and length <= most:
+            patterns = [np.zeros((total, 0))]
+            for part in rows:
+                # Principal patterns over successive poses whose correlation falls by 1 / e over the length.
+                order = np.arange(len(part.poses))
+                values, vectors = np.linalg.eigh(np.exp(-np.abs(order[:, None] - order) / length))
+                largest = np.argsort(values)[::-1][:_MOST_PATTERNS]
+                patterns.append(np.zeros((total, len(largest))))
+                patterns[-1][part.poses] = vectors[:, largest] * np.sqrt(values[largest])
+            candidates[length] = np.concatenate(patterns, axis=1)
+    return probability, SUCCESSIVE, candidates
 
 
-def _smooth_patterns(part: Rows, length: float, total: int) -> Float[np.ndarray, "M c"]:
-    """Principal patterns over successive poses whose correlation falls by 1 / e over a length, in poses."""
-    order = np.arange(len(part.poses))
-    values, vectors = np.linalg.eigh(np.exp(-np.abs(order[:, None] - order) / length))
-    largest = np.argsort(values)[::-1][:_MOST_PATTERNS]
-    patterns = np.zeros((total, len(largest)))
-    patterns[part.poses] = vectors[:, largest] * np.sqrt(values[largest])
-    return patterns
-
-
-class _Functions(NamedTuple):
-    """Functions of the readings that the model lacks, in groups."""
-
-    probability: float
-    names: tuple[str, ...]
-    kinds: list[str]
-    units: list[str]
-    members: Float[np.ndarray, "g k"]
-    steps: Float[np.ndarray, " k"]
-    turned: tuple[Float[np.ndarray, "M k"], np.ndarray, Float[np.ndarray, " k"]]  # what `SharedProblem.turned` takes
-    columns: Float[np.ndarray, "R k"]
-    follow: Float[np.ndarray, "p k"]
-    sd: Float[np.ndarray, " g"] = np.zeros(0)  # of each group, natural steps
-    degrees_of_freedom: Float[np.ndarray, " g"] = np.zeros(0)
-
-    def of(self, effects: Effects) -> "_Functions":
-        """With the standard deviation of each group."""
-        sd, degrees_of_freedom = group_deviations(effects, self.columns, self.members)
-        return self._replace(sd=sd, degrees_of_freedom=degrees_of_freedom)
-
-    def joined(self, problem: SharedProblem, effects: Effects) -> Effects:
-        """Effects with these."""
-        return effects.joined(problem.turned(*self.turned), self.sd**2 @ self.members)
-
-
-def _functions(problem: SharedProblem) -> _Functions | None:
-    """What the arm does not have of the functions that joints may follow."""
+def _functions(problem: SharedProblem) -> tuple[float, _Functions | None]:
+    """What the arm does not have of the functions that joints may follow, and the probability that residuals follow
+    one of them so much by chance."""
     arm: Arm = to_numpy(problem.record.calibrated.arm)
     names = missing_functions(arm)
     if not names:
-        return None
+        return 1.0, None
     values, joints = functions_of(names, arm, np.asarray(problem.record.recording.capture.readings))
-    steps = natural_steps(names)
-    columns = problem.turned(values, joints, steps)
     prior = default_prior(with_further_corrections(arm, names)).of(names, np.zeros(len(names)))
     assert prior is not None
     members = np.zeros((len(prior.members), len(names)))
     for row, group in zip(members, prior.members, strict=True):
         row[list(group)] = 1.0
+    groups = dict(zip(prior.groups, prior.units, strict=True))
+    functions = _Functions(names, values, joints, natural_steps(names), groups, members)
+    columns = functions.columns(problem)
     candidates: dict[tuple[int, tuple[float, ...]], list[int]] = {}
     for i in range(len(names)):
         candidates.setdefault((int(joints[i]), tuple(members[:, i])), []).append(i)
     tests = score_tests(problem.left, [columns[:, together] for together in candidates.values()])
     number = sum(test.degrees_of_freedom[0] > 0 for test in tests)
-    return _Functions(
-        probability=min(min((test.probability for test in tests), default=1.0) * number, 1.0),
-        names=names,
-        kinds=list(prior.groups),
-        units=list(prior.units),
-        members=members,
-        steps=steps,
-        turned=(values, joints, steps),
-        columns=columns,
-        follow=problem.by_functions(values, joints),
-    )
+    return min(min((test.probability for test in tests), default=1.0) * number, 1.0), functions
 
 
 def missing_functions(arm: Arm) -> tuple[str, ...]:
@@ -320,37 +310,32 @@ def missing_functions(arm: Arm) -> tuple[str, ...]:
     )
 
 
-def _places(problem: SharedProblem, effects: Effects) -> _Tips:
+def _places(problem: SharedProblem, effects: Effects) -> _Tips | None:
     """Errors that all poses of a socket share, which only lengths show."""
-    capture = problem.record.recording.capture
-    nothing = _Tips(PLACES, 1.0, [])
+    capture, r = problem.record.recording.capture, effects.left.values
     if len(capture.lengths) < 2:
-        return nothing
+        return None
     patterns = places_of(capture)
     columns = problem.moved(patterns)
-    information, r = effects.product(columns, columns), effects.left.values[:, None]
-    values, vectors = np.linalg.eigh(information)
-    seen = values > NULL * max(values.max(initial=0.0), 1e-300)
-    if not seen.any():
-        return nothing
-    by_poses = np.where(np.arange(len(r))[:, None] < sum(part.residual.size for part in problem.rows), r, 0.0)
-    explained = np.sum((vectors[:, seen].T @ effects.product(columns, by_poses)[:, 0]) ** 2 / values[seen])
-    if explained > _MOST_OF_POSES * float(effects.product(by_poses, by_poses)[0, 0]):
-        return nothing
-    number = int(seen.sum())
-    freedom = effects.left.degrees_of_freedom - number
-    places = nothing._replace(patterns=[patterns])
-    if number >= _FEW:
-        return places.of(problem, effects)
-    square = float(np.sum((vectors[:, seen].T @ effects.product(columns, r)[:, 0]) ** 2 / values[seen]))
-    if effects.given:
-        probability = chi_square_tail(square, number)
-    else:
-        rest = max(float(effects.product(r, r)[0, 0]) - square, 1e-300)
-        probability = f_tail(square / number / (rest / freedom), number, freedom)
-    if not len(effects.variances):
-        probability = min(probability, _chance_of_neighbours(problem))
-    return places.of(problem, effects) if probability < _GATE else nothing
+    by_poses = np.where(np.arange(len(r)) < sum(part.residual.size for part in problem.rows), r, 0.0)
+    values, squares = effects.spectrum(columns, by_poses)
+    number = len(values)
+    whole = float(effects.product(by_poses[:, None], by_poses[:, None])[0, 0])
+    if not number or np.sum(squares / values) > _MOST_OF_POSES * whole:
+        return None
+    if number < _FEW:
+        square = float(np.sum(effects.spectrum(columns, r)[1] / values))
+        freedom = effects.left.degrees_of_freedom - number
+        if effects.given:
+            probability = chi_square_tail(square, number)
+        else:
+            rest = max(float(effects.product(r[:, None], r[:, None])[0, 0]) - square, 1e-300)
+            probability = f_tail(square / number / (rest / freedom), number, freedom)
+        if not len(effects.variances):
+            probability = min(probability, _chance_of_neighbours(problem))
+        if probability >= _GATE:
+            return None
+    return _tips(problem, effects, PLACES, {np.nan: patterns})
 
 
 def _chance_of_neighbours(problem: SharedProblem) -> float:

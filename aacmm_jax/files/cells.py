@@ -17,8 +17,7 @@ from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat
 
 from ..core.errors import InputError, naming
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
-from ..kinematics.body import Body, body_along_links, segment_distance
-from ..kinematics.collisions import Box, Cell, HalfSpace, Post, check_obstacle
+from ..kinematics.collisions import Body, Box, Cell, HalfSpace, Post, body_along_links, check_obstacle, segment_distance
 from ..kinematics.parameters import ArmSpecification, UrdfSource
 from ..kinematics.workspace import total_link_length
 from .arms import load_specification, urdf_folder

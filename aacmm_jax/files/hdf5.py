@@ -13,18 +13,15 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.backend import check_backend, is_from_jax
 from ..core.errors import InputError
+from ..core.jax_setup import check_backend, is_from_jax
 from .inputs import STREAMED, largest_file, open_input, storable_name
 from .outputs import ELSEWHERE, storable, write_atomically
 from .reader_process import damaged, read_through, start, vouch_for
-
-if TYPE_CHECKING:
-    import h5py
 
 FORMAT = "aacmm_jax"
 FORMAT_VERSION = 6  # fields are declared since 6, and earlier files are refused
@@ -265,8 +262,8 @@ def read_summary(path: str | os.PathLike, kinds: Sequence[str]) -> tuple[dict[st
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True) -> "Iterator[h5py.File]":
-    """A file of aacmm, of a kind that is asked for.
+def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True) -> Iterator[Any]:
+    """A file of aacmm (`h5py.File`), of a kind that is asked for.
 
     A file without the right SHA-256 at its end is never given to the HDF5 library. ``verify=False``: this process has
     verified it before. Raises `InputError` where it is damaged.

@@ -17,6 +17,7 @@ from .arm import Arm, arm_of
 from .chain import Geometry
 from .independence import NEARLY_PARALLEL
 
+Vector = Float[np.ndarray, " 3"]
 Transform = Float[np.ndarray, "4 4"]
 _NO_LENGTH, _NO_ANGLE = 1e-12, 1e-15  # mm and rad: below the rounding of a chain of some metres
 _UNCHANGED = 2e-11, 2e-14  # mm and rad: far above the rounding of a round trip, far below 1e-9 mm at any tip
@@ -28,37 +29,6 @@ class Axes(NamedTuple):
     directions: Float[np.ndarray, "n 3"]  # unit vectors; a reading counts by the right-hand rule, a slide along them
     points: Float[np.ndarray, "n 3"]  # mm, on each axis (anywhere, of a slide); frames stay at them where D-H allows it
     tip: Transform  # mm
-
-
-def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geometry]:
-    """Exact D-H parameters of a chain; readings keep their sign, since z of every frame is along its axis.
-
-    Neighbouring axes within about 1 degree of parallel or antiparallel get Hayati's beta, with a ``d`` that is chosen;
-    standard D-H would put the next frame hundreds of metres away. The last frame has the orientation of the tip, by
-    alpha, theta and beta of the last joint. Source: Hayati and Mirmirani 1985.
-
-    With ``keep_points``, ``d`` between nearly parallel axes is such that the next frame is at the given point of its
-    axis; otherwise it is 0. Returned are the first D-H frame in the frame of the base (the same frame where the first
-    axis is its z axis), and the parameters, mm and rad; ``beta`` is None where it is not needed.
-    """
-    base = _first_frame(axes.directions[0], axes.points[0])
-    frame, rows = base, []
-    for direction, point in zip(axes.directions[1:], axes.points[1:], strict=True):
-        direction = frame[:3, :3].T @ direction
-        point = frame[:3, :3].T @ (point - frame[:3, 3])
-        row = _to_axis(direction, point, keep_points)
-        rows.append(row)
-        frame = frame @ link_transform(*row)
-    row, probe = _to_frame(inverse(frame) @ axes.tip)
-    theta, d, a, alpha, beta = np.array([*rows, row]).T
-    return base, Geometry(alpha, a, d, theta, beta if np.any(beta) else None, probe)
-
-
-def link_transform(theta: float, d: float, a: float, alpha: float, beta: float) -> Transform:
-    """Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta); mm and rad."""
-    link = rotation(2, theta) @ rotation(0, alpha) @ rotation(1, beta)
-    link[:3, 3] = a * math.cos(theta), a * math.sin(theta), d
-    return link
 
 
 def rotation(axis: int, angle: float) -> Transform:
@@ -79,35 +49,43 @@ def inverse(transform: Transform) -> Transform:
     return result
 
 
+def same_transform(first: Transform, second: Transform) -> bool:
+    """Whether two transforms are the same to rounding."""
+    (length, angle), difference = _UNCHANGED, np.abs(first - second)
+    return bool(difference[:3, 3].max() <= length and difference[:3, :3].max() <= angle)
+
+
+def _link(theta: float, d: float, a: float, alpha: float, beta: float) -> Transform:
+    """Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta); mm and rad."""
+    link = rotation(2, theta) @ rotation(0, alpha) @ rotation(1, beta)
+    link[:3, 3] = a * math.cos(theta), a * math.sin(theta), d
+    return link
+
+
+def _links(geometry: Geometry) -> list[list[float]]:
+    """theta, d, a, alpha and beta of each joint of one arm."""
+    beta = np.zeros_like(geometry.alpha) if geometry.beta is None else geometry.beta
+    return np.array([geometry.theta, geometry.d, geometry.a, geometry.alpha, beta]).T.tolist()
+
+
 def dh_frames(geometry: Geometry, base: Transform) -> list[Transform]:
     """The D-H frames 0 to n of one arm at reading 0; ``base`` is frame 0."""
-    beta = np.zeros_like(geometry.alpha) if geometry.beta is None else geometry.beta
     frames = [base]
-    for row in zip(geometry.theta, geometry.d, geometry.a, geometry.alpha, beta, strict=True):
-        frames.append(frames[-1] @ link_transform(*map(float, row)))
+    for row in _links(geometry):
+        frames.append(frames[-1] @ _link(*row))
     return frames
 
 
-def without_far_frames(arm: Arm) -> Arm:
-    """The same arm with d = 0 and Hayati's beta between nearly parallel axes; positions, readings and probe stay.
+def _with_probe(frame: Transform, geometry: Geometry) -> Transform:
+    """The last frame with the tip as its origin."""
+    tip = frame.copy()
+    tip[:3, 3] += tip[:3, :3] @ np.asarray(geometry.probe)
+    return tip
 
-    A table by the common normal alone puts frames on nearly parallel axes far from the arm (those of Universal Robots
-    hundreds of metres), where parameters trade off with each other and no calibration can tell them apart.
 
-    Args:
-        arm: One arm.
-
-    Example:
-        >>> far = aj.load_arm("robot.urdf").replace(alpha=[-1.570796, 1e-5, 0.0], d=[300.0, 40000.0, -40000.0])
-        >>> near = aj.kinematics.without_far_frames(far)
-        >>> print(near.d.round(1), near.beta)
-        [300.   0.   0.] [ 0.000000e+00 -9.999995e-09  0.000000e+00]
-    """
-    geometry = geometry_of(arm)
-    frames = dh_frames(geometry, np.eye(4))
-    directions, points = (np.array([frame[:3, i] for frame in frames[:-1]]) for i in (2, 3))
-    _, near = dh_of_axes(Axes(directions, points, frames[-1]), keep_points=False)
-    return arm_of(near._replace(probe=near.probe + geometry.probe, kinds=geometry.kinds), arm.limits)
+def tip_frame(geometry: Geometry, base: Transform) -> Transform:
+    """The last D-H frame at reading 0, with the tip as its origin."""
+    return _with_probe(dh_frames(geometry, base)[-1], geometry)
 
 
 def geometry_of(arm: Arm) -> Geometry:
@@ -120,73 +98,34 @@ def geometry_of(arm: Arm) -> Geometry:
     return jax.tree.map(np.asarray, arm.geometry)
 
 
-def tip_frame(geometry: Geometry, base: Transform) -> Transform:
-    """The last D-H frame at reading 0, with the tip as its origin."""
-    tip = dh_frames(geometry, base)[-1].copy()
-    tip[:3, 3] += tip[:3, :3] @ np.asarray(geometry.probe)
-    return tip
+def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geometry]:
+    """Exact D-H parameters of a chain; readings keep their sign, since z of every frame is along its axis.
 
+    Neighbouring axes within about 1 degree of parallel or antiparallel get Hayati's beta, with a ``d`` that is chosen;
+    standard D-H would put the next frame hundreds of metres away. The last frame has the orientation of the tip, by
+    alpha, theta and beta of the last joint. Source: Hayati and Mirmirani 1985.
 
-def calibrated_frames(
-    origins: list[Transform], nominal: Geometry, calibrated: Geometry, base: Transform
-) -> list[Transform]:
-    """Origins of the joints of a calibrated chain, each in the frame of the joint before it, at reading 0.
-
-    A frame on axis i turns about its axis with theta_i, so that a link keeps its shape where only zero offsets changed,
-    and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that; that of
-    a prismatic joint moves on along its axis with d_i, for the same reason (anywhere else would do as well). An origin
-    that does not change comes back as it was, to the bit.
-
-    The first nominal origin is in the frame of the base, and ``base`` the first D-H frame in it, which calibration does
-    not change; ``nominal`` are the parameters that `dh_of_axes` gave. All in mm.
+    With ``keep_points``, ``d`` between nearly parallel axes is such that the next frame is at the given point of its
+    axis; otherwise it is 0. Returned are the first D-H frame in the frame of the base (the same frame where the first
+    axis is its z axis), and the parameters, mm and rad; ``beta`` is None where it is not needed.
     """
-    before, after = dh_frames(nominal, base), dh_frames(calibrated, base)
-    was, now, changed = np.eye(4), np.eye(4), []
-    for i, origin in enumerate(origins):
-        was = was @ origin
-        expected = now @ origin
-        turn = rotation(2, float(calibrated.theta[i] - nominal.theta[i]))
-        frame = after[i] @ turn @ inverse(before[i]) @ was
-        point, axis = after[i][:3, 3], after[i][:3, 2]
-        slides = nominal.kinds is not None and nominal.kinds.prismatic[i]
-        offset = float(calibrated.d[i] - nominal.d[i]) if slides else 0.0
-        frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis + offset) * axis
-        unchanged = same_transform(frame, expected)
-        changed.append(origin if unchanged else inverse(now) @ frame)
-        # Not the product of what is returned: an inverse by transposition doubles the rounding from joint to joint.
-        now = expected if unchanged else frame
-    return changed
+    base = _first_frame(axes.directions[0], axes.points[0])
+    frame, rows = base, []
+    for direction, point in zip(axes.directions[1:], axes.points[1:], strict=True):
+        point = frame[:3, :3].T @ (point - frame[:3, 3])
+        rows.append(_to_axis(frame[:3, :3].T @ direction, point, keep_points))
+        frame = frame @ _link(*rows[-1])
+    row, probe = _to_frame(inverse(frame) @ axes.tip)
+    theta, d, a, alpha, beta = np.array([*rows, row]).T
+    return base, Geometry(alpha, a, d, theta, beta if np.any(beta) else None, probe)
 
 
-def canonical_origins(geometry: Geometry) -> list[Transform]:
-    """Origins of the joints with z along every axis, as D-H has them: T_i = Tx(a) Rx(alpha) Ry(beta) Rz(theta) Tz(d).
-
-    Length, twist and beta are of the joint before, so that the first origin is Rz(theta_1) Tz(d_1). The transform of
-    the tip in the last joint's frame follows as one more.
-    """
-    beta = np.zeros_like(geometry.alpha) if geometry.beta is None else geometry.beta
-    origins, link = [], np.eye(4)
-    for theta, d, a, alpha, second in zip(geometry.theta, geometry.d, geometry.a, geometry.alpha, beta, strict=True):
-        origins.append(link @ link_transform(float(theta), float(d), 0.0, 0.0, 0.0))
-        link = link_transform(0.0, 0.0, float(a), float(alpha), float(second))
-    tip = link.copy()
-    tip[:3, 3] += tip[:3, :3] @ np.asarray(geometry.probe)
-    return [*origins, tip]
-
-
-def same_transform(first: Transform, second: Transform) -> bool:
-    """Whether two transforms are the same to rounding."""
-    (length, angle), difference = _UNCHANGED, np.abs(first - second)
-    return bool(difference[:3, 3].max() <= length and difference[:3, :3].max() <= angle)
-
-
-def _first_frame(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"]) -> Transform:
+def _first_frame(direction: Vector, point: Vector) -> Transform:
     """The frame with z along the first axis that is rotated least, with its origin nearest to that of the base.
 
     For an axis that points down, the base is first rotated by pi about x.
     """
-    frame = np.eye(4)
-    down = direction[2] < 0
+    frame, down = np.eye(4), direction[2] < 0
     x, y, z = (direction[0], -direction[1], -direction[2]) if down else direction
     # Rodrigues' formula about z cross the axis, whose sine is the length of (x, y) and whose cosine is z.
     frame[:3, :3] = [
@@ -200,7 +139,7 @@ def _first_frame(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 
     return frame + 0.0  # without -0.0
 
 
-def _to_axis(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"], keep_point: bool) -> tuple[float, ...]:
+def _to_axis(direction: Vector, point: Vector, keep_point: bool) -> tuple[float, ...]:
     """theta, d, a, alpha and beta to a frame on the next axis, which is given in the frame on this one."""
     sine = math.hypot(direction[0], direction[1])
     if sine < NEARLY_PARALLEL:
@@ -213,8 +152,7 @@ def _to_axis(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"],
             theta, a = theta - math.copysign(math.pi, theta), -a
         x, y, z = rotation(2, -theta)[:3, :3] @ direction
         beta = math.atan2(x, math.hypot(y, z))
-        if abs(beta) < _NO_ANGLE:
-            beta = 0.0
+        beta = 0.0 if abs(beta) < _NO_ANGLE else beta
     else:
         # The common normal ends on the next axis at the point that is nearest to z.
         foot = point - (point[:2] @ direction[:2]) / sine**2 * direction
@@ -229,7 +167,7 @@ def _to_axis(direction: Float[np.ndarray, " 3"], point: Float[np.ndarray, " 3"],
     return theta, d, a if abs(a) > _NO_LENGTH else 0.0, math.atan2(-y + 0.0, z), beta  # -0.0 would make -pi of pi
 
 
-def _to_frame(tip: Transform) -> tuple[tuple[float, ...], Float[np.ndarray, " 3"]]:
+def _to_frame(tip: Transform) -> tuple[tuple[float, ...], Vector]:
     """theta, d, a, alpha and beta to a frame with the orientation of the tip, and the tip in it.
 
     The orientation is Rz(theta) Rx(alpha) Ry(beta). Every angle is that of what those before it leave, so that the
@@ -250,3 +188,68 @@ def _to_frame(tip: Transform) -> tuple[tuple[float, ...], Float[np.ndarray, " 3"
     last = (rotation(0, alpha) @ rotation(1, beta))[:3, :3]
     probe = last.T @ [0.0, y, 0.0] if abs(y) > _NO_LENGTH else np.zeros(3)
     return (theta, float(z), float(x) if abs(x) > _NO_LENGTH else 0.0, alpha, beta), probe
+
+
+def without_far_frames(arm: Arm) -> Arm:
+    """The same arm with d = 0 and Hayati's beta between nearly parallel axes; positions, readings and probe stay.
+
+    A table by the common normal alone puts frames on nearly parallel axes far from the arm (those of Universal Robots
+    hundreds of metres), where parameters trade off with each other and no calibration can tell them apart.
+
+    Args:
+        arm: One arm.
+
+    Example:
+        >>> far = aj.load_arm("robot.urdf").replace(alpha=[-1.570796, 1e-5, 0.0], d=[300.0, 40000.0, -40000.0])
+        >>> near = aj.kinematics.without_far_frames(far)
+        >>> print(near.d.round(1), near.beta)
+        [300.   0.   0.] [ 0.000000e+00 -9.999995e-09  0.000000e+00]
+    """
+    geometry = geometry_of(arm)
+    *frames, last = dh_frames(geometry, np.eye(4))
+    directions, points = (np.array([frame[:3, i] for frame in frames]) for i in (2, 3))
+    _, near = dh_of_axes(Axes(directions, points, last), keep_points=False)
+    return arm_of(near._replace(probe=near.probe + geometry.probe, kinds=geometry.kinds), arm.limits)
+
+
+def calibrated_frames(
+    origins: list[Transform], nominal: Geometry, calibrated: Geometry, base: Transform
+) -> list[Transform]:
+    """Origins of the joints of a calibrated chain, each in the frame of the joint before it, at reading 0; mm.
+
+    A frame on axis i turns about its axis with theta_i, so that a link keeps its shape where only zero offsets changed,
+    and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that; that of
+    a prismatic joint moves on along its axis with d_i, for the same reason (anywhere else would do as well). An origin
+    that does not change comes back as it was, to the bit.
+
+    The first nominal origin is in the frame of the base, and ``base`` the first D-H frame in it, which calibration does
+    not change; ``nominal`` are the parameters that `dh_of_axes` gave.
+    """
+    before, after = dh_frames(nominal, base), dh_frames(calibrated, base)
+    was, now, changed = np.eye(4), np.eye(4), []
+    for i, origin in enumerate(origins):
+        was, expected = was @ origin, now @ origin
+        turn = rotation(2, float(calibrated.theta[i] - nominal.theta[i]))
+        frame = after[i] @ turn @ inverse(before[i]) @ was
+        point, axis = after[i][:3, 3], after[i][:3, 2]
+        slides = nominal.kinds is not None and nominal.kinds.prismatic[i]
+        offset = float(calibrated.d[i] - nominal.d[i]) if slides else 0.0
+        frame[:3, 3] = point + ((expected[:3, 3] - point) @ axis + offset) * axis
+        unchanged = same_transform(frame, expected)
+        changed.append(origin if unchanged else inverse(now) @ frame)
+        # Not the product of what is returned: an inverse by transposition doubles the rounding from joint to joint.
+        now = expected if unchanged else frame
+    return changed
+
+
+def canonical_origins(geometry: Geometry) -> list[Transform]:
+    """Origins of the joints with z along every axis, as D-H has them: T_i = Tx(a) Rx(alpha) Ry(beta) Rz(theta) Tz(d).
+
+    Length, twist and beta are of the joint before, so that the first origin is Rz(theta_1) Tz(d_1). The transform of
+    the tip in the last joint's frame follows as one more.
+    """
+    origins, link = [], np.eye(4)
+    for theta, d, a, alpha, beta in _links(geometry):
+        origins.append(link @ _link(theta, d, 0.0, 0.0, 0.0))
+        link = _link(0.0, 0.0, a, alpha, beta)
+    return [*origins, _with_probe(link, geometry)]

@@ -1,20 +1,53 @@
-"""Obstacles, and how far an arm's body is from them and from itself."""
+"""The body of an arm as capsules that its frames carry, obstacles, and how far the body is from them and from itself.
 
+A capsule is a segment with a radius, so that its distance from another is that of the segments less the radii. Its ends
+may be in two frames: a link whose length changes with a joint keeps its ends. Distances are exact, for batches, and
+under jit too; points are columns, ``(..., 3, N)`` for N configurations, as in `chain`.
+"""
+
+from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..core.arguments import Positive, Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, to_numpy
 from ..core.rotations import rotation_matrix
 from .arm import Arm
-from .body import Body, capsule_ends, distance_from_box, frames_at, segment_distance
+from .chain import Vectors, forward_pass, frame_axes, joint_motion
 
+_SHORTEST = 1e-6  # mm: shorter links have no capsule
+_NEAR = 2.0  # times the sum of the radii: capsules that less of the arm joins than this are neighbours
+_RADIUS = Range(above=0, most=2000, unit="mm")
+_PARALLEL = 1e-14  # squared sine of the angle between segments that count as parallel
+_TINY = 1e-24  # mm^2: keeps derivatives of a square root finite
 _ROWS = 1024  # of one call
 _SAMPLES = 500
 _MOSTLY = 0.5  # of random configurations: capsules that touch in so many overlap by their shapes
+
+Vector = tuple[float, float, float]
+
+
+class Body(NamedTuple):
+    """Capsules and the pairs of them that may not touch; lengths in mm.
+
+    Frame 0 is the base, frame i the one after joint i.
+
+    Example:
+        >>> body = aj.kinematics.body_along_links(arm, 40.0)
+        >>> print(body.names[:3], body.radius[:3])
+        ('offset d_1', 'link a_2', 'offset d_3') [40. 40. 40.]
+    """
+
+    names: tuple[str, ...]
+    start_frame: Int[np.ndarray, " k"]
+    start: Float[np.ndarray, "k 3"]  # in its frame
+    end_frame: Int[np.ndarray, " k"]
+    end: Float[np.ndarray, "k 3"]
+    radius: Float[np.ndarray, " k"]
+    pairs: Int[np.ndarray, "m 2"]
 
 
 class HalfSpace(NamedTuple):
@@ -29,8 +62,8 @@ class HalfSpace(NamedTuple):
     """
 
     name: str
-    normal: tuple[float, float, float]
-    point: tuple[float, float, float]
+    normal: Vector
+    point: Vector
 
 
 class Box(NamedTuple):
@@ -43,9 +76,9 @@ class Box(NamedTuple):
     """
 
     name: str
-    centre: tuple[float, float, float]
-    size: tuple[float, float, float]
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre: Vector
+    size: Vector
+    rotation: Vector = (0.0, 0.0, 0.0)
 
 
 class Post(NamedTuple):
@@ -58,8 +91,8 @@ class Post(NamedTuple):
     """
 
     name: str
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
+    start: Vector
+    end: Vector
     radius: float
 
 
@@ -80,6 +113,170 @@ class Cell(NamedTuple):
     obstacles: tuple[Obstacle, ...] = ()
     clearance: float = 0.0  # smallest distance that is allowed, mm
     unchecked: tuple[tuple[str, str], ...] = ()  # capsule and obstacle, or two capsules, that touch wherever the arm is
+
+
+def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: float | None = None) -> Body:
+    """Capsules about an arm's offsets d, lengths a and its probe, as the D-H table has them.
+
+    That is the body of an arm whose links are where its table's frames are; of a robot with links beside its axes, its
+    URDF's shapes are nearer to the truth (`files.load_cell`). The tool's capsule ends two radii before the tip, so that
+    it clears a surface that the tip is in up to a tilt of 60 deg. Capsules that little of the arm joins touch at their
+    joint, and are no pair.
+
+    Args:
+        arm: One arm.
+        radius: Radius of every link, or one for each joint, mm.
+        tool_radius: Radius of the probe, mm; by default a quarter of the last link's, 8 at most.
+
+    Raises:
+        InputError: A radius is not positive, or not one for each joint.
+
+    Example:
+        >>> body = aj.kinematics.body_along_links(arm, 40.0, tool_radius=5.0)
+        >>> print(len(body.names), body.radius.max(), "mm")
+        7 40.0 mm
+    """
+    arm, n, base = to_numpy(arm), arm.joints, np.zeros(3)
+    shapes = Float[np.ndarray, ""] | Float[np.ndarray, "joints"]
+    radii = np.broadcast_to(checked(radius, Annotated[shapes, _RADIUS], "radius", {"joints": n}), (n,))
+    tool = float(min(radii[-1] / 4, 8.0) if tool_radius is None else tool_radius)
+    checked(tool, Annotated[float, _RADIUS], "tool_radius")
+    beta = np.zeros(n) if arm.beta is None else np.asarray(arm.beta)
+    rows: list[tuple[str, int, np.ndarray, int, np.ndarray, float, float]] = []
+    for i in range(n):
+        a, d = float(arm.a[i]), float(arm.d[i])
+        # The end of the offset, in the frame after the joint: a back along x, which beta turns about y.
+        corner = np.array([-a * np.cos(beta[i]), 0.0, -a * np.sin(beta[i])])
+        rows.append((f"offset d_{i + 1}", i, base, i + 1, corner, radii[i], abs(d)))
+        rows.append((f"link a_{i + 1}", i + 1, corner, i + 1, base, radii[i], abs(a)))
+    rows = [row for row in rows if row[-1] > _SHORTEST]
+    probe = np.asarray(arm.probe, dtype=float)
+    size = float(np.linalg.norm(probe))
+    if size > 2 * tool + _SHORTEST:
+        rows.append(("probe", n, base, n, probe * (1 - 2 * tool / size), tool, size))
+    if not rows:
+        raise InputError("the arm has no link that is longer than 0, so it has no body; give its URDF.")
+    names, *columns, lengths = zip(*rows, strict=True)
+    start_frame, start, end_frame, end, widths = map(np.array, columns)
+    first, second = np.triu_indices(len(rows), 1)
+    until = np.concatenate([[0.0], np.cumsum(lengths)])  # how much of the arm is before each capsule
+    apart = until[second] - until[first + 1] > _NEAR * (widths[first] + widths[second])
+    return Body(names, start_frame, start, end_frame, end, widths, np.column_stack([first, second])[apart])
+
+
+def capsule_ends(
+    body: Body, arm: Arm, q: Float[AnyArray, "N n"]
+) -> tuple[Float[AnyArray, "k 3 N"], Float[AnyArray, "k 3 N"]]:
+    """Where the capsules' segments begin and end at N configurations, in the base frame, mm."""
+    forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
+    xp, (x, y, z) = namespace(forward), frame_axes(forward)
+    base = xp.broadcast_to(xp.asarray(np.eye(3))[None, :, :, None], (1, 3, 3, z.shape[-1]))
+    axes = xp.concatenate([base, xp.stack([x, y, z], axis=2)])
+    origins = xp.concatenate([xp.zeros_like(forward.origin[:1]), forward.origin])
+
+    def placed(frame: Int[np.ndarray, " k"], point: Float[np.ndarray, "k 3"]) -> AnyArray:
+        columns = (axes[frame][:, :, i] * xp.asarray(point[:, i])[:, None, None] for i in range(3))
+        return origins[frame] + sum(columns)
+
+    return placed(body.start_frame, body.start), placed(body.end_frame, body.end)
+
+
+def segment_distance(
+    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
+) -> Float[AnyArray, "... N"]:
+    """Distance between two segments, mm; a segment may be a point.
+
+    The point of one segment that is nearest to the line of the other, the point of the other that is nearest to that,
+    and once more the first: with each kept on its segment, the third step is the minimum (Ericson 2005, 5.1.9).
+    """
+    xp = namespace(start, end, other_start, other_end)
+    along, other_along, between = end - start, other_end - other_start, start - other_start
+    aa, bb, ab = _dot(along, along), _dot(other_along, other_along), _dot(along, other_along)
+    a_between, b_between = _dot(along, between), _dot(other_along, between)
+    determinant = aa * bb - ab**2
+    parallel = determinant <= _PARALLEL * aa * bb
+    first = (ab * b_between - bb * a_between) / xp.where(parallel, 1.0, determinant)
+    first = xp.where(parallel, 0.0, xp.clip(first, 0.0, 1.0))
+    second = xp.clip((ab * first + b_between) / xp.where(bb > 0, bb, 1.0), 0.0, 1.0)
+    first = xp.clip((ab * second - a_between) / xp.where(aa > 0, aa, 1.0), 0.0, 1.0)
+    return _length(between + first[..., None, :] * along - second[..., None, :] * other_along)
+
+
+def distance_from_box(start: Vectors, end: Vectors, half: Float[AnyArray, "... 3 1"]) -> Float[AnyArray, "... N"]:
+    """Distance of a segment from a solid box about the origin with half edges ``half`` along the axes, mm.
+
+    The squared distance along the segment is convex, and its derivative is linear between the places where the segment
+    crosses the planes of the six faces: the zero of the derivative is found between two of these.
+    """
+    xp, along = namespace(start, end, half), end - start
+
+    def beyond(places: AnyArray) -> AnyArray:
+        """From the box to the points at these places, one more axis in front."""
+        points = start[None] + places[..., None, :] * along[None]
+        return points - xp.clip(points, -half[None], half[None])
+
+    still = xp.abs(along) < 1e-9
+    safe = xp.where(still, 1.0, along)
+    crossings = [xp.where(still, 0.0, xp.clip((face - start) / safe, 0.0, 1.0)) for face in (-half, half)]
+    both = xp.concatenate(crossings, axis=-2)
+    ends = xp.concatenate([xp.zeros_like(both[..., :1, :]), both, xp.ones_like(both[..., :1, :])], axis=-2)
+    places = xp.moveaxis(xp.sort(ends, axis=-2), -2, 0)
+    slopes = xp.sum(beyond(places) * along[None], axis=-2)
+    # The last place where the distance still becomes smaller, and the one after it.
+    last = xp.clip(xp.sum(slopes <= 0, axis=0) - 1, 0, len(places) - 2)[None]
+    low, high = (xp.take_along_axis(places, last + i, axis=0)[0] for i in (0, 1))
+    slope_low, slope_high = (xp.take_along_axis(slopes, last + i, axis=0)[0] for i in (0, 1))
+    rise = slope_high - slope_low
+    part = xp.clip(-slope_low / xp.where(rise > 0, rise, 1.0), 0.0, 1.0)
+    # Without a rise the derivative is 0 all along, inside the box, or the segment is a point.
+    place = low + xp.where(rise > 0, part, 0.0) * (high - low)
+    return _length(beyond(place[None])[0])
+
+
+def _dot(vector: AnyArray, other: AnyArray) -> AnyArray:
+    return (vector * other).sum(axis=-2)
+
+
+def _length(vector: AnyArray) -> AnyArray:
+    xp, square = namespace(vector), _dot(vector, vector)
+    return xp.where(square > _TINY, xp.sqrt(xp.maximum(square, _TINY)), 0.0)
+
+
+def _from_obstacle(obstacle: Obstacle, start: Float[AnyArray, "k 3 N"], end: Float[AnyArray, "k 3 N"]) -> AnyArray:
+    """Distances of segments from an obstacle, ``(k, N)``."""
+    xp = namespace(start, end)
+    points = {name: np.asarray(value, dtype=float) for name, value in obstacle._asdict().items() if name != "name"}
+
+    def column(vector: Float[np.ndarray, " 3"]) -> AnyArray:
+        return xp.asarray(vector)[None, :, None]
+
+    if isinstance(obstacle, HalfSpace):
+        normal = points["normal"] / np.linalg.norm(points["normal"])
+        heights = (xp.sum(part * column(normal), axis=1) for part in (start, end))
+        return xp.minimum(*heights) - float(normal @ points["point"])
+    if isinstance(obstacle, Box):
+        rotation = xp.asarray(rotation_matrix(points["rotation"]).T)
+        first, last = (xp.einsum("cd,kdn->kcn", rotation, part - column(points["centre"])) for part in (start, end))
+        return distance_from_box(first, last, column(points["size"] / 2))
+    first, last = (xp.broadcast_to(column(points[name]), start.shape) for name in ("start", "end"))
+    return segment_distance(start, end, first, last) - obstacle.radius
+
+
+def _distances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[list[tuple[str, str]], Float[AnyArray, "m N"]]:
+    """The pairs of things that are checked, by name, and their distances: capsules, then capsules and obstacles."""
+    body, xp = cell.body, namespace(arm, q)
+    start, end = capsule_ends(body, arm, q)
+    first, second = body.pairs.T
+    between = segment_distance(start[first], end[first], start[second], end[second])
+    distances = [between - xp.asarray(body.radius[first] + body.radius[second])[:, None]]
+    names = [(body.names[i], body.names[j]) for i, j in body.pairs]
+    for obstacle in cell.obstacles:
+        pairs = [(name, obstacle.name) for name in body.names]
+        chosen = np.array([pair not in cell.unchecked for pair in pairs])
+        gaps = _from_obstacle(obstacle, start[chosen], end[chosen])
+        distances.append(gaps - xp.asarray(body.radius[chosen])[:, None])
+        names += [pair for pair in pairs if pair not in cell.unchecked]
+    return names, xp.concatenate(distances)
 
 
 def check_obstacle(obstacle: Obstacle) -> None:
@@ -144,43 +341,3 @@ def nearest_contact(cell: Cell, arm: Arm, q: Float[np.ndarray, " n"]) -> tuple[s
     """The two things that are nearest to each other at one configuration: capsules, or a capsule and an obstacle."""
     names, distances = _distances(cell, to_numpy(arm), q[None])
     return names[int(np.argmin(distances[:, 0]))]
-
-
-def _distances(cell: Cell, arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[list[tuple[str, str]], Float[AnyArray, "m N"]]:
-    """The pairs of things that are checked, by name, and their distances: capsules, then capsules and obstacles."""
-    body, xp = cell.body, namespace(arm, q)
-    start, end = capsule_ends(body, frames_at(arm, q))
-    first, second = body.pairs.T
-    between = segment_distance(start[first], end[first], start[second], end[second])
-    distances = [between - xp.asarray(body.radius[first] + body.radius[second])[:, None]]
-    names = [(body.names[i], body.names[j]) for i, j in body.pairs]
-    for obstacle in cell.obstacles:
-        pairs = [(name, obstacle.name) for name in body.names]
-        chosen = np.array([pair not in cell.unchecked for pair in pairs])
-        part = body._replace(radius=body.radius[chosen])
-        distances.append(_from_obstacle(obstacle, part, start[chosen], end[chosen]))
-        names += [pair for pair in pairs if pair not in cell.unchecked]
-    return names, xp.concatenate(distances)
-
-
-def _from_obstacle(
-    obstacle: Obstacle, body: Body, start: Float[AnyArray, "k 3 N"], end: Float[AnyArray, "k 3 N"]
-) -> Float[AnyArray, "k N"]:
-    xp = namespace(start, end)
-    radius = xp.asarray(body.radius)[:, None]
-    if isinstance(obstacle, HalfSpace):
-        normal = np.asarray(obstacle.normal, dtype=float)
-        normal = normal / np.linalg.norm(normal)
-        heights = (xp.sum(part * xp.asarray(normal)[None, :, None], axis=1) for part in (start, end))
-        return xp.minimum(*heights) - float(normal @ np.asarray(obstacle.point)) - radius
-    if isinstance(obstacle, Box):
-        rotation = xp.asarray(rotation_matrix(np.asarray(obstacle.rotation, dtype=float)).T)
-        centre = xp.asarray(np.asarray(obstacle.centre, dtype=float))[None, :, None]
-        first, last = (xp.einsum("cd,kdn->kcn", rotation, part - centre) for part in (start, end))
-        half = xp.asarray(np.asarray(obstacle.size, dtype=float) / 2)[None, :, None]
-        return distance_from_box(first, last, half) - radius
-    first, last = (
-        xp.broadcast_to(xp.asarray(np.asarray(point, dtype=float))[None, :, None], start.shape)
-        for point in (obstacle.start, obstacle.end)
-    )
-    return segment_distance(start, end, first, last) - radius - obstacle.radius

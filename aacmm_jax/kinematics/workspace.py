@@ -1,8 +1,11 @@
-"""The workspace of an arm: its reach, lowest point, configurations at given points, and links as lines in space."""
+"""The workspace of an arm: its reach, lowest point, links as lines in space, and configurations at given points.
+
+A tool may come to a socket from the directions of a cone alone.
+"""
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,13 +14,19 @@ from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import in_chunks, to_numpy
 from .arm import Arm, joint_limits
-from .chain import forward_pass, joint_motion, reading_units
+from .chain import ForwardPass, forward_pass, joint_motion, reading_units
 from .collisions import Cell, checked_cell, is_clear
-from .cones import Cones, into_cones
-from .inverse_kinematics import project_to_targets
+from .inverse_kinematics import ARRIVED, EXACT, LARGEST_STEP, ROWS, damped_inverse, project_to_targets, repeated
+from .jacobian import reading_columns, reading_rotations
 
+TOOL_AXIS = (0.0, 0.0, 1.0)
 _STARTS, _SWEEPS = 256, 30
 _REACHING = 25  # steps: seven of ten random starts arrive, and with 60 eight would
+_LARGEST_TURN = 0.5  # rad, of the tool in a step
+_INSIDE = 1e-4  # rad: what is brought into a cone ends this far inside it
+_LEVER = 100.0  # mm: a rotation of the tool counts as what it moves at this distance
+
+Configurations = Float[np.ndarray, "c n"]
 
 
 class Reach(NamedTuple):
@@ -41,13 +50,7 @@ def arm_reach(arm: Arm) -> Reach:
         >>> print(f"{reach.radius:.0f} mm")
         1359 mm
     """
-    shoulder = _shoulder(arm)
-    return Reach(shoulder, _extreme_distance(arm, shoulder, farthest=True))
-
-
-def _shoulder(arm: Arm) -> Float[np.ndarray, " 3"]:
-    travel = np.mean(joint_limits(arm, None)[0]) if 1 in arm.prismatic else 0.0
-    return np.array([0.0, 0.0, float(np.asarray(arm.d)[0] + travel)])
+    return _extreme_distance(arm, farthest=True)
 
 
 def closest_approach(arm: Arm) -> float:
@@ -62,11 +65,11 @@ def closest_approach(arm: Arm) -> float:
         >>> print(f"{aj.kinematics.closest_approach(arm):.0f} mm")
         146 mm
     """
-    return _extreme_distance(arm, _shoulder(arm), farthest=False)
+    return _extreme_distance(arm, farthest=False).radius
 
 
-def _extreme_distance(arm: Arm, shoulder: Float[np.ndarray, " 3"], *, farthest: bool) -> float:
-    """Largest or smallest distance of the tip from the shoulder.
+def _extreme_distance(arm: Arm, *, farthest: bool) -> Reach:
+    """The shoulder, and the largest or smallest distance of the tip from it.
 
     As a function of one joint the squared distance is a constant plus a sinusoid: with the lever r from a point of the
     joint's axis z to the tip, and s from the shoulder to that point, of 2 s . (r - (z . r) z) cos t + 2 s . (z x r) sin
@@ -74,36 +77,32 @@ def _extreme_distance(arm: Arm, shoulder: Float[np.ndarray, " 3"], *, farthest: 
     minimum. From many random starts, joint after joint is set to its extreme until nothing changes, the last joint
     first: a joint moves the tip, but no axis of the joints before it.
     """
-    sign = 1.0 if farthest else -1.0
-    limits = np.asarray(joint_limits(arm, None))
+    sign, limits, geometry = 1.0 if farthest else -1.0, joint_limits(arm, None), to_numpy(arm.geometry)
     slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
+    shoulder = np.array([0.0, 0.0, float(np.asarray(arm.d)[0] + (np.mean(limits[0]) if slides[0] else 0.0))])
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_STARTS, arm.joints))
-    geometry = to_numpy(arm.geometry)
     best, now = -np.inf, 0.0
     for _ in range(_SWEEPS):
         forward = forward_pass(geometry, joint_motion(geometry, q))
         tip = forward.tip.T
         # The first joint, if it is revolute, rotates the whole arm about the shoulder's axis.
         for joint in range(arm.joints - 1, -1 if slides[0] else 0, -1):
+            axis, (low, high) = forward.z_before[joint].T, limits[joint]
             if slides[joint]:
-                axis, (low, high) = forward.z_before[joint].T, limits[joint]
                 foot = q[:, joint] - np.sum((tip - shoulder) * axis, axis=1)
                 reading = np.where(foot > (low + high) / 2, low, high) if farthest else np.clip(foot, low, high)
                 tip = tip + (reading - q[:, joint])[:, None] * axis
                 q[:, joint] = reading
                 continue
-            axis, origin = forward.z_before[joint].T, forward.origin_before[joint].T
             # tip(t) = origin + (tip - origin) cos t + ..., so that s . tip varies as cosine cos t + sine sin t.
+            origin = forward.origin_before[joint].T
             offset, across = origin - shoulder, np.cross(axis, tip - origin)
             along = np.cross(across, axis)
             cosine, sine = sign * np.sum(offset * along, axis=1), sign * np.sum(offset * across, axis=1)
             highest = q[:, joint] + np.arctan2(sine, cosine)
-            low, high = limits[joint]
             # The angle of the maximum, by whole revolutions within the limits if one is; else the better limit.
             whole = highest + 2 * np.pi * np.ceil((low - highest) / (2 * np.pi))
-            at_low, at_high = (
-                cosine * np.cos(end) + sine * np.sin(end) for end in (low - q[:, joint], high - q[:, joint])
-            )
+            at_low, at_high = (cosine * np.cos(t) + sine * np.sin(t) for t in (low - q[:, joint], high - q[:, joint]))
             reading = np.where(whole <= high, whole, np.where(at_low > at_high, low, high))
             change = (reading - q[:, joint])[:, None]
             tip = tip + (np.cos(change) - 1) * along + np.sin(change) * across
@@ -112,29 +111,24 @@ def _extreme_distance(arm: Arm, shoulder: Float[np.ndarray, " 3"], *, farthest: 
         if sign * now - best <= 1e-12 * abs(now):
             break
         best = sign * now
-    return now
+    return Reach(shoulder, now)
 
 
 def skeleton(arm: Arm, q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m c 3"]:
     """Corners of the arm, mm: the base, the end of each joint's offset and of its link, and the tip (c = 2 n + 2)."""
 
     def lines(rows: np.ndarray) -> np.ndarray:
-        motion = joint_motion(arm.geometry, rows)
-        forward = forward_pass(*to_numpy((arm.geometry, motion)))
-        before, after, axis = (
-            np.asarray(part).reshape(arm.joints, 3, -1)
-            for part in (forward.origin_before, forward.origin, forward.z_before)
-        )
-        along = np.asarray(arm.d)[:, None, None] + (0.0 if motion.slide is None else np.asarray(motion.slide))
-        offset = before + along * axis
-        both = np.stack([offset, after], axis=1).reshape(2 * arm.joints, 3, -1)
-        tip = np.asarray(forward.tip).reshape(1, 3, -1)
-        return np.concatenate([np.zeros_like(tip), both, tip]).transpose(2, 0, 1)
+        geometry, motion = to_numpy((arm.geometry, joint_motion(arm.geometry, rows)))
+        forward = forward_pass(geometry, motion)
+        along = geometry.d[:, None, None] + (0.0 if motion.slide is None else motion.slide)
+        offset = forward.origin_before + along * forward.z_before
+        both = np.stack([offset, np.broadcast_to(forward.origin, offset.shape)], axis=1).reshape(2 * arm.joints, 3, -1)
+        return np.concatenate([np.zeros_like(both[:1]), both, forward.tip[None]]).transpose(2, 0, 1)
 
     return in_chunks(lines, np.asarray(q))
 
 
-def lowest_point(arm: Arm, q: Float[np.ndarray, "c n"]) -> Float[np.ndarray, " c"]:
+def lowest_point(arm: Arm, q: Configurations) -> Float[np.ndarray, " c"]:
     """Height of the lowest joint or tip in the base frame, mm, without the base itself, for each configuration."""
 
     def lowest(rows: np.ndarray) -> np.ndarray:
@@ -154,6 +148,121 @@ def total_link_length(arm: Arm) -> float:
     return float(links + sum(slides))
 
 
+class Cone(NamedTuple):
+    """Directions from which a tool may come to a socket: within ``half_angle`` (rad) of its ``normal``.
+
+    The normal points out of the socket, in the base frame.
+
+    Example:
+        >>> upwards = aj.kinematics.Cone(half_angle=np.radians(45), normal=(0, 0, 1))
+        >>> print(f"{upwards.half_angle:.3f} rad")
+        0.785 rad
+    """
+
+    half_angle: float = math.pi
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
+class Cones(NamedTuple):
+    """The cones of several sockets, and the axis of the last frame that points from the tool into a socket."""
+
+    normals: Float[np.ndarray, "s 3"]
+    half_angles: Float[np.ndarray, " s"]
+    tool_axis: Float[np.ndarray, " 3"]
+
+    @property
+    def any(self) -> bool:
+        """Whether some cone leaves out directions."""
+        return bool(np.any(self.half_angles < math.pi))
+
+    def at(self, sockets: Int[np.ndarray, " c"]) -> "Cones":
+        """The cone of each of these sockets."""
+        return self._replace(normals=self.normals[sockets], half_angles=self.half_angles[sockets])
+
+
+def cones_of(cones: list[Cone], tool_axis: tuple[float, float, float] = TOOL_AXIS) -> Cones:
+    """The cones with unit vectors; `InputError` where a direction has the length 0, or a half angle is not above 0."""
+    directions = {f"normal of cone {i + 1}": cone.normal for i, cone in enumerate(cones)} | {"tool_axis": tool_axis}
+    vectors = np.array([checked(value, Float[np.ndarray, "3"], what) for what, value in directions.items()])
+    sizes = np.linalg.norm(vectors, axis=1, keepdims=True)
+    if np.any(sizes == 0):
+        raise InputError("a normal or the tool's axis has the length 0; give three numbers that are not all 0.")
+    half_angles = np.array([cone.half_angle for cone in cones], dtype=float)
+    degrees = Annotated[Float[np.ndarray, " cones"], Range(above=0, most=180, unit="deg")]
+    checked(np.degrees(half_angles), degrees, "half_angle")
+    unit = vectors / sizes
+    return Cones(unit[:-1], half_angles, unit[-1])
+
+
+def tilts(arm: Arm, q: Configurations, cones: Cones) -> Float[np.ndarray, " c"]:
+    """Angle between a tool and the normal of its socket, rad: 0 where it comes straight from above the socket.
+
+    ``cones`` has a row for each configuration.
+    """
+    rotations = np.asarray(to_numpy(arm).pose(q))[..., :3, :3]
+    return _angle(rotations @ cones.tool_axis, cones.normals)
+
+
+def _angle(tool: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, " c"]:
+    """Angle between the reversed tool and a normal; by its tangent, so that small ones are exact."""
+    return np.arctan2(np.linalg.norm(np.cross(tool, normal), axis=-1), -np.sum(tool * normal, axis=-1))
+
+
+def into_cones(
+    arm: Arm,
+    q: Configurations,
+    targets: Float[np.ndarray, "c 3"],
+    limits: Float[np.ndarray, "n 2"],
+    cones: Cones,
+    steps: int,
+) -> tuple[Configurations, Bool[np.ndarray, " c"]]:
+    """Configurations moved by least-norm steps until the tip is at its target (mm) and the tool in its cone.
+
+    Each step closes the gap of the tip, as `solve_to_targets` does, and where the tool is outside its cone turns it
+    there, with what moves the tip least first taken out: the least-norm solution of four equations by elimination.
+    """
+    geometry = to_numpy(arm.geometry)
+    low, high = limits[:, :1], limits[:, 1:]
+    units = reading_units(geometry)[:, None]  # steps are in what counts alike: 1 rad, or 1 m
+
+    def tool_of(forward: ForwardPass) -> np.ndarray:
+        x, y, z = forward.frame
+        return cones.tool_axis[0] * x + cones.tool_axis[1] * y + cones.tool_axis[2] * z
+
+    # The first three equations move the tip: J dq = gap, solved by dq0 = J+ gap. The fourth turns the tool by r . dq =
+    # turn. Along f = r - J+ J r, the part of r that moves no tip, dq = dq0 + f (turn - r . dq0) / (f . r) solves all.
+    def step(q: Any, targets: Any, normals: Any, wanted: Any) -> tuple[Any, Any]:
+        forward = forward_pass(geometry, joint_motion(geometry, q.T))
+        gap, tool = targets - forward.tip, tool_of(forward)
+        columns = units[..., None] * np.asarray(reading_columns(forward))
+        inverse = damped_inverse(columns, 1e-2 * np.sum(gap**2, axis=0) + 1e-12)
+        change = np.sum(inverse * gap[None], axis=1)
+        angle = _angle(tool.T, normals.T)
+        outside = angle > wanted
+        if outside.any():
+            # d angle / dq = z . (tool x normal) / sin(angle): the cosine is -tool . normal.
+            across = np.cross(tool, normals, axis=0) / np.maximum(np.sin(angle), 0.05)
+            row = _LEVER * np.einsum("jcn,cn->jn", units[..., None] * reading_rotations(forward), across) * outside
+            turn = _LEVER * np.clip(wanted - angle, -_LARGEST_TURN, 0.0) * outside
+            free = row - np.sum(inverse * np.einsum("jn,jcn->cn", row, columns)[None], axis=1)
+            size = np.sum(free * row, axis=0)
+            change = change + free * ((turn - np.sum(row * change, axis=0)) / (size + 1e-2 * turn**2 + 1e-6))
+        new = np.clip(q + units * np.clip(change, -LARGEST_STEP, LARGEST_STEP), low, high)
+        return new, np.any(np.abs(gap) > EXACT, axis=0) | outside
+
+    def moved(rows: np.ndarray) -> np.ndarray:
+        start, targets, normals, half_angles = np.split(rows.T, [arm.joints, arm.joints + 3, arm.joints + 6])
+        q = repeated(step, start, [targets, normals, np.maximum(half_angles - _INSIDE, 0.0)[0]], steps)
+        forward = forward_pass(geometry, joint_motion(geometry, q.T))
+        arrived = np.linalg.norm(targets - forward.tip, axis=0) <= ARRIVED
+        arrived &= _angle(tool_of(forward).T, normals.T) <= half_angles[0]
+        return np.column_stack([q.T, arrived])
+
+    with np.errstate(all="ignore"):
+        solved = in_chunks(moved, np.hstack([q, targets, cones.normals, cones.half_angles[:, None]]), ROWS)
+    return solved[:, :-1], solved[:, -1] > 0
+
+
 class SearchRegion(NamedTuple):
     """Where configurations are looked for, and the random numbers that the search uses."""
 
@@ -164,7 +273,7 @@ class SearchRegion(NamedTuple):
     cones: Cones | None = None  # of approach to each socket; None where the tool may have any direction
     cell: Cell | None = None  # what the arm may not touch
 
-    def draw(self, count: int) -> Float[np.ndarray, "c n"]:
+    def draw(self, count: int) -> Configurations:
         """Random configurations within the limits."""
         return self.random.uniform(self.limits[:, 0], self.limits[:, 1], (count, self.arm.joints))
 
@@ -181,8 +290,7 @@ def search_region(
     """The region ``margin`` (rad, or m of prismatic joints) inside the joint limits (default: the arm's own), ``above``
     (mm) the table, within the cones of approach and clear of the cell's obstacles."""
     checked(seed, Annotated[int, Range(least=0)], "seed")
-    allowed = np.asarray(joint_limits(arm, limits))
-    margins = margin * reading_units(arm.geometry)
+    allowed, margins = joint_limits(arm, limits), margin * reading_units(arm.geometry)
     if not (math.isfinite(margin) and margin >= 0 and np.all(margins < (allowed[:, 1] - allowed[:, 0]) / 2)):
         raise InputError(
             f"a margin of {math.degrees(margin):g} deg leaves a joint no range within its limits; give a smaller one."
@@ -194,12 +302,12 @@ def search_region(
 
 def reached(
     region: SearchRegion,
-    starts: Float[np.ndarray, "c n"],
+    starts: Configurations,
     targets: Float[np.ndarray, "c 3"],
     steps: int = _REACHING,
     sockets: Int[np.ndarray, " c"] | None = None,
     scattered: bool = False,
-) -> tuple[Float[np.ndarray, "c n"], Bool[np.ndarray, " c"]]:
+) -> tuple[Configurations, Bool[np.ndarray, " c"]]:
     """Configurations moved from their starts to the targets, and which of them arrived and can be taken: above the
     table, within the cone of approach, and clear of obstacles.
 
@@ -223,7 +331,7 @@ def reached(
 
 def configurations_at(
     region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
-) -> tuple[Float[np.ndarray, "c n"], Int[np.ndarray, " c"]]:
+) -> tuple[Configurations, Int[np.ndarray, " c"]]:
     """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point.
 
     With several cones, point i has the cone i; or modulo their number, for several placements of the same sockets.

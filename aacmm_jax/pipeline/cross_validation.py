@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..calibration.joint_model import with_joint_model
 from ..calibration.left_out import CrossValidation, LeftOut
 from ..calibration.prediction import unseen_errors
 from ..calibration.record import CalibrationRecord, uncertainty_of
@@ -27,7 +26,7 @@ from ..diagnostics.equations import Equations, equations_of
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
-from .single import CalibrationOptions, calibrate
+from .single import CalibrationOptions, calibrate, with_joint_model
 
 _REGIONS = 4  # a power of two
 _POSES_A_REGION = 10

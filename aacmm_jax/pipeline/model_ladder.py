@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..calibration.joint_model import default_bounds, with_coefficients
 from ..calibration.record import record_of
 from ..calibration.results import Calibration, PriorMetrics
 from ..core.arguments import checked_arguments, items_of
@@ -37,7 +36,7 @@ from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.parameters import ArmSpecification, Bounds
 from ..kinematics.priors import default_prior
 from .cross_validation import UnseenRegion, regions_of, unseen_regions
-from .single import calibrate
+from .single import calibrate, default_bounds, with_coefficients
 
 _LEVEL = 0.05  # of the test by regions
 _EXPECTED_VARIANCE = 9.0  # of a log variance that is expected

@@ -1,4 +1,4 @@
-"""Stage 1 (`identify`), both stages (`calibrate`), and the joint solve."""
+"""Stage 1 (`identify`), both stages (`calibrate`), and the joint solve; with a named model of the joints."""
 
 import warnings
 from typing import Any, Literal, NamedTuple
@@ -7,21 +7,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..calibration.joint_model import with_joint_model
 from ..calibration.results import Calibration, Identification
 from ..calibration.scale_anchor import Method, warn_of_known_scale
 from ..calibration.stages import Stages, identified, in_two_stages, jointly
-from ..calibration.task import (
-    Solving,
-    Task,
-    check_identifiable,
-    check_single,
-    method_of,
-    task_of,
-    without_lengths,
-)
+from ..calibration.task import Solving, Task, method_of, task_of, without_lengths
 from ..core._compat import inside_trace
-from ..core.arguments import Count, check_finite, checked_arguments, with_options
+from ..core.arguments import Count, check_finite, checked_arguments, shown, with_options
 from ..core.arrays import Numbers, is_concrete
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.numpy_or_jax import compiled, namespace, to_jax, to_numpy
@@ -29,11 +20,14 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..diagnostics import noisy_encoders, shared_errors
 from ..diagnostics.findings import amendable
-from ..kinematics.arm import Arm
-from ..kinematics.parameters import Bounds
-from ..kinematics.priors import Prior
+from ..kinematics.arm import DOWN, Arm, correction_names, is_single, without_corrections
+from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.parameters import Bounds, Parameters, based_on
+from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
 from ..uncertainty.covariance import STATED, NoiseModel
+from ..uncertainty.identifiability import observability
+from ..uncertainty.target_parameters import determined_parameters
 
 
 class CalibrationOptions(NamedTuple):
@@ -59,40 +53,14 @@ class CalibrationOptions(NamedTuple):
     max_steps: Count = 300
 
     @property
-    def of_stage1(self) -> dict[str, Any]:
-        """Those that `identify` takes too."""
-        others = ("model", "method", "shared_errors", "undetermined")
-        return {name: value for name, value in self._asdict().items() if name not in others}
-
-    @property
     def solving(self) -> Solving:
-        """Those of a single solve."""
+        """Those of a single solve, which `identify` takes too."""
         return Solving(**{name: getattr(self, name) for name in Solving._fields})
-
-    @property
-    def may_replace_noise(self) -> bool:
-        """Whether the noise of noisy encoders may be replaced: a robust loss and other models of noise have none."""
-        return self.replace_noise and self.noise_model not in ("common", "robust") and self.robust is None
-
-
-_DEFAULT = CalibrationOptions()
 
 
 @checked_arguments
-def identify(
-    arm: Arm,
-    capture: Capture,
-    bounds: Bounds,
-    *,
-    hold: str | None = _DEFAULT.hold,
-    start: Numbers | None = None,
-    noise: Noise | None = None,
-    noise_model: NoiseModel | None = None,
-    robust: LossName | None = None,
-    prior: Prior | None = None,
-    replace_noise: bool = _DEFAULT.replace_noise,
-    max_steps: Count = _DEFAULT.max_steps,
-) -> Identification:
+@with_options(Solving)
+def identify(arm: Arm, capture: Capture, bounds: Bounds, **options: Any) -> Identification:
     """Stage 1: the parameters that make the poses of every socket agree, within bounds.
 
     Minimises the summed squared distance of the tips from their socket's centroid (Cheng et al. 2018, section 2.2).
@@ -133,34 +101,40 @@ def identify(
         >>> print(f"scale anchor {stage1.hold}, DE {stage1.de:.4f} mm")
         scale anchor d_3, DE 0.0124 mm
     """
-    options = CalibrationOptions(None, None, hold, start, noise, noise_model, robust, prior, replace_noise)
-    options = options._replace(max_steps=max_steps)
-    task = _stage1_task("identify_many", arm, capture, bounds, options)
+    given = Solving(**options)
+    task = _stage1_task("identify_many", arm, capture, bounds, given)
     capture = to_numpy(capture)
     result = to_jax(_identified(to_numpy(task), capture))
-    case = amendable(result, capture) if options.may_replace_noise else None
+    case = amendable(result, capture) if given.may_replace_noise else None
     if case is None:
         return result
-    again = options._replace(noise_model=None, replace_noise=False)
-
-    def with_noise(replaced: Noise) -> Identification:
-        return identify(arm, capture, bounds, **again._replace(noise=replaced).of_stage1)
-
+    again = given._replace(noise_model=None, replace_noise=False)
+    with_noise = lambda noise: identify(arm, capture, bounds, **again._replace(noise=noise)._asdict())  # noqa: E731
     return noisy_encoders.amend(result, case, with_noise)
-
-
-def _stage1_task(many: str, arm: Arm, capture: Capture, bounds: Bounds, options: CalibrationOptions) -> Task:
-    """The checked task of stage 1, in which lengths take no part; ``many`` is the function that takes batches."""
-    check_single(arm, capture, bounds, many)
-    for sentence in () if inside_trace() else capture.repeated.sentences():
-        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
-    check_finite(arm=arm, capture=capture, noise=options.noise)
-    return task_of(arm, without_lengths(capture), bounds, options.solving)
 
 
 @compiled(jit=eqx.filter_jit)
 def _identified(task: Task, capture: Capture) -> Identification:
     return identified(task, capture).solution.identification
+
+
+def _stage1_task(many: str, arm: Arm, capture: Capture, bounds: Bounds, solving: Solving) -> Task:
+    """The checked task of stage 1, in which lengths take no part; ``many`` is the function that takes batches."""
+    _check_single(arm, capture, bounds, many)
+    for sentence in () if inside_trace() else capture.repeated.sentences():
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
+    check_finite(arm=arm, capture=capture, noise=solving.noise)
+    return task_of(arm, without_lengths(capture), bounds, solving)
+
+
+def _check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None:
+    """Raise `InputError` where an arm, a capture or bounds are a batch; ``many`` is the function that takes batches."""
+    wide = max(bounds.lower.ndim, bounds.upper.ndim) > 1
+    is_batch = {"arm": not is_single(arm), "capture": capture.q.ndim > 2, "bounds": wide}
+    if batches := [what for what, batch in is_batch.items() if batch]:
+        raise InputError(
+            f"the {' and the '.join(batches)} given are a batch, but one problem is solved here; use {many}."
+        )
 
 
 @checked_arguments
@@ -218,17 +192,17 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     method, at_once = method_of(arm, capture, bounds.space, given.solving, given.method)
     given = given._replace(method=method)
     if at_once:
-        check_single(arm, capture, bounds, "calibrate_many")
+        _check_single(arm, capture, bounds, "calibrate_many")
         check_finite(arm=arm, capture=capture, noise=given.noise)
     elif given.hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
             "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
             "hold."
         )
-    first = None if at_once else _stage1_task("calibrate_many", arm, capture, bounds, given)
+    first = None if at_once else _stage1_task("calibrate_many", arm, capture, bounds, given.solving)
     task = task_of(arm, capture, bounds, given.solving._replace(hold=None))
     if given.undetermined != "ignore":
-        check_identifiable(capture, task.bounds, prior, given.undetermined == "raise")
+        _check_identifiable(capture, task.bounds, prior, given.undetermined == "raise")
     if method == "two-stage" and first is not None and not inside_trace():
         warn_of_known_scale(first.anchor.set_by, bool(arm.prismatic))
     first, task, capture = to_numpy((first, task, capture))
@@ -237,18 +211,32 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     with np.errstate(all="ignore"):
         result, sensitivities, _ = _stages(first, task, capture, method)
     case = amendable(result, capture)
-    if case is not None and given.may_replace_noise:
+    if case is not None and given.solving.may_replace_noise:
         again = given._replace(noise_model=None, replace_noise=False, undetermined="ignore")
-
-        def with_noise(replaced: Noise) -> Calibration:
-            return calibrate(arm, capture, bounds, **again._replace(noise=replaced)._asdict())
-
-        replaced = noisy_encoders.amend(result, case, with_noise)
+        replaced = noisy_encoders.amend(
+            result, case, lambda noise: calibrate(arm, capture, bounds, **again._replace(noise=noise)._asdict())
+        )
         if replaced is not result:
             return replaced
     if case is not None and given.shared_errors:
         result = shared_errors.amend(result, case, sensitivities)
     return to_jax(result)
+
+
+def _check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, strict: bool) -> None:
+    """Warn of, or with ``strict`` refuse, free parameters that these data cannot determine; not of traced values."""
+    if inside_trace() or not is_concrete(*jax.tree.leaves((capture, bounds))):
+        return
+    space = bounds.space
+    stated = prior and prior.of(space.names, space.vector())
+    seen = observability(
+        space.base, capture, space, known=tuple(space.names[i] for i in stated.index) if stated else ()
+    )
+    lost = seen._replace(by_prior=()).sentences()
+    if lost and strict:
+        raise InputError(" ".join(lost))
+    for sentence in seen.sentences():
+        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
 
 
 def _stages(first: Task | None, task: Task, capture: Capture, method: str) -> Stages:
@@ -283,3 +271,51 @@ def _with_components_of(other: Calibration, result: Calibration) -> Calibration:
         return result
     none = eqx.tree_at(lambda lacking: lacking.matrices, lacking, 0 * lacking.matrices)
     return eqx.tree_at(lambda one: one.parameter_covariance.components, result, components.joined(none))
+
+
+def with_joint_model(
+    arm: Arm, capture: Capture, bounds: Bounds | None, model: str | None, prior: Prior | None
+) -> tuple[Arm, Bounds, Prior | None]:
+    """The arm, box and prior of a calibration with a model of the joints; without one, as they are given.
+
+    The box is by default that of `default_bounds`; the prior of a model that of `default_prior`.
+    """
+    if model is None:
+        if bounds is None:
+            bounds = default_bounds(arm, capture)
+            arm = bounds.space.base
+        return arm, bounds, prior
+    if not isinstance(model, str):
+        raise InputError(f"the model is {shown(model)}; give a text such as 'gravity,harmonics=1'.")
+    plain = without_corrections(arm)
+    bounds = default_bounds(plain, capture) if bounds is None else bounds
+    corrected = with_corrections(plain, model, gravity=DOWN if arm.gravity is None else arm.gravity)
+    bounds = with_coefficients(bounds, corrected)
+    arm = bounds.space.base  # with Hayati's beta, where the box has it
+    if prior is None and arm.corrections is not None:
+        prior = default_prior(arm)
+    return arm, bounds, prior
+
+
+def default_bounds(arm: Arm, capture: Capture) -> Bounds:
+    """Around the parameters that such data determine, as for an arm's file without ``[identification]``, and without
+    bounds around the coefficients of joint corrections."""
+    plain = without_corrections(arm)
+    try:
+        space = determined_parameters(plain, capture)
+    except InputError:
+        space = Parameters.free_of(plain)
+    bounds = Bounds.around(plain, space)
+    return bounds if arm.corrections is None else with_coefficients(bounds, arm)
+
+
+def with_coefficients(bounds: Bounds, arm: Arm) -> Bounds:
+    """The box of the Denavit-Hartenberg parameters, with the coefficients of a corrected arm free and without bounds:
+    their prior is enough."""
+    kept = [i for i, name in enumerate(bounds.space.names) if name not in correction_names(bounds.space.base)]
+    added = tuple(name for name in correction_names(arm) if not name.startswith("gravity_"))
+    names = (*(bounds.space.names[i] for i in kept), *added)
+    base = based_on(Parameters(bounds.space.base, names[: len(kept)]), arm).base
+    endless = np.full(len(added), np.inf)
+    sides = np.asarray(bounds.lower)[kept], np.asarray(bounds.upper)[kept]
+    return Bounds(Parameters(base, names), np.concatenate([sides[0], -endless]), np.concatenate([sides[1], endless]))

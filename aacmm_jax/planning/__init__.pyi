@@ -4,4 +4,4 @@ from .kit import KitPlan as KitPlan
 from .kit import plan_kit as plan_kit
 from .kit_placement import KitItem as KitItem
 from .motion import Motion as Motion
-from .options import PlanOptions as PlanOptions
+from .problem import PlanOptions as PlanOptions

@@ -8,40 +8,26 @@ from jaxtyping import Float, Int
 
 from ..core.arguments import with_options
 from ..core.arrays import Numbers
-from ..core.errors import InputError
+from ..core.errors import InputError, nearest
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
-from ..kinematics.cones import Cone, Cones
-from ..kinematics.workspace import configurations_at, reached
+from ..kinematics.workspace import Cone, Cones, cones_of, configurations_at, reached
 from ..uncertainty.identifiability import observability
-from .fedorov_exchange import Candidates, exchange
-from .information import (
-    LOOSE,
-    DesignProblem,
-    Pool,
-    Prediction,
-    best_poses,
-    candidates_of,
-    pool_of,
-    prediction_of,
-    predictions,
-)
+from .designs import Candidates
 from .motion import Motion, approaches, hardly_reached, ordered_motion
-from .options import (
+from .placement import (
     LEAST_POSES,
-    Criterion,
     FixturePlacement,
-    PlacementRegion,
-    PlanOptions,
-    PlanTask,
+    Pool,
+    best_placement,
+    candidates_of,
     check_counts,
-    check_length,
-    checked_cones,
     given_placement,
+    pool_of,
 )
-from .placement import best_placement
+from .problem import LOOSE, Criterion, DesignProblem, PlanOptions, Prediction, best_poses, prediction_of, predictions
 
 _CANDIDATES = 3000
 _LEAST_CANDIDATES, _ROUNDS = 20, 5  # in a socket, from so many rounds of random starts at most
@@ -126,71 +112,78 @@ def plan(
         >>> print(planned.random.largest > 2 * planned.predicted.largest)  # with random poses about 0.1 mm
         True
     """
-    task = PlanTask.of(arm, PlanOptions(**options))
-    options_of_all = task.options
-    ranges = PlacementRegion.of(task.arm, options_of_all.region, options_of_all.farthest)
-    check_counts(sockets, poses, len(task.space.names), u, lengths)
+    problem = DesignProblem.of(arm, PlanOptions(**options))
+    check_counts(sockets, poses, len(problem.space.names), u, lengths)
     if isinstance(sockets, Mapping):
         names, placement = given_placement(sockets, u, lengths)
     else:
         names = [chr(ord("A") + i) if sockets <= 26 else f"S{i + 1}" for i in range(sockets)]
         placement = None
-    span = (length, length) if isinstance(length, int | float) else length
+        if lengths:
+            raise InputError("lengths are between sockets that are given; with a number of sockets, give length and u.")
+    problem = problem.within(cones=_cones(cone, names, problem.options.tool_axis))
     if placement is None:
-        check_length(task.arm, span, lengths)
-    cones = checked_cones(cone, names, options_of_all.tool_axis)
-    problem = DesignProblem.of(task, task.search_region(cones))
-    if placement is None:
-        placement = best_placement(problem, len(names), poses, span, u, ranges, options_of_all)
-    pool, q, owner = _chosen(problem, placement, names, poses, options_of_all)
-    order, motion = ordered_motion(problem.region, q, owner, cones.normals[owner], problem.retract)
+        span = (length, length) if isinstance(length, int | float) else length
+        placement = best_placement(problem, len(names), poses, span, u)
+    pool, q, owner = _chosen(problem, placement, names, poses)
+    cones = problem.region.cones
+    assert cones is not None
+    order, motion = ordered_motion(problem.region, q, owner, cones.normals[owner], problem.options.retract)
     # From here on sockets have the order in which the arm visits them.
     visited = np.array(list(dict.fromkeys(owner[order].tolist())))
-    q, owner, place = q[order], np.argsort(visited)[owner[order]], np.argsort(visited)
+    place = np.argsort(visited)
+    q, owner = q[order], place[owner[order]]
     placement, cones, pool = placement.in_order(visited), cones.at(visited), pool._replace(owner=place[pool.owner])
     if isinstance(sockets, Mapping) or isinstance(cone, Mapping):  # otherwise names are given out in their order
         names = [names[i] for i in visited]
-    problem = problem._replace(region=problem.region._replace(cones=cones))
+    problem = problem.within(cones=cones)
+    distances = [float(np.linalg.norm(placement.points[b] - placement.points[a])) for a, b in placement.ends]
+    rows = zip(placement.ends, distances, placement.u, strict=True)
     planned = Plan(
-        arm=task.arm,
-        names=task.space.names,
+        arm=problem.arm,
+        names=problem.space.names,
         sockets={name: (x, y, z) for name, (x, y, z) in zip(names, placement.points.tolist(), strict=True)},
         q=q,
         owner=owner,
-        lengths=_reference_lengths(names, placement),
-        noise=task.noise,
-        criterion=options_of_all.criterion,
-        check_length=task.check_length,
+        lengths=tuple(ReferenceLength(names[a], names[b], distance, u) for (a, b), distance, u in rows),
+        noise=problem.noise,
+        criterion=problem.options.criterion,
+        check_length=problem.check_length,
         **_predictions(problem, placement, pool, q, owner),
         unconstrained=None,
         cones=cones,
         cell=problem.region.cell,
-        retract=problem.retract,
+        retract=problem.options.retract,
         motion=motion,
     )
-    unseen = observability(task.arm, planned.capture(), task.space)
-    if unseen.rank < len(task.space.names):
+    unseen = observability(problem.arm, planned.capture(), problem.space)
+    if unseen.rank < len(problem.space.names):
         raise InputError(f"no {poses} poses in these sockets determine the parameters. {' '.join(unseen.sentences())}")
-    if options_of_all.unconstrained:
-        free = problem._replace(region=problem.region._replace(cones=None, cell=None))
-        _, q, owner = _chosen(free, placement, names, poses, options_of_all)
-        planned = planned._replace(
-            unconstrained=prediction_of(free, candidates_of(free, placement, pool_of(free, q, owner)))
-        )
+    if problem.options.unconstrained:
+        free = problem.within(cones=None, cell=None)
+        _, q, owner = _chosen(free, placement, names, poses)
+        anywhere = prediction_of(free, candidates_of(free, placement, pool_of(free, q, owner)))
+        planned = planned._replace(unconstrained=anywhere)
     return planned
 
 
-def _reference_lengths(names: Sequence[str], placement: FixturePlacement) -> tuple[ReferenceLength, ...]:
-    distances = [float(np.linalg.norm(placement.points[b] - placement.points[a])) for a, b in placement.ends]
-    rows = zip(placement.ends, distances, placement.u, strict=True)
-    return tuple(ReferenceLength(names[a], names[b], distance, u) for (a, b), distance, u in rows)
+def _cones(
+    cone: Cone | Mapping[str, Cone] | None, names: Sequence[str], tool_axis: tuple[float, float, float]
+) -> Cones:
+    """The cone of each socket; a socket without one has the normal (0, 0, 1) and every direction."""
+    if isinstance(cone, Mapping):
+        for name in cone:
+            if name not in names:
+                raise InputError(f"a cone is given for the unknown socket '{name}'{nearest(str(name), names)}")
+    by_name = cone if isinstance(cone, Mapping) else dict.fromkeys(names, cone or Cone())
+    return cones_of([by_name.get(name, Cone()) for name in names], tool_axis)
 
 
 def _chosen(
-    problem: DesignProblem, placement: FixturePlacement, names: Sequence[str], poses: int, options: PlanOptions
+    problem: DesignProblem, placement: FixturePlacement, names: Sequence[str], poses: int
 ) -> tuple[Pool, Float[np.ndarray, "N n"], Int[np.ndarray, " N"]]:
     """The candidates for a placement, and the best poses found."""
-    region, retract = problem.region, problem.retract
+    region, retract = problem.region, problem.options.retract
 
     def possible(q: np.ndarray, owner: np.ndarray) -> Pool:
         """Those of the configurations that have an approach point."""
@@ -205,7 +198,7 @@ def _chosen(
         q, good = reached(region, starts, placement.points[owner], sockets=owner)
         return chosen.joined(possible(q[good], owner[good]))
 
-    starts = max((options.candidates or _CANDIDATES) // len(names), 50)
+    starts = max((problem.options.candidates or _CANDIDATES) // len(names), 50)
     pool = possible(*configurations_at(region, placement.points, starts))
     for _ in range(1, _ROUNDS):
         few = np.flatnonzero(np.bincount(pool.owner, minlength=len(names)) < _LEAST_CANDIDATES)
@@ -215,13 +208,7 @@ def _chosen(
     else:
         raise InputError(hardly_reached(f"socket '{names[few[0]]}'", placement.points[few[0]]))
     chosen = best_poses(
-        problem,
-        pool,
-        lambda pool: candidates_of(problem, placement, pool),
-        Pool.at,
-        near,
-        lambda candidates, report: exchange(candidates, poses, problem.objective, least=LEAST_POSES, progress=report),
-        options,
+        problem, pool, poses, LEAST_POSES, lambda pool: candidates_of(problem, placement, pool), Pool.at, near
     )
     return pool, chosen.q, chosen.owner
 

@@ -19,12 +19,12 @@ from ..kinematics.arm import Arm, joint_limits, parameter_names
 from ..kinematics.chain import joint_motion
 from ..kinematics.independence import generic_poses
 from ..kinematics.parameters import Parameters
-from ..kinematics.workspace import search_region
+from ..kinematics.workspace import configurations_at, search_region
 from ..uncertainty.identifiability import Observability, observability
 from ..uncertainty.volume import default_length, sample_lengths
-from .fedorov_exchange import Candidates, Objective, covariance_of
-from .information import PRIOR, DesignProblem, candidates_of, length_derivatives, pool_at, pool_of
-from .options import FixturePlacement
+from .designs import Candidates, Objective, covariance_of
+from .placement import FixturePlacement, candidates_of, pool_of
+from .problem import PRIOR, DesignProblem, length_derivatives
 
 COUNTS = (10, 15, 20, 30, 40, 60, 80, 120, 160, 240)  # of poses
 _LENGTHS = 200  # that predictions are of
@@ -175,7 +175,7 @@ def _thorough(
 def _in_sockets(problem: DesignProblem, points: Float[np.ndarray, "s 3"]) -> tuple[Candidates, int]:
     """Random poses in sockets, two by two at the ends of reference lengths, and how many there are."""
     pairs = tuple((i, i + 1) for i in range(0, len(points), 2))
-    pool = pool_at(problem, points, _STARTS)
+    pool = pool_of(problem, *configurations_at(problem.region, points, _STARTS))
     return candidates_of(problem, FixturePlacement(points, pairs, (U_LENGTH,) * len(pairs)), pool), len(pool.q)
 
 

@@ -1,11 +1,8 @@
-"""Plans with artefacts and instruments: where to put what is at hand, and which poses to take with it.
-
-The information of a pose is that of the model's own rows (`uncertainty.linearisation`), so every kind of observation
-that can be simulated can be planned, and nothing here depends on a kind.
-"""
+"""Plans with artefacts and instruments: where to put what is at hand, and which poses to take with it."""
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,19 +15,14 @@ from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import Cell
-from ..kinematics.cones import Cone, cones_of
-from ..kinematics.workspace import reached
+from ..kinematics.workspace import Cone, cones_of, reached
 from ..uncertainty.identifiability import observability
-from .fedorov_exchange import exchange
-from .information import LOOSE, DesignProblem, Prediction, best_poses, prediction_of, predictions
-from .kit_placement import KitItem, PlacedKit, approachable, candidates_of_kit, least_poses, place, region_of, set_up
+from .kit_placement import KitItem, Thing, candidates_of_kit, least_poses, place, set_up
 from .motion import Motion, ordered_motion
-from .options import Criterion, PlacementRegion, PlanOptions, PlanTask
+from .problem import LOOSE, Criterion, DesignProblem, PlanOptions, Prediction, best_poses, prediction_of, predictions
 
 _CANDIDATES = 2000
 _RANDOM_SETS, _LOOSE_SETS = 30, 5  # of poses, for predictions
-
-Observations = Sequence[AbstractObservation]
 
 
 class KitPlan(NamedTuple):
@@ -103,67 +95,39 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         >>> print(f"u of {planned.check_length:.0f} mm: at most {planned.predicted.largest:.2f} mm")
         u of 300 mm: at most 0.04 mm
     """
-    task = PlanTask.of(arm, PlanOptions(**options))
-    items, ranges = _checked(kit), PlacementRegion.of(task.arm, task.options.region, task.options.farthest)
-    problem = DesignProblem.of(task, task.search_region(cones_of([Cone()], task.options.tool_axis)))
-    count = task.options.candidates or _CANDIDATES
-    placed = place(problem, items, poses, ranges, task.options.report)
-    pool = _pool(problem, placed, count)
+    problem, items = DesignProblem.of(arm, PlanOptions(**options)), _checked(kit)
+    things = place(problem, items, poses)
+    pool = _pool(problem, things)
     least = least_poses(pool)
     if poses < least.sum():
         raise InputError(
             f"{poses} poses are too few for this kit; give {least.sum()} at least, or leave something out."
         )
-    chosen, motions = _in_order(problem, placed, _chosen(problem, placed, pool, poses, least, task.options))
-    unseen = observability(arm, Capture({}, (), chosen), task.space)
-    if unseen.rank < len(task.space.names):
+    chosen, motions = _in_order(problem, things, _chosen(problem, things, pool, poses, least))
+    unseen = observability(problem.arm, Capture({}, (), chosen), problem.space)
+    if unseen.rank < len(problem.space.names):
         raise InputError(f"this kit does not determine the parameters. {' '.join(unseen.sentences())}")
     planned = KitPlan(
-        arm=arm,
-        names=task.space.names,
-        kit=placed.kit,
-        parts=placed.parts,
+        arm=problem.arm,
+        names=problem.space.names,
+        kit=tuple(thing.simulated for thing in things),
+        parts=tuple(thing.item.simulated.name for thing in things),
         observations=tuple(chosen),
-        noise=task.noise,
-        criterion=task.options.criterion,
-        check_length=task.check_length,
-        **_predictions(problem, placed, pool, chosen, task.options),
+        noise=problem.noise,
+        criterion=problem.options.criterion,
+        check_length=problem.check_length,
+        **_predictions(problem, things, pool, chosen),
         motions=motions,
         cell=problem.region.cell,
-        retract=problem.retract,
+        retract=problem.options.retract,
     )
-    if task.options.unconstrained:
-        free = problem._replace(region=problem.region._replace(cell=None))
-        anywhere = placed._replace(items=tuple(item._replace(half_angle=math.pi) for item in placed.items))
-        poses_anywhere = _chosen(free, anywhere, _pool(free, anywhere, count), poses, least, task.options)
+    if problem.options.unconstrained:
+        free = problem.within(cell=None)
+        anywhere = [thing._replace(item=thing.item._replace(half_angle=math.pi)) for thing in things]
+        poses_anywhere = _chosen(free, anywhere, _pool(free, anywhere), poses, least)
         unconstrained = prediction_of(free, candidates_of_kit(free, poses_anywhere))
         planned = planned._replace(unconstrained=unconstrained)
     return planned
-
-
-def _pool(problem: DesignProblem, placed: PlacedKit, count: int) -> list[AbstractObservation]:
-    """Poses to choose from in everything."""
-    starts = count // len(placed.kit)
-    things = zip(placed.kit, placed.items, strict=True)
-    return [set_up(problem.region, thing, starts, item=item, retract=problem.retract) for thing, item in things]
-
-
-def _in_order(
-    problem: DesignProblem, placed: PlacedKit, chosen: Observations
-) -> tuple[list[AbstractObservation], tuple[Motion, ...]]:
-    """Each observation with its poses in the order in which to take them, place after place, and how the arm moves.
-
-    What has no cone has no normal either, and its tilts are not numbers.
-    """
-    ordered, motions = [], []
-    for simulated, item, poses in zip(placed.kit, placed.items, chosen, strict=True):
-        region, q = region_of(problem.region, simulated, item), np.asarray(poses.q)
-        assert region.cones is not None
-        normals = np.tile(region.cones.normals, (len(q), 1))
-        order, motion = ordered_motion(region, q, poses.places, normals, problem.retract if item.has_cone else 0.0)
-        ordered.append(poses.select(order))
-        motions.append(motion if item.has_cone else motion._replace(tilt=np.full(len(q), np.nan)))
-    return ordered, tuple(motions)
 
 
 def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
@@ -185,83 +149,94 @@ def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
     return items
 
 
+def _pool(problem: DesignProblem, things: Sequence[Thing]) -> list[AbstractObservation]:
+    """Poses to choose from in everything."""
+    starts = (problem.options.candidates or _CANDIDATES) // len(things)
+    return [set_up(problem.region, thing, starts, retract=problem.options.retract) for thing in things]
+
+
 def _chosen(
     problem: DesignProblem,
-    placed: PlacedKit,
+    things: Sequence[Thing],
     pool: list[AbstractObservation],
     poses: int,
     least: Int[np.ndarray, " s"],
-    options: PlanOptions,
 ) -> list[AbstractObservation]:
     """The best poses in everything."""
 
+    def taken(pool: list[AbstractObservation], rows: np.ndarray) -> list[AbstractObservation]:
+        """The observations with some of the poses of the pool, which are numbered through."""
+        first = np.cumsum([0, *(observation.q.shape[0] for observation in pool)])
+        parts = [np.sort(rows[(rows >= start) & (rows < end)]) - start for start, end in pairwise(first)]
+        return [observation.select(part) for observation, part in zip(pool, parts, strict=True)]
+
     def near(chosen: list[AbstractObservation]) -> list[AbstractObservation]:
-        return [_near(problem, *thing) for thing in zip(placed.kit, placed.items, chosen, strict=True)]
+        """The poses, and others near each: joints changed, and the tip brought back."""
+        poses = []
+        for thing, observation in zip(things, chosen, strict=True):
+            seat, q = thing.seat(problem.region), np.asarray(observation.q)
+            starts, which = problem.near(q)
+            moved, good = reached(seat, starts, np.asarray(seat.arm.position(q))[which])
+            good[good] = thing.approachable(seat, moved[good], problem.options.retract)
+            rows = np.concatenate([np.arange(len(q)), which[good]])
+            order = np.argsort(observation.places[rows], kind="stable")
+            q = np.concatenate([q, moved[good]])[order]
+            poses.append(observation.select(rows[order]).changed(q=q))
+        return poses
 
-    return best_poses(
-        problem,
-        pool,
-        lambda pool: candidates_of_kit(problem, pool),
-        _taken,
-        near,
-        lambda candidates, report: exchange(candidates, poses, problem.objective, least=least, progress=report),
-        options,
-    )
-
-
-def _taken(pool: Sequence[AbstractObservation], rows: Int[np.ndarray, " N"]) -> list[AbstractObservation]:
-    """The observations with some of the poses of the pool, numbered through."""
-    chosen, first = [], 0
-    for one in pool:
-        last = first + one.q.shape[0]
-        chosen.append(one.select(np.sort(rows[(rows >= first) & (rows < last)]) - first))
-        first = last
-    return chosen
+    return best_poses(problem, pool, poses, least, lambda pool: candidates_of_kit(problem, pool), taken, near)
 
 
-def _near(
-    problem: DesignProblem, simulated: AbstractSimulated, item: KitItem, chosen: AbstractObservation
-) -> AbstractObservation:
-    """The poses of an observation, and others near each: joints changed, and the tip brought back."""
-    region, q = region_of(problem.region, simulated, item), np.asarray(chosen.q)
-    starts, which = problem.near(q)
-    moved, good = reached(region, starts, np.asarray(region.arm.position(q))[which])
-    good[good] = approachable(region, moved[good], item, problem.retract)
-    rows = np.concatenate([np.arange(len(q)), which[good]])
-    order = np.argsort(chosen.places[rows], kind="stable")
-    return chosen.select(rows[order]).changed(q=np.concatenate([q, moved[good]])[order])
+def _in_order(
+    problem: DesignProblem, things: Sequence[Thing], chosen: Sequence[AbstractObservation]
+) -> tuple[list[AbstractObservation], tuple[Motion, ...]]:
+    """Each observation with its poses in the order in which to take them, place after place, and how the arm moves.
 
-
-def _loosened(
-    problem: DesignProblem, simulated: AbstractSimulated, item: KitItem, chosen: AbstractObservation
-) -> AbstractObservation:
-    """The same poses, with joints off by some degrees and the tip brought back."""
-    region, q = region_of(problem.region, simulated, item), np.asarray(chosen.q)
-    moved, good = reached(region, q + LOOSE * region.random.normal(size=q.shape), np.asarray(region.arm.position(q)))
-    return chosen.changed(q=np.where(good[:, None], moved, q))
+    What has no cone has no normal either, and its tilts are not numbers.
+    """
+    ordered, motions = [], []
+    for thing, poses in zip(things, chosen, strict=True):
+        seat, q = thing.seat(problem.region), np.asarray(poses.q)
+        assert seat.cones is not None
+        normals = np.tile(seat.cones.normals, (len(q), 1))
+        retract = problem.options.retract if thing.item.has_cone else 0.0
+        order, motion = ordered_motion(seat, q, poses.places, normals, retract)
+        ordered.append(poses.select(order))
+        motions.append(motion if thing.item.has_cone else motion._replace(tilt=np.full(len(q), np.nan)))
+    return ordered, tuple(motions)
 
 
 def _predictions(
     problem: DesignProblem,
-    placed: PlacedKit,
+    things: Sequence[Thing],
     pool: list[AbstractObservation],
     chosen: list[AbstractObservation],
-    options: PlanOptions,
 ) -> dict[str, Any]:
     """For the plan, for random poses, for imprecise and more poses, and without each part of the kit."""
-    options.report("Predicting", 0.0)
+
+    def loosened(thing: Thing, poses: AbstractObservation) -> AbstractObservation:
+        """The same poses, with joints off by some degrees and the tip brought back."""
+        seat, q = thing.seat(problem.region), np.asarray(poses.q)
+        starts = q + LOOSE * seat.random.normal(size=q.shape)
+        moved, good = reached(seat, starts, np.asarray(seat.arm.position(q)))
+        return poses.changed(q=np.where(good[:, None], moved, q))
+
+    report, names = problem.options.report, [thing.item.simulated.name for thing in things]
+    report("Predicting", 0.0)
     planned, possible = candidates_of_kit(problem, chosen), candidates_of_kit(problem, pool)
-    things = list(zip(placed.kit, placed.items, chosen, strict=True))
-    loose = (candidates_of_kit(problem, [_loosened(problem, *thing) for thing in things]) for _ in range(_LOOSE_SETS))
+    loose = (
+        candidates_of_kit(problem, [loosened(*pair) for pair in zip(things, chosen, strict=True)])
+        for _ in range(_LOOSE_SETS)
+    )
     predicted: dict[str, Any] = predictions(problem, planned, possible, loose, _RANDOM_SETS)
     without = {}
-    parts = list(dict.fromkeys(placed.parts)) if len(set(placed.parts)) > 1 else []
+    parts = list(dict.fromkeys(names)) if len(set(names)) > 1 else []
     for number, part in enumerate(parts):
-        options.report("Predicting", 0.4 + 0.6 * number / len(parts))
-        left = [poses for poses, of_part in zip(chosen, placed.parts, strict=True) if of_part != part]
+        report("Predicting", 0.4 + 0.6 * number / len(parts))
+        left = [poses for poses, name in zip(chosen, names, strict=True) if name != part]
         seen = observability(problem.arm, Capture({}, (), left), problem.space)
-        complete = seen.rank == len(problem.space.names)
-        open_ended = Prediction(math.inf, math.inf)
-        without[part] = prediction_of(problem, candidates_of_kit(problem, left)) if complete else open_ended
-    options.report("Predicting", 1.0)
+        without[part] = Prediction(math.inf, math.inf)
+        if seen.rank == len(problem.space.names):
+            without[part] = prediction_of(problem, candidates_of_kit(problem, left))
+    report("Predicting", 1.0)
     return predicted | {"without": without}

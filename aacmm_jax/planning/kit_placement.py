@@ -1,7 +1,11 @@
-"""Where to put what is in a kit: random placements, ranked by the poses that they allow, then moved a little."""
+"""Where to put what is in a kit: random placements, ranked by the poses that they allow, then moved a little.
+
+The information of a pose is that of the model's own rows (`uncertainty.linearisation`), so every kind of observation
+that can be simulated can be planned, and nothing here depends on a kind.
+"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,15 +18,12 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.rotations import rotation_vector
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation, AbstractSimulated
-from ..kinematics.cones import TOOL_AXIS, Cone, cones_of
-from ..kinematics.workspace import SearchRegion, reached, total_link_length
+from ..kinematics.workspace import TOOL_AXIS, Cone, SearchRegion, cones_of, reached, total_link_length
 from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation
-from .fedorov_exchange import Candidates, relaxed_value
-from .information import PRIOR, DesignProblem
+from .designs import Candidates, best_layout, relaxed_value
 from .motion import approaches, hardly_reached
-from .options import PlacementRegion
-from .placement import best_layout
+from .problem import PRIOR, DesignProblem
 
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS = 120, 8, 60
 _STARTS, _DESIGN_STARTS = 120, 400  # random configurations for each thing: of the first score, and of the second
@@ -33,6 +34,8 @@ _LEAST_U = 1e-4  # mm: an exact certified value would be a row of infinite weigh
 _START_AGREES = 0.1  # mm or rad: a start of the geometry that is farther off is fitted
 _TRIES = 200
 _SHIFT, _ROTATION = 0.06, 0.4  # of a neighbour: relative to the sum of the links; rad
+
+Frame = Float[np.ndarray, " 6"]
 
 
 class KitItem(NamedTuple):
@@ -59,25 +62,31 @@ class KitItem(NamedTuple):
         return self.half_angle < math.pi
 
 
-class PlacedKit(NamedTuple):
-    """Things in their places."""
+class Thing(NamedTuple):
+    """An item in one of its places."""
 
-    items: tuple[KitItem, ...]  # of which each is a placement
-    kit: tuple[AbstractSimulated, ...]
-    frames: tuple[Float[np.ndarray, " 6"] | None, ...]  # None of what stands where it is
+    item: KitItem
+    simulated: AbstractSimulated
+    frame: Frame | None = None  # None of what stands where it is
 
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The name of the item of each."""
-        return tuple(item.simulated.name for item in self.items)
+    def at(self, frame: Frame) -> "Thing":
+        """The same thing elsewhere."""
+        simulated: Any = self.item.simulated.placed(self.simulated.name, frame)
+        return Thing(self.item, simulated, frame)
 
-    def placed(self, frames: Sequence[Float[np.ndarray, " 6"] | None]) -> "PlacedKit":
-        """The same things elsewhere."""
-        things = zip(self.items, self.kit, frames, strict=True)
-        kit: list[Any] = [
-            thing if frame is None else item.simulated.placed(thing.name, frame) for item, thing, frame in things
-        ]
-        return PlacedKit(self.items, tuple(kit), tuple(frames))
+    def seat(self, region: SearchRegion) -> SearchRegion:
+        """The region of the tip that it holds, with its cone."""
+        if self.simulated.offset is not None:
+            region = region._replace(arm=region.arm.replace(probe=self.simulated.offset))
+        normal = np.asarray(self.simulated.orientation) @ np.asarray(self.item.normal, dtype=float)
+        axis = TOOL_AXIS if region.cones is None else tuple(region.cones.tool_axis.tolist())
+        return region._replace(cones=cones_of([Cone(self.item.half_angle, tuple(normal.tolist()))], axis))
+
+    def approachable(self, seat: SearchRegion, q: Float[np.ndarray, "c n"], retract: float) -> Bool[np.ndarray, " c"]:
+        """Which poses can be taken by way of their approach points; all where it has none."""
+        if not (retract and self.item.has_cone and seat.cones is not None):
+            return np.ones(len(q), dtype=bool)
+        return approaches(seat, q, np.tile(seat.cones.normals, (len(q), 1)), retract).possible
 
 
 class _WithoutErrors(np.random.Generator):
@@ -87,37 +96,20 @@ class _WithoutErrors(np.random.Generator):
         return loc + 0.0 * scale * np.zeros(() if size is None else size)
 
 
-def region_of(region: SearchRegion, simulated: AbstractSimulated, item: KitItem | None = None) -> SearchRegion:
-    """The region of the tip that an observation holds, with the cone of its item."""
-    if simulated.offset is not None:
-        region = region._replace(arm=region.arm.replace(probe=simulated.offset))
-    if item is None:
-        return region
-    normal = np.asarray(simulated.orientation) @ np.asarray(item.normal, dtype=float)
-    axis = TOOL_AXIS if region.cones is None else tuple(region.cones.tool_axis.tolist())
-    return region._replace(cones=cones_of([Cone(item.half_angle, tuple(normal.tolist()))], axis))
-
-
 def set_up(
-    region: SearchRegion,
-    simulated: AbstractSimulated,
-    starts: int,
-    share: float = 0.0,
-    item: KitItem | None = None,
-    retract: float = 0.0,
+    region: SearchRegion, thing: Thing, starts: int, share: float = 0.0, retract: float = 0.0
 ) -> AbstractObservation:
     """Poses in one thing from random starts, as the observation that they would give without errors of the arm.
 
-    ``item`` says from which cone it is approached, and ``retract`` how far its approach points are, mm. Raises
-    `InputError` where a place is reached from fewer than this ``share`` of the starts, or hardly ever.
+    ``retract`` says how far its approach points are, mm. Raises `InputError` where a place is reached from fewer than
+    this ``share`` of the starts, or hardly ever.
     """
-    seat = region_of(region, simulated, item)
+    seat, simulated = thing.seat(region), thing.simulated
     places = len(simulated.changed(poses=1).tips(np.random.default_rng(0)))
     many = simulated.changed(poses=max(starts // places, 2 * _LEAST_CANDIDATES))
     tips = many.tips(region.random)
     q, good = reached(seat, seat.draw(len(tips)), tips, scattered=True)
-    if item is not None:
-        good[good] = approachable(seat, q[good], item, retract)
+    good[good] = thing.approachable(seat, q[good], retract)
     transforms = np.asarray(seat.arm.pose(q)).copy()
     transforms[:, :3, 3] = tips
     # In NumPy: every number of poses would be another program of JAX.
@@ -128,15 +120,6 @@ def set_up(
         point = tips[whole.places == int(np.argmin(counts / tried))][0]
         raise InputError(hardly_reached(f"'{simulated.name}'", point))
     return whole.select(np.flatnonzero(good))
-
-
-def approachable(
-    region: SearchRegion, q: Float[np.ndarray, "c n"], item: KitItem, retract: float
-) -> Bool[np.ndarray, " c"]:
-    """Which poses of an item can be taken by way of their approach points; all where it has none."""
-    if not (retract and item.has_cone and region.cones is not None):
-        return np.ones(len(q), dtype=bool)
-    return approaches(region, q, np.tile(region.cones.normals, (len(q), 1)), retract).possible
 
 
 def candidates_of_kit(problem: DesignProblem, observations: Sequence[AbstractObservation]) -> Candidates:
@@ -174,124 +157,110 @@ def least_poses(observations: Sequence[AbstractObservation]) -> Int[np.ndarray, 
     return np.array(least)
 
 
-def place(
-    problem: DesignProblem,
-    items: Sequence[KitItem],
-    poses: int,
-    ranges: PlacementRegion,
-    report: Callable[[str, float], None],
-) -> PlacedKit:
+def place(problem: DesignProblem, items: Sequence[KitItem], poses: int) -> list[Thing]:
     """The best placement found of what is to be placed; the rest stands where it is."""
-    of_things, kit = [], []
+    things = []
     for item in items:
         name = item.simulated.name
         if item.places and item.simulated.placed(name, np.zeros(6)) is None:
             raise InputError(f"'{name}' is an instrument and has no placements; remove its number of places.")
         names = [f"{name}/{i + 1}" for i in range(item.places)] if item.places > 1 else [name]
-        kit += [item.simulated.changed(name=one) for one in names]
-        of_things += [item] * len(names)
-    standing = PlacedKit(tuple(of_things), tuple(kit), (None,) * len(kit))
+        things += [Thing(item, item.simulated.changed(name=name)) for name in names]
     if not any(item.places for item in items):
-        return standing
-    return _Search(problem, standing, poses, ranges).best(report)
+        return things
 
+    def value(pools: Sequence[AbstractObservation], iterations: int) -> float:
+        return relaxed_value(candidates_of_kit(problem, pools), poses, problem.objective, iterations)
 
-class _Search(NamedTuple):
-    problem: DesignProblem
-    standing: PlacedKit
-    poses: int
-    ranges: PlacementRegion
+    def report(fraction: float) -> None:
+        problem.options.report("Placing the kit", fraction)
 
-    def best(self, report: Callable[[str, float], None]) -> PlacedKit:
-        """Random placements scored by random poses, the best few by relaxed designs, then neighbours of the best."""
-        stage = "Placing the kit"
-        scored: list[tuple[float, int, PlacedKit]] = []
-        for number in range(_PLACEMENTS):
-            report(stage, 0.4 * number / _PLACEMENTS)
-            frames = [self._random_frame(item) if item.places else None for item in self.standing.items]
-            layout = self.standing.placed(frames)
-            pools = self._pools(layout, _STARTS)
-            if pools is not None:
-                scored.append((self._value(pools, 0), number, layout))
-        if not scored:
-            raise InputError(
-                "no placement of the kit was found that can be reached well; give a region nearer to the arm, fewer "
-                "places, or wider cones."
-            )
-        return best_layout(
-            [layout for _, _, layout in sorted(scored)[:_DESIGNED]],
-            lambda layout, best, pools: self._pools(layout, _DESIGN_STARTS, best, pools),
-            lambda layout, pools: self._value(pools, _ITERATIONS),
-            self._neighbour,
-            _NEIGHBOURS,
-            lambda fraction: report(stage, fraction),
+    scored: list[tuple[float, int, list[Thing]]] = []
+    for number in range(_PLACEMENTS):
+        report(0.4 * number / _PLACEMENTS)
+        layout = [thing.at(_random_frame(problem, thing.item)) if thing.item.places else thing for thing in things]
+        pools = _pools(problem, layout, _STARTS)
+        if pools is not None:
+            scored.append((value(pools, 0), number, layout))
+    if not scored:
+        raise InputError(
+            "no placement of the kit was found that can be reached well; give a region nearer to the arm, fewer "
+            "places, or wider cones."
         )
+    return best_layout(
+        [layout for _, _, layout in sorted(scored)[:_DESIGNED]],
+        lambda layout, best, pools: _pools(problem, layout, _DESIGN_STARTS, best, pools),
+        lambda layout, pools: value(pools, _ITERATIONS),
+        lambda layout: _neighbour(problem, layout),
+        _NEIGHBOURS,
+        report,
+    )
 
-    def _value(self, pools: Sequence[AbstractObservation], iterations: int) -> float:
-        candidates = candidates_of_kit(self.problem, pools)
-        return relaxed_value(candidates, self.poses, self.problem.objective, iterations)
 
-    def _pools(
-        self,
-        layout: PlacedKit,
-        starts: int,
-        before: PlacedKit | None = None,
-        known: Sequence[AbstractObservation] | None = None,
-    ) -> list[AbstractObservation] | None:
-        """Poses in everything, those of what has not moved kept; None where something is hard to reach."""
-        pools = []
-        for i, (item, simulated, frame) in enumerate(zip(*layout, strict=True)):
-            if before is not None and known is not None and frame is before.frames[i]:
-                pools.append(known[i])
-                continue
-            try:
-                share = 0.0 if frame is None else _REACHED
-                pools.append(set_up(self.problem.region, simulated, starts, share, item))
-            except InputError:
-                if frame is None:
-                    raise
-                return None
-        return pools
-
-    def _random_frame(self, item: KitItem) -> Float[np.ndarray, " 6"]:
-        """A rotation, and the middle of the thing where the tip of a random configuration is."""
-        random = self.problem.region.random
-        local = _extent(item.simulated)
-        for _ in range(_TRIES):
-            turn = {
-                "any": Rotation.from_quat(random.normal(size=4)),
-                "vertical": Rotation.from_rotvec([0, 0, random.uniform(-np.pi, np.pi)]),
-                "not": Rotation.identity(),
-            }[item.turned]
-            middle = np.asarray(self.problem.arm.position(self.problem.region.draw(1)))[0]
-            frame = _about(turn, local.mean(axis=0), middle)
-            if self.ranges.contains(turn.apply(local) + frame[3:]).all():
-                return frame
-        raise InputError(f"'{item.simulated.name}' does not fit into the region; widen it.")
-
-    def _neighbour(self, layout: PlacedKit) -> PlacedKit | None:
-        """With one thing shifted and turned a little, or None where that leaves the region."""
-        random = self.problem.region.random
-        which = random.choice([i for i, frame in enumerate(layout.frames) if frame is not None])
-        item, frame = layout.items[which], layout.frames[which]
-        assert frame is not None
-        axes = {"any": [1, 1, 1], "vertical": [0, 0, 1], "not": [0, 0, 0]}[item.turned]
-        turn = Rotation.from_rotvec(_ROTATION * random.normal(size=3) * axes) * Rotation.from_rotvec(frame[:3])
-        local = _extent(item.simulated)
-        old = Rotation.from_rotvec(frame[:3]).apply(local.mean(axis=0)) + frame[3:]
-        shift = _SHIFT * total_link_length(self.problem.arm) * random.normal(size=3)
-        new = _about(turn, local.mean(axis=0), old + shift)
-        if not self.ranges.contains(turn.apply(local) + new[3:]).all():
+def _pools(
+    problem: DesignProblem,
+    layout: Sequence[Thing],
+    starts: int,
+    before: Sequence[Thing] | None = None,
+    reusable: Sequence[AbstractObservation] | None = None,
+) -> list[AbstractObservation] | None:
+    """Poses in everything, those of what has not moved reused; None where something is hard to reach."""
+    pools = []
+    for i, thing in enumerate(layout):
+        if before is not None and reusable is not None and thing.frame is before[i].frame:
+            pools.append(reusable[i])
+            continue
+        try:
+            pools.append(set_up(problem.region, thing, starts, 0.0 if thing.frame is None else _REACHED))
+        except InputError:
+            if thing.frame is None:
+                raise
             return None
-        return layout.placed([new if i == which else frame for i, frame in enumerate(layout.frames)])
+    return pools
 
 
-def _extent(simulated: AbstractSimulated) -> Float[np.ndarray, "m 3"]:
+def _random_frame(problem: DesignProblem, item: KitItem) -> Frame:
+    """A rotation, and the middle of the thing where the tip of a random configuration is."""
+    random = problem.region.random
+    for _ in range(_TRIES):
+        turn = {
+            "any": Rotation.from_quat(random.normal(size=4)),
+            "vertical": Rotation.from_rotvec([0, 0, random.uniform(-np.pi, np.pi)]),
+            "not": Rotation.identity(),
+        }[item.turned]
+        middle = np.asarray(problem.arm.position(problem.region.draw(1)))[0]
+        frame = _frame_within(problem, item, turn, middle)
+        if frame is not None:
+            return frame
+    raise InputError(f"'{item.simulated.name}' does not fit into the region; widen it.")
+
+
+def _neighbour(problem: DesignProblem, layout: Sequence[Thing]) -> list[Thing] | None:
+    """With one thing shifted and turned a little, or None where that leaves the region."""
+    random = problem.region.random
+    which = random.choice([i for i, thing in enumerate(layout) if thing.frame is not None])
+    item, frame = layout[which].item, layout[which].frame
+    assert frame is not None
+    axes = {"any": [1, 1, 1], "vertical": [0, 0, 1], "not": [0, 0, 0]}[item.turned]
+    former = Rotation.from_rotvec(frame[:3])
+    turn = Rotation.from_rotvec(_ROTATION * random.normal(size=3) * axes) * former
+    middle = former.apply(_points_of(item).mean(axis=0)) + frame[3:]
+    shift = _SHIFT * total_link_length(problem.arm) * random.normal(size=3)
+    moved = _frame_within(problem, item, turn, middle + shift)
+    if moved is None:
+        return None
+    return [thing.at(moved) if i == which else thing for i, thing in enumerate(layout)]
+
+
+def _frame_within(
+    problem: DesignProblem, item: KitItem, turn: Rotation, middle: Float[np.ndarray, " 3"]
+) -> Frame | None:
+    """The frame that turns a thing and takes its middle to a point; None where that is not within the region."""
+    points, matrix = _points_of(item), turn.as_matrix()
+    frame = np.concatenate([np.asarray(rotation_vector(matrix)), middle - matrix @ points.mean(axis=0)])
+    return frame if problem.contains(turn.apply(points) + frame[3:]).all() else None
+
+
+def _points_of(item: KitItem) -> Float[np.ndarray, "m 3"]:
     """Some of the points of a thing, where it stands."""
-    return simulated.changed(poses=20).tips(np.random.default_rng(0))
-
-
-def _about(turn: Rotation, middle: Float[np.ndarray, " 3"], to: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 6"]:
-    """The frame that turns a thing and takes its middle to a point."""
-    matrix = turn.as_matrix()
-    return np.concatenate([np.asarray(rotation_vector(matrix)), to - matrix @ middle])
+    return item.simulated.changed(poses=20).tips(np.random.default_rng(0))

@@ -10,10 +10,8 @@ from jaxtyping import Bool, Float, Int
 from ..core.numpy_or_jax import to_numpy
 from ..kinematics.arm import Arm
 from ..kinematics.collisions import clearances, is_clear, nearest_contact
-from ..kinematics.cones import Cone, cones_of, tilts
-from ..kinematics.correction import readings_at_poses
-from ..kinematics.inverse_kinematics import project_to_targets
-from ..kinematics.workspace import SearchRegion, lowest_point
+from ..kinematics.inverse_kinematics import project_to_targets, readings_at_poses
+from ..kinematics.workspace import Cone, SearchRegion, cones_of, lowest_point, tilts
 
 _STEP = np.radians(2.0)  # largest step of a joint between samples of a move
 _ROUNDS = 25  # of ordering and checking

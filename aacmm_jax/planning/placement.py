@@ -1,19 +1,27 @@
-"""Where to set up sockets and reference lengths: random placements, ranked by the poses that they allow, then moved."""
+"""Sockets and reference lengths: where to set them up, by the poses that they allow, and what these poses tell."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from ..core.errors import InputError
-from ..core.numpy_or_jax import in_chunks
-from ..kinematics.workspace import reached, total_link_length
-from .fedorov_exchange import relaxed_value
-from .information import DesignProblem, Pool, candidates_of, pool_at, pool_of
-from .options import LEAST_POSES, FixturePlacement, PlacementRegion, PlanOptions
+from ..core.arrays import Numbers
+from ..core.errors import InputError, nearest
+from ..core.linear_algebra import inverse_cholesky
+from ..core.numpy_or_jax import in_chunks, to_numpy
+from ..data.noise import tip_covariances
+from ..data.simulation import socket_point
+from ..kinematics.arm import jacobian_at
+from ..kinematics.chain import joint_motion
+from ..kinematics.workspace import configurations_at, reached, total_link_length
+from .designs import Candidates, best_layout, relaxed_value
+from .problem import PRIOR, DesignProblem
 
+LEAST_POSES = 2  # in a socket: one shows no scatter
+_U_RANGE = (1e-6, 100.0)  # mm
 # Random placements, those of them for which poses are chosen, tried neighbours of the best, and starts for each.
 _PLACEMENTS, _DESIGNED, _NEIGHBOURS, _STARTS = 600, 10, 200, 1000
 _BLOCK = 25  # placements scored together
@@ -24,57 +32,134 @@ _ITERATIONS = 8  # of the relaxed design: as good a ranking as by a sweep of exc
 _STEPS = 10  # of inverse kinematics, for a neighbour: enough for configurations that are moved along
 _SHIFT, _ROTATION = 0.05, 0.4  # of a neighbour: relative to the sum of the links; rad
 
-Layout = TypeVar("Layout")
-Poses = TypeVar("Poses")
+
+class FixturePlacement(NamedTuple):
+    """Positions of sockets, and which of them are the ends of reference lengths, of what standard uncertainty; mm."""
+
+    points: Float[np.ndarray, "s 3"]
+    ends: tuple[tuple[int, int], ...]
+    u: tuple[float, ...]
+
+    def in_order(self, sockets: Int[np.ndarray, " s"]) -> "FixturePlacement":
+        """The same sockets in another order."""
+        place = np.argsort(sockets).tolist()
+        ends = tuple((place[start], place[end]) for start, end in self.ends)
+        return FixturePlacement(self.points[sockets], ends, self.u)
 
 
-def best_layout(
-    shortlist: Sequence[Layout],
-    poses_in: Callable[[Layout, Layout | None, Poses | None], Poses | None],
-    score: Callable[[Layout, Poses], float],
-    neighbour: Callable[[Layout], Layout | None],
-    tries: int,
-    report: Callable[[float], None],
-) -> Layout:
-    """The layout with the lowest score among some good ones and, then, neighbours of the best so far.
+def check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, lengths: Sequence[tuple]) -> None:
+    """Raise `InputError` where there are too few poses, or an uncertainty is none."""
+    for stated in (u, *(float(pair[2]) for pair in lengths if len(pair) > 2)):
+        if not _U_RANGE[0] <= stated <= _U_RANGE[1]:
+            raise InputError(
+                f"u of a reference length is {stated:g} mm; give a standard uncertainty from {_U_RANGE[0]:g} to "
+                f"{_U_RANGE[1]:g} mm."
+            )
+    number = len(sockets) if isinstance(sockets, Mapping) else sockets
+    if number < 1 or poses < LEAST_POSES * number:
+        raise InputError(
+            f"{poses} poses are too few for {number} sockets; give one socket or more, and {LEAST_POSES} poses in each."
+        )
+    unknowns = parameters + 3 * number - (len(lengths) if isinstance(sockets, Mapping) else number // 2)
+    if 3 * poses < unknowns:
+        raise InputError(
+            f"{poses} poses in {number} sockets give fewer equations than the {unknowns} unknowns; take "
+            f"{-(-unknowns // 3)} at least."
+        )
 
-    ``poses_in(layout, best, poses)`` are poses in a layout, which may reuse those in the best; None where it is not
-    reached. ``report`` is called with the fraction done.
-    """
-    best, best_poses, best_score = None, None, np.inf
-    for number in range(len(shortlist) + tries):
-        report(0.4 + 0.6 * number / (len(shortlist) + tries))
-        if number < len(shortlist):
-            layout, poses = shortlist[number], poses_in(shortlist[number], None, None)
-        elif best is None:
-            break
-        else:
-            layout = neighbour(best)
-            poses = None if layout is None else poses_in(layout, best, best_poses)
-        value = np.inf if layout is None or poses is None else score(layout, poses)
-        if value < best_score:
-            best, best_poses, best_score = layout, poses, value
-    report(1.0)
-    return shortlist[0] if best is None else best
+
+def given_placement(
+    sockets: Mapping[str, Numbers], u: float, lengths: Sequence[tuple]
+) -> tuple[list[str], FixturePlacement]:
+    """Names and placement of sockets whose positions are given."""
+    points = {name: np.asarray(socket_point(name, point)) for name, point in sockets.items()}
+    names = list(points)
+    for pair in lengths:
+        for end in pair[:2]:
+            if end not in names:
+                raise InputError(
+                    f"reference length {pair[0]}, {pair[1]} names the unknown socket '{end}'{nearest(end, names)}"
+                )
+    if len({frozenset(pair[:2]) for pair in lengths}) < len(lengths):
+        raise InputError("a reference length is named twice; its certified value counts once, so name it once.")
+    if any(len(set(pair[:2])) < 2 for pair in lengths):
+        raise InputError("a reference length joins a socket to itself; name two different sockets.")
+    for i, name in enumerate(names):
+        for other in names[:i]:
+            if np.linalg.norm(points[name] - points[other]) < 1:
+                raise InputError(f"sockets '{other}' and '{name}' are in the same position; move one, or leave it out.")
+    ends = tuple((names.index(pair[0]), names.index(pair[1])) for pair in lengths)
+    each_u = tuple(float(pair[2]) if len(pair) > 2 else u for pair in lengths)
+    return names, FixturePlacement(np.array(list(points.values())), ends, each_u)
+
+
+class Pool(NamedTuple):
+    """Configurations in sockets, and what each measures of the parameters: derivatives of the tip, whitened."""
+
+    q: Float[np.ndarray, "c n"]
+    owner: Int[np.ndarray, " c"]  # index of each one's socket
+    jacobian: Float[np.ndarray, "c 3 p"]  # by the parameters in natural steps, in standard deviations
+    roots: Float[np.ndarray, "c 3 3"]  # that whiten the tips
+
+    def at(self, rows: Any) -> "Pool":
+        """Some of these configurations."""
+        return Pool(*(part[rows] for part in self))
+
+    def joined(self, other: "Pool") -> "Pool":
+        """Both."""
+        return Pool(*(np.concatenate(parts) for parts in zip(self, other, strict=True)))
+
+    def fewest(self, sockets: int) -> int:
+        """The number of configurations in the socket that has the fewest."""
+        return int(np.bincount(self.owner, minlength=sockets).min())
+
+
+def pool_of(problem: DesignProblem, q: Float[np.ndarray, "c n"], owner: Int[np.ndarray, " c"]) -> Pool:
+    """Configurations with their whitened derivatives."""
+    geometry, noise = to_numpy((problem.arm.geometry, problem.noise))
+
+    def whitening(rows: np.ndarray) -> np.ndarray:
+        covariances = tip_covariances(geometry, joint_motion(geometry, rows), noise)
+        return np.asarray(inverse_cholesky(np.moveaxis(np.asarray(covariances), -1, 0)))
+
+    roots = in_chunks(whitening, q)
+    jacobian = jacobian_at(problem.arm, q, problem.space.names) * np.asarray(problem.space.scale)
+    return Pool(q, owner, roots @ jacobian, roots)
+
+
+def candidates_of(problem: DesignProblem, placement: FixturePlacement, pool: Pool) -> Candidates:
+    """The information that each configuration would add, and that of the lengths alone."""
+    p, sockets = len(problem.space.names), len(placement.points)
+    unknowns = p + 3 * sockets
+    rows = np.zeros((len(pool.q), 3, unknowns))
+    rows[:, :, :p] = pool.jacobian
+    for axis in range(3):
+        rows[np.arange(len(pool.q)), :, p + 3 * pool.owner + axis] = -pool.roots[:, :, axis]
+    base = PRIOR * np.eye(unknowns)
+    for (start, end), u in zip(placement.ends, placement.u, strict=True):
+        between = placement.points[end] - placement.points[start]
+        row = np.zeros(unknowns)
+        direction = between / np.linalg.norm(between)
+        row[p + 3 * end : p + 3 * end + 3], row[p + 3 * start : p + 3 * start + 3] = direction, -direction
+        base += np.outer(row, row) / u**2
+    return Candidates(rows, pool.owner, base, p)
 
 
 def best_placement(
-    problem: DesignProblem,
-    sockets: int,
-    poses: int,
-    length: tuple[float, float],
-    u: float,
-    ranges: PlacementRegion,
-    options: PlanOptions,
+    problem: DesignProblem, sockets: int, poses: int, length: tuple[float, float], u: float
 ) -> FixturePlacement:
     """The best placement found: random ones scored by random poses, the best few by chosen poses, then neighbours."""
+    low, high = length
+    if not 0 < low <= high < 2 * total_link_length(problem.arm):
+        raise InputError(
+            f"a reference length of {low:g} to {high:g} mm does not fit this arm; give one shorter than its reach."
+        )
 
     def report(fraction: float) -> None:
-        options.report("Placing the sockets", fraction)
+        problem.options.report("Placing the sockets", fraction)
 
     report(0.0)
-    placements = random_placements(problem, _PLACEMENTS, sockets, length, u, ranges)
-    scores: list[float] = []
+    placements, scores = _random_placements(problem, sockets, length, u), []
     while len(scores) < len(placements):
         scores += _random_scores(problem, placements[len(scores) : len(scores) + _BLOCK], poses)
         report(0.4 * len(scores) / len(placements))
@@ -90,71 +175,61 @@ def best_placement(
 
     def pool_in(placement: FixturePlacement, best: FixturePlacement | None, pool: Pool | None) -> Pool:
         if best is None or pool is None:
-            return pool_at(problem, placement.points, starts)
+            return pool_of(problem, *configurations_at(problem.region, placement.points, starts))
         return _moved_pool(problem, pool, best, placement, starts)
 
-    return best_layout(
-        shortlist,
-        pool_in,
-        lambda placement, pool: _designed_score(problem, placement, pool, poses),
-        lambda placement: _neighbour(problem, placement, ranges),
-        _NEIGHBOURS,
-        report,
-    )
+    def score(placement: FixturePlacement, pool: Pool) -> float:
+        if pool.fewest(sockets) < LEAST_POSES:
+            return np.inf
+        return relaxed_value(candidates_of(problem, placement, pool), poses, problem.objective, _ITERATIONS)
+
+    return best_layout(shortlist, pool_in, score, lambda placement: _neighbour(problem, placement), _NEIGHBOURS, report)
 
 
-def _random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:
-    """The objective for so many random poses in each placement; infinite if a socket is hard to reach."""
-    sockets = len(placements[0].points)
-    pool = pool_at(problem, np.concatenate([placement.points for placement in placements]), _FEW_STARTS)
-    scores = []
-    for number, placement in enumerate(placements):
-        part = pool.at(pool.owner // sockets == number)
-        part = part._replace(owner=part.owner % sockets)
-        enough = part.fewest(sockets) >= _REACHED * _FEW_STARTS
-        scores.append(
-            relaxed_value(candidates_of(problem, placement, part), poses, problem.objective, 0) if enough else np.inf
-        )
-    return scores
-
-
-def _designed_score(problem: DesignProblem, placement: FixturePlacement, pool: Pool, poses: int) -> float:
-    """The objective for nearly the best poses; infinite if a socket is not reached."""
-    if pool.fewest(len(placement.points)) < LEAST_POSES:
-        return np.inf
-    return relaxed_value(candidates_of(problem, placement, pool), poses, problem.objective, _ITERATIONS)
-
-
-def random_placements(
-    problem: DesignProblem, count: int, sockets: int, length: tuple[float, float], u: float, ranges: PlacementRegion
+def _random_placements(
+    problem: DesignProblem, sockets: int, length: tuple[float, float], u: float
 ) -> list[FixturePlacement]:
-    """Random placements of sockets within ranges, two by two as the ends of the reference length."""
-    random = problem.region.random
+    """Random placements of sockets within the region, two by two as the ends of the reference length."""
+    random, pairs = problem.region.random, sockets // 2
     placements: list[FixturePlacement] = []
-    pairs = sockets // 2
     ends = tuple((2 * i, 2 * i + 1) for i in range(pairs))
     for _ in range(60):
-        drawn = problem.region.draw(40 * count * (pairs + 1))
+        drawn = problem.region.draw(40 * _PLACEMENTS * (pairs + 1))
         middle = in_chunks(lambda q: np.asarray(problem.arm.position(q)), drawn, _ROWS)
         direction = random.normal(size=middle.shape)
         size = np.exp(random.uniform(math.log(length[0]), math.log(length[1]), len(middle)))[:, None]
         half = 0.5 * size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         both = np.stack([middle - half, middle + half], axis=1)
-        both = both[ranges.contains(both).all(axis=1)]
-        single = middle[ranges.contains(middle)]
+        both = both[problem.contains(both).all(axis=1)]
+        single = middle[problem.contains(middle)]
         for i in range(min(len(both) // max(pairs, 1), len(single))):
-            points = both[i * pairs : (i + 1) * pairs].reshape(-1, 3)
-            points = np.concatenate([points, single[i : i + sockets % 2]])
+            points = np.concatenate([both[i * pairs : (i + 1) * pairs].reshape(-1, 3), single[i : i + sockets % 2]])
             placements.append(FixturePlacement(points, ends, (u,) * pairs))
-            if len(placements) == count:
+            if len(placements) == _PLACEMENTS:
                 return placements
     raise InputError(
         "no placement of the sockets and the reference length was found in the region; widen it, or shorten the length."
     )
 
 
-def _neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: PlacementRegion) -> FixturePlacement | None:
-    """A placement with one length, or single socket, shifted and rotated a little; None if that leaves the ranges."""
+def _random_scores(problem: DesignProblem, placements: Sequence[FixturePlacement], poses: int) -> list[float]:
+    """The objective for so many random poses in each placement; infinite if a socket is hard to reach."""
+    sockets = len(placements[0].points)
+    points = np.concatenate([placement.points for placement in placements])
+    pool = pool_of(problem, *configurations_at(problem.region, points, _FEW_STARTS))
+    scores = []
+    for number, placement in enumerate(placements):
+        part = pool.at(pool.owner // sockets == number)
+        part = part._replace(owner=part.owner % sockets)
+        score = np.inf
+        if part.fewest(sockets) >= _REACHED * _FEW_STARTS:
+            score = relaxed_value(candidates_of(problem, placement, part), poses, problem.objective, 0)
+        scores.append(score)
+    return scores
+
+
+def _neighbour(problem: DesignProblem, placement: FixturePlacement) -> FixturePlacement | None:
+    """A placement with one length, or single socket, shifted and rotated a little; None if that leaves the region."""
     random = problem.region.random
     points = placement.points.copy()
     fixtures = [list(pair) for pair in placement.ends]
@@ -164,7 +239,7 @@ def _neighbour(problem: DesignProblem, placement: FixturePlacement, ranges: Plac
     shift = random.normal(size=3) * _SHIFT * total_link_length(problem.arm)
     rotation = Rotation.from_rotvec(random.normal(size=3) * _ROTATION)
     points[moved] = middle + shift + rotation.apply(points[moved] - middle)
-    return placement._replace(points=points) if ranges.contains(points).all() else None
+    return placement._replace(points=points) if problem.contains(points).all() else None
 
 
 def _moved_pool(
@@ -182,5 +257,4 @@ def _moved_pool(
         owner.append(np.full(len(followed) + len(new), socket))
     sockets = np.concatenate(owner)
     q, good = reached(problem.region, np.concatenate(starts), after.points[sockets], _STEPS, sockets=sockets)
-    moved = pool_of(problem, q[good], sockets[good])
-    return Pool(*(np.concatenate(parts) for parts in zip(kept, moved, strict=True)))
+    return kept.joined(pool_of(problem, q[good], sockets[good]))

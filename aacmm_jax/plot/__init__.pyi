@@ -5,12 +5,15 @@ from .arm import save_arm_figure as save_arm_figure
 from .drift import drift_trend as drift_trend
 from .drift import parameter_trend as parameter_trend
 from .drift import save_drift_trend as save_drift_trend
-from .joint_models import joint_function as joint_function
-from .joint_models import model_comparison as model_comparison
 from .lengths import acceptance_metrics as acceptance_metrics
 from .lengths import reference_length_errors as reference_length_errors
+from .lengths import volumetric_uncertainty_map as volumetric_uncertainty_map
+from .parameters import correlation_matrix as correlation_matrix
+from .parameters import joint_function as joint_function
 from .parameters import length_parameter_errors as length_parameter_errors
+from .parameters import model_comparison as model_comparison
 from .parameters import parameter_changes as parameter_changes
+from .parameters import singular_values as singular_values
 from .residuals import pose_distances as pose_distances
 from .residuals import residual_patterns as residual_patterns
 from .residuals import residuals_by_kind as residuals_by_kind
@@ -22,6 +25,3 @@ from .study import study_distributions as study_distributions
 from .study import study_errors as study_errors
 from .study import study_metric as study_metric
 from .study import study_scale as study_scale
-from .uncertainty import correlation_matrix as correlation_matrix
-from .uncertainty import singular_values as singular_values
-from .uncertainty import volumetric_uncertainty_map as volumetric_uncertainty_map

@@ -26,17 +26,10 @@ def arm_poses(arm: Arm, q: Numbers, axes: Any = None) -> Any:
     Args:
         arm: The arm.
         q: Joint readings, rad, of shape ``(poses, joints)`` or ``(joints,)``.
-        axes: Three-dimensional axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If the axes are not three-dimensional, or ``q`` does not fit the arm.
+        axes: Three-dimensional axes to plot into, which are returned; new ones if None.
 
     Example:
-        >>> axes = aj.plot.arm_poses(result.arm, capture.q[:5])
-        >>> axes.figure.savefig("poses.svg")
+        >>> aj.plot.arm_poses(result.arm, capture.q[:5]).figure.savefig("poses.svg")
     """
     axes = _axes_in_space(axes)
     configurations = np.atleast_2d(np.asarray(checked_readings(arm, q)))
@@ -55,14 +48,8 @@ def arm_at_zero(arm: Arm, axes: Any = None, *, base: Float[np.ndarray, "4 4"] | 
 
     Args:
         arm: The arm.
-        axes: Three-dimensional axes to plot into; new ones if None.
+        axes: Three-dimensional axes to plot into, which are returned; new ones if None.
         base: The first frame in a robot's base link, mm; the plot is in the base link then.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If the axes are not three-dimensional.
 
     Example:
         >>> aj.plot.arm_at_zero(result.arm).figure.savefig("arm.svg")
@@ -91,10 +78,7 @@ def arm_workspace(arm: Arm, axes: Any = None) -> Any:
 
     Args:
         arm: The arm.
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> axes = aj.plot.arm_workspace(arm)
@@ -124,9 +108,6 @@ def save_arm_figure(arm: Arm, path: Path, *, title: str = "", base: Float[np.nda
         path: The file to write (.png, .svg or .pdf).
         title: What the arm is called.
         base: The first frame in a robot's base link, mm.
-
-    Raises:
-        InputError: The format is none of these, or the file cannot be written.
 
     Example:
         >>> from pathlib import Path

@@ -22,11 +22,7 @@ SERIES: tuple[dict[str, Any], ...] = (
     {"symbol": "diamond", "tone": "main"}, {"symbol": "cross", "tone": "accent"}, {"symbol": "ring", "tone": "ink"},
     {"symbol": "square", "tone": "main"}, {"symbol": "triangle", "tone": "accent"},
 )  # fmt: skip
-_SCALES: dict[str, tuple[Any, Any]] = {
-    "linear": (np.asarray, np.asarray),
-    "log": (np.log10, lambda power: 10.0**power),
-    "asinh": (np.arcsinh, np.sinh),
-}
+_SCALES: dict[str, Any] = {"linear": np.asarray, "log": np.log10, "asinh": np.arcsinh}
 _WITHIN = 0.98  # of the values have shades that divide their range evenly
 _MOST_NAMES = 45  # along an axis; more would overlap
 
@@ -82,15 +78,8 @@ class Axis(NamedTuple):
         values = np.asarray(values, dtype=float)
         if self.scale == "log":
             values = np.where(values > 0, values, np.nan)
-        along = _SCALES[self.scale][0]
-        low, high = along([self.low, self.high])
-        return (along(values) - low) / (high - low)
-
-    def value(self, at: Any) -> Any:
-        """What stands at fractions of the axis: the inverse of `at`."""
-        along, back = _SCALES[self.scale]
-        low, high = along([self.low, self.high])
-        return back(low + np.asarray(at) * (high - low))
+        low, high = _SCALES[self.scale]([self.low, self.high])
+        return (_SCALES[self.scale](values) - low) / (high - low)
 
 
 class Plot(NamedTuple):

@@ -22,9 +22,6 @@ def save_drift_trend(trend: Trend, path: Path) -> None:
         trend: The comparison of two calibrations or more (`drift.trend`).
         path: The file to write, whole or not at all; its name ends in ``.png``, ``.svg`` or ``.pdf``.
 
-    Raises:
-        InputError: For another format, or if the file cannot be written.
-
     Example:
         >>> from pathlib import Path
         >>> trend = aj.drift.trend([record, record_in_june], ["2026-01-31", "2026-06-30"], points=20)
@@ -41,10 +38,7 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
 
     Args:
         trend: The comparison of two calibrations or more (`drift.trend`).
-        axes: Two axes to plot into; new ones if None.
-
-    Returns:
-        Both axes.
+        axes: Two axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> trend = aj.drift.trend([record, record_in_june], ["2026-01-31", "2026-06-30"], points=20)
@@ -72,19 +66,14 @@ def parameter_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None
 
     Args:
         trend: The comparison of three calibrations or more (`drift.trend`).
-        axes: Axes to plot into.
+        axes: Axes to plot into, which are returned.
         positions: Abscissa of each calibration; evenly spaced if None.
-
-    Returns:
-        The axes.
 
     Example:
         >>> import matplotlib.pyplot as plt
         >>> dates = ["2026-01-31", "2026-06-30", "2026-12-31"]
         >>> trend = aj.drift.trend([record, record_in_june, record], dates, points=20)
         >>> axes = aj.plot.parameter_trend(trend, plt.subplots()[1])
-        >>> print(axes.get_ylabel())
-        change / expanded uncertainty
     """
     positions = np.arange(len(trend.dates)) if positions is None else positions
     return draw(_changes_over_time(trend, linear("", positions, margin=0.03), positions), axes)

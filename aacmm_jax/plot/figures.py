@@ -9,13 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import InputError
-from ..core.extras import require
+from ..core.errors import InputError, require
 from ..files.outputs import write_atomically
 from .charts import Axis, Marks, Plot
 
-_FORMATS = ("png", "svg", "pdf")
-_USE = "a figure"
 TONES = {"main": "#1b3a6b", "accent": "#d95f02", "soft": "0.65", "ink": "0.2", "page": "white"}
 _SHADES = ("#dbe3ef", "#b3c2da", "#8aa0c3", "#6079a5", "#3a5586", "#14305f")
 _MARKERS = {"dot": "o", "square": "s", "triangle": "^", "diamond": "D", "cross": "x", "ring": "o"}
@@ -25,7 +22,7 @@ _ROOM = 74  # characters side by side in a legend
 
 def new_figure(size: tuple[float, float]) -> Any:
     """A figure outside matplotlib's global state, its size in inches; `MissingExtra` without matplotlib."""
-    require("plot", _USE)
+    require("plot", "a figure")
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, layout="constrained")
@@ -78,9 +75,9 @@ def draw_all(
 def check_format(path: Path) -> str:
     """The format of a figure by its file name; `InputError` for any but PNG, SVG and PDF, or without matplotlib."""
     suffix = path.suffix.lower().removeprefix(".")
-    if suffix not in _FORMATS:
+    if suffix not in ("png", "svg", "pdf"):
         raise InputError(f"{path} is no figure that can be drawn; end its name in .png, .svg or .pdf.")
-    require("plot", _USE)
+    require("plot", "a figure")
     return suffix
 
 
@@ -98,8 +95,7 @@ def _columns(labels: list[str]) -> int:
 
 def _scale(axes: Any, which: str, axis: Axis, before: Sequence[float]) -> None:
     """Title, range and scale of an axis; with the labels of the chart where these are names, or not evenly spaced."""
-    options = {"linear_width": 1.0} if axis.scale == "asinh" else {}
-    getattr(axes, f"set_{which}scale")(axis.scale, **options)
+    getattr(axes, f"set_{which}scale")(axis.scale, **({"linear_width": 1.0} if axis.scale == "asinh" else {}))
     ends = (axis.low, axis.high) if not before else (min(axis.low, *before), max(axis.high, *before))
     axes.set(**{f"{which}label": axis.title, f"{which}lim": ends})
     if axis.named or axis.scale != "linear":
@@ -112,56 +108,48 @@ def _scale(axes: Any, which: str, axis: Axis, before: Sequence[float]) -> None:
 
 def _draw_marks(axes: Any, marks: Marks) -> None:
     """One series: its shades one by one, and after them what is said in words."""
-    color, label = TONES.get(marks.tone, marks.tone), marks.name or None
+    style = {"color": TONES.get(marks.tone, marks.tone), "label": marks.name or None}
     x, y = np.asarray(marks.x, dtype=float), np.asarray(marks.y, dtype=float)
-    span: Any = None if marks.low is None else (np.asarray(marks.low), np.asarray(marks.high))
+    low, high = (None if ends is None else np.asarray(ends) for ends in (marks.low, marks.high))
+    errors = {} if low is None or high is None else {"yerr": [y - low, high - y], "capsize": 3}
     if marks.symbol in ("level", "border"):
-        across = {"level": axes.axhline, "border": axes.axvline}[marks.symbol]
-        style = {"color": "0.4", "linewidth": 0.8, "zorder": 0, "linestyle": "-" if marks.symbol == "level" else "--"}
-        for value in y if marks.symbol == "level" else x:
-            across(value, **style)
+        across, values, line = {"level": (axes.axhline, y, "-"), "border": (axes.axvline, x, "--")}[marks.symbol]
+        for value in values:
+            across(value, color="0.4", linewidth=0.8, zorder=0, linestyle=line)
     elif marks.symbol == "text":
         for place in zip(x, y, marks.words, strict=True):
-            axes.text(*place, ha="center", va="center", color=color, fontsize=marks.size)
+            axes.text(*place, ha="center", va="center", color=style["color"], fontsize=marks.size)
     elif marks.symbol == "band":
-        axes.fill_between(x, *span, color=color, alpha=0.2, linewidth=0, label=label)
+        axes.fill_between(x, low, high, alpha=0.2, linewidth=0, **style)
     elif marks.symbol == "bars":
-        axes.vlines(x, *span, color=color, alpha=0.35, linewidth=marks.size, label=label)
+        axes.vlines(x, low, high, alpha=0.35, linewidth=marks.size, **style)
     elif marks.symbol in _LINES:
-        axes.plot(x, y, color=color, linestyle=_LINES[marks.symbol], linewidth=marks.size / 4, label=label)
+        axes.plot(x, y, linestyle=_LINES[marks.symbol], linewidth=marks.size / 4, **style)
+    elif marks.symbol == "boxes" and not marks.box[1]:
+        axes.bar(x, y, marks.box[0], **style, **errors, **({"ecolor": "0.2"} if errors else {}))
     elif marks.symbol == "boxes":
-        _draw_boxes(axes, marks, x, y, span)
+        _draw_table(axes, marks, x, y)
     else:
-        _draw_points(axes, marks, x, y, span)
-
-
-def _draw_points(axes: Any, marks: Marks, x: np.ndarray, y: np.ndarray, span: tuple | None) -> None:
-    style = {"marker": _MARKERS[marks.symbol], "markersize": 0.7 * marks.size, "linestyle": "none"}
-    style |= {"markerfacecolor": "none"} if marks.symbol == "ring" else {}
-    style |= {"linestyle": "-", "linewidth": marks.size / 4} if marks.joined else {}
-    if marks.shade is not None:
-        for i, color in enumerate(_SHADES):
+        style |= {"marker": _MARKERS[marks.symbol], "markersize": 0.7 * marks.size, "linestyle": "none"}
+        style |= {"markerfacecolor": "none"} if marks.symbol == "ring" else {}
+        style |= {"linestyle": "-", "linewidth": marks.size / 4} if marks.joined else {}
+        for i, color in enumerate(() if marks.shade is None else _SHADES):
             chosen = np.asarray(marks.shade) == i
-            shaded = style | {"markersize": 0.7 * (marks.size + 1.6 * i), "markeredgecolor": "0.5"}
-            label = marks.shade_names[i] if marks.limits else None
-            axes.plot(x[chosen], y[chosen], color=color, label=label, markeredgewidth=0.4, **shaded)
-    elif span is not None:
-        bars = {"yerr": [y - span[0], span[1] - y], "capsize": 3, "elinewidth": 1.0}
-        axes.errorbar(x, y, color=TONES.get(marks.tone, marks.tone), label=marks.name or None, **bars, **style)
-    else:
-        axes.plot(x, y, color=TONES.get(marks.tone, marks.tone), label=marks.name or None, **style)
+            shaded = {"color": color, "label": marks.shade_names[i] if marks.limits else None}
+            shaded |= {"markersize": 0.7 * (marks.size + 1.6 * i), "markeredgecolor": "0.5", "markeredgewidth": 0.4}
+            axes.plot(x[chosen], y[chosen], **(style | shaded))
+        if errors:
+            axes.errorbar(x, y, elinewidth=1.0, **style, **errors)
+        elif marks.shade is None:
+            axes.plot(x, y, **style)
 
 
-def _draw_boxes(axes: Any, marks: Marks, x: np.ndarray, y: np.ndarray, span: tuple | None) -> None:
-    width, height = marks.box
-    color = TONES.get(marks.tone, marks.tone)
-    if not height:
-        errors = {} if span is None else {"yerr": [y - span[0], span[1] - y], "capsize": 3, "ecolor": "0.2"}
-        axes.bar(x, y, width, color=color, label=marks.name or None, **errors)
-        return
+def _draw_table(axes: Any, marks: Marks, x: np.ndarray, y: np.ndarray) -> None:
+    """Boxes about their places, in their shades."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
+    width, height = marks.box
     shade = np.zeros(len(x), dtype=int) if marks.shade is None else np.asarray(marks.shade)
     boxes = [Rectangle((a - width / 2, b - height / 2), width, height) for a, b in zip(x, y, strict=True)]
     faces = [_SHADES[i] for i in shade.tolist()]

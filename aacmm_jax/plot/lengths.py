@@ -1,4 +1,4 @@
-"""Errors of lengths, placement by placement, and metrics of acceptance tests against their limits."""
+"""Errors of lengths, placement by placement; metrics of acceptance tests; uncertainty over the working volume."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,13 +8,18 @@ import numpy as np
 from ..acceptance.results import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
-from ..summaries.tables import format_number
-from .charts import Axis, Chart, Marks, Plot, borders, level, linear, names, ordinates, runs
+from ..core.units import DEG
+from ..diagnostics.tried_poses import TriedPoses
+from ..summaries.tables import decimals_for, format_number
+from ..uncertainty.volume import VolumetricUncertainty
+from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, ordinates, runs, shades, thinned
 from .figures import draw
 
 _NAMED = 16  # most lengths or placements along an axis
 _LEAST = 1e-6  # mm: drawn for a limit of zero
 _TITLE = "measured − value [mm]"
+_ACROSS, _UP = "distance from the first axis [mm]", "height [mm]"
+_TIPS = 400  # most tips of the calibration that are drawn
 
 
 def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, Axis, np.ndarray]:
@@ -41,6 +46,10 @@ def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, Axis, 
     return x, Axis(title, -0.6, len(x) - 0.4, named=True), np.zeros(0)
 
 
+def _errors_plot(axis: Axis, edges: np.ndarray, marks: Sequence[Marks]) -> Plot:
+    return Plot(axis, linear(_TITLE, *ordinates(marks), [0.0]), (*marks, borders(edges), level(0.0)))
+
+
 def length_chart(between: Sequence[tuple[str, str]], errors: Mapping[str, np.ndarray], expanded: np.ndarray) -> Chart:
     """Errors of reference lengths, given by their ends, by one arm or two, mm; the last with its U, NaN where there is
     none."""
@@ -53,12 +62,9 @@ def length_chart(between: Sequence[tuple[str, str]], errors: Mapping[str, np.nda
     ]
     marks = [Marks(name, x, values, "diamond", "accent") for name, values in earlier]
     name = f"{last}, with U (95 %)" if np.any(np.isfinite(expanded)) else last
-    low, high = error - expanded, error + expanded
-    marks.append(Marks(name, x, error, "square", "main", words, low, high, size=7))
-    y = linear(_TITLE, *ordinates(marks), [0.0])
+    marks.append(Marks(name, x, error, "square", "main", words, error - expanded, error + expanded, size=7))
     description = "Measured minus calibrated value" + (", before and after the scale fix." if earlier else ".")
-    plot = Plot(axis, y, (*marks, borders(edges), level(0.0)))
-    return Chart("lengths", "Errors of the reference lengths", description, (plot,))
+    return Chart("lengths", "Errors of the reference lengths", description, (_errors_plot(axis, edges, marks),))
 
 
 def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
@@ -75,33 +81,23 @@ def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
         + (f", MPE {format_number(part.limit)} mm" if part.limit is not None else "")
         for part in metric.values
     ]
-    low, high = values - bars, values + bars
     name = "single readings" + (", with U" if np.any(bars > 0) else "")
-    marks = [Marks(name, x, values, "dot", "main", words, low, high, size=5)]
+    marks = [Marks(name, x, values, "dot", "main", words, values - bars, values + bars, size=5)]
     limits = np.array([np.nan if part.limit is None else part.limit for part in metric.values])
-    limited, order = bool(np.any(np.isfinite(limits))), np.argsort(x)
-    if limited:
-        marks += [Marks("MPE", x[order], side * limits[order], "dashed", "ink") for side in (1, -1)]
-    y = linear(_TITLE, *ordinates(marks), [0.0])
     description = "Errors of the reference lengths, reading by reading, by the calibrated arm"
-    plot = Plot(axis, y, (*marks, borders(edges), level(0.0)))
-    return Chart(
-        "length-errors", "Errors of lengths", description + (", and their limits." if limited else "."), (plot,)
-    )
+    if np.any(np.isfinite(limits)):
+        order = np.argsort(x)
+        marks += [Marks("MPE", x[order], side * limits[order], "dashed", "ink") for side in (1, -1)]
+        description += ", and their limits"
+    return Chart("length-errors", "Errors of lengths", f"{description}.", (_errors_plot(axis, edges, marks),))
 
 
 def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     """Plot the errors of the reference lengths before and after the scale fix, mm, with expanded uncertainty (95 %).
 
     Args:
-        record: The calibration.
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If the calibration has no reference lengths.
+        record: The calibration; `InputError` if it has no reference lengths.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> axes = aj.plot.reference_length_errors(record)
@@ -123,19 +119,17 @@ def metrics_chart(tests: Sequence[AcceptanceTest]) -> Chart:
     """The worst value of every metric with U, divided by its limit if limits were given."""
     metrics = [metric for test in tests for metric in test.metrics]
     limited = [metric for metric in metrics if metric.worst.limit is not None]
+    y, lines, title, divisors = "|value| [mm]", [], "Metrics", np.ones(len(metrics))
+    description = "The value of each metric, with U. No limit was given."
     if limited:
-        metrics, y, lines = limited, "|value| / MPE", [1.0]
-        divisors = [max(metric.worst.limit or 0.0, _LEAST) for metric in metrics]
-        title = "Metrics against their limits"
+        metrics, y, lines, title = limited, "|value| / MPE", [1.0], "Metrics against their limits"
+        divisors = np.array([max(metric.worst.limit or 0.0, _LEAST) for metric in metrics])
         description = (
             "The value of each metric, divided by its limit, with U. The decisions are in the tables: they follow the "
             "rule stated above, whose guard band may be less than U."
         )
-    else:
-        y, lines, divisors = "|value| [mm]", [], [1.0] * len(metrics)
-        title, description = "Metrics", "The value of each metric, with U. No limit was given."
-    values = np.array([abs(metric.value) / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
-    bars = np.array([metric.worst.expanded / divisor for metric, divisor in zip(metrics, divisors, strict=True)])
+    values = np.array([abs(metric.value) for metric in metrics]) / divisors
+    bars = np.array([metric.worst.expanded for metric in metrics]) / divisors
     words = [f"{metric.name}: {format_number(metric.value)} mm at {metric.worst.where}" for metric in metrics]
     labels = [f"{metric.name}: {metric.decision}" if metric.decision else metric.name for metric in metrics]
     # An absolute value is not negative, so a bar that is longer than its value ends at 0.
@@ -151,21 +145,87 @@ def acceptance_metrics(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any
     The decision beside each name follows its rule, whose guard band may be less than the bar.
 
     Args:
-        tests: Acceptance tests of one arm (`acceptance.run`).
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If no metric has a limit.
+        tests: Acceptance tests of one arm (`acceptance.run`); `InputError` if no metric has a limit.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
         >>> tests = aj.acceptance.run(measured, limits={"SPAT": 0.1, "Length": 0.05})
-        >>> axes = aj.plot.acceptance_metrics(tests)
-        >>> axes.figure.savefig("acceptance.svg")
+        >>> aj.plot.acceptance_metrics(tests).figure.savefig("acceptance.svg")
     """
     if not any(metric.worst.limit for test in tests for metric in test.metrics):
         raise InputError("no metric has a limit to be drawn against; give limits to accept.")
     return draw(metrics_chart(tests).plots[0], axes)
+
+
+def volume_chart(volume: VolumetricUncertainty) -> Chart:
+    """U of lengths over the working volume: half a section through it."""
+    finite = np.isfinite(volume.expanded_length)
+    expanded, start = volume.expanded_length[finite], volume.start[finite]
+    shade, limits = shades(expanded)
+    order = np.argsort(shade, kind="stable")
+    words = [
+        f"({', '.join(f'{x:.0f}' for x in point)}) mm: U = {format_number(u, decimals_for(u))} mm"
+        for point, u in zip(start[order], expanded[order].tolist(), strict=True)
+    ]
+    name, radius = f"U of a {volume.length:g} mm length", np.hypot(start[:, 0], start[:, 1])
+    limits = limits if np.any(finite) else ()
+    marks = Marks(name, radius[order], start[order, 2], words=words, shade=shade[order], limits=limits, unit="mm")
+    axes = linear(_ACROSS, np.hypot(volume.start[:, 0], volume.start[:, 1]), [0.0]), linear(_UP, volume.start[:, 2])
+    description = "The larger the mark, the more uncertain; height against distance from the first axis."
+    return Chart("volume", f"{name} over the volume", description, (Plot(*axes, (marks,), height=380),))
+
+
+def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) -> Any:
+    """Plot U (95 %) of lengths over the working volume: larger and darker marks are more uncertain.
+
+    Each length is marked at the height and the distance from the first axis where it starts.
+
+    Args:
+        volume: The result of `volumetric_uncertainty`; `InputError` if no length has a finite uncertainty.
+        axes: Axes to plot into, which are returned; new ones if None.
+
+    Example:
+        >>> volume = aj.volumetric_uncertainty(aj.uncertainty_of(result), points=20)
+        >>> axes = aj.plot.volumetric_uncertainty_map(volume)
+    """
+    if not np.any(np.isfinite(volume.expanded_length)):
+        raise InputError("no length over the volume is determined, so there is no uncertainty to draw.")
+    return draw(volume_chart(volume).plots[0], axes)
+
+
+def tried_chart(volume: VolumetricUncertainty, tips: np.ndarray, poses: TriedPoses) -> Chart:
+    """Half a section through the volume: random poses by their distance from the nearest calibrated one, and the tips
+    of the calibration, mm."""
+    ratio = poses.distance / max(poses.spacing, 1e-12)
+    shade, limits = tried_shades(ratio)
+    order = np.argsort(shade, kind="stable")
+    radius, height = np.hypot(volume.start[:, 0], volume.start[:, 1]), volume.start[:, 2]
+    words = [
+        f"({', '.join(f'{x:.0f}' for x in volume.start[i])}) mm: {poses.distance[i] / DEG:.0f} deg from the nearest "
+        f"pose, {ratio[i]:.1f} times their spacing"
+        for i in order
+    ]
+    tips = tips[thinned(len(tips), _TIPS)]
+    across = np.hypot(tips[:, 0], tips[:, 1])
+    marks = (
+        Marks("", radius[order], height[order], words=words, shade=shade[order], limits=limits, size=5),
+        Marks("tips of the calibration", across, tips[:, 2], "square", "accent", size=4),
+    )
+    plot = Plot(linear(_ACROSS, radius, across, [0.0]), linear(_UP, height, tips[:, 2]), marks, height=380)
+    description = (
+        "Random poses all over the volume by their distance in joint space from the nearest pose of the calibration, "
+        "in multiples of the spacing of its own poses: up to 1 it was tried there; the larger the mark, the less."
+    )
+    return Chart("tried", "Coverage of the working volume", description, (plot,))
+
+
+def tried_shades(ratio: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
+    """The shade of each multiple of the spacing: the first ends at 1, the others divide what is beyond."""
+    beyond = ratio > 1.0
+    if np.all(beyond) or not np.any(beyond):
+        return shades(ratio)
+    shade = np.zeros(len(ratio), dtype=int)
+    shade_beyond, limits = shades(ratio[beyond], SHADES - 1)
+    shade[beyond] = shade_beyond + 1
+    return shade, (0.0, 1.0, *limits[1:])

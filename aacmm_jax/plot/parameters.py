@@ -1,50 +1,56 @@
-"""Parameters of a calibration: their changes with U, their errors in a simulation, their position within bounds."""
+"""Parameters of a calibration: changes with U, errors in a simulation, bounds, correlations, functions of joints."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..calibration.record import CalibrationRecord, function_of_joint, uncertainty_of
 from ..core.errors import InputError
-from ..core.units import people_read
+from ..core.units import DEG, people_read
+from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import is_length, parameter_unit
+from ..kinematics.corrections import Term
+from ..pipeline.model_ladder import ComparedModels
+from ..summaries.compared_models import compared_models_summary
 from ..summaries.harmonics import listed_apart
 from ..summaries.tables import decimals_for, format_number
-from .charts import Axis, Chart, Marks, Plot, level, linear, logarithmic, names
-from .figures import draw
+from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.identifiability import Observability
+from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, names
+from .figures import TONES, draw
 
 _LEAST = 1e-5  # mm: an error of zero on a logarithmic axis
+_LEAST_SINGULAR = 1e-12  # of the largest singular value: a zero on a logarithmic axis
 _UNITS = {"length": "mm", "angle": "rad"}
+_SAID, _SIGNED = 0.3, 0.5  # correlations from which they are said under the pointer, and their sign is written
+_IN_A_BIN, _MOST_BINS = 8, 80  # poses, and bins of a joint's travel
+_WIDTH = 0.38  # of a bar
 
 
 def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
     """Calibrated minus nominal value of the parameters of a unit ("mm" or "rad") with U: rows with "parameter",
     "nominal", "calibrated" and "expanded", None of what the data determine only together with others."""
     scale, label = people_read(unit)
-    labels = [row["parameter"] for row in parameters]
-    x, change = np.arange(len(labels)), scale * np.array([row["calibrated"] - row["nominal"] for row in parameters])
+    x, change = np.arange(len(parameters)), scale * np.array([row["calibrated"] - row["nominal"] for row in parameters])
     expanded = np.array([np.nan if row["expanded"] is None else scale * row["expanded"] for row in parameters])
-    finite = np.isfinite(expanded)
-    words = []
-    for name, value, bar in zip(labels, change.tolist(), expanded.tolist(), strict=True):
+    finite, words = np.isfinite(expanded), []
+    for row, value, bar in zip(parameters, change.tolist(), expanded.tolist(), strict=True):
         decimals = decimals_for(bar)
         u = f"U {format_number(bar, decimals)} {label}" if np.isfinite(bar) else "no uncertainty of its own"
-        words.append(f"{name}: {format_number(value, decimals, signed=True)} {label}, {u}")
+        words.append(f"{row['parameter']}: {format_number(value, decimals, signed=True)} {label}, {u}")
     words, low, high = np.array(words), (change - expanded)[finite], (change + expanded)[finite]
     marks = [Marks("with U (95 %)", x[finite], change[finite], "dot", "main", words[finite].tolist(), low, high)]
     # What has no uncertainty of its own has an arbitrary value: within the range of the others it has a cross.
-    axis = linear(
-        f"calibrated − nominal [{label}]", *((change[finite], low, high) if any(finite) else (change,)), [0.0]
-    )
+    ends = (change[finite], low, high) if any(finite) else (change,)
+    axis = linear(f"calibrated − nominal [{label}]", *ends, [0.0])
     if not np.all(finite):
         at = np.clip(change[~finite], axis.low, axis.high)
         name = "only determined with others, or on a bound"
         marks.append(Marks(name, x[~finite], at, "cross", "accent", words[~finite].tolist()))
-    outside = int(np.sum((change < axis.low) | (change > axis.high)))
-    plot = Plot(names("", labels), axis, (*marks, level(0.0)), height=260)
+    plot = Plot(names("", [row["parameter"] for row in parameters]), axis, (*marks, level(0.0)), height=260)
     description = "Calibrated minus nominal; bars are U, and smaller than the mark where none is visible."
-    if outside:
+    if outside := int(np.sum((change < axis.low) | (change > axis.high))):
         description += f" At the edge: {outside} without U, whose values (in the table) lie outside."
     kind = "length" if unit == "mm" else "angle"
     return Chart(f"change-{unit}", f"Change of {kind} parameters", description, (plot,))
@@ -58,13 +64,7 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
     Args:
         record: The calibration.
         kind: ``"length"`` for the length parameters, mm; ``"angle"`` for the angle parameters, deg.
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If ``kind`` is neither.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> axes = aj.plot.parameter_changes(record, "angle")
@@ -93,18 +93,11 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 
     Args:
         record: The calibration of a simulated arm.
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If the calibration is not of a simulation.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> simulated = recording._replace(true=nominal._replace(arm=true))
-        >>> of_simulation = aj.calibration.record_of(result, simulated)
-        >>> axes = aj.plot.length_parameter_errors(of_simulation)
+        >>> axes = aj.plot.length_parameter_errors(aj.calibration.record_of(result, simulated))
         >>> print(axes.get_ylabel())
         error against the true arm [mm]
     """
@@ -130,9 +123,8 @@ def error_plot(record: CalibrationRecord) -> Plot:
 
 def bounds_chart(labels: Sequence[str], positions: np.ndarray, on_bound: np.ndarray, left_out: int) -> Chart:
     """Positions of parameters within their bounds, -1 at the lower and 1 at the upper one, and which are on one."""
-    x = np.arange(len(labels))
+    x, inside = np.arange(len(labels)), ~on_bound
     words = np.array([f"{name}: {position:+.2f}" for name, position in zip(labels, positions, strict=True)])
-    inside = ~on_bound
     marks = [Marks("within", x[inside], positions[inside], words=words[inside].tolist())]
     if np.any(on_bound):
         # Stage 1 may have been on a bound that the calibrated value has left.
@@ -141,6 +133,208 @@ def bounds_chart(labels: Sequence[str], positions: np.ndarray, on_bound: np.ndar
     y = Axis("position within bounds", -1.15, 1.15, ((-1.0, "lower"), (0.0, "middle"), (1.0, "upper")), named=True)
     plot = Plot(names("", labels), y, (*marks, level(-1.0, 1.0)), height=220)
     description = "Diamonds are on a bound." if np.any(on_bound) else "None is on a bound."
-    if left_out:
-        description += f" Not drawn: {left_out} coefficients of harmonics within theirs."
+    description += f" Not drawn: {left_out} coefficients of harmonics within theirs." if left_out else ""
     return Chart("bounds", "Position of every parameter within its bounds", description, (plot,))
+
+
+def correlation_plot(labels: list[str], table: np.ndarray, title: str = "") -> Plot:
+    """Correlations by their size, with the sign written where it is at least 0.5."""
+    strength, count = np.abs(np.asarray(table, dtype=float)), len(labels)
+    rows, columns = np.nonzero(strength > 0.05)
+    pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
+    words = [
+        f"{labels[i]} with {labels[j]}: {table[i, j]:+.3f}".replace("-", "−")
+        if strength[i, j] >= _SAID and i != j
+        else ""
+        for i, j in pairs
+    ]
+    shade = np.minimum((strength[rows, columns] * SHADES).astype(int), SHADES - 1)
+    limits = tuple(i / SHADES for i in range(SHADES + 1))
+    boxes = Marks("|r|", columns, rows, "boxes", words=words, shade=shade, limits=limits, box=(1.0, 1.0))
+    y, x = np.array([(i, j) for i, j in pairs if strength[i, j] >= _SIGNED and i != j], dtype=int).reshape(-1, 2).T
+    signed = ["+" if positive else "−" for positive in table[y, x] > 0]
+    signs = Marks("", x, y, "text", "page", signed, size=10 if count <= 25 else 6)
+    axis = names("", labels)._replace(low=-0.5, high=count - 0.5)
+    downwards = Axis("", count - 0.5, -0.5, axis.ticks, named=True)
+    return Plot(axis, downwards, (boxes, signs), title=title, height=560, square=True)
+
+
+def correlation_chart(uncertainty: Uncertainty) -> Chart:
+    """Correlations of the parameters; of very many, of those that are correlated most."""
+    labels, chosen = list(uncertainty.names), uncertainty.most_correlated()
+    most = f"the {len(chosen)} parameters of {len(labels)} that are correlated most"
+    part = np.asarray(uncertainty.correlation)[np.ix_(chosen, chosen)]
+    plot = correlation_plot([labels[i] for i in chosen], part, most if len(chosen) < len(labels) else "")
+    return Chart(
+        "correlations",
+        "Correlation of the parameters",
+        "The colour is the size of the correlation; its sign is written from 0.5 on. Strongly correlated "
+        "parameters are determined better in combination than one by one.",
+        (plot,),
+    )
+
+
+def correlation_matrix(uncertainty: Uncertainty, axes: Any = None) -> Any:
+    """Plot the correlations of the parameters: darker is stronger, with the sign written where it is at least 0.5.
+
+    Of more than 45 parameters, those that are correlated most are drawn.
+
+    Args:
+        uncertainty: Uncertainty of a calibrated arm (`uncertainty_of`).
+        axes: Axes to plot into, which are returned; new ones if None.
+
+    Example:
+        >>> axes = aj.plot.correlation_matrix(aj.uncertainty_of(result))
+        >>> print(len(axes.get_xticklabels()), "parameters")
+        21 parameters
+    """
+    return draw(correlation_chart(uncertainty).plots[0], axes, (7.4, 7.6))
+
+
+def singular_chart(observed: Observability) -> Chart:
+    """Singular values of the identification Jacobian; zero ones are crosses at the least that the axis shows."""
+    values, rank = np.maximum(observed.singular, _LEAST_SINGULAR * observed.singular.max()), observed.rank
+    order = np.arange(1, len(values) + 1)
+    words = [f"{i}: {value:.3g}" for i, value in zip(order, observed.singular.tolist(), strict=True)]
+    marks = [Marks("determined", order[:rank], values[:rank], words=words[:rank])]
+    if rank < len(values):
+        marks.append(Marks("not determined", order[rank:], values[rank:], "cross", "accent", words[rank:]))
+    plot = Plot(linear("number", order), logarithmic("singular value", values), tuple(marks), height=240)
+    what = "Sensitivity of the data to each independent direction of the parameters, in steps of 1 mm and 1 mrad."
+    return Chart("singular", "Singular values", what, (plot,))
+
+
+def singular_values(observed: Observability, axes: Any = None) -> Any:
+    """Plot the singular values of the identification Jacobian, in steps of 1 mm and 1 mrad; zero ones are crosses.
+
+    Args:
+        observed: The result of `observability`.
+        axes: Axes to plot into, which are returned; new ones if None.
+
+    Example:
+        >>> axes = aj.plot.singular_values(aj.observability(arm, capture, space))
+    """
+    return draw(singular_chart(observed).plots[0], axes)
+
+
+def models_chart(summary: Mapping[str, Any]) -> Chart:
+    """RMS errors of models inside and outside what they were fitted to, with the standard error outside; mm."""
+    keys = ("rms_inside", "rms_outside", "u_outside")
+    inside, outside, u = (np.array([row[key] for row in summary["models"]], dtype=float) for key in keys)
+    labels = [row["model"] for row in summary["models"]]
+    words = [
+        f"{label}: inside {format_number(a)} mm, outside {format_number(b)} ± {format_number(c)} mm"
+        for label, a, b, c in zip(labels, inside.tolist(), outside.tolist(), u.tolist(), strict=True)
+    ]
+    left, box = np.arange(len(labels)) - _WIDTH / 2, (_WIDTH, 0.0)
+    low, high, right = outside - u, outside + u, left + _WIDTH
+    marks = (
+        Marks("poses that were fitted", left, inside, "boxes", "soft", words, box=box),
+        Marks("regions left out, ± one standard error", right, outside, "boxes", "main", words, low, high, box=box),
+    )
+    named = [f"{label} (recommended)" if label == summary["recommended"] else label for label in labels]
+    y = linear("RMS distance from the geometry [mm]", inside, outside, high, [0.0], zero=True)
+    description = "The RMS distance of poses from their geometry, from the simplest model to the richest."
+    return Chart("models", "Errors by model", description, (Plot(names("", named), y, marks, height=260),))
+
+
+def model_comparison(compared: ComparedModels, axes: Any = None) -> Any:
+    """Plot the errors of compared models inside and outside what they were fitted to, mm.
+
+    Bars with the standard error of `ComparedModel.u_outside`; the recommended model is marked.
+
+    Args:
+        compared: What `compare_models` returned.
+        axes: Axes to plot into, which are returned; new ones if None.
+
+    Example:
+        >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
+        >>> print(len(aj.plot.model_comparison(compared).patches), "bars")
+        4 bars
+    """
+    return draw(models_chart(compared_models_summary(compared, "")).plots[0], axes)
+
+
+def functions_chart(record: CalibrationRecord) -> Chart | None:
+    """What each joint does besides its reading; None for an arm whose joints do what they read."""
+    arm = record.calibrated.arm
+    plots = [plot for joint in range(1, arm.joints + 1) if (plot := _joint_plot(record, joint, True))]
+    if not plots or arm.corrections is None:
+        return None
+    kinds = [term.kind for term in arm.corrections.functions.terms if isinstance(term, Term)]
+    words = [dict.fromkeys(kind.description for kind in kinds if kind.of_own_reading is by) for by in (True, False)]
+    drawn, others = map(", ".join, words)
+    description = (
+        f"The curve: corrections of each joint by its own reading ({drawn}), less their mean"
+        + (f"; without {others}" if others else "")
+        + ". Marks: the curve and what the residuals of neighbouring poses ask besides, with twice its standard error. "
+        "Dashed lines are the ends of the travel that was measured."
+    )
+    return Chart("functions", "What the joints do besides their readings", description, tuple(plots))
+
+
+def joint_function(
+    record: CalibrationRecord, joint: int, axes: Any = None, *, label: str | None = None, color: str = TONES["main"]
+) -> Any:
+    """Plot what a joint does besides its reading, against its reading; mrad, or mm of a prismatic joint.
+
+    Marks are means over neighbouring poses, with twice their standard error: the change of this joint that alone would
+    explain most of their residuals, added to the calibrated function. That function is the curve, with its expanded
+    uncertainty (95 %): harmonics and gear ratio of the arm, less their mean over the poses, which a zero offset takes
+    up. It goes a little beyond the travel of the poses (between the dashed lines), within the limits of the joint.
+    Marks off the curve, or a pattern of marks without a curve, are errors that the model lacks.
+
+    Args:
+        record: A calibration from observations or with a prior, the residuals of which are known pose by pose.
+        joint: Number of the joint, from 1.
+        axes: Axes to plot into, which are returned; new ones if None. Several records may share axes.
+        label: For the legend; by default none.
+        color: Of marks and curve.
+
+    Example:
+        >>> robust = aj.calibrate(arm, two_bars, bounds, robust="huber")
+        >>> by_pose = aj.calibration.record_of(robust, aj.Recording(two_bars, nominal), robust="huber")
+        >>> axes = aj.plot.joint_function(by_pose, 2)
+    """
+    joints = record.calibrated.arm.joints
+    if not 1 <= joint <= joints:
+        raise InputError(f"joint is {joint}; the arm has joints 1 to {joints}.")
+    plot = _joint_plot(record, joint)
+    assert plot is not None
+    marks = [part._replace(tone=color) if part.tone == "main" else part for part in plot.marks]
+    marks = [part._replace(name=label or "") if part.symbol == "dot" else part for part in marks]
+    return draw(plot._replace(marks=tuple(marks)), axes, legend=False)
+
+
+def _joint_plot(record: CalibrationRecord, joint: int, only_corrected: bool = False) -> Plot | None:
+    """The function of one joint, and what residuals ask of it; ``only_corrected``: None where it has no function."""
+    residuals = observation_residuals(record)
+    q = np.concatenate([np.asarray(part.observation.q) for part in residuals])
+    curve = function_of_joint(record, joint, q)
+    if curve is None and only_corrected:
+        return None
+    asked = np.concatenate([part.by_joint[joint - 1] for part in residuals])
+    lever = np.concatenate([part.lever[joint - 1] for part in residuals])
+    slides, travel = joint in record.calibrated.arm.prismatic, q[:, joint - 1]
+    unit, reading = (1.0, 1.0) if slides else (1e-3, DEG)
+    marks: list[Marks] = []
+    if curve is not None:
+        x, value, expanded = curve.reading / reading, curve.value / unit, curve.expanded / unit
+        marks = [Marks("", x, value, "band", low=value - expanded, high=value + expanded), Marks("", x, value, "line"),
+                 borders([travel.min() / reading, travel.max() / reading])]  # fmt: skip
+        asked = asked + curve.at_poses
+    rows = []
+    for members in np.array_split(np.argsort(travel), np.clip(len(travel) // _IN_A_BIN, 1, _MOST_BINS)):
+        # Weighted by how far the joint moves the tip; standard errors by the scatter.
+        weight = lever[members] ** 2 / max(np.sum(lever[members] ** 2), 1e-300)
+        value = weight @ asked[members]
+        rows.append((travel[members].mean(), value, np.sqrt(np.sum((weight * (asked[members] - value)) ** 2))))
+    means, values, u = np.array(rows).T
+    y, u, tone = values / unit, u / unit, "main" if curve is None else "accent"
+    marks.append(Marks("", means / reading, y, "dot", tone, low=y - 2 * u, high=y + 2 * u, size=4))
+    ends = [end for mark in marks for end in (mark.low, mark.high) if end is not None]
+    axes = (
+        linear(f"reading of joint {joint} [{'mm' if slides else 'deg'}]", *(mark.x for mark in marks), margin=0.02),
+        linear(f"joint {joint} [{'mm' if slides else 'mrad'}]", *ends, [0.0]),
+    )
+    return Plot(*axes, (*marks, level(0.0)), height=150)

@@ -31,12 +31,9 @@ _NAMED = 16  # most sockets or observations that are named along an axis
 _SEPARATED = 60  # most of them with lines between them
 _LISTED = 400  # most poses in the table of a chart
 _LEAST = 1e-5  # a residual of zero on a logarithmic axis, mm
-_MOST_IN_A_ROW = 3  # panels of a figure
-_QUANTITIES = {"standard deviations": "residual", "deg": "angle between orientations"}
 Marked = tuple[str, Sequence[int] | np.ndarray]  # why poses are marked, and their indices
 _OF_ARMS: tuple[dict[str, Any], ...] = ({"symbol": "square", "tone": "soft"}, SERIES[0])  # nominal, calibrated
-_LITTLE_WEIGHT = "half of its weight or less"
-# Of residuals in each unit: identity and title of the chart, and the values.
+# Of residuals in each unit: identity and title of the chart, and what of the poses of an observation.
 _UNITS: dict[str, tuple[str, str, Callable[[ObservationResiduals], Any]]] = {
     "mm": ("residuals", "Residuals in mm", lambda part: part.distance),
     "standard deviations": ("normalised", "Residuals in standard deviations", lambda part: part.normalised),
@@ -46,7 +43,6 @@ _DRAWN = 400  # most poses in one plot of a pattern in a page
 _FEWEST = 12  # poses: fewer show no pattern
 _BINS = (4, 12)  # least and most of them; a band needs some 15 poses in each
 _INSIDE = 0.995  # of the residuals lie within the axis; the others are drawn at its edge
-_COLUMNS = 4  # of panels in a figure of patterns
 
 
 class Groups(NamedTuple):
@@ -72,14 +68,10 @@ class Groups(NamedTuple):
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
     @property
-    def numbers(self) -> np.ndarray:
-        """Number of each pose within its group, from 1."""
-        return np.concatenate([np.arange(1, size + 1) for size in self.sizes])
-
-    def only(self, chosen: Sequence[int]) -> "Groups":
-        """Some of the groups."""
-        names, sizes, kinds, word = self
-        return Groups(*(tuple(part[i] for i in chosen) for part in (names, sizes, kinds)), word)  # type: ignore
+    def labels(self) -> list[str]:
+        """What each pose is called: its group, and its number in it from 1."""
+        pairs = zip(self.names, self.sizes, strict=True)
+        return [f"{name}, pose {number}" for name, size in pairs for number in range(1, size + 1)]
 
     def parts(self) -> tuple[tuple[tuple[float, str], ...], np.ndarray]:
         """Names at the middle of each group, or of those that share a folder ("monday/"), and the borders between them;
@@ -112,7 +104,8 @@ def pose_chart(
     if not len(finite):
         return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", ())
     drawn = np.union1d(finite[thinned(len(finite), most or len(finite))], marked)
-    kind = np.asarray(groups.kinds)[groups.owner]
+    labels, kind = groups.labels, np.asarray(groups.kinds)[groups.owner]
+    # Said of each mark, in the key, residuals, poses, and how they are drawn.
     if len(arms) > 1:
         series = [(arm, f"{arm}, RMS {format_number(rms(values[np.isfinite(values)]), 3)} {unit}", values, drawn, style)
                   for (arm, values), style in zip(arms.items(), _OF_ARMS, strict=True)]  # fmt: skip
@@ -122,25 +115,29 @@ def pose_chart(
     marks = []
     for said, name, values, chosen, style in series:
         chosen = chosen[np.isfinite(values[chosen])]
-        words = [f"{groups.names[groups.owner[i]]}, pose {groups.numbers[i]}: {format_number(float(values[i]))} {unit} "
-                 f"({said})" for i in chosen]  # fmt: skip
+        words = [f"{labels[i]}: {format_number(float(values[i]))} {unit} ({said})" for i in chosen]
         marks.append(Marks(name, chosen + 1, np.maximum(values[chosen], _LEAST), words=words, size=5, **style))
     if len(marked):
         marks.append(Marks(far[0], marked + 1, np.maximum(last[marked], _LEAST), "ring", "accent", size=11))
+    if unit == "standard deviations":
+        marks.append(level(1.0))
     ticks, edges = groups.parts()
-    word = "pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}"
-    x = linear(word, [0.0, len(last) + 1.0], margin=0.0)
-    x = x._replace(ticks=ticks, named=True) if ticks else x
+    x = linear("pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}",
+               [0.0, len(last) + 1.0], margin=0.0)  # fmt: skip
     centre = "geometry" if groups.word == "observation" else "socket's centroid"
-    expected = [level(1.0)] if unit == "standard deviations" else []
-    y = logarithmic(f"{_QUANTITIES.get(unit, f'distance from the {centre}')} [{unit}]",
-                    *(mark.y for mark in (*marks, *expected)))  # fmt: skip
+    y = {"standard deviations": "residual", "deg": "angle between orientations"}.get(
+        unit, f"distance from the {centre}"
+    )
+    plot = Plot(
+        x._replace(ticks=ticks, named=True) if ticks else x,
+        logarithmic(f"{y} [{unit}]", *(mark.y for mark in marks)),
+        (*marks, borders(edges)),
+    )
     median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
     description = f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
     description += " The only pose of a socket has no distance." if len(finite) < len(last) else ""
     description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
-    table = None if len(arms) > 1 else _pose_table(groups, last, unit, far)
-    return Chart(id, title, description, (Plot(x, y, (*marks, *expected, borders(edges))),), table)
+    return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
 
 
 def _pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked) -> Table:
@@ -149,12 +146,12 @@ def _pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked) -
     if len(chosen) > _LISTED:
         chosen = np.argsort(-np.nan_to_num(residuals))[:_LISTED]
         caption = f"The {_LISTED} farthest of {len(residuals)} poses"
-    says, marked = Cell(far[0], None, "outlier"), np.isin(chosen, far[1])
+    owner, says = groups.owner, Cell(far[0], None, "outlier")
     columns = {
-        groups.word: [groups.names[i] for i in groups.owner[chosen]],
-        "pose": groups.numbers[chosen].tolist(),
+        groups.word: [groups.names[i] for i in owner[chosen]],
+        "pose": [int(i - np.searchsorted(owner, owner[i]) + 1) for i in chosen],
         f"calibrated [{unit}]": numbers(residuals[chosen], 5),
-        "marked": [says if mark else "" for mark in marked],
+        "marked": [says if marked else "" for marked in np.isin(chosen, far[1])],
     }
     return by_columns(caption, columns)
 
@@ -188,10 +185,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
 
     Args:
         record: The calibration.
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> axes = aj.plot.pose_distances(record)
@@ -204,24 +198,17 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
 def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
     """Plot the residual of every pose of a calibration by kind of observation (logarithmic).
 
-    Poses that a robust loss took half of their weight from or more have a ring.
+    Poses that a robust loss took half of their weight from or more have a ring. `InputError` for orientations that the
+    calibration does not have.
 
     Args:
         record: The calibration.
         unit: ``"mm"``, ``"standard deviations"``, or ``"deg"`` for orientations.
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If the calibration has no such residuals (orientations, for ``"deg"``).
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> robust = aj.calibrate(arm, capture, bounds, robust="huber")
         >>> axes = aj.plot.residuals_by_kind(aj.calibration.record_of(robust, recording, robust="huber"))
-        >>> print(axes.get_ylabel())
-        distance from the socket's centroid [mm]
     """
     if unit not in _UNITS:
         raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
@@ -239,10 +226,14 @@ def kinds_chart(
     parts = [part for part in enumerate(observation_residuals(record)) if unit != "deg" or part[1].angle is not None]
     if not parts:
         return None
-    groups = Groups.of(record.recording.capture).only([i for i, _ in parts])
+    names, sizes, kinds, word = Groups.of(record.recording.capture)
+    index = [i for i, _ in parts]
+    names, sizes, kinds = (tuple(values[i] for i in index) for values in (names, sizes, kinds))
     values = np.concatenate([np.asarray(_UNITS[unit][2](part)) for _, part in parts])
     if far is None or unit == "deg":
-        far = _LITTLE_WEIGHT, np.flatnonzero(np.concatenate([part.weight for _, part in parts]) <= 0.5)
+        weights = np.concatenate([part.weight for _, part in parts])
+        far = "half of its weight or less", np.flatnonzero(weights <= 0.5)
+    groups = Groups(names, sizes, kinds, word)  # type: ignore
     return pose_chart(*_UNITS[unit][:2], groups, {"calibrated": values}, unit=unit, far=far, most=most)
 
 
@@ -254,9 +245,6 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
         record: The calibration.
         path: The file to write, whole or not at all; its name ends in ``.png``, ``.svg`` or ``.pdf``.
 
-    Raises:
-        InputError: For another format, or if the file cannot be written.
-
     Example:
         >>> from pathlib import Path
         >>> aj.plot.save_calibration_figure(record, Path("calibration.svg"))
@@ -266,8 +254,7 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     charts.append(kinds_chart(record, "deg"))
     plots = [chart.plots[0] for chart in charts if chart is not None]
     plots += [] if record.recording.true is None else [error_plot(record)]
-    columns = len(plots) if len(plots) <= _MOST_IN_A_ROW else 2
-    save_figure(draw_all(plots, columns, (5.5, 3.9), legends=True), path)
+    save_figure(draw_all(plots, len(plots) if len(plots) <= 3 else 2, (5.5, 3.9), legends=True), path)
 
 
 def residual_patterns(record: CalibrationRecord) -> Any:
@@ -276,26 +263,19 @@ def residual_patterns(record: CalibrationRecord) -> Any:
 
     Noise scatters evenly about zero; the means of neighbouring poses, with twice their standard errors, show what the
     model lacks: a wave is an eccentric encoder or a bending link, a slope a wrong gear ratio, a step something that
-    moved.
+    moved. The figure is returned; `InputError` if no pose has a residual with a direction.
 
     Args:
         record: The calibration.
 
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: If no pose has a residual with a direction.
-
     Example:
-        >>> figure = aj.plot.residual_patterns(record)
-        >>> figure.savefig("residuals.svg")
+        >>> aj.plot.residual_patterns(record).savefig("residuals.svg")
     """
     residuals = signed_residuals(record)
     if residuals is None:
         raise InputError("no pose has a residual with a direction, as no socket has several poses; record more poses.")
     charts = _pattern_charts(record, residuals, len(residuals.poses))
-    return draw_all([plot for chart in charts for plot in chart.plots], _COLUMNS)
+    return draw_all([plot for chart in charts for plot in chart.plots], 4)
 
 
 def pattern_charts(record: CalibrationRecord) -> list[Chart]:
@@ -309,37 +289,37 @@ def pattern_charts(record: CalibrationRecord) -> list[Chart]:
 def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most: int) -> list[Chart]:
     q = np.asarray(record.recording.capture.readings)[residuals.poses]
     order = np.arange(1, len(residuals.poses) + 1)
-    units = by_joint(record.calibrated.arm, (DEG, "deg"), (1.0, "mm"))
     by_reading = [
         (q[:, i] / unit, f"reading of joint {i + 1} [{name}]", residuals.along_joint[:, i], "")
-        for i, (unit, name) in enumerate(units)
+        for i, (unit, name) in enumerate(by_joint(record.calibrated.arm, (DEG, "deg"), (1.0, "mm")))
     ]
     by_order = [
         (order, "pose, in the order of the capture", residuals.vector[:, i], f"along {axis}")
         for i, axis in enumerate("xyz")
     ]
-    return [
-        Chart(
+    rows = (
+        (
             "by-joint",
             "Residuals against the readings",
             "The component of each residual along which the joint would move the tip, mm, against its reading. A wave "
             "is an eccentric encoder or a bending link, a slope a wrong gear ratio or zero.",
             _patterns(by_reading, most),
         ),
-        Chart(
+        (
             "by-order",
             "Residuals along x, y and z",
             "The residual in the base frame, mm, pose after pose as the capture holds them. A step between sockets or "
             "placements, or a slope, is something that moved, warmed or wore meanwhile.",
             _patterns(by_order, most),
         ),
-        Chart(
+        (
             "histogram",
             "Histogram of the residuals",
             "All coordinates of all poses; those beyond 4.5 standard deviations stand in the outermost boxes.",
             (_histogram(residuals.normalised[np.isfinite(residuals.normalised)]),),
         ),
-    ]
+    )
+    return [Chart(*row) for row in rows]
 
 
 def _histogram(values: np.ndarray) -> Plot:

@@ -1,6 +1,7 @@
 """Figures of a Monte Carlo study; each takes its results."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -8,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..study.results import Results
-from ..study.statistics import METRICS, correlation, factor_title, level_text, level_title, metric_title, shown_unit
+from ..study.blocks import METRICS
+from ..study.results import correlation
+from ..study.store import Results
+from ..study.tables import factor_title, level_text, level_title, metric_title, shown_unit
 from ..summaries.tables import format_number
 from .charts import SERIES, Marks, Plot, linear, logarithmic, names, thinned
 from .figures import draw, draw_all, save_figure
-from .uncertainty import correlation_plot
+from .parameters import correlation_plot
 
-_WIDTHS = ("bounds.length_mm", "bounds.angle_deg")
-_SHIFTS = ("bounds.length_shift_mm", "bounds.angle_shift_deg")
 _MOST_PLOTS = 12  # of a metric, each with a combination of factors
 _WIDE = 20  # times: positive values over a wider range need a logarithmic axis
 _SCALE_ERROR = "error of the scale of stage 1 [parts in a million]"
@@ -30,14 +31,8 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
 
     Args:
         results: The study.
-        metric: Name of the metric, a key of `study.statistics.METRICS`.
-        axes: Axes to plot into; new ones if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: If there is no such metric.
+        metric: Name of the metric, a key of `study.blocks.METRICS`.
+        axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
         >>> axes = aj.plot.study_metric(results, "de_stage1")
@@ -92,17 +87,11 @@ def _plots(results: Results, factor: str, panels: Mapping[str, Sequence[_Series]
 
 
 def save_study_figures(results: Results, folder: Path) -> list[Path]:
-    """Write every figure that the study's factors allow into a folder, as PNG.
+    """Write every figure that the study's factors allow into a folder, as PNG; returns the files.
 
     Args:
         results: The study.
         folder: The folder, made if there is none.
-
-    Returns:
-        The files written.
-
-    Raises:
-        InputError: If the folder or a file cannot be written.
 
     Example:
         >>> from pathlib import Path
@@ -120,14 +109,12 @@ def save_study_figures(results: Results, folder: Path) -> list[Path]:
     if any(np.any(results.column("converged", cell) == 1) for cell in range(len(results.study.cells))):
         for chosen, prefix, plot in (
             (tuple(factors), "distributions", study_distributions),
-            (_WIDTHS, "error_against", study_errors),
-            (_SHIFTS, "k_against", study_scale),
+            (("bounds.length_mm", "bounds.angle_deg"), "error_against", study_errors),
+            (("bounds.length_shift_mm", "bounds.angle_shift_deg"), "k_against", study_scale),
         ):
-            figures |= {
-                f"{prefix}_{factor.replace('.', '_')}": lambda factor=factor, plot=plot: plot(results, factor)
-                for factor in chosen
-                if factor in factors
-            }
+            for factor in chosen:
+                if factor in factors:
+                    figures[f"{prefix}_{factor.replace('.', '_')}"] = partial(plot, results, factor)
         figures["correlation"] = lambda: study_correlation(results, 1)
     for name, figure in figures.items():
         save_figure(figure(), folder / f"{name}.png")
@@ -138,15 +125,12 @@ def study_distributions(
     results: Results, factor: str, metrics: Sequence[str] = ("de", "length_error", "angle_error")
 ) -> Any:
     """Plot how metrics are distributed at each level of a factor, over all other factors: quartiles as boxes, medians
-    as marks, and whiskers from the 5th to the 95th percentile.
+    as marks, and whiskers from the 5th to the 95th percentile; returns the figure.
 
     Args:
         results: The study.
         factor: Name of a varied factor.
         metrics: Names of the metrics, one panel each; those of stage 1 if the study has no scale fix.
-
-    Returns:
-        The figure.
 
     Example:
         >>> aj.plot.study_distributions(results, "bounds.length_mm").savefig("distributions.svg")
@@ -169,14 +153,12 @@ def study_distributions(
 
 
 def study_errors(results: Results, factor: str) -> Any:
-    """Plot the largest length or angle error before and after the scale fix against a half-width of the bounds.
+    """Plot the largest length or angle error before and after the scale fix against a half-width of the bounds: medians
+    and bars from the 5th to the 95th percentile; returns the figure.
 
     Args:
         results: The study.
         factor: ``"bounds.length_mm"`` or ``"bounds.angle_deg"``, varied in the study.
-
-    Returns:
-        The figure, with medians and bars from the 5th to the 95th percentile.
 
     Example:
         >>> aj.plot.study_errors(results, "bounds.length_mm").savefig("errors.svg")
@@ -191,14 +173,12 @@ def study_errors(results: Results, factor: str) -> Any:
 
 
 def study_scale(results: Results, factor: str) -> Any:
-    """Plot the error of the scale that stage 1 leaves (found / true - 1) against a shift of the bounds' centre.
+    """Plot the error of the scale that stage 1 leaves (found / true - 1) against a shift of the bounds' centre, as
+    `study_errors` does.
 
     Args:
         results: The study.
         factor: ``"bounds.length_shift_mm"`` or ``"bounds.angle_shift_deg"``, varied in the study.
-
-    Returns:
-        The figure, with medians and bars from the 5th to the 95th percentile.
 
     Example:
         >>> aj.plot.study_scale(results, "bounds.length_shift_mm").savefig("scale.svg")
@@ -208,17 +188,11 @@ def study_scale(results: Results, factor: str) -> Any:
 
 def study_correlation(results: Results, cell: int) -> Any:
     """Plot the correlations of the parameters' errors in one cell: darker is stronger, with the sign written where it
-    is at least 0.5.
+    is at least 0.5; returns the figure.
 
     Args:
         results: The study.
         cell: The cell, counted from 1.
-
-    Returns:
-        The figure.
-
-    Raises:
-        InputError: If the study has no such cell.
 
     Example:
         >>> aj.plot.study_correlation(results, cell=1).savefig("correlation.svg")
@@ -233,13 +207,11 @@ def study_correlation(results: Results, cell: int) -> Any:
 
 
 def study_convergence(results: Results) -> Any:
-    """Plot the percentage of trials that converged over the two factors with the most levels, or along the only one.
+    """Plot the percentage of trials that converged over the two factors with the most levels, or along the only one;
+    returns the figure.
 
     Args:
         results: The study.
-
-    Returns:
-        The figure.
 
     Example:
         >>> aj.plot.study_convergence(results).savefig("convergence.svg")
@@ -262,14 +234,12 @@ def study_convergence(results: Results) -> Any:
         Marks("", x, y, "boxes", shade=shade, box=(1.0, 1.0)),
         Marks("", x, y, "text", "ink", ["-" if np.isnan(p) else f"{p:.4g}" for p in percentage], size=8),
     )
-    x_axis, y_axis = (
-        names(fill(factor_title(name) if name else "", 14 + 8 * len(labels)), labels)._replace(
-            low=-0.5, high=len(labels) - 0.5
-        )
-        for name, labels in zip(factors, levels, strict=True)
-    )
+    axes = []
+    for name, labels in zip(factors, levels, strict=True):
+        title = fill(factor_title(name) if name else "", 14 + 8 * len(labels))
+        axes.append(names(title, labels)._replace(low=-0.5, high=len(labels) - 0.5))
     size = 1.9 + 0.75 * max(len(levels[0]), 4), 1.9 + 0.5 * len(levels[1])
-    return draw_all([Plot(x_axis, y_axis, marks, title="trials that converged [%]")], 1, size)
+    return draw_all([Plot(axes[0], axes[1], marks, title="trials that converged [%]")], 1, size)
 
 
 def _percentiles(
@@ -279,8 +249,7 @@ def _percentiles(
     where there are none."""
     columns = []
     for cells in levels:
-        rows = [results.column(metric, cell)[results.column("converged", cell) == 1] for cell in cells]
-        values = np.concatenate(rows)
+        values = np.concatenate([results.column(metric, c)[results.column("converged", c) == 1] for c in cells])
         values = 1e6 * (values - 1) if metric == "scale" else shown_unit(metric)[1] * values
         values = values[np.isfinite(values)]
         columns.append(np.percentile(values if len(values) else [np.nan], percentiles))

@@ -5,12 +5,12 @@ dots keep their size; text stands at percentages. Colours are those of the page'
 """
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from .charts import Axis, Marks, Plot
+from .charts import Marks, Plot
 
 _CHARACTER = 6.6  # pixels: mean width of one in a label
 _OVERLAP = 16  # pixels: least distance of labels of the vertical axis
@@ -20,20 +20,19 @@ _LINES = ("line", "dashed", "dotted")
 def drawn(plot: Plot, label: str) -> str:
     """One plot: its axes and marks; ``label`` is the id of what describes it."""
     x, y = plot.x, plot.y
-    left = 14 + _CHARACTER * max((len(text) for _, text in y.ticks), default=0)
-    below = 20.0
+    left, below = 14 + _CHARACTER * max((len(text) for _, text in y.ticks), default=0), 20.0
     if x.slanted:
         longest = max((len(text) for _, text in x.ticks), default=0)
         below, left = 14 + 0.9 * _CHARACTER * longest, max(left, 12 + 0.5 * _CHARACTER * min(longest, 8))
     title, y_title, x_title = (
-        f'<p class="{kind}">{_text(words)}</p>' if words else ""
+        f'<p class="{kind}">{html.escape(words)}</p>' if words else ""
         for kind, words in (("plot-title", plot.title), ("axis-title", y.title), ("axis-title below", x.title))
     )
     style = f"padding:6px 12px {below:.0f}px {left:.0f}px"
     ratio = ' square"' if plot.square else '"'
     # Lines across are below everything else.
     ordered = sorted(plot.marks, key=lambda marks: marks.symbol not in ("level", "border"))
-    body = "".join((*_grid(plot), *(_marks(plot, marks) for marks in ordered), *_labels(plot)))
+    body = "".join((*_grid(plot), *(part for marks in ordered for part in _marks(plot, marks)), *_labels(plot)))
     return (
         f'<div class="plot">{title}{y_title}<div class="axes{ratio} style="{style}">'
         f'<svg role="img" aria-labelledby="{label}" style="--height:{plot.height}px">{body}</svg></div>'
@@ -43,10 +42,9 @@ def drawn(plot: Plot, label: str) -> str:
 
 def key(plots: Sequence[Plot]) -> list[tuple[str, str]]:
     """The glyph and the name of every shade, and of every named series where there are others."""
-    shades = {
-        name: _box(f"boxes s{i}") for plot in plots for marks in plot.marks for i, name in enumerate(marks.shade_names)
-    }
-    named = {marks.name: _glyph(marks) for plot in plots for marks in plot.marks if marks.name and not marks.limits}
+    series = [marks for plot in plots for marks in plot.marks]
+    shades = {name: _box(f"boxes s{i}") for marks in series for i, name in enumerate(marks.shade_names)}
+    named = {marks.name: _glyph(marks) for marks in series if marks.name and not marks.limits}
     entries = shades | (named if shades or len(named) > 1 else {})
     return [(glyph, name) for name, glyph in entries.items()]
 
@@ -58,15 +56,9 @@ def points(plot: Plot) -> list[list]:
         if len(marks.words) and marks.symbol != "text":
             places = zip(*_positions(plot, marks.x, marks.y), marks.words, strict=True)
             said += [
-                [round(float(x)), round(float(y)), words]
-                for x, y, words in places
-                if words and np.isfinite(x) and np.isfinite(y)
+                [round(float(x)), round(float(y)), words] for x, y, words in places if words and np.isfinite(x + y)
             ]
     return said
-
-
-def _text(words: object) -> str:
-    return html.escape(str(words))
 
 
 def _positions(plot: Plot, x: object, y: object) -> tuple[Any, Any]:
@@ -86,7 +78,7 @@ def _path(d: Iterable[str], kind: str, width: float | None = None) -> str:
     )
 
 
-def _grid(plot: Plot) -> Iterable[str]:
+def _grid(plot: Plot) -> Iterator[str]:
     """Frame and grid; a table of boxes has no grid."""
     x, y = (1000 * axis.at([tick for tick, _ in axis.ticks]) for axis in (plot.x, plot.y))
     if not any(marks.symbol == "boxes" and marks.box[1] for marks in plot.marks):
@@ -95,117 +87,91 @@ def _grid(plot: Plot) -> Iterable[str]:
     yield _path(["M0 0V1000H1000"], "frame")
 
 
-def _marks(plot: Plot, marks: Marks) -> str:
-    if marks.symbol == "level":
-        return _path([f"M0 {_number(y)}H1000" for y in 1000 * (1 - plot.y.at(marks.y))], "level")
-    if marks.symbol == "border":
-        return _path([f"M{_number(x)} 0V1000" for x in 1000 * plot.x.at(marks.x)], "separate") if len(marks.x) else ""
-    tone = f"t-{marks.tone}"
-    x, y = _positions(plot, marks.x, marks.y)
-    if marks.symbol == "text":
-        return "".join(
-            f'<text x="{a / 10:.2f}%" y="{b / 10:.2f}%" dy="4" class="middle sign {tone}">{_text(words)}</text>'
-            for a, b, words in zip(x, y, marks.words, strict=True)
-        )
-    if marks.low is None or marks.high is None:
-        spans = ""
-    elif marks.symbol == "band":
-        return _band(plot, marks, tone)
-    else:
-        thick = marks.symbol == "bars"
-        of_box = "bar t-ink" if marks.symbol == "boxes" else f"bar {tone}"
-        spans = _spans(plot, marks, f"bars {tone}" if thick else of_box, marks.size if thick else None)
-    line = _line(marks, x, y, tone) if marks.joined or marks.symbol in _LINES else ""
-    if marks.symbol == "bars" or marks.symbol in _LINES:
-        return spans + line
-    if marks.symbol == "boxes":
-        return "".join(_boxes(plot, marks, x, y, tone)) + spans
-    return spans + line + "".join(_points(marks, x, y, tone))
-
-
-def _line(marks: Marks, x: np.ndarray, y: np.ndarray, tone: str) -> str:
-    """A line through the points, interrupted where there is none."""
+def _marks(plot: Plot, marks: Marks) -> Iterator[str]:
+    """One series: bars and bands, lines, and points."""
+    symbol, tone = marks.symbol, f"t-{marks.tone}"
+    x, y = _positions(plot, marks.x if symbol != "level" else 0.0, marks.y if symbol != "border" else 1.0)
+    if symbol == "level":
+        yield _path([f"M0 {_number(at)}H1000" for at in y], "level")
+    elif symbol == "border":
+        yield _path([f"M{_number(at)} 0V1000" for at in x], "separate") if len(x) else ""
+    elif symbol == "text":
+        for a, b, words in zip(x, y, marks.words, strict=True):
+            place = f'x="{a / 10:.2f}%" y="{b / 10:.2f}%" dy="4"'
+            yield f'<text {place} class="middle sign {tone}">{html.escape(words)}</text>'
+    elif symbol == "boxes":
+        yield from _boxes(plot, marks, x, y)
+    if marks.low is not None and marks.high is not None:
+        yield _spans(plot, marks)
     finite = np.isfinite(x) & np.isfinite(y)
-    begins = [i == 0 or not finite[i - 1] for i in range(len(x))]
-    d = [
-        f"{'M' if new else 'L'}{_number(a)} {_number(b)}"
-        for a, b, new, k in zip(x, y, begins, finite, strict=True)
-        if k
-    ]
-    return _path(d, f"curve {tone}" + (f" {marks.symbol}" if marks.symbol in ("dashed", "dotted") else ""))
-
-
-def _points(marks: Marks, x: np.ndarray, y: np.ndarray, tone: str) -> Iterable[str]:
-    """Dots are lines without length, whose ends are round or square; in PDF, square ends need a direction."""
-    finite = np.isfinite(x) & np.isfinite(y)
-    if marks.symbol not in ("dot", "square"):
+    if marks.joined or symbol in _LINES:
+        # Interrupted where there is no point.
+        begins = [i == 0 or not finite[i - 1] for i in range(len(x))]
+        places = zip(x, y, begins, finite, strict=True)
+        d = [f"{'M' if new else 'L'}{_number(a)} {_number(b)}" for a, b, new, there in places if there]
+        yield _path(d, f"curve {tone}" + (f" {symbol}" if symbol in ("dashed", "dotted") else ""))
+    if symbol in ("dot", "square"):
+        # Dots are lines without length, whose ends are round or square; in PDF, square ends need a direction.
+        length = "h0" if symbol == "dot" else "h.1"
+        for i, chosen in _by_shade(marks, finite):
+            d = [f"M{_number(a)} {_number(b)}{length}" for a, b in zip(x[chosen], y[chosen], strict=True)]
+            yield _path(d, f"{symbol}s {tone if i < 0 else f's{i}'}", marks.size + 1.6 * max(i, 0))
+    elif symbol in ("triangle", "diamond", "cross", "ring"):
         for a, b in zip(x[finite], y[finite], strict=True):
-            yield f'<use href="#{marks.symbol}" x="{a / 10:.2f}%" y="{b / 10:.2f}%" class="{tone}"/>'
-        return
-    length = "h0" if marks.symbol == "dot" else "h.1"
-    shade = np.full(len(x), -1) if marks.shade is None else np.asarray(marks.shade)
-    for i in np.unique(shade[finite]).tolist():
-        chosen = finite & (shade == i)
-        d = [f"M{_number(a)} {_number(b)}{length}" for a, b in zip(x[chosen], y[chosen], strict=True)]
-        yield _path(d, f"{marks.symbol}s {tone if i < 0 else f's{i}'}", marks.size + 1.6 * max(i, 0))
+            yield f'<use href="#{symbol}" x="{a / 10:.2f}%" y="{b / 10:.2f}%" class="{tone}"/>'
 
 
-def _ends(plot: Plot, marks: Marks) -> list[tuple[float, float, float]]:
-    """Abscissa, lower and upper end of each bar, or of each place of a band."""
+def _by_shade(marks: Marks, among: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """The marks of each shade, -1 without any."""
+    shade = np.full(len(among), -1) if marks.shade is None else np.asarray(marks.shade)
+    for i in np.unique(shade[among]).tolist():
+        yield i, among & (shade == i)
+
+
+def _spans(plot: Plot, marks: Marks) -> str:
+    """Bars, or a band, from the lower to the upper ends."""
     x, low = _positions(plot, marks.x, marks.low)
     high = _positions(plot, marks.x, marks.high)[1]
     finite = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
-    return list(zip(x[finite], low[finite], high[finite], strict=True))
+    ends = list(zip(x[finite], low[finite], high[finite], strict=True))
+    tone, thick = f"t-{marks.tone}", marks.symbol == "bars"
+    if marks.symbol == "band":
+        around = [(a, b) for a, b, _ in ends] + [(a, b) for a, _, b in reversed(ends)]
+        return (
+            _path(["M", "L".join(f"{_number(a)} {_number(b)}" for a, b in around), "Z"], f"band {tone}") if ends else ""
+        )
+    kind = f"bars {tone}" if thick else "bar t-ink" if marks.symbol == "boxes" else f"bar {tone}"
+    d = [f"M{_number(a)} {_number(b)}V{_number(c)}" for a, b, c in ((a, *np.clip(pair, 0, 1000)) for a, *pair in ends)]
+    return _path(d, kind, marks.size if thick else None)
 
 
-def _spans(plot: Plot, marks: Marks, kind: str, width: float | None) -> str:
-    ends = ((x, *np.clip((low, high), 0, 1000)) for x, low, high in _ends(plot, marks))
-    return _path([f"M{_number(x)} {_number(low)}V{_number(high)}" for x, low, high in ends], kind, width)
-
-
-def _band(plot: Plot, marks: Marks, tone: str) -> str:
-    ends = _ends(plot, marks)
-    around = [(x, low) for x, low, _ in ends] + [(x, high) for x, _, high in reversed(ends)]
-    if not around:
-        return ""
-    return _path(["M", "L".join(f"{_number(x)} {_number(y)}" for x, y in around), "Z"], f"band {tone}")
-
-
-def _boxes(plot: Plot, marks: Marks, x: np.ndarray, y: np.ndarray, tone: str) -> Iterable[str]:
+def _boxes(plot: Plot, marks: Marks, x: np.ndarray, y: np.ndarray) -> Iterator[str]:
     width = 1000 * marks.box[0] / abs(plot.x.high - plot.x.low)
     height = 1000 - y
     if marks.box[1]:
         height = np.full(len(y), 1000 * marks.box[1] / abs(plot.y.high - plot.y.low))
         y = y - height / 2
-    shade = np.full(len(x), -1) if marks.shade is None else np.asarray(marks.shade)
-    for i in np.unique(shade).tolist():
-        places = zip(x[shade == i] - width / 2, y[shade == i], height[shade == i], strict=True)
-        size = _number(width)
+    for i, chosen in _by_shade(marks, np.ones(len(x), dtype=bool)):
+        places, size = zip(x[chosen] - width / 2, y[chosen], height[chosen], strict=True), _number(width)
         d = [f"M{_number(a)} {_number(b)}h{size}v{_number(c)}h-{size}z" for a, b, c in places if c > 0]
-        yield _path(d, f"boxes {tone if i < 0 else f's{i}'}")
+        yield _path(d, f"boxes {f't-{marks.tone}' if i < 0 else f's{i}'}")
 
 
-def _labels(plot: Plot) -> Iterable[str]:
-    """Numbers and names along both axes."""
-    for position, words in _apart(plot.y, plot.height):
-        yield f'<text x="-7" y="{position:.2f}%" dy="4" class="end">{_text(words)}</text>'
+def _labels(plot: Plot) -> Iterator[str]:
+    """Numbers and names along both axes; of the vertical one those that have room."""
+    last = np.inf
+    for tick, words in plot.y.ticks:
+        position = 100 * (1 - float(plot.y.at(tick)))
+        if abs(position - last) * plot.height / 100 >= _OVERLAP:
+            last = position
+            yield f'<text x="-7" y="{position:.2f}%" dy="4" class="end">{html.escape(words)}</text>'
     for tick, words in plot.x.ticks:
-        position = 100 * float(plot.x.at(tick))
+        position, words = f"{100 * float(plot.x.at(tick)):.2f}%", html.escape(words)
         if plot.x.slanted:
-            text = f'<text class="end" transform="translate(4 12) rotate(-60)">{_text(words)}</text>'
-            yield f'<svg x="{position:.2f}%" y="100%">{text}</svg>'
+            text = f'<text class="end" transform="translate(4 12) rotate(-60)">{words}</text>'
+            yield f'<svg x="{position}" y="100%">{text}</svg>'
         else:
-            yield f'<text x="{position:.2f}%" y="100%" dy="16" class="middle">{_text(words)}</text>'
-
-
-def _apart(axis: Axis, height: int) -> list[tuple[float, str]]:
-    """The labels of the vertical axis that have room, as percentages from above."""
-    labels: list[tuple[float, str]] = []
-    for tick, words in axis.ticks:
-        position = 100 * (1 - float(axis.at(tick)))
-        if not labels or abs(position - labels[-1][0]) * height / 100 >= _OVERLAP:
-            labels.append((position, words))
-    return labels
+            yield f'<text x="{position}" y="100%" dy="16" class="middle">{words}</text>'
 
 
 def _glyph(marks: Marks) -> str:

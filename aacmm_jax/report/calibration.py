@@ -27,8 +27,7 @@ from ..summaries.tables import (
 )
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
-from .elements import Block, Report, Section
-from .tables import DRAWN, length_table, observation_tables, removed_tables
+from .elements import DRAWN, Block, Report, Section, length_table, observation_tables, removed_tables
 
 _METHODS = {
     "two-stage": "Identification from repeatability, then a scale fix",

@@ -11,12 +11,11 @@ from ..core.units import DEG, people_read
 from ..diagnostics.pose_residuals import observation_residuals
 from ..diagnostics.tried_poses import TriedPoses, tried_poses
 from ..kinematics.arm import joint_limits, parameter_unit
-from ..model.metrics import pose_outliers
+from ..model.sockets import pose_outliers
 from ..plot.charts import Chart, Marks, Plot, linear, names, thinned
-from ..plot.joint_models import functions_chart
-from ..plot.parameters import bounds_chart, change_chart
+from ..plot.lengths import tried_chart, volume_chart
+from ..plot.parameters import bounds_chart, change_chart, correlation_chart, functions_chart, singular_chart
 from ..plot.residuals import Groups, distances_in, kinds_chart, pattern_charts
-from ..plot.uncertainty import correlation_chart, singular_chart, tried_chart, volume_chart
 from ..summaries.harmonics import listed_apart
 from ..summaries.result_tables import geometry_table, harmonics_table, parameter_table, weights_table, with_u_digits
 from ..summaries.tables import (
@@ -35,9 +34,7 @@ from ..summaries.tables import (
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
-from .arm_view import view_of_arm
-from .elements import Block, Section
-from .tables import DRAWN, residual_chart, socket_table
+from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_of_arm
 
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",

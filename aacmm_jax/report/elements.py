@@ -1,14 +1,43 @@
-"""The elements of a report, independent of how they are shown: sections of text, tables, charts and views."""
+"""The elements of a report, independent of how they are shown; tables, charts and views of captures and evaluations."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..plot.charts import Chart
-from ..summaries.tables import Table
+import numpy as np
+from jaxtyping import Float
+
+from ..calibration.evaluation import Evaluation
+from ..calibration.record import CalibrationRecord
+from ..core.numpy_or_jax import AnyArray
+from ..data.capture import Capture
+from ..data.observations.observation import POINT, offset_of
+from ..diagnostics.pose_residuals import distances_of, observation_residuals
+from ..kinematics.arm import Arm
+from ..kinematics.workspace import arm_reach, skeleton
+from ..model.sockets import pose_outliers
+from ..plot.charts import Chart, thinned
+from ..plot.residuals import Groups, distances_in, pose_chart
+from ..summaries.observations import capture_observations
+from ..summaries.result_tables import BY_CONSTRUCTION, with_u_digits
+from ..summaries.tables import (
+    Cell,
+    Table,
+    by_columns,
+    decimals_for,
+    format_number,
+    listed,
+    number,
+    numbers,
+    quantity_words,
+)
+
+DRAWN = 1000  # most poses in a chart
+_VIEWED = 150  # most poses in the view of the arm
+_NO_GEOMETRY: Mapping[str, Any] = {}
 
 
 class ArmView(NamedTuple):
-    """An interactive view of the arm in its poses: see `arm_view`."""
+    """An interactive view of the arm in its poses."""
 
     id: str
     title: str
@@ -40,3 +69,154 @@ class Report(NamedTuple):
     simulated: bool = False
     decision: str | None = None  # of its acceptance tests, all together
     administrative: Sequence[tuple[str, list[tuple[str, str]]]] = ()  # groups of titles and values
+
+
+def view_of_arm(
+    arm: Arm,
+    capture: Capture,
+    distances: Float[np.ndarray, " m"],
+    geometry: Mapping[str, Float[AnyArray, " _"]] = _NO_GEOMETRY,
+) -> ArmView:
+    """The calibrated arm in the poses of a capture: marks at sockets and at the points of the geometry (centres,
+    pivots), and up to 150 poses as lines from joint to joint, mm, each with its residual (NaN where there is none).
+
+    ``geometry`` has the parts of the unknown geometry, mm and rad, of a capture with observations besides sockets.
+    """
+    groups, q = Groups.of(capture), np.asarray(capture.readings)
+    owner, labels, chosen = groups.owner, groups.labels, thinned(len(q), _VIEWED)
+    tips = np.asarray(arm.position(capture.q))
+    marks = {name: tips[capture.owner == i].mean(axis=0) for i, name in enumerate(capture.names)}
+    lines = skeleton(arm, q[chosen])
+    for i, observation in enumerate(capture.observations, start=len(capture.names)):
+        points = [part for part, units in observation.unknowns.items() if units == POINT]
+        # A part with certified values has its numbers in a frame of its own.
+        marks |= {part: geometry[part] for part in points if part not in observation.certified}
+        if observation.target:
+            of_target = owner[chosen] == i
+            held = arm.replace(probe=geometry[offset_of(observation.target)])
+            lines[of_target] = skeleton(held, q[chosen[of_target]])
+    data: dict[str, Any] = {
+        "marks": [{"name": name, "at": np.round(at, 1).tolist()} for name, at in marks.items()],
+        "from": "geometry" if capture.observations else "socket's centroid",
+        "poses": [
+            {
+                "label": labels[i],
+                "points": np.round(line, 1).tolist(),
+                "distance": float(f"{distances[i]:.4g}") if np.isfinite(distances[i]) else None,
+            }
+            for i, line in zip(chosen, lines, strict=True)
+        ],
+        "reach": round(arm_reach(arm).radius, 1),
+    }
+    points = f", its {'points' if capture.observations else 'sockets'}" if marks else ""
+    return ArmView(
+        "scene",
+        f"The calibrated arm{points} and its poses",
+        "Drag, or use the arrow keys, to rotate the view; plus and minus change its size. The slider goes through the "
+        "poses.",
+        data,
+    )
+
+
+def socket_table(capture: Capture, evaluation: Evaluation) -> Table:
+    """Repeatability and number of outliers, socket by socket."""
+    scatter = evaluation.repeatability
+    outliers, _ = pose_outliers(np.asarray(evaluation.distances), capture.sizes)
+    far = np.bincount(capture.owner[outliers], minlength=len(capture.names)).tolist()
+    scattered = np.asarray(capture.sizes) > 1
+    metrics = {"DE": scatter.socket_de, "Deltam": scatter.socket_deltam, "RMS": scatter.socket_rms}
+    columns = {
+        "socket": capture.names,
+        "poses": capture.sizes,
+        **{name: numbers(np.where(scattered, values, np.nan)) for name, values in metrics.items()},
+        "marked poses": [number(count, 0, mark="outlier" if count else "") for count in far],
+    }
+    return by_columns("Repeatability by socket [mm]", columns)
+
+
+def residual_chart(capture: Capture, evaluation: Evaluation) -> Chart:
+    """Distances of all poses by the calibrated arm; those far off are marked, and a table lists the largest."""
+    groups, distances = Groups.of(capture), distances_in(capture, evaluation)
+    far = pose_outliers(np.concatenate(distances_of(capture, evaluation)), groups.sizes)[0]
+    says = "far from its socket" if groups.word == "socket" else "far from its geometry"
+    title = "Residuals of the calibrated arm"
+    return pose_chart("residuals", title, groups, {"calibrated": distances}, far=(says, far), most=DRAWN)
+
+
+def length_table(
+    caption: str,
+    rows: Sequence[Mapping[str, Any]],
+    before: Mapping[str, np.ndarray],
+    fixed_scale: int | None = None,
+) -> Table:
+    """Lengths: value, errors by earlier arms, error of the calibrated arm, and its U.
+
+    ``fixed_scale``: index of the length that fixed the scale, so that its error is zero by construction.
+    """
+
+    def error(i: int, value: float) -> Cell:
+        return number(value, decimals_for(rows[i]["expanded_mm"]), signed=True)
+
+    return listed(
+        caption,
+        range(len(rows)),
+        {
+            "between": lambda i: f"{rows[i]['from']} – {rows[i]['to']}",
+            "value": lambda i: rows[i]["value_mm"],
+            **{f"error, {arm}": lambda i, errors=errors: error(i, float(errors[i])) for arm, errors in before.items()},
+            "error, calibrated": lambda i: BY_CONSTRUCTION if i == fixed_scale else error(i, rows[i]["error_mm"]),
+            "U of error": lambda i: with_u_digits(rows[i]["expanded_mm"]),
+        },
+    )
+
+
+def observation_tables(record: CalibrationRecord) -> list[Table]:
+    """What was observed besides sockets and lengths, what is certified of it, and what else was stated."""
+    capture = record.recording.capture
+    if not capture.observations:
+        return []
+    u = {part.observation.name: part.u for part in observation_residuals(record)}
+    rows = capture_observations(capture)
+    certified = [{"observation": row["observation"]} | quantity for row in rows for quantity in row["certified"]]
+    columns = {
+        "observation": "observation",
+        "kind": "kind",
+        "tip": lambda row: row["target"] or "own probe",
+        "poses": "poses",
+        "unknown geometry": lambda row: ", ".join(row["unknowns"]),
+        "u of what was measured [mm]": lambda row: number(u[row["observation"]] or None),
+        "stated": lambda row: "; ".join(f"{quantity['quantity']} {_words(quantity)}" for quantity in row["stated"]),
+    }
+    if not any(row["stated"] for row in rows):
+        del columns["stated"]
+    if not any(u[row["observation"]] for row in rows):
+        del columns["u of what was measured [mm]"]
+    of_certified = {
+        "observation": "observation",
+        "quantity": "quantity",
+        "certified value": _words,
+        "u [mm]": lambda quantity: "taken as exact" if quantity["u"] == 0 else number(quantity["u"]),
+    }
+    tables = [listed("Observations", rows, columns)]
+    return [*tables, *([listed("Certified values", certified, of_certified)] if certified else [])]
+
+
+def removed_tables(record: CalibrationRecord) -> list[Table]:
+    """What was left out because it contradicts the rest, why, and what that changed."""
+    columns = {
+        "group": lambda left_out: left_out.group,
+        "kind": lambda left_out: left_out.kind,
+        "its sockets and observations": lambda left_out: ", ".join(left_out.members),
+        "F": lambda left_out: number(left_out.ratio, 1),
+        "degrees of freedom": lambda left_out: "{} and {}".format(*left_out.degrees_of_freedom),
+        "p": lambda left_out: left_out.probability if left_out.probability >= 1e-4 else "< 0.0001",
+        "RMS of the rest, with it [mm]": lambda left_out: left_out.rms_with,
+        "without it [mm]": lambda left_out: left_out.rms_without,
+        "changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
+    }
+    caption = "Left out, because it contradicts the rest"
+    return [listed(caption, record.removed, columns)] if record.removed else []
+
+
+def _words(quantity: dict[str, Any]) -> str:
+    return quantity_words(quantity, u=False).replace("-", "−")

@@ -12,7 +12,7 @@ from ..acceptance.results import AcceptanceTest
 from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
 from ..data.capture import ReferenceLength
-from ..data.sphere import ProbedSphere
+from ..data.recording import ProbedSphere
 from ..plot.lengths import metrics_chart, reading_errors_chart
 from ..plot.residuals import arms_chart, distances_in
 from ..summaries import result_tables
@@ -20,9 +20,7 @@ from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import Cell, Table, decimals_for, format_number, listed, number
 from ..summaries.verdicts import overall_decision
-from .arm_view import view_of_arm
-from .elements import Block, Report, Section
-from .tables import DRAWN, length_table, residual_chart, socket_table
+from .elements import DRAWN, Block, Report, Section, length_table, residual_chart, socket_table, view_of_arm
 
 _STAGES = ("nominal", "calibrated")
 _GROUPS = (("held_out", "Held-out data"), ("identified_from", "Data used for identification"))

@@ -3,19 +3,19 @@
 import base64
 import hashlib
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from ..acceptance.record import SIMULATED
-from ..core.extras import require
-from ..files.administrative_data import AdministrativeData, check_conformity
+from ..core.errors import require
+from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together, write_text
 from ..plot.charts import Chart
 from ..plot.svg import drawn, key, points
 from ..summaries.tables import Cell, Table
-from .administrative_data import administrative_groups
 from .elements import ArmView, Report
 
 KINDS = ("calibration", "evaluation", "study", "model comparison")
@@ -24,23 +24,42 @@ _MOST_STACKED = 30  # cells: more would be a list without end
 _NARROW, _CHARACTER, _GAP = 370.0, 7.6, 8.0  # pixels: a telephone's page, a character, between columns
 _LONGEST = 14  # characters: longer texts are wrapped
 
+# Group of rows: part, key, title, and whether it is shown where it is not stated.
+_ROWS: dict[str, tuple[tuple[str, str, str, bool], ...]] = {
+    "Laboratory": (("laboratory", "name", "Name", True), ("laboratory", "code", "Accreditation", False)),
+    "Customer": (("customer", "name", "Name", True),),
+    "Item": (
+        ("item", "name", "Arm", False),
+        ("item", "manufacturer", "Manufacturer", True),
+        ("item", "model", "Model", True),
+        ("item", "serial_number", "Serial number", True),
+        ("item", "customer_number", "Customer's number", False),
+    ),
+    "Calibration": (
+        ("certificate", "number", "Certificate number", True),
+        ("certificate", "received", "Received on", False),
+        ("certificate", "begin", "Begun on", True),
+        ("certificate", "end", "Ended on", True),
+        ("certificate", "issued", "Issued on", False),
+        ("certificate", "place", "Place", False),
+        ("certificate", "remarks", "Remarks", False),
+    ),
+}
+_ADDRESS = ("street", "postal_code", "city", "country", "email", "phone")
+
 
 def write_report(
     source: str | os.PathLike, target: str | os.PathLike, administrative_data: AdministrativeData | None = None
 ) -> dict[str, Any]:
     """Write the report of a calibration, an evaluation, a study or compared models as one HTML file.
 
+    Returns title, verdict, warnings and size of the report. `InputError` if the source cannot be read or the target not
+    written, the administrative data state a conformity that the source contradicts, or Jinja is not installed.
+
     Args:
         source: The HDF5 file of the calibration, the evaluation, the study or the compared models.
         target: The HTML file to write, whole or not at all.
         administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
-
-    Returns:
-        Title, verdict, warnings and size of the report.
-
-    Raises:
-        InputError: If the source cannot be read or the target not written, the administrative data state a conformity
-            that the source contradicts, or Jinja is not installed.
 
     Example:
         >>> aj.files.save_calibration("calibration.h5", record)
@@ -49,25 +68,22 @@ def write_report(
         Calibration of Cheng 2018, simulated arm
     """
     require("report", "a report")
+    source, target = Path(source), Path(target)
     with together(target):
-        return _written(Path(source), Path(target), administrative_data)
-
-
-def _written(source: Path, target: Path, administrative_data: AdministrativeData | None) -> dict[str, Any]:
-    kind = read_summary(source, KINDS)[0]["kind"]
-    read = source if kind == "study" else InputFile(source)  # a study is read in parts
-    attributes = read_tables(read, (kind,), without=("trials",)).attributes
-    report = _report_of(kind, read, attributes)
-    if report.simulated:
-        warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
-        mark = "unsure" if report.decision == "conforms" else report.verdict_mark  # no real arm conforms
-        report = report._replace(warnings=warnings, verdict_mark=mark)
-    if administrative_data is not None:
-        tested = kind == "evaluation"
-        check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, tested=tested)
-        report = report._replace(administrative=administrative_groups(administrative_data, tested))
-    page = _render(report, _origin(read, attributes))
-    write_text(target, page)
+        kind = read_summary(source, KINDS)[0]["kind"]
+        read = source if kind == "study" else InputFile(source)  # a study is read in parts
+        attributes = read_tables(read, (kind,), without=("trials",)).attributes
+        report = _report_of(kind, read, attributes)
+        if report.simulated:
+            warnings = list(dict.fromkeys([SIMULATED, *report.warnings]))
+            mark = "unsure" if report.decision == "conforms" else report.verdict_mark  # no real arm conforms
+            report = report._replace(warnings=warnings, verdict_mark=mark)
+        if administrative_data is not None:
+            tested = kind == "evaluation"
+            check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, tested=tested)
+            report = report._replace(administrative=_administrative(administrative_data, tested))
+        page = _render(report, _origin(read, attributes))
+        write_text(target, page)
     return {
         "kind": "report",
         "of": str(source),
@@ -93,12 +109,12 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
         of_points = attributes.get("of") == "points"
         return (points_report if of_points else evaluation_report)(load_evaluation(source))
     if kind == "study":
-        from ..study.results import Results
-        from .study import study_report
+        from ..study.store import Results
+        from .studies import study_report
 
         return study_report(Results.of(source))
     from ..files.compared_models import load_compared_models
-    from .models import models_report
+    from .studies import models_report
 
     return models_report(load_compared_models(source))
 
@@ -145,7 +161,8 @@ def _render(report: Report, origin: list[tuple[str, list[str]]]) -> str:
         style=read("page_style.css"),
         script=script,
         mark=hashlib.sha256(repr(origin).encode()).hexdigest()[:12],
-        allowed=_script_hash(script),
+        # The source expression by which the page's content security policy allows its own script.
+        allowed="sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
 
 
@@ -160,6 +177,42 @@ def _stacked(table: Table, cells: list[list[Cell]]) -> bool:
     return characters * _CHARACTER + _GAP * len(texts) > _NARROW
 
 
-def _script_hash(script: str) -> str:
-    """The source expression by which the page's content security policy allows one of its own scripts."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+def _administrative(given: AdministrativeData, tested: bool) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Groups of titles and values of the administrative data; ``tested``: whether the report has acceptance tests."""
+
+    def stated(part: str, key: str) -> str:
+        value = getattr(getattr(given, part), key)
+        return "" if value is None or value == "other" else str(value)
+
+    groups: list[tuple[str, list[tuple[str, str]]]] = []
+    for group, rows in _ROWS.items():
+        values = [(title, stated(part, key), always) for part, key, title, always in rows]
+        shown = [(title, value or NOT_STATED) for title, value, always in values if always or value]
+        if group in ("Laboratory", "Customer"):
+            address = _joined(stated(group.lower(), key) for key in _ADDRESS)
+            shown += [("Address", address)] if address else []
+        groups.append((group, shown))
+    temperature, u = given.certificate.temperature_celsius, given.certificate.temperature_u_celsius
+    celsius = NOT_STATED if temperature is None else f"{temperature:g} °C" + ("" if u is None else f", u = {u:g} °C")
+    groups[-1][1].append(("Temperature", celsius))
+    artefacts = [
+        _joined((part.name, part.manufacturer, part.model, part.serial_number,
+                 part.certificate_number and f"certificate {part.certificate_number}"))
+        for part in given.reference
+    ]  # fmt: skip
+    persons = [
+        _joined((person.name, person.role, "signs the certificate" if person.main_signer else None))
+        for person in given.person
+    ]
+    for title, lines in (("Reference artefacts", artefacts), ("Responsible", persons)):
+        groups.append((title, [("", line) for line in lines or [NOT_STATED]]))
+    if given.conformity is not None:
+        source = "" if tested else " (stated by the laboratory; this file contains no acceptance test)"
+        conformity = given.conformity
+        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}{source}"
+        groups.append(("Statement of conformity", [("", words)]))
+    return groups
+
+
+def _joined(parts: Iterable[str | None]) -> str:
+    return ", ".join(filter(None, parts))

@@ -1,4 +1,4 @@
-"""Monte Carlo studies of calibrations: specification, trials, store, executors, results.
+"""Monte Carlo studies of calibrations: specification, trials, store, results.
 
 Trials are solved in batches, which look for no encoder that is noisier than the others and for no errors that poses
 share: intervals of a study are by its noise alone, and not by what `calibrate` adds to it.

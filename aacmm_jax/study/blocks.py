@@ -1,80 +1,92 @@
-"""What is stored of every trial, and how trials are cut into blocks."""
+"""What is stored of every trial, how trials are cut into blocks, and what their numbers are computed with.
 
-import hashlib
-from collections.abc import Iterator
-from pathlib import Path
-from typing import NamedTuple
+A study's file keeps what its numbers depend on besides the study (versions, the kind of device, settings of the
+environment), the names of its blocks contain its checksum, and every worker compares its own before it computes a
+block: so no study mixes numbers that were computed in two ways. Random numbers need none of this, see
+`core.random_keys`. Two processors may round differently all the same, and are not told apart.
+"""
 
+import json
+import os
+from importlib import metadata
+from typing import Any, NamedTuple
+
+import jax
 import numpy as np
 
+from ..core._compat import jax_setting
 from ..core.errors import InputError
-from .computed_with import computed_with
 from .definition import Study
-from .settings import Setting
 
 MOST_BLOCKS = 10_000  # files in one folder
 DIMENSIONS = ("cell", "trial", "parameter")
-NOT_RUN = -1  # of whole numbers; NaN of others, and -128 of active, where -1 is a bound
+
+_PACKAGES = ("aacmm_jax", "jax", "jaxlib", "numpy", "scipy")
+# Settings of JAX that change programs, with their defaults; benchmarks/attacks/settings.py tries all that JAX has.
+_SETTINGS: dict[str, Any] = {
+    "jax_default_dtype_bits": "64",
+    "jax_default_matmul_precision": None,
+    "jax_disable_jit": False,
+    "jax_disable_most_optimizations": False,
+    "jax_exec_time_optimization_effort": 0.0,
+    "jax_memory_fitting_effort": 0.0,
+    "jax_memory_fitting_level": "O2",
+    "jax_optimization_level": "UNKNOWN",
+}
+_FLAGS = "XLA_FLAGS"
+# What linear algebra, functions of NumPy and those of the C library are computed with.
+_ENVIRONMENT = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "GLIBC_TUNABLES", "MKL_CBWR")
+_HARMLESS = (
+    "--xla_cpu_multi_thread_eigen",
+    "--xla_cpu_parallel_codegen_split_count",
+    "--xla_dump",
+    "--xla_force_host_platform_device_count",
+    "--xla_hlo_profile",
+)
 
 
-class _Variable(NamedTuple):
+class Variable(NamedTuple):
     """One array of results."""
 
-    dtype: str
-    by_parameter: bool  # whether it has an axis for the parameters
     units: str
     long_name: str
+    dtype: str = "f8"
+    fill: float = np.nan  # of trials that have not run
+    by_parameter: bool = False  # whether it has an axis for the parameters
 
 
 METRICS = {
-    "k": "k, measured / nominal",
-    "scale": "scale after stage 1, found / true",
-    "scale_error": "scale after the fix, found / true - 1",
-    "de_stage1": "DE before the scale fix",
-    "deltam_stage1": "Deltam before the scale fix",
-    "length_error_stage1": "largest length error before the scale fix",
-    "angle_error_stage1": "largest angle error before the scale fix",
-    "de": "DE after the scale fix",
-    "deltam": "Deltam after the scale fix",
-    "length_error": "largest length error after the scale fix",
-    "angle_error": "largest angle error after the scale fix",
+    "k": Variable("1", "k, measured / nominal"),
+    "scale": Variable("1", "scale after stage 1, found / true"),
+    "scale_error": Variable("1", "scale after the fix, found / true - 1"),
+    "de_stage1": Variable("mm", "DE before the scale fix"),
+    "deltam_stage1": Variable("mm", "Deltam before the scale fix"),
+    "length_error_stage1": Variable("mm", "largest length error before the scale fix"),
+    "angle_error_stage1": Variable("rad", "largest angle error before the scale fix"),
+    "de": Variable("mm", "DE after the scale fix"),
+    "deltam": Variable("mm", "Deltam after the scale fix"),
+    "length_error": Variable("mm", "largest length error after the scale fix"),
+    "angle_error": Variable("rad", "largest angle error after the scale fix"),
 }
-
-
-def unit_of(metric: str) -> str:
-    """The unit of a metric in files."""
-    return "1" if metric in ("k", "scale", "scale_error") else "rad" if metric.startswith("angle") else "mm"
-
-
 VARIABLES = {
-    "converged": _Variable("i1", False, "1", "1 where every solve ended at a minimum, 0 where not, -1 not yet run"),
-    "reason": _Variable("i1", False, "1", "why the last solve ended, see attribute reasons"),
-    "steps": _Variable("i4", False, "1", "evaluations of all solves"),
-    **{name: _Variable("f8", False, unit_of(name), title) for name, title in METRICS.items()},
-    "truth_inside": _Variable("i1", False, "1", "1 where the true arm lies inside the bounds"),
-    "active": _Variable("i1", True, "1", "-1 on the lower bound, +1 on the upper, 0 inside, -128 not yet run"),
-    "estimate": _Variable("f8", True, "mm or rad", "identified parameters, at the end"),
-    "true": _Variable("f8", True, "mm or rad", "parameters of the true arm"),
+    "converged": Variable("1", "1 where every solve ended at a minimum, 0 where not, -1 not yet run", "i1", -1),
+    "reason": Variable("1", "why the last solve ended, see attribute reasons", "i1", -1),
+    "steps": Variable("1", "evaluations of all solves", "i4", -1),
+    **METRICS,
+    "truth_inside": Variable("1", "1 where the true arm lies inside the bounds", "i1", -1),
+    "active": Variable("1", "-1 on the lower bound, +1 on the upper, 0 inside, -128 not yet run", "i1", -128, True),
+    "estimate": Variable("mm or rad", "identified parameters, at the end", by_parameter=True),
+    "true": Variable("mm or rad", "parameters of the true arm", by_parameter=True),
 }
-
-
-def fill_of(name: str) -> float:
-    """The value that marks a trial that has not run."""
-    return np.nan if VARIABLES[name].dtype == "f8" else -128 if name == "active" else NOT_RUN
 
 
 class Block(NamedTuple):
-    """Trials of some cells, all of one setting."""
+    """Trials of some cells, all of one setting; the last ones are not included."""
 
     first_cell: int
-    last_cell: int  # not included
+    last_cell: int
     first_trial: int
-    last_trial: int  # not included
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Cells, and trials in each."""
-        return self.last_cell - self.first_cell, self.last_trial - self.first_trial
+    last_trial: int
 
     @property
     def slices(self) -> tuple[slice, slice]:
@@ -82,67 +94,62 @@ class Block(NamedTuple):
         return slice(self.first_cell, self.last_cell), slice(self.first_trial, self.last_trial)
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Cells, and trials in each."""
+        return self.last_cell - self.first_cell, self.last_trial - self.first_trial
+
+    @property
     def size(self) -> int:
         """Number of trials."""
         return self.shape[0] * self.shape[1]
 
 
-class Layout(NamedTuple):
-    """How trials are cut into blocks: all trials of some cells, or some trials of one cell."""
+def blocks_of(study: Study, chunk: int) -> list[Block]:
+    """Blocks of about ``chunk`` trials, in order: all trials of some cells that have the same compiled program, or some
+    trials of one cell."""
+    cells, trials = len(study.cells), study.trials
+    if cells * -(-trials // chunk) > MOST_BLOCKS:
+        raise InputError(
+            f"chunks of {chunk} cut {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} blocks; "
+            "give a larger chunk."
+        )
 
-    cells: int
-    trials: int
-    parameters: int
-    block_cells: int
-    block_trials: int
-    mark: str  # in the names of the files: of this study, of this size, and of what it is computed with
-    chunk: int  # trials in a block that were asked for
-    computed_with: str
+    def of_one_setting(count: int) -> bool:
+        groups = (study.settings[i : i + count] for i in range(0, cells, count))
+        return all(len(set(group)) == 1 for group in groups)
 
-    @classmethod
-    def of(cls, study: Study, chunk: int, settings: str | None = None) -> "Layout":
-        """Blocks of about ``chunk`` trials; small cells share a block where they have the same compiled program.
+    together = max(filter(of_one_setting, range(1, min(max(chunk // trials, 1), cells) + 1)))
+    # Blocks of nearly equal size: a short last one would run the same compiled program for fewer trials.
+    size = -(-trials // -(-trials // chunk))
+    return [
+        Block(cell, min(cell + together, cells), trial, min(trial + size, trials))
+        for cell in range(0, cells, together)
+        for trial in range(0, trials, size)
+    ]
 
-        ``settings`` is what the numbers are `computed_with`; by default as they are here.
-        """
-        cells, trials = len(study.cells), study.trials
-        if cells * -(-trials // chunk) > MOST_BLOCKS:
+
+def computed_with() -> str:
+    """What the numbers that this process computes depend on, as JSON; settings are left out where they are as usual."""
+    used = {name: metadata.version(name) for name in _PACKAGES} | {"platform": jax.default_backend()}
+    for name, usual in _SETTINGS.items():
+        if (value := jax_setting(name, usual)) != usual:
+            used[name.upper()] = str(value)
+    flags = {flag for flag in os.environ.get(_FLAGS, "").split() if not flag.startswith(_HARMLESS)}
+    environment = {name: os.environ.get(name, "") for name in _ENVIRONMENT} | {_FLAGS: " ".join(sorted(flags))}
+    return json.dumps(used | {name: text for name, text in environment.items() if text}, sort_keys=True)
+
+
+def check_same(begun: str, where: str, advice: str) -> None:
+    """Raise `InputError` where this process computes with something else than ``begun``, naming the first difference.
+
+    ``where`` names the study's file; ``advice`` is an alternative to what the message asks for.
+    """
+    then, here = json.loads(begun), json.loads(computed_with())
+    for name in sorted({*then, *here}, key=str.lower):
+        sign = " " if name in (*_PACKAGES, "platform") else "="
+        before, now = (f"{name}{sign}{side[name]}" if name in side else f"no {name}" for side in (then, here))
+        if before != now:
             raise InputError(
-                f"chunks of {chunk} cut {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} blocks; "
-                "give a larger chunk."
+                f"{where} was begun with {before}, and here is {now}, which can change the numbers; make it the same, "
+                f"or {advice}."
             )
-        settings = settings or computed_with()
-        mark = f"{study.digest[:12]}-{chunk}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
-        together = 1
-        if trials < chunk:
-            together = max(n for n in range(1, min(chunk // trials, cells) + 1) if _uniform(study.settings, n))
-        # Blocks of nearly equal size: a short last one would run the same compiled program for fewer trials.
-        block_trials = -(-trials // -(-trials // chunk))
-        return cls(cells, trials, len(study.space.names), together, block_trials, mark, chunk, settings)
-
-    def shape(self, name: str, cells: int | None = None, trials: int | None = None) -> tuple[int, ...]:
-        """Shape of an array of results, of the whole study or of part of it."""
-        shape = (self.cells if cells is None else cells, self.trials if trials is None else trials)
-        return (*shape, self.parameters) if VARIABLES[name].by_parameter else shape
-
-    def blocks(self) -> Iterator[Block]:
-        """All blocks, in order."""
-        for cell in range(0, self.cells, self.block_cells):
-            for trial in range(0, self.trials, self.block_trials):
-                last = min(trial + self.block_trials, self.trials)
-                yield Block(cell, min(cell + self.block_cells, self.cells), trial, last)
-
-
-def _uniform(settings: list[Setting], together: int) -> bool:
-    """Whether every group of so many consecutive cells has one setting."""
-    return all(len(set(settings[i : i + together])) == 1 for i in range(0, len(settings), together))
-
-
-def parts_of(path: Path) -> Path:
-    """Folder of the blocks of an unfinished study."""
-    return path.with_name(path.name + ".parts")
-
-
-def part_of(path: Path, block: Block, layout: Layout) -> Path:
-    """File of one block."""
-    return parts_of(path) / f"{layout.mark}-cell{block.first_cell:05d}-trial{block.first_trial:010d}.npz"

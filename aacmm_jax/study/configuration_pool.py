@@ -9,7 +9,6 @@ import threading
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +22,7 @@ from ..kinematics import chain
 from ..kinematics.arm import Arm
 from ..kinematics.inverse_kinematics import damped_inverse, least_norm_inverse, solve_to_targets
 from ..kinematics.jacobian import reading_columns
-from .definition import POOL_PARTS, Study, pool_capacity
-from .settings import Fixture, Setting
+from .definition import POOL_PARTS, Fixture, Setting, Study
 from .specification import Region
 
 _ROUNDS, _STEPS, _ROWS = 100, 20, 2048
@@ -34,43 +32,42 @@ _MOST_CONDITION = 30.0
 _CANDIDATES = 65_536  # placements at a time; most may lie outside a narrow region
 _STARTS = 8  # configurations tried at each end of a candidate placement
 
-
-class Pool(NamedTuple):
-    """A row for each configuration: q, cos and sin of q + theta, damped inverse (n, 3), and the point that it reaches,
-    of the nominal arm without corrections: what its joints do, and not what they read.
-
-    ``first``, ``placements`` and ``poses`` are the first row and the capacity of each fixture:
-    row = first + ((part * placements + placement) * ends + end) * poses + pose.
-    """
-
-    table: Float[np.ndarray, "rows columns"]
-    first: tuple[int, ...]
-    placements: tuple[int, ...]
-    poses: tuple[int, ...]
-
+# A row for each configuration: q, cos and sin of q + theta, damped inverse (n, 3), and the point that it reaches, of
+# the nominal arm without corrections: what its joints do, and not what they read.
+Table = Float[np.ndarray, "rows columns"]
+# Of each fixture: first row, placements, ends, poses in the pool, poses that a trial takes at each end;
+# row = first + ((part * placements + placement) * ends + end) * poses + pose.
+Places = tuple[tuple[int, int, int, int, int], ...]
 
 _building = threading.Lock()
 
 
-def pool_of(study: Study, setting: Setting) -> Pool:
+def pool_of(study: Study, setting: Setting) -> tuple[Table, Places]:
     """The pool of a setting. Raises `InputError` for a fixture out of reach, or without a placement in its region."""
     with _building:  # threads that need the same pool wait for the first, which builds it on all cores
         return _pool(study, setting)
 
 
 @lru_cache(maxsize=4)
-def _pool(study: Study, setting: Setting) -> Pool:
+def _pool(study: Study, setting: Setting) -> tuple[Table, Places]:
+    fixtures = setting.fixtures
     if setting.recorded:
-        return _recorded(study)
-    capacities = [pool_capacity(study, fixture) for fixture in setting.fixtures]
-    # The number of poses that a trial takes does not change the pool.
-    tables = [
-        _fixture_table(study, fixture._replace(poses=0), setting.limits, capacity)
-        for fixture, capacity in zip(setting.fixtures, capacities, strict=True)
-    ]
-    first = np.cumsum([0, *(len(table) for table in tables)])[:-1]
-    placements, poses = zip(*capacities, strict=True)
-    return Pool(np.concatenate(tables), tuple(map(int, first)), placements, poses)
+        capacities, tables = [(1, fixture.poses) for fixture in fixtures], [_recorded(study)]
+        counts = [fixture.poses for fixture in fixtures]
+    else:
+        capacities = [study.pool_capacity(fixture) for fixture in fixtures]
+        # The number of poses that a trial takes does not change the pool.
+        tables = [
+            _fixture_table(study, fixture._replace(poses=0), setting.limits, capacity)
+            for fixture, capacity in zip(fixtures, capacities, strict=True)
+        ]
+        counts = [len(table) for table in tables]
+    first = np.cumsum([0, *counts])[:-1].tolist()
+    places = tuple(
+        (row, placements, fixture.ends, poses, fixture.poses)
+        for row, fixture, (placements, poses) in zip(first, fixtures, capacities, strict=True)
+    )
+    return np.concatenate(tables), places
 
 
 def forget_pools() -> None:
@@ -79,33 +76,43 @@ def forget_pools() -> None:
     _fixture_table.cache_clear()
 
 
-def _recorded(study: Study) -> Pool:
-    """The configurations of the recording, and the centroid of the tips in every socket."""
-    capture, setting = study.capture, study.settings[0]
+def _recorded(study: Study) -> Table:
+    """The configurations of the recording, corrections included, and the centroid of the tips in every socket."""
+    capture, arm = study.capture, study.nominal.arm
     assert capture is not None
-    points = np.repeat([fixture.points[0] for fixture in setting.fixtures if fixture.points], capture.sizes, axis=0)
-    first = np.cumsum([0, *capture.sizes])[:-1]
-    table = _rows(study.plain_arm, _joint_values(study.nominal.arm, np.asarray(capture.q)), points)
-    return Pool(table, tuple(map(int, first)), (1,) * len(first), capture.sizes)
-
-
-def _joint_values(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
-    """What the joints do at these readings, corrections included."""
-    if arm.corrections is None:
-        return q
-    geometry = to_numpy(arm.geometry)
-    return q + np.asarray(chain.joint_errors(geometry, chain.joint_motion(geometry, q)))[:, 0].T
+    points = [fixture.points[0] for fixture in study.settings[0].fixtures if fixture.points]
+    q = np.asarray(capture.q)
+    if arm.corrections is not None:
+        geometry = to_numpy(arm.geometry)
+        q = q + np.asarray(chain.joint_errors(geometry, chain.joint_motion(geometry, q)))[:, 0].T
+    return _rows(study.plain_arm, q, np.repeat(points, capture.sizes, axis=0))
 
 
 @lru_cache(maxsize=16)
-def _fixture_table(study: Study, fixture: Fixture, limits: tuple, capacity: tuple[int, int]) -> np.ndarray:
-    arm, (placements, poses) = study.plain_arm, capacity
+def _fixture_table(study: Study, fixture: Fixture, limits: tuple, capacity: tuple[int, int]) -> Table:
+    """The pool of one fixture. A point's row depends on its index alone, not on which others are still unsolved.
+
+    `random_configurations` tries the missing points together and accepts nearly straight arms, so it cannot be used
+    here.
+    """
+    arm, (placements, poses), bounds = study.plain_arm, capacity, jnp.asarray(limits)
     key = pool_key(study.specification.seed, fixture, limits, capacity)
     if fixture.points is not None:
         points = np.tile(np.array(fixture.points), (POOL_PARTS, 1))
     else:
-        points = _placements(arm, fixture, jnp.asarray(limits), key, POOL_PARTS * placements).reshape(-1, 3)
-    return _fixture_rows(arm, np.repeat(points, poses, axis=0), jnp.asarray(limits), key, fixture)
+        points = _placements(arm, fixture, bounds, key, POOL_PARTS * placements).reshape(-1, 3)
+    points = np.repeat(points, poses, axis=0)
+    q, missing = np.zeros((len(points), arm.joints)), np.arange(len(points))
+    for number in range(_ROUNDS):
+        start = _uniform(jax.random.fold_in(key, number), bounds, len(points))
+        solved, good = _solved(arm, start[missing], points[missing], bounds)
+        q[missing[good]] = solved[good]
+        missing = missing[~good]
+        if not len(missing):
+            return _rows(arm, q, points)
+        if number == 9 and 2 * len(missing) > len(points):  # a point well within reach takes a few rounds
+            break
+    raise _out_of_reach(fixture)
 
 
 def pool_key(seed: int, fixture: Fixture, limits: tuple, capacity: tuple[int, int]) -> Array:
@@ -150,28 +157,6 @@ def _out_of_reach(fixture: Fixture) -> InputError:
     )
 
 
-def _fixture_rows(
-    arm: Arm, points: Float[np.ndarray, "m 3"], limits: Array, key: Array, fixture: Fixture
-) -> np.ndarray:
-    """Rows for all points. A point's row depends on its index alone, not on which other points are still unsolved.
-
-    `random_configurations` tries the missing points together and accepts nearly straight arms, so it cannot be used
-    here.
-    """
-    q = np.zeros((len(points), arm.joints))
-    missing = np.arange(len(points))
-    for number in range(_ROUNDS):
-        start = _uniform(jax.random.fold_in(key, number), limits, len(points))
-        solved, good = _solved(arm, start[missing], points[missing], limits)
-        q[missing[good]] = solved[good]
-        missing = missing[~good]
-        if not len(missing):
-            return _rows(arm, q, points)
-        if number == 9 and 2 * len(missing) > len(points):  # a point well within reach takes a few rounds
-            break
-    raise _out_of_reach(fixture)
-
-
 def _uniform(key: Array, limits: Array, count: int) -> np.ndarray:
     low, high = limits[None, :, 0], limits[None, :, 1]
     return np.asarray(jax.random.uniform(key, (count, limits.shape[0]), jnp.float64, low, high))
@@ -203,7 +188,7 @@ def _solve(geometry: chain.Geometry, start: Array, points: Array, limits: Array)
     return q, (distance <= _TOLERANCE) & (condition <= _MOST_CONDITION)
 
 
-def _rows(arm: Arm, q: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _rows(arm: Arm, q: np.ndarray, points: np.ndarray) -> Table:
     """Rows of the table for configurations."""
     inverses = [
         np.asarray(_inverse(arm.geometry, jnp.asarray(np.resize(q[i : i + _ROWS], (_ROWS, q.shape[1])))))
@@ -241,27 +226,19 @@ def _placements(arm: Arm, fixture: Fixture, limits: Array, key: Array, count: in
 
 
 def _candidates(fixture: Fixture, region: Region, key: Array, count: int) -> np.ndarray:
-    """Random placements with all ends in the region."""
+    """Random placements with all ends in the region; their middles are uniform over its bounding box."""
     centre_key, direction_key = jax.random.split(key)
-    centre = _in_region(region, centre_key, count)
-    if fixture.length is None:
-        return centre[_inside(region, centre)][:, None, :]
-    direction = np.asarray(jax.random.normal(direction_key, (count, 3), jnp.float64))
-    half = 0.5 * fixture.length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    ends = np.stack([centre - half, centre + half], axis=1)
-    return ends[_inside(region, ends).all(axis=1)]
-
-
-def _in_region(region: Region, key: Array, count: int) -> np.ndarray:
-    """Points distributed uniformly over the bounding box of a region."""
-    outer = region.distance_mm[1] if region.distance_mm else np.inf
-    axes = (region.x_mm, region.y_mm, region.z_mm)
+    axes, outer = (region.x_mm, region.y_mm, region.z_mm), region.distance_mm[1] if region.distance_mm else np.inf
     low, high = np.array([(max(r[0], -outer), min(r[1], outer)) if r else (-outer, outer) for r in axes]).T
-    return low + (high - low) * np.asarray(jax.random.uniform(key, (count, 3), jnp.float64))
-
-
-def _inside(region: Region, points: Float[np.ndarray, "... 3"]) -> np.ndarray:
-    amounts = (*np.moveaxis(points, -1, 0), np.linalg.norm(points, axis=-1))
-    limits = (region.x_mm, region.y_mm, region.z_mm, region.distance_mm)
-    pairs = [(amount, pair) for amount, pair in zip(amounts, limits, strict=True) if pair is not None]
-    return np.all([(amount >= low) & (amount <= high) for amount, (low, high) in pairs], axis=0)
+    centre = low + (high - low) * np.asarray(jax.random.uniform(centre_key, (count, 3), jnp.float64))
+    ends = centre[:, None]
+    if fixture.length is not None:
+        direction = np.asarray(jax.random.normal(direction_key, (count, 3), jnp.float64))
+        half = 0.5 * fixture.length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        ends = np.stack([centre - half, centre + half], axis=1)
+    inside = np.ones(ends.shape[:-1], dtype=bool)
+    amounts = (*np.moveaxis(ends, -1, 0), np.linalg.norm(ends, axis=-1))
+    for amount, limits in zip(amounts, (*axes, region.distance_mm), strict=True):
+        if limits is not None:
+            inside &= (amount >= limits[0]) & (amount <= limits[1])
+    return ends[inside.all(axis=1)]

@@ -1,12 +1,13 @@
-"""A study: its specification, the nominal arm, perhaps a recording; and the programs and values of every cell."""
+"""A study: its specification, the nominal arm, perhaps a recording; and the setting and values of every cell."""
 
 import hashlib
 import math
 from collections.abc import Mapping
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ..calibration.scale_anchor import default_method, scale_anchor
 from ..calibration.task import check_enough, check_observed
@@ -19,28 +20,66 @@ from ..kinematics.arm import Arm, correction_names, joint_limits, without_correc
 from ..kinematics.parameters import ArmSpecification, Parameters, single
 from ..kinematics.priors import Prior
 from ..model.observed import Observed
-from .joint_models import (
-    Identified,
-    all_joints,
-    check_deviations,
-    coefficients_of,
-    deviation_of,
-    identified,
-    prior_of,
-)
-from .settings import CellValues, Fixture, Setting
-from .specification import Distribution, Region, Specification, label
+from .joint_models import all_joints, check_deviations, coefficients_of, deviation_of, prior_of, space_of
+from .specification import Distribution, Point, Region, Specification, label
 
 _MODEL = "identification.model"
-_NONE = Distribution(uniform=0.0)
 POOL_PARTS = 32  # independent parts of a pose pool; trial t draws from part t modulo this
+
+
+class Fixture(NamedTuple):
+    """What fixes the tip: a socket (one end), or a reference length (two ends)."""
+
+    name: str
+    poses: int  # at each end
+    points: tuple[Point, ...] | None  # positions of the ends, mm; None: drawn at random in the region
+    region: Region | None = None
+    length: float | None = None  # of a reference length at random, mm
+
+    @property
+    def ends(self) -> int:
+        """Number of points at which the tip is fixed."""
+        return len(self.points) if self.points is not None else 1 if self.length is None else 2
+
+
+class Setting(NamedTuple):
+    """What determines the compiled program of a cell, and its pose pool."""
+
+    fixtures: tuple[Fixture, ...]
+    limits: tuple[tuple[float, float], ...]  # rad, or mm of prismatic joints; none of a recording
+    hold: str | None
+    method: str
+    random_start: bool
+    recorded: bool  # the poses are those of the recording
+    model: str | None = None  # of the joints; None: that of the nominal arm
+    prior: str | None = None  # as a text; None: the default
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Poses in each socket."""
+        return tuple(fixture.poses for fixture in self.fixtures for _ in range(fixture.ends))
+
+
+class CellValues(NamedTuple):
+    """What differs from cell to cell within one compiled program; the first axis is the cell. mm and rad."""
+
+    width: Float[np.ndarray, "c p"]  # of the deviation
+    normal: Bool[np.ndarray, "c p"]
+    lower: Float[np.ndarray, "c p"]
+    upper: Float[np.ndarray, "c p"]
+    encoder: Float[np.ndarray, " c"]
+    resolution: Float[np.ndarray, " c"]
+    seating: Float[np.ndarray, " c"]
+    eccentricity: Float[np.ndarray, " c"]
+    linear_encoder: Float[np.ndarray, " c"]  # of prismatic joints
+    linear_resolution: Float[np.ndarray, " c"]
+    u: Float[np.ndarray, " c"]  # of reference lengths; NaN: as recorded
 
 
 class Study:
     """A Monte Carlo study of calibrations: made by `make_study` and `read_study`, run by `run_study`. Immutable.
 
     Studies are equal where they give the same numbers (`digest`), whatever their names and the sources of their files.
-    A copy or an unpickled study, as workers receive it, keeps its own contents.
 
     Args:
         specification: What is asked.
@@ -55,20 +94,17 @@ class Study:
         4 cells of 20 trials: {'bounds.length_mm': [5.0, 10.0], 'bounds.length_shift_mm': [0.0, 3.0]}
     """
 
-    specification: Specification
-    nominal: ArmSpecification
-    recording: Recording | None
-
     def __init__(self, specification: Specification, nominal: ArmSpecification, recording: Recording | None = None):
         single(nominal.arm)
+        self.specification, self.nominal, self.recording = specification, _picklable(nominal), recording
         if recording is not None:
             true = None if recording.true is None else _picklable(recording.true)
-            recording = recording._replace(nominal=_picklable(recording.nominal), true=true)
-        self.specification, self.nominal, self.recording = specification, _picklable(nominal), recording
+            self.recording = recording._replace(nominal=_picklable(recording.nominal), true=true)
         self._check()
 
-    def __reduce__(self):
-        return _restored, (self.digest, self.specification, self.nominal, self.recording)
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy has the contents and the digest; the rest is derived again, in a worker once: `equal_study`."""
+        return {name: getattr(self, name) for name in ("specification", "nominal", "recording", "digest")}
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Study) and self.digest == other.digest
@@ -106,47 +142,6 @@ class Study:
         return factors
 
     @cached_property
-    def space(self) -> Parameters:
-        """What true arms deviate in and any cell identifies, on the nominal arm: the free parameters, and coefficients
-        of joint corrections."""
-        spaces = list(self._spaces.values())
-        names = [name for space in spaces for name in space.names]
-        coefficients = [name for name in correction_names(self._joints) if not name.startswith("gravity_")]
-        beta = spaces[0].base.beta
-        base = self._joints if beta is None else self._joints.replace(beta=beta)
-        return Parameters(base, tuple(dict.fromkeys([*names, *coefficients])))
-
-    def identified(self, setting: Setting) -> Identified:
-        """The free parameters of the cells of a setting, and their prior."""
-        return Identified(self._spaces[setting.model], self._prior(setting.model, setting.prior))
-
-    def _prior(self, model: str | None, text: str | None) -> Prior | None:
-        with naming("identification.prior"):
-            return prior_of(self.nominal, self._spaces[model], model, text)
-
-    @property
-    def plain_arm(self) -> Arm:
-        """The nominal arm whose joints do what they read: of configurations that trials begin with."""
-        return without_corrections(self.nominal.arm) if self.nominal.arm.corrections is not None else self.nominal.arm
-
-    @cached_property
-    def _joints(self) -> Arm:
-        """The nominal arm with all corrections of the study."""
-        arm = self.nominal.arm
-        for key in ("deviation.model", _MODEL):
-            with naming(key):
-                models = dict.fromkeys(cell[key] for cell in self.cells if key in cell)
-                arm = all_joints(self.nominal._replace(arm=arm), models)
-        return arm
-
-    @cached_property
-    def _spaces(self) -> dict[str | None, Parameters]:
-        """The free parameters by model of the joints."""
-        held, models = self.specification.identification.held, dict.fromkeys(cell.get(_MODEL) for cell in self.cells)
-        with naming("identification.held"):
-            return {model: identified(self.nominal, self._joints, held, model) for model in models}
-
-    @cached_property
     def digest(self) -> str:
         """SHA-256 of all that the numbers depend on: studies with the same digest give the same numbers."""
         content = [self.specification.content(), specification_toml(self.nominal._replace(name=""))]
@@ -162,41 +157,74 @@ class Study:
                     content.append(f"{name} {array.shape} {values}")
         return hashlib.sha256("\n".join(content).encode()).hexdigest()
 
+    @property
+    def plain_arm(self) -> Arm:
+        """The nominal arm whose joints do what they read: of configurations that trials begin with."""
+        return without_corrections(self.nominal.arm) if self.nominal.arm.corrections is not None else self.nominal.arm
+
+    @cached_property
+    def joints(self) -> Arm:
+        """The nominal arm with all corrections of the study."""
+        arm = self.nominal.arm
+        for key in ("deviation.model", _MODEL):
+            with naming(key):
+                models = dict.fromkeys(cell[key] for cell in self.cells if key in cell)
+                arm = all_joints(self.nominal._replace(arm=arm), models)
+        return arm
+
+    @cached_property
+    def _spaces(self) -> dict[str | None, Parameters]:
+        """The free parameters by model of the joints."""
+        held, models = self.specification.identification.held, dict.fromkeys(cell.get(_MODEL) for cell in self.cells)
+        with naming("identification.held"):
+            return {model: space_of(self.nominal, self.joints, held, model) for model in models}
+
+    @cached_property
+    def space(self) -> Parameters:
+        """What true arms deviate in and any cell identifies, on the nominal arm: the free parameters, and coefficients
+        of joint corrections."""
+        spaces = list(self._spaces.values())
+        names = [name for space in spaces for name in space.names]
+        coefficients = [name for name in correction_names(self.joints) if not name.startswith("gravity_")]
+        beta = spaces[0].base.beta
+        base = self.joints if beta is None else self.joints.replace(beta=beta)
+        return Parameters(base, tuple(dict.fromkeys([*names, *coefficients])))
+
+    def identified(self, setting: Setting) -> tuple[Parameters, Prior | None]:
+        """The free parameters of the cells of a setting, and their prior."""
+        space = self._spaces[setting.model]
+        with naming("identification.prior"):
+            return space, prior_of(self.nominal, space, setting.model, setting.prior)
+
     @cached_property
     def settings(self) -> list[Setting]:
         """The setting of each cell."""
-        keys = [(cell["identification.hold"], cell.get(_MODEL)) for cell in self.cells]
-        anchors = {key: self._scale_anchor(*key) for key in dict.fromkeys(keys)}
-        recorded, capture = None, self.capture
+        recorded, capture, anchors = None, self.capture, {}
         if capture is not None:
             tips = np.split(np.asarray(self.nominal.arm.position(capture.q)), np.cumsum(capture.sizes))[:-1]
             points = [tuple(tip.mean(axis=0).tolist()) for tip in tips]
             rows = zip(capture.names, capture.sizes, points, strict=True)
             recorded = tuple(Fixture(name, size, (point,)) for name, size, point in rows)
-        return [self._setting(cell, anchors[key], recorded) for cell, key in zip(self.cells, keys, strict=True)]
-
-    def _scale_anchor(self, hold: str, model: str | None) -> str | None:
-        space = self._spaces[model]
-        with naming("identification.hold"):
-            return scale_anchor(space, space.base, None if hold == "none" else hold, capture=self.capture).hold
-
-    def _setting(self, cell: Mapping[str, Any], hold: str | None, recorded: tuple[Fixture, ...] | None) -> Setting:
-        random_start, joints = (
-            cell["identification.start"] == "random",
-            (cell.get(_MODEL), cell.get("identification.prior")),
-        )
-        method = self._method(cell.get("identification.method"), self._prior(*joints))
-        if recorded is not None:
-            return Setting(recorded, (), hold, method, random_start, True, *joints)
-        region, poses = cell.get("capture.region"), cell["capture.poses"]
-        points = cell.get("capture.positions_mm")
-        if points is not None:
-            fixtures = [Fixture(f"S{i + 1}", poses, (tuple(point),)) for i, point in enumerate(points)]
-        else:
-            fixtures = [Fixture(f"S{i + 1}", poses, None, region) for i in range(cell["capture.sockets"])]
-        fixtures += _reference_fixtures(cell, region)
-        limits = self._limits(cell.get("capture.joint_limits_deg"))
-        return Setting(tuple(fixtures), limits, hold, method, random_start, False, *joints)
+        settings = []
+        for cell in self.cells:
+            model, prior, hold = cell.get(_MODEL), cell.get("identification.prior"), cell["identification.hold"]
+            space = self._spaces[model]
+            if (hold, model) not in anchors:
+                with naming("identification.hold"):
+                    asked = None if hold == "none" else hold
+                    anchors[hold, model] = scale_anchor(space, space.base, asked, capture=capture).hold
+            setting = Setting(
+                fixtures=_fixtures(cell) if recorded is None else recorded,
+                limits=self._limits(cell.get("capture.joint_limits_deg")) if recorded is None else (),
+                hold=anchors[hold, model],
+                method="",
+                random_start=cell["identification.start"] == "random",
+                recorded=recorded is not None,
+                model=model,
+                prior=prior,
+            )
+            settings.append(setting._replace(method=self._method(cell.get("identification.method"), setting)))
+        return settings
 
     def _limits(self, degrees: list[tuple[float, float]] | None) -> tuple[tuple[float, float], ...]:
         arm = self.nominal.arm
@@ -213,9 +241,20 @@ class Study:
         limits = joint_limits(arm, None if degrees is None else [[math.radians(x) for x in pair] for pair in degrees])
         return tuple((float(lowest), float(highest)) for lowest, highest in limits)
 
-    def _method(self, asked: str | None, prior: Prior | None) -> str:
-        if self.observed:
-            return self._observed_method(asked)
+    def _method(self, asked: str | None, setting: Setting) -> str:
+        """Observations besides sockets are solved at once: jointly, or as stage 1 where nothing fixes the scale."""
+        capture, prior = self.capture, self.identified(setting)[1]
+        scaled = self.specification.reference is not None if capture is None else bool(capture.lengths)
+        if capture is not None and capture.observations:
+            scaled = scaled or any(observation.fixes_scale for observation in capture.observations)
+            possible = "joint" if scaled else "stage1"
+            if asked not in (None, possible):
+                raise InputError(
+                    f"identification.method is '{asked}', but captures with observations besides sockets are solved at "
+                    f"once, {'as they fix the scale' if scaled else 'and these leave the scale open'}; use "
+                    f"'{possible}'."
+                )
+            return possible
         if asked == "two-stage" and prior is not None:
             raise InputError(
                 "identification.method is 'two-stage', which ignores a prior; use 'joint', or prior = 'none' in "
@@ -223,26 +262,7 @@ class Study:
             )
         if asked is not None:
             return asked
-        reference = self.specification.reference is not None
-        scaled = reference if self.capture is None else bool(self.capture.lengths)
         return default_method(self.nominal.arm, general=prior is not None) if scaled else "stage1"
-
-    def _observed_method(self, asked: str | None) -> str:
-        """All observations are solved at once: jointly, or as stage 1 where nothing fixes the scale."""
-        assert self.capture is not None
-        fixed = bool(self.capture.lengths) or any(item.fixes_scale for item in self.capture.observations)
-        possible = "joint" if fixed else "stage1"
-        if asked not in (None, possible):
-            raise InputError(
-                f"identification.method is '{asked}', but captures with observations besides sockets are solved at "
-                f"once, {'as they fix the scale' if fixed else 'and these leave the scale open'}; use '{possible}'."
-            )
-        return possible
-
-    @cached_property
-    def eccentric(self) -> bool:
-        """Whether any cell has eccentric encoders (their sines are then computed for all)."""
-        return bool(np.any(self.cell_values.eccentricity > 0))
 
     @cached_property
     def cell_values(self) -> CellValues:
@@ -252,13 +272,13 @@ class Study:
 
     def _deviations(self, cell: Mapping[str, Any]) -> tuple[np.ndarray, list[bool]]:
         """Half-widths or standard deviations of the parameters of true arms, and which are standard deviations."""
-        names, corrections = self.space.names, set(correction_names(self._joints))
+        names, corrections = self.space.names, set(correction_names(self.joints))
         true = coefficients_of(self.nominal, cell["deviation.model"]) if "deviation.model" in cell else names
         widths, normal = [], []
         for name in names:
-            drawn, unit = deviation_of(cell, self._joints, name)
+            drawn, unit = deviation_of(cell, self.joints, name)
             if drawn is None or (name in corrections and name not in true):
-                drawn = _NONE
+                drawn = Distribution(uniform=0.0)
             normal.append(drawn.normal is not None)
             widths.append(unit * (drawn.normal or drawn.uniform or 0.0))
         return np.array(widths), normal
@@ -266,10 +286,9 @@ class Study:
     def _bounds(self, cell: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the parameters; coefficients of corrections have none."""
         space, nominal, override = self.space, self.nominal, self.specification.bounds.override
-        coefficients = np.isin(space.names, correction_names(self._joints))
-        length, angle = cell.get("bounds.length_mm"), cell.get("bounds.angle_deg")
-        length = nominal.length if length is None else length
-        angle = nominal.angle if angle is None else math.radians(angle)
+        coefficients = np.isin(space.names, correction_names(self.joints))
+        length = cell.get("bounds.length_mm", nominal.length)
+        angle = math.radians(cell["bounds.angle_deg"]) if "bounds.angle_deg" in cell else nominal.angle
         half = np.where(coefficients, np.inf, np.where(space.lengths, length, angle))
         if override is None:  # in the units of the arm's file
             for name in set(nominal.override) & set(space.names):
@@ -282,8 +301,16 @@ class Study:
         centre = np.asarray(space.vector())
         return centre - half + shift, centre + half + shift
 
+    def pool_capacity(self, fixture: Fixture) -> tuple[int, int]:
+        """Placements of a fixture in each part of its pool, and poses at each of its ends (a power of two)."""
+        rows = self.specification.capture.pool // (POOL_PARTS * fixture.ends)
+        if fixture.points is not None:
+            return 1, 2 ** int(math.log2(rows))
+        poses = max(2 ** math.ceil(math.log2(1.25 * self._most_poses[fixture.ends])), 16)
+        return rows // poses, poses
+
     @cached_property
-    def most_poses(self) -> dict[int, int]:
+    def _most_poses(self) -> dict[int, int]:
         """The most poses that any cell takes at an end, of sockets (1) and of reference lengths (2)."""
         fixtures = {fixture for setting in dict.fromkeys(self.settings) for fixture in setting.fixtures}
         return {ends: max((item.poses for item in fixtures if item.ends == ends), default=0) for ends in (1, 2)}
@@ -297,7 +324,7 @@ class Study:
             raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
         deviations = self.specification.deviation
         given = [key for key in type(deviations).model_fields if getattr(deviations, key) is not None]
-        check_deviations(given, self._joints, self.space.names)
+        check_deviations(given, self.joints, self.space.names)
         for setting in dict.fromkeys(self.settings):
             space = self._spaces[setting.model]
             if capture is not None and self.observed:
@@ -313,7 +340,7 @@ class Study:
 
     def _check_pool(self, fixture: Fixture) -> None:
         """Raise `InputError` where the pool is too small for a fixture."""
-        pool, (placements, poses) = self.specification.capture.pool, pool_capacity(self, fixture)
+        pool, (placements, poses) = self.specification.capture.pool, self.pool_capacity(fixture)
         if fixture.points is None and placements < 2:
             raise InputError(
                 f"a capture.pool of {pool} poses holds fewer than two placements of {fixture.poses} poses in each of "
@@ -327,24 +354,8 @@ class Study:
 
 
 @lru_cache(maxsize=4)
-def _derived(digest: str) -> dict[str, Any]:
-    """What this process has derived from studies of one digest: filled by the first that is restored, shared by all."""
-    return {}
-
-
-def _restored(digest: str, *contents: Any) -> Study:
-    """A copied or unpickled study, with its own contents.
-
-    What is derived from them depends on the digest alone: a worker receives the study with every block, and derives
-    once.
-    """
-    study, shared = object.__new__(Study), _derived(digest)
-    given = dict(zip(Study.__annotations__, contents, strict=True))
-    vars(study).update(given)
-    if not shared:
-        study._check()
-        shared.update({name: value for name, value in vars(study).items() if name not in given}, digest=digest)
-    vars(study).update(shared)
+def equal_study(study: Study) -> Study:
+    """The first of equal studies that this process was given: a worker receives one with every block."""
     return study
 
 
@@ -353,24 +364,22 @@ def _picklable(specification: ArmSpecification) -> ArmSpecification:
     return specification._replace(override=dict(specification.override))
 
 
-def pool_capacity(study: Study, fixture: Fixture) -> tuple[int, int]:
-    """Placements of a fixture in each part of its pool, and poses at each of its ends (a power of two)."""
-    rows = study.specification.capture.pool // (POOL_PARTS * fixture.ends)
-    if fixture.points is not None:
-        return 1, 2 ** int(math.log2(rows))
-    poses = max(2 ** math.ceil(math.log2(1.25 * study.most_poses[fixture.ends])), 16)
-    return rows // poses, poses
-
-
-def _reference_fixtures(cell: Mapping[str, Any], region: Region | None) -> list[Fixture]:
-    if "reference.poses" not in cell:
-        return []
-    poses, region = cell["reference.poses"], cell.get("reference.region", region)
-    if "reference.ends_mm" in cell:
-        pairs = cell["reference.ends_mm"]
-        return [Fixture(f"L{i + 1}", poses, (tuple(a), tuple(b))) for i, (a, b) in enumerate(pairs)]
-    length = cell["reference.length_mm"]
-    return [Fixture(f"L{i + 1}", poses, None, region, length) for i in range(cell["reference.positions"])]
+def _fixtures(cell: Mapping[str, Any]) -> tuple[Fixture, ...]:
+    """The sockets of a cell, then its reference lengths."""
+    region, poses, points = cell.get("capture.region"), cell["capture.poses"], cell.get("capture.positions_mm")
+    if points is not None:
+        fixtures = [Fixture(f"S{i + 1}", poses, (tuple(point),)) for i, point in enumerate(points)]
+    else:
+        fixtures = [Fixture(f"S{i + 1}", poses, None, region) for i in range(cell["capture.sockets"])]
+    if "reference.poses" in cell:
+        poses, region = cell["reference.poses"], cell.get("reference.region", region)
+        pairs, length = cell.get("reference.ends_mm"), cell.get("reference.length_mm")
+        if pairs is not None:
+            fixtures += [Fixture(f"L{i + 1}", poses, (tuple(a), tuple(b))) for i, (a, b) in enumerate(pairs)]
+        else:
+            count = cell["reference.positions"]
+            fixtures += [Fixture(f"L{i + 1}", poses, None, region, length) for i in range(count)]
+    return tuple(fixtures)
 
 
 def _noise(cell: Mapping[str, Any]) -> tuple[float, ...]:
@@ -381,7 +390,7 @@ def _noise(cell: Mapping[str, Any]) -> tuple[float, ...]:
         cell["noise.resolution_arcsec"] * ARCSEC,
         cell["noise.seating_mm"],
         cell["noise.eccentricity_arcsec"] * ARCSEC,
-        cell.get("noise.linear_encoder_mm", M * cell["noise.encoder_arcsec"] * ARCSEC),
+        cell.get("noise.linear_encoder_mm", M * encoder),
         cell.get("noise.linear_resolution_mm", 0.0),
         cell.get("reference.u_mm", math.nan),
     )

@@ -5,7 +5,7 @@ drawn by one program; a cell whose true arms or model lack some of them has zero
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
@@ -15,11 +15,7 @@ from ..kinematics.corrected_arm import loads_of, with_corrections
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.priors import Prior, default_prior, is_of_group
 
-# By kind of parameter or correction: the key of `DeviationTable`, and its unit in mm, rad or that of the coefficient.
-_DEVIATIONS = {
-    **{"a": ("a_mm", 1.0), "d": ("d_mm", 1.0), "probe": ("probe_mm", 1.0)},
-    **{"alpha": ("alpha_deg", DEG), "theta": ("theta_deg", DEG), "beta": ("beta_deg", DEG)},
-}
+# Kind and unit of coefficients; the key of `DeviationTable`, and its unit in that of the coefficient.
 _COEFFICIENTS = (
     ("harmonics", "rad", "harmonics_arcsec", ARCSEC),
     ("harmonics", "mm", "harmonics_mm", 1.0),
@@ -28,23 +24,6 @@ _COEFFICIENTS = (
     ("gravity", "rad/m", "gravity_mrad_per_m", 1e-3),
     ("gravity", "rad/(kN m)", "gravity_mrad_per_knm", 1e-3),
 )
-
-
-class Identified(NamedTuple):
-    """What cells of one setting identify."""
-
-    space: Parameters  # the free parameters, on the arm that is the start
-    prior: Prior | None
-
-
-def plain(nominal: ArmSpecification) -> ArmSpecification:
-    """The nominal arm without corrections, and its identification."""
-    names = set(correction_names(nominal.arm))
-    return nominal._replace(
-        arm=without_corrections(nominal.arm),
-        held=None if nominal.held is None else tuple(name for name in nominal.held if name not in names),
-        free=tuple(name for name in nominal.free if name not in names),
-    )
 
 
 def coefficients_of(nominal: ArmSpecification, model: str | None) -> tuple[str, ...]:
@@ -65,19 +44,20 @@ def all_joints(nominal: ArmSpecification, models: Iterable[str | None]) -> Arm:
     return arm.replace(**{name: value_of(nominal.arm, name) for name in stated})
 
 
-def identified(nominal: ArmSpecification, joints: Arm, held: list[str] | None, model: str | None) -> Parameters:
+def space_of(nominal: ArmSpecification, joints: Arm, held: list[str] | None, model: str | None) -> Parameters:
     """The free parameters of a cell, on an arm with all corrections: with a model, from coefficients of 0."""
-    specification = nominal if model is None else plain(nominal)
-    chosen = specification.held if held is None else tuple(held)
     if model is None:
-        space = specification.space() if held is None else Parameters.free_of(specification.arm, held=held)
+        space = nominal.space() if held is None else Parameters.free_of(nominal.arm, held=held)
         names = space.names
     else:
-        coefficients = coefficients_of(nominal, model)
-        without = None if chosen is None else tuple(name for name in chosen if name not in correction_names(joints))
-        space = Parameters.free_of(specification.arm, held=without, free=specification.free if held is None else ())
-        names = (*space.names, *(name for name in coefficients if name not in (chosen or ())))
-        joints = joints.replace(**{name: 0.0 for name in correction_names(joints) if not name.startswith("gravity_")})
+        corrections, chosen = correction_names(joints), held
+        if held is None and nominal.held is not None:
+            chosen = [name for name in nominal.held if name not in correction_names(nominal.arm)]
+        without = None if chosen is None else tuple(name for name in chosen if name not in corrections)
+        free = () if held is not None else tuple(name for name in nominal.free if name not in corrections)
+        space = Parameters.free_of(without_corrections(nominal.arm), held=without, free=free)
+        names = (*space.names, *(name for name in coefficients_of(nominal, model) if name not in (chosen or ())))
+        joints = joints.replace(**{name: 0.0 for name in corrections if not name.startswith("gravity_")})
     return Parameters(joints if space.base.beta is None else joints.replace(beta=space.base.beta), names)
 
 
@@ -93,12 +73,13 @@ def prior_of(nominal: ArmSpecification, space: Parameters, model: str | None, te
 def deviation_of(cell: Mapping[str, Any], arm: Arm, name: str) -> tuple[Any, float]:
     """The distribution of a parameter's deviation, that of its kind or of all lengths or angles, and its unit in mm,
     rad or that of the coefficient; None where it does not deviate."""
-    if name not in correction_names(arm):
-        key, unit = _DEVIATIONS[name.rpartition("_")[0]]
-        general = "length_mm" if is_length(name) else "angle_deg"
-        return cell.get(f"deviation.{key}", cell[f"deviation.{general}"]), unit
-    key, unit = _coefficient(arm, name)
-    return cell.get(f"deviation.{key}"), unit
+    if name in correction_names(arm):
+        key, unit = _coefficient(arm, name)
+        return cell.get(f"deviation.{key}"), unit
+    kind, (general, measure, unit) = name.rpartition("_")[0], ("angle", "deg", DEG)
+    if is_length(name):
+        general, measure, unit = "length", "mm", 1.0
+    return cell.get(f"deviation.{kind}_{measure}", cell[f"deviation.{general}_{measure}"]), unit
 
 
 def check_deviations(given: Iterable[str], arm: Arm, names: Iterable[str]) -> None:

@@ -1,24 +1,31 @@
-"""Results of a study, read from its file: labelled for users (`open_study`), and cell by cell for tables and plots."""
+"""Results of a study as people use them: labelled arrays, and statistics of each cell with Monte Carlo standard errors.
 
+Trials of a cell fall into groups that are independent of each other: each draws from its own part of the pose pool.
+Standard errors come from the scatter between groups, so they contain the whole Monte Carlo error, that of the finite
+pools included, and need no formula for the statistic: one group at a time is left out (delete-a-group jackknife).
+"""
+
+import math
 import os
-from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from ..core.extras import require
-from ..files.hdf5 import check_sense, undamaged
-from ..files.outputs import as_path
-from . import store
-from .blocks import DIMENSIONS, VARIABLES, fill_of
-from .definition import POOL_PARTS, Study
+from ..core.errors import require
+from ..files.hdf5 import undamaged
+from ..kinematics.arm import parameter_unit
+from ..solver.reason import Reason, numbers_of
+from .blocks import DIMENSIONS, METRICS, VARIABLES
+from .specification import label
+from .store import Results, factor_columns
 
 if TYPE_CHECKING:
     import xarray
 
-_LARGEST = 1e20  # mm, rad, or a factor
+PERCENTILES = (5, 50, 95)
+_REASONS = ("gradient", "step", "rounding", "max_steps", "stalled", "nonfinite")
 
 
 def open_study(path: str | os.PathLike) -> "xarray.Dataset":
@@ -45,17 +52,23 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     import xarray
 
     results = Results.of(path)
-    study, stored = results.study, results.stored
+    study = results.study
     with undamaged(path):
-        if stored.parts is None:
+        if not results.in_blocks:
             data = xarray.open_dataset(results.path, group="trials", engine="h5netcdf")
         else:
-            arrays = _assembled(results)
-            data = xarray.Dataset({name: (DIMENSIONS[: x.ndim], x, _words(name)) for name, x in arrays.items()})
-            data = data.assign_coords(parameter=list(study.space.names))
+            arrays = {name: results.empty(name) for name in VARIABLES}
+            for block in results.finished_blocks():
+                for name, values in results.of_block(block).items():
+                    arrays[name][block.slices] = values
+            variables = {
+                name: (DIMENSIONS[: x.ndim], x, {key: getattr(VARIABLES[name], key) for key in ("units", "long_name")})
+                for name, x in arrays.items()
+            }
+            data = xarray.Dataset(variables, coords={"parameter": list(study.space.names)})
         labels = {
             name: ("cell", np.asarray(column.values), {"units": column.units, "long_name": column.long_name})
-            for name, column in store.factor_columns(study).items()
+            for name, column in factor_columns(study).items()
         }
         nominal = ("parameter", np.asarray(study.space.vector()), {"long_name": "value in the nominal arm"})
         data = data.assign_coords(labels | {"nominal": nominal})
@@ -72,107 +85,203 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     return data
 
 
-def _words(name: str) -> dict[str, str]:
-    return {"units": VARIABLES[name].units, "long_name": VARIABLES[name].long_name}
+def study_summary(results: Results, only: int | None = None) -> dict[str, Any]:
+    """Summarise a study as ``aacmm show --json`` prints it.
 
+    Args:
+        results: The study.
+        only: Only this cell, counted from 1; all if None.
 
-def _assembled(results: "Results") -> dict[str, np.ndarray]:
-    """The results of all blocks that are kept in their folder."""
-    layout = results.stored.layout
-    arrays = {name: np.full(layout.shape(name), fill_of(name), kind.dtype) for name, kind in VARIABLES.items()}
-    for block in store.finished_blocks(results.path, layout):
-        for name, values in store.read_part(results.path, block, layout).items():
-            arrays[name][block.slices] = values
-    return arrays
-
-
-def _check_sense(path: Path, rows: Mapping[str, np.ndarray]) -> None:
-    """Raise `InputError` for results that no trial has; one that failed may have NaN or an infinite number.
-
-    A converged trial may have NaN for what the study does not compute, such as k without reference lengths, but not
-    for its parameters.
-    """
-    converged = rows["converged"] == 1
-    floats = {name: values for name, values in rows.items() if values.dtype.kind == "f"}
-    parameters = [floats[name][converged] for name in ("estimate", "true") if name in floats]
-    large = any(np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats.values())
-    infinite = any(np.any(np.isinf(x[converged])) for x in floats.values())
-    check_sense(
-        path,
-        {
-            "a result is larger than any can be": large,
-            "a trial that converged has an infinite result": infinite,
-            "a trial that converged has a parameter without a number": any(np.any(np.isnan(x)) for x in parameters),
-        },
-    )
-
-
-class Results(NamedTuple):
-    """Results of a study, read cell by cell from its file; ``Results.of(path)`` opens it, also while the study runs.
+    Returns:
+        The study's name, arm, seed, size and factors, and under "results" the `cell_summary` of each cell.
 
     Example:
-        >>> print(results.finished, results.study.factors)
-        True {'bounds.length_mm': [5.0, 10.0], 'bounds.length_shift_mm': [0.0, 3.0]}
+        >>> summary = aj.study.study_summary(results)
+        >>> print(summary["trials"], summary["finished"], len(summary["results"]))
+        20 True 4
     """
+    study = results.study
+    cells = [cell_summary(results, cell) for cell in range(len(study.cells)) if only is None or cell == only - 1]
+    return {
+        "kind": "study",
+        "name": study.specification.name,
+        "arm": study.nominal.name,
+        "seed": study.specification.seed,
+        "finished": results.finished,
+        "cells": len(study.cells),
+        "trials": study.trials,
+        "trials_run": sum(cell["trials_run"] for cell in cells),
+        "factors": study.factors,
+        "results": cells,
+    }
 
-    path: Path
-    stored: store.StoredStudy
 
-    @property
-    def study(self) -> Study:
-        """The study that was run."""
-        return self.stored.study
+def cell_summary(results: Results, cell: int) -> dict[str, Any]:
+    """Statistics of the trials of one cell, each a dictionary of its ``value`` and Monte Carlo standard error ``se``.
 
-    @property
-    def finished(self) -> bool:
-        """Whether every trial has run."""
-        return self.stored.finished
+    Args:
+        results: The study.
+        cell: The cell, counted from 0.
 
-    @classmethod
-    def of(cls, path: str | os.PathLike) -> "Results":
-        """Open a study.
+    Returns:
+        Fractions of trials that converged, had the truth within their bounds, or ended on a bound; under "figures"
+        mean, standard deviation ("spread") and percentiles of each metric of `METRICS` over the converged trials, mm
+        and rad; under "parameters" the bias and standard deviation of each parameter.
 
-        Args:
-            path: File of the study (HDF5).
+    Example:
+        >>> summary = aj.study.cell_summary(results, 0)
+        >>> print(summary["converged"]["value"], summary["figures"].keys() >= {"de", "deltam"})
+        1.0 True
+    """
+    columns = results.columns(cell)
+    ran = columns["converged"] >= 0
+    columns = {name: values[ran] for name, values in columns.items()}
+    good = columns["converged"] == 1
+    levels = results.study.cells[cell]
+    # A factor is shown by numbers where all of its levels are numbers.
+    labels = {
+        name: label(levels[name]) if isinstance(values[0], float) else str(label(levels[name]))
+        for name, values in results.study.factors.items()
+    }
+    reasons = {name: int(numbers_of(getattr(Reason, name))) for name in _REASONS}
+    summary: dict[str, Any] = {
+        "cell": cell + 1,
+        "factors": labels,
+        "trials_run": int(ran.sum()),
+        "converged": statistic(np.mean, good.astype(float), columns["group"]),
+        "truth_inside": statistic(np.mean, columns["truth_inside"].astype(float), columns["group"]),
+        "reasons": {name: int(np.sum(columns["reason"] == number)) for name, number in reasons.items()},
+        "steps_mean": float(columns["steps"].mean()) if ran.any() else None,
+        "figures": {},
+    }
+    for name in METRICS:
+        finite = good & np.isfinite(columns[name])
+        if finite.any():
+            summary["figures"][name] = distribution(columns[name][finite], columns["group"][finite])
+    return summary | _parameters(results, cell)
 
-        Returns:
-            Its results, for `cell_summary`, `study_summary` and the figures of `aacmm_jax.plot`.
 
-        Raises:
-            InputError: Where the file is missing, damaged or no study, or its folder of blocks is missing.
-        """
-        path = Path(os.path.realpath(as_path(path)))
-        stored = store.read(path)
-        store.check_parts(path, stored)
-        store.check_results(path, stored)
-        return cls(path, stored)
+def distribution(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
+    """Mean, standard deviation (key "spread") and percentiles, each with its standard error."""
+    order = np.argsort(values)
+    values, groups = values[order], groups[order]
+    figures = {"mean": statistic(np.mean, values, groups)}
+    if len(values) > 1:
+        figures["spread"] = statistic(lambda x: np.std(x, ddof=1 if len(x) > 1 else 0), values, groups)
+    percentiles = statistic(_percentiles, values, groups)
+    for i, percentile in enumerate(PERCENTILES):
+        figures[f"p{percentile}"] = {key: value[i] for key, value in percentiles.items()}
+    return figures
 
-    def column(self, name: str, cell: int) -> np.ndarray:
-        """One array of results of one cell (counted from 0)."""
-        return self._columns([name], cell)[name]
 
-    def columns(self, cell: int) -> dict[str, np.ndarray]:
-        """Arrays of one cell with one number a trial; ``group`` is the part of the pool that a trial drew from."""
-        columns = self._columns([name for name, kind in VARIABLES.items() if not kind.by_parameter], cell)
-        return columns | {"group": np.arange(self.study.trials) % POOL_PARTS}
+def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
+    """A statistic of trials and its Monte Carlo standard error (None where there are too few groups)."""
+    if not len(values):
+        return {"value": None, "se": None}
+    value = np.asarray(function(values))
+    # Groups of at least the square root of all trials: the jackknife of a percentile that leaves out fewer at a time is
+    # inconsistent (Shao and Wu 1989).
+    groups = groups % max(int(len(values) ** 0.5), 2)
+    members = np.unique(groups)
+    count = len(members)
+    none = [None] * len(value) if value.ndim else None
+    if count < 2:
+        return {"value": value.tolist(), "se": none}
+    se = _jackknife(np.array([function(values[groups != group]) for group in members]))
+    # No scatter at all (every trial converged) does not mean that the value has no error.
+    return {"value": value.tolist(), "se": none if not np.any(se) else se.tolist()}
 
-    def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
-        layout = self.stored.layout
-        arrays = {name: np.full(layout.shape(name)[1:], fill_of(name), VARIABLES[name].dtype) for name in names}
-        for part, rows in self._rows([*{*names, "converged"}], cell):
-            for name in names:
-                arrays[name][part] = rows[name]
-        return arrays
 
-    def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:
-        """Of converged trials, some at a time: parameter errors (estimate minus truth), active bounds, groups."""
-        for part, rows in self._rows(["converged", "estimate", "true", "active"], cell):
-            good = rows["converged"] == 1
-            group = np.arange(part.start, part.stop) % POOL_PARTS
-            yield (rows["estimate"] - rows["true"])[good], rows["active"][good], group[good]
+def _jackknife(rest: np.ndarray) -> np.ndarray:
+    """The standard error of a statistic from its values with one group left out each (Efron and Stein 1981)."""
+    return np.asarray(np.sqrt((len(rest) - 1) / len(rest) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0)))
 
-    def _rows(self, names: list[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
-        with undamaged(self.path):
-            for part, rows in store.rows_of(self.path, self.stored, names, cell):
-                _check_sense(self.path, rows)
-                yield part, rows
+
+def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
+    """Percentiles of sorted values, linear between neighbours as in `numpy.percentile` (which would sort again)."""
+    return np.interp(np.array(PERCENTILES) / 100 * (len(ordered) - 1), np.arange(len(ordered)), ordered)
+
+
+def _parameters(results: Results, cell: int) -> dict[str, Any]:
+    """Bias and standard deviation of every parameter that the cell identifies, and how often it is on a bound, from
+    sums over groups."""
+    study = results.study
+    space, groups = study.space, {}
+    names, identified = space.names, study.identified(study.settings[cell])[0].names
+    for error, active, group in results.errors(cell):
+        for g in np.unique(group):
+            rows = group == g
+            on_bound = active[rows] != 0
+            moments = (rows.sum(), error[rows].sum(axis=0), (error[rows] ** 2).sum(axis=0))
+            sums = (*moments, on_bound.sum(axis=0), int(on_bound.any(axis=1).sum()))
+            groups[g] = tuple(a + b for a, b in zip(groups.get(g, (0, 0, 0, 0, 0)), sums, strict=True))
+    if not groups:
+        return {"on_a_bound": {"value": None, "se": None}, "parameters": []}
+    count, first, second, active, any_active = (np.array(column) for column in zip(*groups.values(), strict=True))
+
+    def statistics(chosen: np.ndarray) -> np.ndarray:
+        n = max(count[chosen].sum(), 1)
+        mean = first[chosen].sum(axis=0) / n
+        deviation = np.sqrt(np.maximum(second[chosen].sum(axis=0) / n - mean**2, 0) * n / max(n - 1, 1))
+        fraction = active[chosen].sum(axis=0) / n
+        return np.stack([mean, deviation, fraction, np.full(len(names), any_active[chosen].sum() / n)])
+
+    value, se = statistics(np.full(len(count), True)), np.full((4, len(names)), np.nan)
+    if len(count) > 1:
+        se = _jackknife(np.array([statistics(np.arange(len(count)) != g) for g in range(len(count))]))
+
+    def entry(row: int, i: int) -> dict[str, Any]:
+        return {"value": float(value[row, i]), "se": None if np.isnan(se[row, i]) else float(se[row, i])}
+
+    parameters = [
+        {"parameter": name, "unit": parameter_unit(space.base, name)}
+        | {key: entry(row, i) for row, key in enumerate(("bias", "spread", "on_a_bound"))}
+        for i, name in enumerate(names)
+        if name in identified
+    ]
+    return {"on_a_bound": entry(3, 0), "parameters": parameters}
+
+
+def correlation(results: Results, cell: int) -> Float[np.ndarray, "p p"]:
+    """Correlation of parameter errors over the converged trials of a cell (counted from 0); 0 where one is constant."""
+    count, first, second = 0, 0.0, 0.0
+    for error, _, _ in results.errors(cell):
+        count, first, second = count + len(error), first + error.sum(axis=0), second + error.T @ error
+    p = len(results.study.space.names)
+    if count < 2:
+        return np.full((p, p), np.nan)
+    covariance = second / count - np.outer(first / count, first / count)
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
+    scale = np.outer(deviation, deviation)
+    return np.divide(covariance, scale, out=np.zeros_like(scale), where=scale > 0)
+
+
+def concise(value: float | None, se: float | None) -> str:
+    """Write a number with the standard error of its last digits in parentheses, as in 0.01068(3) (JCGM 100, 7.2.2).
+
+    Args:
+        value: The number; "-" is written for None and NaN.
+        se: Its standard error; without one four digits are written.
+
+    Returns:
+        The text.
+
+    Example:
+        >>> print(aj.study.concise(0.010683, 0.000031), aj.study.concise(0.010683, None))
+        0.01068(3) 0.01068
+    """
+    if value is None or math.isnan(value):
+        return "-"
+    if not se:
+        return f"{value:.4g}"
+    if not math.isfinite(se):
+        return f"{value:.4g}(?)"
+    magnitude = math.floor(math.log10(abs(value))) if value else 0
+    if magnitude < -4 and se < 1:
+        mantissa = concise(value / 10.0**magnitude, se / 10.0**magnitude)
+        return f"{mantissa}e{magnitude:+03d}"
+    decimals = max(-math.floor(math.log10(se)), 0)
+    digits = round(se * 10**decimals)
+    if digits == 10 and decimals > 0:  # 0.0096 is 0.01
+        decimals, digits = decimals - 1, 1
+    return f"{value:.{decimals}f}({digits})"

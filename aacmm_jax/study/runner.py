@@ -3,13 +3,13 @@
 import itertools
 import os
 import platform
+import shutil
 import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,19 +17,20 @@ import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
-from ..core.errors import InputError
+from ..core._compat import reset_compilation_cache
+from ..core.errors import InputError, require
+from ..core.jax_setup import set_up
 from ..files.outputs import OutputFile
-from . import store
-from .blocks import Block, Layout, parts_of
-from .computed_with import check_same, computed_with
+from .blocks import Block, check_same, computed_with
 from .configuration_pool import check_reach
-from .definition import Study
-from .executors import THREADS, available_cores
-from .settings import Setting
+from .definition import Study, equal_study
+from .store import Results, check_owners, parts_of, read, write_block
 from .trials import run_block
 
 _CHUNK_CPU, _CHUNK_ELSEWHERE = 1000, 65_536
 _QUEUED = 2  # blocks running or waiting, for each worker
+_RETRIES = 3  # of a block whose worker died
+THREADS = "aacmm-study"  # beginning of the names of threads that may still compute when an interrupt is answered
 
 
 class StudyProgress(NamedTuple):
@@ -37,7 +38,6 @@ class StudyProgress(NamedTuple):
 
     done: int  # trials kept, those of earlier runs included
     total: int
-    before: int  # trials kept by earlier runs
     programs: int = 0  # compiled programs that this run needs, one for each setting of the study
     compiling: int = 0  # those that have not computed their first block yet
     stopping: bool = False  # after an interrupt: the running blocks end
@@ -71,7 +71,7 @@ def run_study(
     """Run a study into an HDF5 file, or continue the one that the file contains.
 
     The first block of every setting runs before all others: it takes the time to compile, which then is known to be
-    over. An interrupt (Ctrl-C, SIGTERM) in that time returns at once; later it lets the running blocks end and keeps
+    over. An interrupt (Ctrl-C, SIGTERM) in that time returns at once; later it lets the submitted blocks end and keeps
     them, and a second one does not wait for them. What does not end is left to its thread, and its result discarded. A
     kill at any moment loses only the running blocks.
 
@@ -101,52 +101,101 @@ def run_study(
         80 True
     """
     output = OutputFile(path)
-    path = output.target
-    for what, number in (("workers", workers), ("chunk", chunk)):
-        if number is not None and (not isinstance(number, int) or number < 1):
-            raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")
-    if executor is not None:
-        _check_executor(executor)
+    path, total, tell = output.target, len(study.cells) * study.trials, watch or (lambda _: None)
+    _check_arguments(executor, workers=workers, chunk=chunk)
     with _locked(output):
-        store.check_ours(path)
-        store.tidy(path)
-        layout, finished = _opened(study, path, chunk, executor)
-        total = layout.cells * layout.trials
-        if finished and not parts_of(path).is_dir():
+        check_owners(path)
+        for left in parts_of(path).glob(".*.????????.part"):  # of killed processes
+            left.unlink(missing_ok=True)
+        results = _opened(study, path, chunk, executor)
+        if not results.in_blocks:
+            shutil.rmtree(parts_of(path), ignore_errors=True)  # left by a killed process
             return Outcome(path, total, total, 0)
         # Blocks of earlier runs are read completely: a damaged one runs again.
-        kept = {block for block in store.finished_blocks(path, layout) if store.is_readable(path, block, layout)}
-        missing = [block for block in layout.blocks() if block not in kept]
-        if finished and not missing:
+        kept = {block for block in results.finished_blocks() if results.is_readable(block)}
+        missing = [block for block in results.blocks if block not in kept]
+        if results.finished and not missing:
             return Outcome(path, total, total, 0)
-        keep_parts = keep_parts or finished
-        before = sum(block.size for block in kept)
+        done = before = total - sum(block.size for block in missing)
         first, others = _in_order(study, missing)
-        progress = StudyProgress(before, total, before, len(first), len(first))
-        tell = watch or (lambda _: None)
+        progress = StudyProgress(done, total, len(first), len(first))
         tell(progress)
         with _stop_on_interrupt() as stopped:
-            with _executor(executor, workers) as (pool, count, resources):
-                task = partial(_run, study, layout, path if shards else None)
-                submit = lambda block: pool.submit(task, block, next(resources))  # noqa: E731
-                waits_known = isinstance(pool, ThreadPoolExecutor | ProcessPoolExecutor)
-                results = _completed(submit, (first, others), _QUEUED * count, stopped, waits_known)
-                for block, kept_here in results:
+            with _pool(executor, workers) as (pool, count, devices):
+
+                def submit(block: Block) -> Future:
+                    file = results.file_of(block) if shards else None
+                    return pool.submit(_run, study, results.computed_with, block, file, next(devices))
+
+                for block, arrays in _completed(submit, (first, others), _QUEUED * count, stopped):
                     if block is None:
                         tell(progress := progress._replace(stopping=True))
                         continue
-                    if kept_here is not None:
-                        store.write_part(path, block, kept_here, layout)
-                    done, compiling = progress.done + block.size, max(progress.compiling - 1, 0)
+                    if arrays is not None:
+                        write_block(results.file_of(block), arrays)
+                    done, compiling = done + block.size, max(progress.compiling - 1, 0)
                     tell(progress := progress._replace(done=done, compiling=compiling))
-            done = progress.done
             if done == total:  # interrupts are still caught: one within HDF5 could damage the file
-                store.finish(path, study, layout, keep_parts)
+                results.finish(keep_parts or results.finished)
         return Outcome(path, done, total, done - before)
 
 
-def _check_executor(executor: Any) -> None:
-    if not isinstance(executor, Executor):
+@contextmanager
+def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
+    """Connect to a Dask cluster; a context manager.
+
+    A Dask scheduler runs whatever it is sent, with the rights of whoever started its workers, and a worker's answer is
+    unpickled here. ``tcp://`` trusts everybody who can reach its port, every user of its machine included. ``tls://``
+    asks both sides for a certificate, those that Dask's configuration names (``distributed.comm.tls``).
+
+    Args:
+        address: Of a scheduler (``tls://host:8786``, ``tcp://host:8786``, or a scheduler file).
+
+    Returns:
+        The executor for `run_study`, and its number of workers.
+
+    Raises:
+        InputError: Where Dask is not installed, no scheduler answers, or the cluster has no workers.
+
+    Example:
+        >>> with aj.study.dask_executor("tls://scheduler:8786") as (executor, workers):  # doctest: +SKIP
+        ...     aj.study.run_study(study, "study.h5", executor=executor, workers=workers)
+    """
+    require("dask", "a study on a Dask cluster")
+    import distributed
+
+    target: dict[str, Any] = {"scheduler_file": address} if os.path.isfile(address) else {"address": address}
+    try:
+        connected: Any = distributed.Client(**target, timeout=5)
+    except Exception as error:  # of a dozen types: no such file or host, no answer, not a scheduler's file
+        raise InputError(
+            f"no Dask scheduler answers at {address}; start one, or leave --dask out to use this machine's cores."
+        ) from error
+    with connected as client:
+        count = len(client.scheduler_info(n_workers=-1)["workers"])
+        if not count:
+            raise InputError(
+                f"the Dask cluster at {address} has no workers; start some, for example: dask worker {address}"
+            )
+        client.register_worker_callbacks(use_compilation_cache)  # of workers that join later, too
+        yield client.get_executor(retries=_RETRIES, pure=False), count
+
+
+def use_compilation_cache() -> None:
+    """Use the cache that the environment names, or else the user's own, in a worker: JAX may have been imported there
+    before its environment was set."""
+    set_up()
+    least = os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
+    if least is not None:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", float(least))
+    reset_compilation_cache()  # a process that has compiled without a cache would never look for one again
+
+
+def _check_arguments(executor: Any, **numbers: Any) -> None:
+    for what, number in numbers.items():
+        if number is not None and (not isinstance(number, int) or number < 1):
+            raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")
+    if executor is not None and not isinstance(executor, Executor):
         raise InputError(
             f"executor is a {type(executor).__name__}; give a concurrent.futures.Executor, or leave it out."
         )
@@ -157,38 +206,68 @@ def _check_executor(executor: Any) -> None:
         )
 
 
-def _run(
-    study: Study, layout: Layout, shared: Path | None, block: Block, resources: "_Resources"
-) -> dict[str, np.ndarray] | None:
-    """The task of a worker: one block, computed with what the study was begun with; written in a shared folder."""
-    check_same(layout.computed_with, f"on the worker {platform.node()}: the study", "leave that worker out")
-    results = run_block(study, block, device=resources.device, workers=resources.threads)
-    if shared is None:
+def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> Results:
+    """What an existing file holds, or a new one."""
+    if not path.exists():
+        # It may compile, which Ctrl-C cannot interrupt in the thread that does it.
+        thread = ThreadPoolExecutor(1, thread_name_prefix=THREADS)
+        try:
+            thread.submit(check_reach, study).result()
+        finally:
+            thread.shutdown(wait=False)
+        chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
+        # With what a worker computes: it may be another machine, with other devices.
+        settings = computed_with() if executor is None else _result(executor.submit(computed_with), "the first task")
+        results = Results(path, study, chunk, settings)
+        results.create()
         return results
-    store.write_part(shared, block, results, layout)
+    results = read(path)
+    if results.study != study:
+        raise InputError(
+            f"{path} holds another study ({_difference(results.study, study)}); choose another output path."
+        )
+    if results.in_blocks and chunk not in (None, results.chunk):
+        raise InputError(f"{path} was begun with chunks of {results.chunk} trials; leave the chunk out to continue.")
+    if results.in_blocks and executor is None:
+        check_same(results.computed_with, str(path), "choose another output path")
+    return results
+
+
+def _difference(begun: Study, asked: Study) -> str:
+    """The first key in which two studies differ, in words."""
+    before, now = (study.specification.model_dump(exclude={"name", "arm"}) for study in (begun, asked))
+    for table, value in now.items():
+        if isinstance(value, dict) and isinstance(before[table], dict):
+            for key in value:
+                if before[table].get(key) != value[key]:
+                    return f"{table}.{key} differs"
+        elif value != before[table]:
+            return f"{table} differs"
+    return "its arm or its capture differs"
+
+
+def _run(study: Study, begun: str, block: Block, file: Path | None, device: Any = None) -> dict[str, np.ndarray] | None:
+    """The task of a worker: one block, computed with what the study was begun with; written to a shared folder."""
+    check_same(begun, f"on the worker {platform.node()}: the study", "leave that worker out")
+    results = run_block(equal_study(study), block, device=device)
+    if file is None:
+        return results
+    write_block(file, results)
     return None
 
 
-class _Resources(NamedTuple):
-    """What of its process a block uses; None: the first device, all cores."""
-
-    device: Any = None
-    threads: int | None = None
-
-
 @contextmanager
-def _executor(executor: Executor | None, workers: int | None) -> Iterator[tuple[Executor, int, Iterator[_Resources]]]:
-    """The executor, its number of workers, and the resources of one block after another."""
+def _pool(executor: Executor | None, workers: int | None) -> Iterator[tuple[Executor, int, Iterator[Any]]]:
+    """The executor, its number of workers, and the device of one block after another; None: all that it has."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if executor is not None:
-        count = workers or getattr(executor, "_max_workers", None) or len(available_cores())
-        yield executor, count, itertools.repeat(_Resources())
+        yield executor, workers or getattr(executor, "_max_workers", None) or cores, itertools.repeat(None)
         return
     devices = jax.local_devices()
-    cores = len(available_cores()) if devices[0].platform == "cpu" else 0
-    count = workers or max(cores, len(devices))
+    count = workers or max(cores if devices[0].platform == "cpu" else 0, len(devices))
     threads = ThreadPoolExecutor(count, thread_name_prefix=THREADS)
     try:
-        yield threads, count, itertools.cycle(_Resources(device, 1) for device in devices)
+        yield threads, count, itertools.cycle(devices)
     finally:  # where a block is running still, an interrupt does not wait for it
         threads.shutdown(wait=False, cancel_futures=True)
 
@@ -198,7 +277,7 @@ def _in_order(study: Study, missing: list[Block]) -> tuple[list[Block], list[Blo
 
     Blocks of one setting run consecutively, so that few pools are needed at a time.
     """
-    by_setting: dict[Setting, list[Block]] = {setting: [] for setting in study.settings}
+    by_setting = {setting: [] for setting in study.settings}
     for block in missing:
         by_setting[study.settings[block.first_cell]].append(block)
     groups = [blocks for blocks in by_setting.values() if blocks]
@@ -210,13 +289,10 @@ def _completed(
     phases: tuple[list[Block], list[Block]],
     queued: int,
     stopped: threading.Event,
-    waits_known: bool,
 ) -> Iterator[tuple[Block | None, Any]]:
     """Results of blocks as they end: first of those that compile, then of the others, at most ``queued`` at a time.
 
-    ``waits_known``: whether a future can be cancelled only before it has begun. Dask's can always.
-
-    Once ``stopped``, (None, None) and then those of blocks that are running; nothing more where programs compile.
+    Once ``stopped``, (None, None) and then those of blocks that are submitted; nothing more where programs compile.
     """
     submitted: dict[Future, Block] = {}
     try:
@@ -234,8 +310,6 @@ def _completed(
                     continue
                 if blocks is phases[0]:
                     return
-                for future in [future for future in submitted if waits_known and future.cancel()]:
-                    del submitted[future]  # those that have not begun
                 if submitted and not told:
                     told = True
                     yield None, None
@@ -297,46 +371,3 @@ def _locked(output: OutputFile) -> Iterator[None]:
         # Removed before it is released: otherwise a third process could lock a new file while a second has this one.
         Path(lock.lock_file).unlink(missing_ok=True)
         lock.release()
-
-
-def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | None) -> tuple[Layout, bool]:
-    """The layout of an existing or a new file, and whether it is finished."""
-    if not path.exists():
-        # It may compile, which Ctrl-C cannot interrupt in the thread that does it.
-        thread = ThreadPoolExecutor(1, thread_name_prefix=THREADS)
-        try:
-            thread.submit(check_reach, study).result()
-        finally:
-            thread.shutdown(wait=False)
-        chunk = chunk or (_CHUNK_CPU if jax.local_devices()[0].platform == "cpu" else _CHUNK_ELSEWHERE)
-        # With what a worker computes: it may be another machine, with other devices.
-        settings = computed_with() if executor is None else _result(executor.submit(computed_with), "the first task")
-        layout = Layout.of(study, chunk, settings)
-        store.create(path, study, layout)
-        return layout, False
-    stored = store.read(path)
-    if stored.study != study:
-        raise InputError(
-            f"{path} holds another study ({_difference(stored.study, study)}); choose another output path."
-        )
-    store.check_parts(path, stored._replace(finished=False))
-    if stored.finished and stored.parts is None:
-        store.clean(path)  # left by a killed process
-        return stored.layout, True
-    begun = stored.layout
-    if chunk not in (None, begun.chunk):
-        raise InputError(f"{path} was begun with chunks of {begun.chunk} trials; leave the chunk out to continue.")
-    if executor is None:
-        check_same(begun.computed_with, str(path), "choose another output path")
-    return begun, stored.finished
-
-
-def _difference(one: Study, other: Study) -> str:
-    """The first key in which two studies differ, in words."""
-    begun, asked = (s.specification.model_dump(exclude={"name", "arm"}) for s in (one, other))
-    for table, value in asked.items():
-        if value != begun[table]:
-            both = isinstance(value, dict) and isinstance(begun[table], dict)
-            inner = [key for key in value if begun[table].get(key) != value[key]] if both else []
-            return f"{table}{'.' + inner[0] if inner else ''} differs"
-    return "its arm or its capture differs"

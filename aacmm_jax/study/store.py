@@ -1,4 +1,4 @@
-"""The file of a study, and its blocks until it is complete, whenever a process is killed.
+"""The file of a study, its blocks until it is complete, and its results, whenever a process is killed.
 
 The file holds what was asked from the beginning, and all results at the end. Until then each finished block is a file
 of NumPy's arrays in ``FILE.parts``, written under a temporary name and renamed: it is there entirely or not at all, and
@@ -9,18 +9,20 @@ before anything in the folder is read or removed: nobody but its owner can repla
 """
 
 import contextlib
-import glob
+import hashlib
 import io
 import os
 import shutil
 import stat
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..core._compat import named_members
 from ..core.errors import InputError
@@ -28,152 +30,262 @@ from ..core.file_owners import POSIX, is_ours, keeps_owners, others_may_write, u
 from ..files.captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from ..files.hdf5 import Table, Variable, check_sense, columns, opened, read_tables, undamaged, write_tables
 from ..files.inputs import InputFile
-from ..files.outputs import ELSEWHERE, write_atomically
+from ..files.outputs import ELSEWHERE, as_path, write_atomically
 from ..kinematics.arm import parameter_unit
-from .blocks import DIMENSIONS, VARIABLES, Block, Layout, fill_of, part_of, parts_of
-from .definition import Study
+from ..solver.reason import Reason, numbers_of
+from .blocks import DIMENSIONS, VARIABLES, Block, blocks_of
+from .definition import POOL_PARTS, Study
 from .specification import Specification, unit
 
 _ADVICE = "free some space there, then run the same command again: what is finished is kept"
 _TRIALS_IN_MEMORY = 50_000
+_LARGEST = 1e20  # mm, rad, or a factor
 
 
-def write_part(path: Path, block: Block, results: Mapping[str, np.ndarray], layout: Layout) -> None:
+def parts_of(path: Path) -> Path:
+    """Folder of the blocks of an unfinished study."""
+    return path.with_name(path.name + ".parts")
+
+
+def write_block(file: Path, results: Mapping[str, np.ndarray]) -> None:
     """Write a finished block: its file appears complete, or not at all."""
-    target, content = part_of(path, block, layout), io.BytesIO()
+    content = io.BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(results[name]) for name in VARIABLES}
-    np.savez(content, block=np.array(target.name), **arrays)
-    with write_atomically(target, _ADVICE, leftovers=False) as temporary:
+    np.savez(content, block=np.array(file.name), **arrays)
+    with write_atomically(file, _ADVICE, leftovers=False) as temporary:
         temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: nobody else may change a block
         temporary.write_bytes(content.getbuffer())
 
 
-def read_part(path: Path, block: Block, layout: Layout) -> dict[str, np.ndarray]:
-    """The arrays of a block. Raises `InputError` where its file is somebody else's, damaged or another block's."""
-    file = part_of(path, block, layout)
-    check_block(file)
-    with undamaged(file), np.load(io.BytesIO(InputFile(file).content), allow_pickle=False) as archive:
-        results = {name: archive[name] for name in VARIABLES}
-        shapes = any(values.shape != layout.shape(name, *block.shape) for name, values in results.items())
-        check_sense(file, {"it is another block": str(archive["block"]) != file.name or shapes})
+@dataclass(frozen=True)
+class Results:
+    """Results of a study, read cell by cell from its file; ``Results.of(path)`` opens it, also while the study runs.
+
+    Example:
+        >>> print(results.finished, results.study.factors)
+        True {'bounds.length_mm': [5.0, 10.0], 'bounds.length_shift_mm': [0.0, 3.0]}
+    """
+
+    path: Path
+    study: Study
+    chunk: int  # trials in a block
+    computed_with: str
+    finished: bool = False  # whether every trial has run
+    in_blocks: bool = True  # whether results are in blocks still, and not in the file
+
+    @classmethod
+    def of(cls, path: str | os.PathLike) -> "Results":
+        """Open a study.
+
+        Args:
+            path: File of the study (HDF5).
+
+        Returns:
+            Its results, for `cell_summary`, `study_summary` and the figures of `aacmm_jax.plot`.
+
+        Raises:
+            InputError: Where the file is missing, damaged or no study, or its folder of blocks is missing.
+        """
+        results = read(Path(os.path.realpath(as_path(path))))
+        missing = len(results.blocks) - len(results.finished_blocks()) if results.in_blocks else 0
+        if results.finished and missing:
+            raise InputError(
+                f"{missing} blocks are missing in {parts_of(results.path).name}; put them there, or run the study "
+                "again with --resume to make them."
+            )
+        if not results.in_blocks:
+            with opened(results.path, ("study",), verify=False) as file:
+                arrays = {name: file["trials"][name] for name in VARIABLES}
+                shapes = any(array.shape != results.empty(name).shape for name, array in arrays.items())
+                check_sense(results.path, {"its results have other shapes than its study": shapes})
+                ran = (arrays["converged"][()] != VARIABLES["converged"].fill).all()
+                check_sense(results.path, {"it has trials that did not run": not ran})
         return results
 
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """All blocks, in order."""
+        return blocks_of(self.study, self.chunk)
 
-def is_readable(path: Path, block: Block, layout: Layout) -> bool:
-    """Whether a block's file is as it was written."""
-    try:
-        return bool(read_part(path, block, layout))
-    except InputError:
-        return False
+    @cached_property
+    def mark(self) -> str:
+        """How the names of its blocks begin: of this study, of this size, and of what it is computed with."""
+        settings = hashlib.sha256(self.computed_with.encode()).hexdigest()
+        return f"{self.study.digest[:12]}-{self.chunk}-{settings[:8]}"
 
+    def file_of(self, block: Block) -> Path:
+        """File of a block."""
+        return parts_of(self.path) / f"{self.mark}-cell{block.first_cell:05d}-trial{block.first_trial:010d}.npz"
 
-def finished_blocks(path: Path, layout: Layout) -> list[Block]:
-    """Blocks whose files exist. Raises `InputError` where one is a link, or somebody else's."""
-    folder = parts_of(path)
-    names = {item.name for item in folder.glob("*.npz")} if folder.is_dir() else set()
-    finished = [block for block in layout.blocks() if part_of(path, block, layout).name in names]
-    for block in finished:
-        check_block(part_of(path, block, layout))
-    return finished
+    def empty(self, name: str, *shape: int) -> np.ndarray:
+        """An array of results of trials that have not run: of all cells and trials, or of so many."""
+        kind = VARIABLES[name]
+        shape = shape or (len(self.study.cells), self.study.trials)
+        axes = (*shape, len(self.study.space.names)) if kind.by_parameter else shape
+        return np.full(axes, kind.fill, kind.dtype)
 
+    def finished_blocks(self) -> list[Block]:
+        """Blocks whose files exist. Raises `InputError` where one is a link, or somebody else's."""
+        folder = parts_of(self.path)
+        names = {item.name for item in folder.glob("*.npz")} if folder.is_dir() else set()
+        finished = [block for block in self.blocks if self.file_of(block).name in names]
+        for block in finished:
+            _check_block(self.file_of(block))
+        return finished
 
-def create(path: Path, study: Study, layout: Layout) -> None:
-    """Make the file of a new study, and the folder of its blocks."""
-    folder = parts_of(path)
-    try:
-        folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
-        check_ours(path)
-        for item in folder.glob("*.npz"):  # blocks of a study whose file was removed
-            if not item.name.startswith(f"{layout.mark}-"):
-                item.unlink()
-        _write(path, study, layout, finished=False, advice=ELSEWHERE)
-    except OSError as error:
-        raise InputError(
-            f"{folder} cannot be created: {(error.strerror or str(error)).lower()}; choose another output path."
-        ) from error
-    except BaseException:
-        with contextlib.suppress(OSError):  # one with blocks is left as it is
-            folder.rmdir()
-        raise
+    def of_block(self, block: Block) -> dict[str, np.ndarray]:
+        """The arrays of a block. Raises `InputError` where its file is somebody else's, damaged or another block's."""
+        file = self.file_of(block)
+        _check_block(file)
+        with undamaged(file), np.load(io.BytesIO(InputFile(file).content), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in VARIABLES}
+            shapes = any(array.shape != self.empty(name, *block.shape).shape for name, array in arrays.items())
+            check_sense(file, {"it is another block": str(archive["block"]) != file.name or shapes})
+            return arrays
 
+    def is_readable(self, block: Block) -> bool:
+        """Whether the file of a block is as it was written."""
+        try:
+            return bool(self.of_block(block))
+        except InputError:
+            return False
 
-def finish(path: Path, study: Study, layout: Layout, keep_parts: bool = False) -> None:
-    """Copy all blocks into the study's file and remove their folder; with ``keep_parts``, leave them as they are."""
-    _write(path, study, layout, None if keep_parts else partial(_add_results, path, layout), finished=True)
-    if not keep_parts:
-        clean(path)
+    def column(self, name: str, cell: int) -> np.ndarray:
+        """One array of results of one cell (counted from 0)."""
+        return self._columns([name], cell)[name]
 
+    def columns(self, cell: int) -> dict[str, np.ndarray]:
+        """Arrays of one cell with one number a trial; ``group`` is the part of the pool that a trial drew from."""
+        columns = self._columns([name for name, kind in VARIABLES.items() if not kind.by_parameter], cell)
+        return columns | {"group": np.arange(self.study.trials) % POOL_PARTS}
 
-def _add_results(path: Path, layout: Layout, file: Any) -> None:
-    """Copy the results of all blocks into the open file of a study."""
-    from ..solver.reason import Reason, numbers_of
+    def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
+        columns = {name: self.empty(name, self.study.trials) for name in names}
+        for trials, rows in self._checked_rows([*{*names, "converged"}], cell):
+            for name in names:
+                columns[name][trials] = rows[name]
+        return columns
 
-    group = file["trials"]
-    for name, kind in VARIABLES.items():
-        dataset = group.create_dataset(name, layout.shape(name), kind.dtype)
-        dataset.attrs["units"], dataset.attrs["long_name"] = kind.units, kind.long_name
-        for axis, dimension in enumerate(DIMENSIONS[: dataset.ndim]):
-            dataset.dims[axis].attach_scale(group[dimension])
-    numbered = (f"{int(numbers_of(reason))}: {name}" for name, reason in named_members(Reason))
-    group["reason"].attrs["reasons"] = ", ".join(numbered)
-    for block in layout.blocks():
-        for name, values in read_part(path, block, layout).items():
-            group[name][block.slices] = values
+    def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:
+        """Of converged trials, some at a time: parameter errors (estimate minus truth), active bounds, groups."""
+        for trials, rows in self._checked_rows(["converged", "estimate", "true", "active"], cell):
+            good = rows["converged"] == 1
+            group = np.arange(trials.start, trials.stop) % POOL_PARTS
+            yield (rows["estimate"] - rows["true"])[good], rows["active"][good], group[good]
 
+    def _checked_rows(self, names: list[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+        """Results of one cell, some trials at a time. Raises `InputError` for results that no trial has.
 
-def clean(path: Path) -> None:
-    """Remove the blocks of a finished study, which are now in its file."""
-    shutil.rmtree(parts_of(path), ignore_errors=True)
+        A trial that failed may have NaN or an infinite number; a converged one NaN for what the study does not compute,
+        such as k without reference lengths, but not for its parameters.
+        """
+        with undamaged(self.path):
+            for trials, rows in self.rows(names, cell):
+                floats = {name: values for name, values in rows.items() if values.dtype.kind == "f"}
+                converged = {name: values[rows["converged"] == 1] for name, values in floats.items()}
+                parameters = [converged[name] for name in ("estimate", "true") if name in converged]
+                large = any(np.any(np.isfinite(x) & (np.abs(x) > _LARGEST)) for x in floats.values())
+                infinite = any(np.any(np.isinf(x)) for x in converged.values())
+                missing = any(np.any(np.isnan(x)) for x in parameters)
+                problems = {
+                    "a result is larger than any can be": large,
+                    "a trial that converged has an infinite result": infinite,
+                    "a trial that converged has a parameter without a number": missing,
+                }
+                check_sense(self.path, problems)
+                yield trials, rows
 
+    def rows(self, names: list[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+        """Results of one cell as they are in the file or in the blocks: which trials, and their arrays."""
+        if self.in_blocks:
+            for block in self.finished_blocks():
+                if block.first_cell <= cell < block.last_cell:
+                    arrays = self.of_block(block)
+                    yield block.slices[1], {name: arrays[name][cell - block.first_cell] for name in names}
+            return
+        with opened(self.path, ("study",), verify=False) as file:
+            arrays = {name: file["trials"][name] for name in names}
+            for first in range(0, self.study.trials, _TRIALS_IN_MEMORY):
+                trials = slice(first, min(first + _TRIALS_IN_MEMORY, self.study.trials))
+                yield trials, {name: arrays[name][cell, trials] for name in names}
 
-def tidy(path: Path) -> None:
-    """Remove the temporary files of killed processes."""
-    for folder, name in ((path.parent, glob.escape(path.name)), (parts_of(path), "*")):
-        for left in folder.glob(f".{name}.????????.part"):
-            left.unlink(missing_ok=True)
+    def create(self) -> None:
+        """Make the file of a new study, and the folder of its blocks."""
+        folder = parts_of(self.path)
+        try:
+            folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
+            check_owners(self.path)
+            for item in folder.glob("*.npz"):  # blocks of a study whose file was removed
+                if not item.name.startswith(f"{self.mark}-"):
+                    item.unlink()
+            self._write(ELSEWHERE)
+        except OSError as error:
+            raise InputError(
+                f"{folder} cannot be created: {(error.strerror or str(error)).lower()}; choose another output path."
+            ) from error
+        except BaseException:
+            with contextlib.suppress(OSError):  # one with blocks is left as it is
+                folder.rmdir()
+            raise
 
+    def finish(self, keep_parts: bool = False) -> None:
+        """Copy all blocks into the study's file and remove their folder; with ``keep_parts``, leave them there."""
+        replace(self, finished=True, in_blocks=keep_parts)._write()
+        if not keep_parts:
+            shutil.rmtree(parts_of(self.path), ignore_errors=True)
 
-def _write(
-    path: Path,
-    study: Study,
-    layout: Layout,
-    extend: Callable[[Any], None] | None = None,
-    *,
-    finished: bool,
-    advice: str = _ADVICE,
-) -> None:
-    """Write the study's file; ``extend`` adds the results. ``advice``: what to do where it fails."""
-    attributes = {
-        "name": study.specification.name,
-        "seed": study.specification.seed,
-        "digest": study.digest,
-        "chunk": layout.chunk,
-        "computed_with": layout.computed_with,
-        "finished": int(finished),
-        "parts": parts_of(path).name if extend is None else None,
-    }
-    names = list(study.space.names)
-    parameter = columns("parameter", parameter=(names, "", "free parameter"))
-    units = [parameter_unit(study.space.base, name) for name in names]
-    nominal = (np.asarray(study.space.vector()), "mm or rad", "value in the nominal arm")
-    cell = columns("cell", cell=(np.arange(1, len(study.cells) + 1), "1", "cell of the grid"))
-    trial = columns("trial", trial=(np.arange(1, study.trials + 1), "1", "trial in the cell"))
-    text = study.specification.model_dump_json(exclude_unset=True)
-    tables = {
-        "specification": Table(columns("line", text=([text], "", "specification as JSON"))),
-        "cells": Table(cell | factor_columns(study)),
-        "parameters": Table(
-            parameter | columns("parameter", unit=(units, "", "unit of the parameter"), nominal=nominal)
-        ),
-    }
-    if extend is not None:
-        tables["trials"] = Table(cell | trial | parameter)
-    if study.recording is None:
-        tables["nominal_arm"] = arm_table(study.nominal)
-    else:
-        tables |= recording_tables(study.recording._replace(nominal=study.nominal))
-        attributes = dict(recording_attributes(study.recording)) | attributes
-    write_tables(path, "study", tables, attributes, extend=extend, advice=advice)
+    def _write(self, advice: str = _ADVICE) -> None:
+        """Write the study's file, with the results of all blocks if they are to be in it.
+
+        ``advice`` says what to do where it fails.
+        """
+        study = self.study
+        attributes = {
+            "name": study.specification.name,
+            "seed": study.specification.seed,
+            "digest": study.digest,
+            "chunk": self.chunk,
+            "computed_with": self.computed_with,
+            "finished": int(self.finished),
+            "parts": parts_of(self.path).name if self.in_blocks else None,
+        }
+        names = list(study.space.names)
+        parameter = columns("parameter", parameter=(names, "", "free parameter"))
+        units = [parameter_unit(study.space.base, name) for name in names]
+        nominal = (np.asarray(study.space.vector()), "mm or rad", "value in the nominal arm")
+        cell = columns("cell", cell=(np.arange(1, len(study.cells) + 1), "1", "cell of the grid"))
+        text = study.specification.model_dump_json(exclude_unset=True)
+        tables = {
+            "specification": Table(columns("line", text=([text], "", "specification as JSON"))),
+            "cells": Table(cell | factor_columns(study)),
+            "parameters": Table(
+                parameter | columns("parameter", unit=(units, "", "unit of the parameter"), nominal=nominal)
+            ),
+        }
+        if not self.in_blocks:
+            trial = columns("trial", trial=(np.arange(1, study.trials + 1), "1", "trial in the cell"))
+            tables["trials"] = Table(cell | trial | parameter)
+        if study.recording is None:
+            tables["nominal_arm"] = arm_table(study.nominal)
+        else:
+            tables |= recording_tables(study.recording._replace(nominal=study.nominal))
+            attributes = dict(recording_attributes(study.recording)) | attributes
+        extend = None if self.in_blocks else self._add_results
+        write_tables(self.path, "study", tables, attributes, extend=extend, advice=advice)
+
+    def _add_results(self, file: Any) -> None:
+        """Copy the results of all blocks into the open file of a study."""
+        group = file["trials"]
+        for name, kind in VARIABLES.items():
+            dataset = group.create_dataset(name, self.empty(name).shape, kind.dtype)
+            dataset.attrs["units"], dataset.attrs["long_name"] = kind.units, kind.long_name
+            for axis, dimension in enumerate(DIMENSIONS[: dataset.ndim]):
+                dataset.dims[axis].attach_scale(group[dimension])
+        numbered = (f"{int(numbers_of(reason))}: {name}" for name, reason in named_members(Reason))
+        group["reason"].attrs["reasons"] = ", ".join(numbered)
+        for block in self.blocks:
+            for name, values in self.of_block(block).items():
+                group[name][block.slices] = values
 
 
 def factor_columns(study: Study) -> dict[str, Variable]:
@@ -187,17 +299,9 @@ def factor_columns(study: Study) -> dict[str, Variable]:
     return columns("cell", **by_name)
 
 
-class StoredStudy(NamedTuple):
-    """What a study's file contains, without the results."""
-
-    study: Study
-    layout: Layout  # how it is cut into blocks
-    finished: bool
-    parts: str | None  # folder of the blocks, where the results are in it
-
-
-def read(path: Path) -> StoredStudy:
-    """Read a study without its results. Raises `InputError` for a file that is missing, damaged or no study."""
+def read(path: Path) -> Results:
+    """Read a study, but not its results. Raises `InputError` for a file that is missing, damaged or no study, and where
+    the folder of its blocks is missing or somebody else's."""
     stored = read_tables(path, ("study",), without=("trials",))
     with undamaged(path):
         specification = Specification.model_validate_json(str(stored.tables["specification"]["text"][0]))
@@ -205,106 +309,36 @@ def read(path: Path) -> StoredStudy:
         study = Study(specification, nominal, recording_of(path, stored) if "capture" in stored.tables else None)
         different = study.digest != attributes["digest"]
         check_sense(path, {"its specification does not match its results": different})
-        layout = Layout.of(study, attributes["chunk"], attributes["computed_with"])
-        return StoredStudy(study, layout, bool(attributes["finished"]), attributes.get("parts"))
+        parts, finished = attributes.get("parts"), bool(attributes["finished"])
+        results = Results(path, study, attributes["chunk"], attributes["computed_with"], finished, parts is not None)
+    if parts is None:
+        return results
+    if parts != parts_of(path).name:
+        raise InputError(
+            f"{path} was renamed, but its results are in {parts}; rename it back to {parts.removesuffix('.parts')}."
+        )
+    if not parts_of(path).is_dir():
+        raise InputError(f"{path} has its results in the folder {parts}, which is missing; put it next to the file.")
+    check_owners(path, reading=True)
+    return results
 
 
-def check_parts(path: Path, stored: StoredStudy) -> None:
-    """Raise `InputError` where the results are in a folder of blocks that is missing or incomplete."""
+def check_owners(path: Path, *, reading: bool = False) -> None:
+    """Raise `InputError` where a study that is to be run or continued is somebody else's, or its folder of blocks, or
+    others may write there. Where it is only read, the folder may be of whoever owns the file."""
     folder = parts_of(path)
-    if stored.parts is None:
-        return
-    if stored.parts != folder.name:
-        raise InputError(
-            f"{path} was renamed, but its results are in {stored.parts}; rename it back to "
-            f"{stored.parts.removesuffix('.parts')}."
-        )
-    if not folder.is_dir():
-        raise InputError(
-            f"{path} has its results in the folder {stored.parts}, which is missing; put it next to the file."
-        )
-    check_readable(path)
-    layout = stored.layout
-    missing = sum(1 for _ in layout.blocks()) - len(finished_blocks(path, layout))
-    if stored.finished and missing:
-        raise InputError(
-            f"{missing} blocks are missing in {stored.parts}; put them there, or run the study again with --resume to "
-            "make them."
-        )
-
-
-def check_results(path: Path, stored: StoredStudy) -> None:
-    """Raise `InputError` where the results have other shapes, or a finished study has trials that did not run."""
-    if stored.parts is not None:
-        return
-    layout = stored.layout
-    with opened(path, ("study",), verify=False) as file:
-        arrays = {name: file["trials"][name] for name in VARIABLES}
-        shapes = any(array.shape != layout.shape(name) for name, array in arrays.items())
-        check_sense(path, {"its results have other shapes than its study": shapes})
-        ran = stored.finished and (arrays["converged"][()] != fill_of("converged")).all()
-        check_sense(path, {"it has trials that did not run": not ran})
-
-
-def rows_of(
-    path: Path, stored: StoredStudy, names: Sequence[str], cell: int
-) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
-    """Results of one cell, some trials at a time: which trials, and their arrays."""
-    layout = stored.layout
-    if stored.parts is None:
-        with opened(path, ("study",), verify=False) as file:
-            trials = {name: file["trials"][name] for name in names}
-            for first in range(0, layout.trials, _TRIALS_IN_MEMORY):
-                part = slice(first, min(first + _TRIALS_IN_MEMORY, layout.trials))
-                yield part, {name: trials[name][cell, part] for name in names}
-        return
-    for block in finished_blocks(path, layout):
-        if block.first_cell <= cell < block.last_cell:
-            results = read_part(path, block, layout)
-            yield block.slices[1], {name: results[name][cell - block.first_cell] for name in names}
-
-
-def check_ours(path: Path) -> None:
-    """Raise `InputError` where a study that is to be run or continued is somebody else's, or its folder of blocks."""
-    for item in (path, parts_of(path)):
+    for item in (folder,) if reading else (path, folder):
         status = _status(item)
-        if status is not None and not is_ours(status):
-            _refuse(
-                item,
-                f"{item} belongs to {user_name(status.st_uid)}, so its results are not continued; choose another "
-                "output path.",
+        if status is None or is_ours(status):
+            continue
+        user = user_name(status.st_uid)
+        if not reading:
+            _refuse(item, f"{item} belongs to {user}, so its results are not continued; choose another output path.")
+        elif status.st_uid != (owner := os.stat(path).st_uid):
+            raise InputError(
+                f"{folder} belongs to {user}, but {path.name} to {user_name(owner)}, so its blocks are not read; have "
+                "one user own both."
             )
-    _check_folder(parts_of(path))
-
-
-def check_readable(path: Path) -> None:
-    """Raise `InputError` where the blocks of a study that is read are neither ours nor those of who owns its file."""
-    folder = parts_of(path)
-    status = _status(folder)
-    if status is None or not POSIX:
-        return
-    owner = os.stat(path).st_uid
-    if status.st_uid != owner and not is_ours(status):
-        raise InputError(
-            f"{folder} belongs to {user_name(status.st_uid)}, but {path.name} to {user_name(owner)}, so its blocks are "
-            "not read; have one user own both."
-        )
-    _check_folder(folder)
-
-
-def check_block(file: Path) -> None:
-    """Raise `InputError` where a block is a link, or not the property of who owns its folder."""
-    status = _status(file)
-    if status is None or not POSIX:
-        return
-    what = "is a link" if stat.S_ISLNK(status.st_mode) else ""
-    if not what and status.st_uid != os.stat(file.parent).st_uid:
-        what = f"belongs to {user_name(status.st_uid)}, who does not own its folder"
-    if what:
-        raise InputError(f"{file} {what}, so it is not read; remove it, and run the study again with --resume.")
-
-
-def _check_folder(folder: Path) -> None:
     status = _status(folder)
     if status is None:
         return
@@ -318,6 +352,18 @@ def _check_folder(folder: Path) -> None:
             f"others may write to {folder} (mode {stat.S_IMODE(status.st_mode):04o}), so the blocks in it are not "
             f"read; if they are yours, run chmod go-w '{folder}', otherwise remove it.",
         )
+
+
+def _check_block(file: Path) -> None:
+    """Raise `InputError` where a block is a link, or not the property of who owns its folder."""
+    status = _status(file)
+    if status is None or not POSIX:
+        return
+    what = "is a link" if stat.S_ISLNK(status.st_mode) else ""
+    if not what and status.st_uid != os.stat(file.parent).st_uid:
+        what = f"belongs to {user_name(status.st_uid)}, who does not own its folder"
+    if what:
+        raise InputError(f"{file} {what}, so it is not read; remove it, and run the study again with --resume.")
 
 
 def _refuse(path: Path, sentence: str) -> None:

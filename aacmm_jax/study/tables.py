@@ -1,16 +1,73 @@
-"""Tables of a study, made of its summary: terminal and report show the same ones."""
+"""Tables of a study, made of its summary, and its metrics and factors in words: terminal and report show the same."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ..core.units import error_unit
+from ..core.units import ARCSEC, error_unit
 from ..summaries.tables import Cell, Table, format_number, listed, number
-from .statistics import METRICS, factor_title, level_text, level_title, metric_title, shown_unit
+from .blocks import METRICS
+from .specification import unit
 
 _MOST_CELLS, _MOST_ROWS = 400, 2000
 _STATISTICS = {"mean": "mean", "standard deviation": "spread", "5 %": "p5", "50 %": "p50", "95 %": "p95"}
+_FACTORS = {
+    "bounds.length_mm": "half-width of lengths [mm]",
+    "bounds.angle_deg": "half-width of angles [deg]",
+    "bounds.length_shift_mm": "shift of the centre, lengths [mm]",
+    "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
+    "identification.hold": "scale anchor",
+    "identification.method": "method",
+    "identification.model": "model of the joints",
+    "identification.prior": "prior",
+    "deviation.model": "what the true joints do",
+    "deviation.harmonics_arcsec": "encoder harmonics [arcsec]",
+    "deviation.gear_ppm": "errors of gear ratios [ppm]",
+    "deviation.coupled_ppm": "couplings of joints [ppm]",
+    "deviation.gravity_mrad_per_m": "compliance under gravity [mrad/m]",
+    "deviation.gravity_mrad_per_knm": "compliance under gravity [mrad/(kN m)]",
+    "noise.encoder_arcsec": "encoder noise [arcsec]",
+    "noise.linear_encoder_mm": "noise of linear encoders [mm]",
+    "noise.seating_mm": "seating noise [mm]",
+    "capture.poses": "poses in a socket",
+    "capture.sockets": "sockets",
+    "reference.positions": "positions of the reference length",
+}
+
+
+def shown_unit(metric: str) -> tuple[str, float]:
+    """The unit in which people read a metric, and the factor to it from mm and rad."""
+    if metric == "scale_error":
+        return "parts in a million", 1e6
+    return {"1": ("", 1.0), "mm": ("mm", 1.0), "rad": ("arcsec", 1 / ARCSEC)}[METRICS[metric].units]
+
+
+def metric_title(metric: str) -> str:
+    """What a metric is, with the unit in which people read it."""
+    shown, _ = shown_unit(metric)
+    return METRICS[metric].long_name + (f" [{shown}]" if shown else "")
+
+
+def factor_title(name: str) -> str:
+    """What a factor is, with its unit: ``noise.encoder_arcsec`` is "encoder noise [arcsec]"."""
+    if name in _FACTORS:
+        return _FACTORS[name]
+    table, _, key = name.partition(".")
+    words = key.removesuffix(f"_{unit(name)}").replace("_", " ")
+    prefix = {"reference": "reference ", "deviation": "deviation of "}.get(table, "")
+    return prefix + words + (f" [{unit(name)}]" if unit(name) != "1" else "")
+
+
+def level_title(name: str, level: float | str) -> str:
+    """A factor and one of its levels with the unit: "encoder noise 2 arcsec"."""
+    words, _, measure = factor_title(name).partition(" [")
+    return f"{words} {level_text(level)}" + (f" {measure.removesuffix(']')}" if measure else "")
+
+
+def level_text(level: float | str) -> str:
+    """A level of a factor: numbers in their shortest form."""
+    return level if isinstance(level, str) else f"{level:g}"
 
 
 def label(summary: Mapping[str, Any], cell: Mapping[str, Any]) -> str:

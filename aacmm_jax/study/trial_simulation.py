@@ -30,9 +30,8 @@ from ..kinematics.chain import (
 )
 from ..kinematics.inverse_kinematics import damped_inverse
 from ..kinematics.jacobian import reading_columns
-from .configuration_pool import Pool, forget_pools, pool_of
-from .definition import POOL_PARTS, Study
-from .settings import CellValues, DrawnTrials, Setting
+from .configuration_pool import Places, forget_pools, pool_of
+from .definition import POOL_PARTS, CellValues, Setting, Study
 
 _WIDTH = 16  # trials at a time: of one width, so that every trial's arithmetic is the same whatever the chunk
 _SIZES = 64, 256  # trials of one call of the compiled program: few sizes, as each takes 10 s to compile
@@ -41,16 +40,34 @@ _SUBSTITUTIONS = 6  # slopes of 0.01, as of 50 arcsec of order 31, leave 1e-12 o
 _MOST_STEPS = 40  # deviations of a few microns take 3, the paper's tolerances 5 or 6
 
 
+class DrawnTrials(NamedTuple):
+    """Trials, as `identify_many` takes them; mm and rad. q is NaN where the true arm did not reach its points.
+
+    Example:
+        >>> drawn, captures = aj.study.draw_trials(study, 0, [0, 1, 2])
+        >>> print(drawn.q.shape, drawn.true.shape)
+        (3, 30, 6) (3, 21)
+    """
+
+    q: Float[Any, "t N n"]
+    true: Float[Any, "t p"]
+    lower: Float[Any, "t p"]
+    upper: Float[Any, "t p"]
+    start: Float[Any, "t p"]
+    value: Float[Any, "t l"]  # certified values of the reference lengths
+    u: Float[Any, "t l"]
+
+
 class _Static(NamedTuple):
     """What determines the compiled program."""
 
-    fixtures: tuple[tuple[int, int, int, int, int], ...]  # first row, placements, ends, poses in the pool, poses taken
+    fixtures: Places
     lengths: tuple[tuple[int, int], ...]  # first poses of both ends
     indices: tuple[tuple[str, int], ...]  # of the free parameters: kind and joint
     recorded: bool
     anchor: int | None  # index of the length that stage 1 fixes
     random_start: bool
-    eccentric: bool
+    eccentric: bool  # of any cell: sines are then computed for all
 
 
 class _Shared(NamedTuple):
@@ -72,25 +89,31 @@ def draw(
     padded = -(-count // size) * size
     cells, trials = (np.resize(numbers, padded) for numbers in (cells, trials))
     values = CellValues(*(column[cells] for column in study.cell_values))
-    seed = np.asarray(study.specification.seed)
-
-    def part(first: int) -> DrawnTrials:
-        given = jax.tree.map(lambda column: column[first : first + size], (cells, trials, values))
+    seed, parts = np.asarray(study.specification.seed), []
+    for first in range(0, padded, size):
+        given = jax.tree.map(lambda column, i=first: column[i : i + size], (cells, trials, values))
         with jax.default_device(device):
             drawn = _draw(static, shared, *jax.device_put((seed, *given), device))
-        return jax.tree.map(np.asarray, drawn)
-
-    parts = [part(first) for first in range(0, padded, size)]
+        parts.append(jax.tree.map(np.asarray, drawn))
     return DrawnTrials(*(np.concatenate(column)[:count] for column in zip(*parts, strict=True)))
 
 
 @lru_cache(maxsize=16)
 def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Static, _Shared]:
     """What all trials of a setting share, on the device."""
-    pool = pool_of(study, setting)
-    static = _static(study, setting, pool)
+    table, places = pool_of(study, setting)
+    starts = np.cumsum([0, *setting.sizes]).tolist()
+    static = _Static(
+        fixtures=places,
+        lengths=tuple((starts[a], starts[b]) for a, b in ends_of(study, setting)),
+        indices=study.space.indices(),
+        recorded=setting.recorded,
+        anchor=None if setting.hold is None else study.space.index(setting.hold),
+        random_start=setting.random_start,
+        eccentric=bool(np.any(study.cell_values.eccentricity > 0)),
+    )
     u = [float(length.u) for length in study.capture.lengths] if study.capture else [0.0] * len(static.lengths)
-    shared = _Shared(pool.table, study.space.base.geometry, np.asarray(study.space.vector()), np.array(u))
+    shared = _Shared(table, study.space.base.geometry, np.asarray(study.space.vector()), np.array(u))
     return static, jax.device_put(shared, device)
 
 
@@ -104,24 +127,12 @@ def clear_pools() -> None:
     _prepared.cache_clear()
 
 
-def _static(study: Study, setting: Setting, pool: Pool) -> _Static:
-    fixtures = tuple(
-        (first, placements, fixture.ends, poses, fixture.poses)
-        for fixture, first, placements, poses in zip(setting.fixtures, *pool[1:], strict=True)
-    )
-    starts = np.cumsum([0, *setting.sizes])
-    ends = tuple((int(starts[a]), int(starts[b])) for a, b in ends_of(study, setting))
-    anchor = None if setting.hold is None else study.space.index(setting.hold)
-    indices = study.space.indices()
-    return _Static(fixtures, ends, indices, setting.recorded, anchor, setting.random_start, study.eccentric)
-
-
 def ends_of(study: Study, setting: Setting) -> list[tuple[int, int]]:
     """The reference lengths, as pairs of sockets."""
     if study.capture is not None:
         return [(int(a), int(b)) for a, b in study.capture.ends()]
-    first = np.cumsum([0, *(fixture.ends for fixture in setting.fixtures)])
-    return [(int(i), int(i) + 1) for fixture, i in zip(setting.fixtures, first, strict=False) if fixture.ends == 2]
+    first = np.cumsum([0, *(fixture.ends for fixture in setting.fixtures)]).tolist()
+    return [(i, i + 1) for fixture, i in zip(setting.fixtures, first, strict=False) if fixture.ends == 2]
 
 
 @partial(jax.jit, static_argnames=("static",))
@@ -159,11 +170,11 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
     geometry = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_WIDTH, *leaf.shape)), geometry)
     geometry = geometry._replace(**with_values(geometry, true, static.indices))
     offsets = jnp.swapaxes(geometry.theta - shared.geometry.theta[None], 0, 1)[:, :, None]
-    joints = _Joints(cosine, sine, None)
+    joints = JointMotion(cosine, sine, None)
     if geometry.kinds is not None:  # the angle of a prismatic joint is that of the true arm
         prismatic, angle = geometry.kinds.mask(3), jnp.swapaxes(geometry.theta, 0, 1)[:, :, None]
         cosine, sine = jnp.where(prismatic, jnp.cos(angle), cosine), jnp.where(prismatic, jnp.sin(angle), sine)
-        joints = _Joints(cosine, sine, jnp.where(prismatic, q, 0.0))
+        joints = JointMotion(cosine, sine, jnp.where(prismatic, q, 0.0))
         offsets = jnp.where(prismatic, 0.0, offsets)
     chain = geometry._replace(coefficients=None, gravity=None)
     q = q + _joint_changes(chain, joints, inverse, target) - offsets
@@ -239,7 +250,7 @@ def _chosen(static: _Static, keys: Array, trials: Int[Array, " w"]) -> Int[Array
 
 def _joint_changes(
     geometry: Geometry,
-    joints: "_Joints",
+    joints: JointMotion,  # with the zero offsets in it
     inverse: Float[Array, "n 3 w N"],
     target: Float[Array, "w 3 N"],
 ) -> Float[Array, "n w N"]:
@@ -253,7 +264,7 @@ def _joint_changes(
     # Barriers keep XLA from computing them again for every pose, and the tip for every joint.
     links, *twist = jax.lax.optimization_barrier((rows, jnp.cos(rows.alpha), jnp.sin(rows.alpha)))
 
-    def gap_of(joints: _Joints) -> tuple[Array, Array]:
+    def gap_of(joints: JointMotion) -> tuple[Array, Array]:
         gap = jax.lax.optimization_barrier(target - jnp.stack(_tip(links, (twist[0], twist[1]), joints), axis=1))
         return gap, jnp.max(jnp.abs(gap), axis=(1, 2))
 
@@ -264,10 +275,10 @@ def _joint_changes(
         number, change, joints, gap, distance = state
         move = sum(inverse[:, i] * gap[None, :, i] for i in range(3))
         move = jnp.where((distance > _TOLERANCE)[None, :, None], move, 0.0)
-        joints = joints.moved(geometry.kinds, move)
+        joints = _moved(joints, geometry.kinds, move)
         return number + 1, change + move, joints, *gap_of(joints)
 
-    begin = (jnp.asarray(0), jnp.zeros_like(joints.cosine), joints, *gap_of(joints))
+    begin = (jnp.asarray(0), jnp.zeros_like(joints.cos), joints, *gap_of(joints))
     _, change, _, _, distance = jax.lax.while_loop(unfinished, step, begin)
     arrived = distance <= _TOLERANCE
 
@@ -280,43 +291,36 @@ def _joint_changes(
     return jax.lax.cond(jnp.all(arrived), lambda: change, again)
 
 
-def _damped_changes(geometry: Geometry, joints: "_Joints", target: Array) -> tuple[Array, Array]:
+def _damped_changes(geometry: Geometry, joints: JointMotion, target: Array) -> tuple[Array, Array]:
     """The same by damped least-norm steps with the true arm's own derivatives; and the final distances, mm."""
     units = reading_units(geometry)[:, None, None]
     zeroed = jax.tree.map(lambda leaf: leaf[:, None, :], geometry._replace(theta=jnp.zeros_like(geometry.theta)))
 
     def step(_: Array, state: tuple) -> tuple:
         change, joints, _ = state
-        forward = forward_pass(zeroed, JointMotion(*jax.tree.map(lambda leaf: leaf[:, :, None], joints)))
+        forward = forward_pass(zeroed, jax.tree.map(lambda leaf: leaf[:, :, None], joints))
         gap = target - forward.tip
         inverse = jax.vmap(damped_inverse, in_axes=(1, 0), out_axes=1)(
             reading_columns(forward) * units[..., None], 1e-2 * jnp.sum(gap**2, axis=1) + 1e-12
         )
         move = units * jnp.clip(jnp.sum(inverse * gap[None], axis=2), -0.2, 0.2)
-        return change + move, joints.moved(geometry.kinds, move), jnp.max(jnp.abs(gap), axis=(1, 2))
+        return change + move, _moved(joints, geometry.kinds, move), jnp.max(jnp.abs(gap), axis=(1, 2))
 
-    begin = (jnp.zeros_like(joints.cosine), joints, jnp.zeros(_WIDTH))
+    begin = (jnp.zeros_like(joints.cos), joints, jnp.zeros(_WIDTH))
     change, _, distance = jax.lax.fori_loop(0, _MOST_STEPS, step, begin)
     return change, distance
 
 
-class _Joints(NamedTuple):
-    """Where the joints are: `JointMotion` with the zero offsets in it."""
-
-    cosine: Float[Array, "n w N"]
-    sine: Float[Array, "n w N"]
-    slide: Float[Array, "n w N"] | None  # mm
-
-    def moved(self, kinds: JointKinds | None, move: Float[Array, "n w N"]) -> "_Joints":
-        """After small changes of the readings."""
-        if self.slide is None or kinds is None:
-            return _Joints(*_rotated(self.cosine, self.sine, move), None)
-        prismatic = kinds.mask(3)
-        turned = _rotated(self.cosine, self.sine, jnp.where(prismatic, 0.0, move))
-        return _Joints(*turned, self.slide + jnp.where(prismatic, move, 0.0))
+def _moved(joints: JointMotion, kinds: JointKinds | None, move: Any) -> JointMotion:
+    """Joints after small changes of the readings."""
+    if joints.slide is None or kinds is None:
+        return JointMotion(*_rotated(joints.cos, joints.sin, move), None)
+    prismatic = kinds.mask(3)
+    turned = _rotated(joints.cos, joints.sin, jnp.where(prismatic, 0.0, move))
+    return JointMotion(*turned, joints.slide + jnp.where(prismatic, move, 0.0))
 
 
-def _rotated(cosine: Array, sine: Array, angle: Array) -> tuple[Array, Array]:
+def _rotated(cosine: Any, sine: Any, angle: Array) -> tuple[Array, Array]:
     """cos and sin after a small rotation, by their series: exact to rounding up to 0.2 rad, and a tenth of the time."""
     square = angle * angle
     sine_ratio, cosine_ratio = jnp.ones_like(angle), jnp.ones_like(angle)
@@ -327,9 +331,9 @@ def _rotated(cosine: Array, sine: Array, angle: Array) -> tuple[Array, Array]:
     return cosine * cos_angle - sine * sin_angle, sine * cos_angle + cosine * sin_angle
 
 
-def _tip(links: Geometry, twist: tuple[Array, Array], joints: _Joints) -> tuple[Array, ...]:
+def _tip(links: Geometry, twist: tuple[Array, Array], joints: JointMotion) -> tuple[Array, ...]:
     """The tip alone, from the probe back to the base: one vector instead of a frame."""
-    (cos_twist, sin_twist), (x, y, z), (cosine, sine, slide) = twist, links.probe, joints
+    (cos_twist, sin_twist), (x, y, z), (cosine, sine, slide, _) = twist, links.probe, joints
     for i in reversed(range(cosine.shape[0])):
         if links.beta is not None:
             cos_tilt, sin_tilt = jnp.cos(links.beta[i]), jnp.sin(links.beta[i])

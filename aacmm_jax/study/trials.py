@@ -1,31 +1,44 @@
-"""A block of trials, from keys to results: drawn, identified by one call, compared with the truth."""
+"""A block of trials, from keys to results: drawn, identified by one call, compared with the truth.
+
+Trials of sockets and lengths are drawn by `trial_simulation`. Those of captures with other observations are drawn here:
+a true arm takes each pose of the recording with its tip, and what it carries, where the nominal arm has them as well as
+it can; what it cannot is taken from the residuals (`calibration.redrawn`). So no kind says how it is drawn.
+"""
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import erf
 
 from ..calibration.batch import calibrate_many, identify_many
-from ..calibration.redrawn import batch_of_captures
+from ..calibration.evaluation import fit_geometry
+from ..calibration.redrawn import ObservedTruth, batch_of_captures, shifted
 from ..core.arrays import Numbers
 from ..core.errors import InputError
+from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, ReferenceLength
-from ..kinematics.arm import correction_names
+from ..kinematics.arm import Arm, by_joint, correction_names
+from ..kinematics.chain import reading_units
 from ..kinematics.parameters import Parameters
+from ..model.observed import Observed
+from ..model.rows import rows_at
 from ..solver.reason import numbers_of
 from .blocks import Block
-from .definition import Study
-from .observed_trials import draw_observed
-from .settings import DrawnTrials, Setting
-from .trial_simulation import draw, ends_of
+from .definition import CellValues, Setting, Study
+from .trial_simulation import DrawnTrials, draw, ends_of
+
+_ROUNDS = 4  # of the configurations' way to their tips, each of which leaves about a hundredth
+_LONGEST_STEP = 0.1  # rad
 
 
-def run_block(study: Study, block: Block, *, device: Any = None, workers: int | None = None) -> dict[str, np.ndarray]:
+def run_block(study: Study, block: Block, *, device: Any = None) -> dict[str, np.ndarray]:
     """Results of a block: name -> array ``(cells, trials, ...)``; `VARIABLES` in `blocks` says what each is.
 
     They depend on the study and on which trials they are, and on nothing else: not on the block, the machine's load or
-    the order; on the kind of processor to rounding.
+    the order; on the kind of processor to rounding. On one ``device`` it takes one core, else all that there are.
     """
     count, trials_each = block.shape
     cells = np.repeat(np.arange(block.first_cell, block.last_cell), trials_each)
@@ -33,7 +46,8 @@ def run_block(study: Study, block: Block, *, device: Any = None, workers: int | 
     setting = study.settings[block.first_cell]
     devices = jax.local_devices() if device is None else [device]
     drawn, captures = _drawn(study, setting, cells, trials, devices[0])
-    results = _identified(study, setting, drawn, captures, devices, workers)
+    options = {"devices": devices, "workers": None if device is None else 1}
+    results = _identified(study, setting, drawn, captures, options)
     return {name: values.reshape(*block.shape, *values.shape[1:]) for name, values in results.items()}
 
 
@@ -69,78 +83,9 @@ def _drawn(
 ) -> tuple[DrawnTrials, Capture]:
     """Trials, and their captures as a batch."""
     if study.observed:
-        return draw_observed(study, setting, cells, trials)
+        return _draw_observed(study, setting, cells, trials)
     drawn = draw(study, setting, cells, trials, device)
     return drawn, batch_of_captures(_template(study, setting), drawn.q, drawn.value, drawn.u)
-
-
-def _identified(
-    study: Study, setting: Setting, drawn: DrawnTrials, capture: Capture, devices: list[Any], workers: int | None
-) -> dict[str, np.ndarray]:
-    space, prior = study.identified(setting)
-    chosen = np.array([study.space.index(name) for name in space.names])
-    fixed = np.asarray(Parameters(space.base, study.space.names).vector())
-    # Coefficients that a model frees begin at 0, whatever the nominal arm's are.
-    corrects = np.isin(study.space.names, correction_names(space.base)) & (setting.model is not None)
-    start = np.where(corrects, fixed, drawn.start)[:, chosen]
-    options = {
-        "space": space,
-        "prior": prior,
-        "hold": setting.hold,
-        "max_steps": study.specification.identification.max_steps,
-        "devices": devices,
-        "workers": workers,
-    }
-    problem = (space.base, capture, drawn.lower[:, chosen], drawn.upper[:, chosen], start)
-    if setting.method == "stage1":
-        many = stage1 = identify_many(*problem, **options)
-    else:
-        many = calibrate_many(*problem, method=setting.method, **options)  # pyright: ignore[reportArgumentType]
-        stage1 = many.stage1
-    identified = _identified_of_all(fixed, chosen, many.parameters)
-    identified1 = _identified_of_all(fixed, chosen, stage1.parameters)
-    k = np.full(len(many.de), np.nan) if many.k is None else many.k
-    lengths = study.space.lengths
-    angles = np.array([kind in ("alpha", "theta", "beta") for kind, _ in study.space.indices()])
-    # Scale of the arm: the factor that best maps the true lengths onto the identified ones. Rows are contiguous, so
-    # that each is summed in the same order however many there are.
-    true = np.ascontiguousarray(np.where(lengths, drawn.true, 0.0))
-    scale, scale_after = (
-        np.ascontiguousarray(values * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
-        for values in (identified1, identified)
-    )
-    scaled = setting.method != "stage1"
-    return {
-        "converged": np.asarray(many.converged, dtype=np.int8),
-        "reason": np.asarray(numbers_of(many.result), dtype=np.int8),
-        "steps": many.steps.astype(np.int32),
-        "k": k,
-        "scale": scale,
-        "scale_error": scale_after - 1 if scaled else np.full(len(k), np.nan),
-        "de_stage1": stage1.de,
-        "deltam_stage1": stage1.deltam,
-        "length_error_stage1": _largest(identified1 - drawn.true, lengths),
-        "angle_error_stage1": _largest(identified1 - drawn.true, angles),
-        "de": many.de if scaled else np.full(len(k), np.nan),
-        "deltam": many.deltam if scaled else np.full(len(k), np.nan),
-        "length_error": _largest(identified - drawn.true, lengths, scaled),
-        "angle_error": _largest(identified - drawn.true, angles, scaled),
-        "truth_inside": np.all((drawn.true >= drawn.lower) & (drawn.true <= drawn.upper), axis=1).astype(np.int8),
-        "active": _identified_of_all(np.zeros(len(fixed), np.int8), chosen, many.active),
-        "estimate": identified,
-        "true": drawn.true,
-    }
-
-
-def _identified_of_all(fixed: np.ndarray, chosen: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values of all parameters of a study, of which a cell identifies some."""
-    every = np.tile(fixed, (len(values), 1))
-    every[:, chosen] = values
-    return every
-
-
-def _largest(error: np.ndarray, which: np.ndarray, present: bool = True) -> np.ndarray:
-    return np.abs(error[:, which]).max(axis=1, initial=0.0) if present else np.full(len(error), np.nan)
 
 
 @lru_cache(maxsize=64)
@@ -151,3 +96,178 @@ def _template(study: Study, setting: Setting) -> Capture:
     rows = np.split(angles, np.cumsum(setting.sizes)[:-1])
     lengths = [ReferenceLength(names[a], names[b], 1.0) for a, b in ends_of(study, setting)]
     return Capture(dict(zip(names, rows, strict=True)), lengths)
+
+
+def _identified(
+    study: Study, setting: Setting, drawn: DrawnTrials, capture: Capture, options: dict[str, Any]
+) -> dict[str, np.ndarray]:
+    space, prior = study.identified(setting)
+    chosen = np.array([study.space.index(name) for name in space.names])
+    fixed = np.asarray(Parameters(space.base, study.space.names).vector())
+    # Coefficients that a model frees begin at 0, whatever the nominal arm's are.
+    corrects = np.isin(study.space.names, correction_names(space.base)) & (setting.model is not None)
+    start = np.where(corrects, fixed, drawn.start)[:, chosen]
+    problem = (space.base, capture, drawn.lower[:, chosen], drawn.upper[:, chosen], start)
+    max_steps, scaled = study.specification.identification.max_steps, setting.method != "stage1"
+    options = options | {"space": space, "prior": prior, "hold": setting.hold, "max_steps": max_steps}
+    if scaled:
+        many = calibrate_many(*problem, method=setting.method, **options)  # pyright: ignore[reportArgumentType]
+        stage1 = many.stage1
+    else:
+        many = stage1 = identify_many(*problem, **options)
+
+    def of_all(values: np.ndarray, others: np.ndarray = fixed) -> np.ndarray:
+        """Values of all parameters of the study, of which the cell identifies some."""
+        every = np.tile(others, (len(values), 1))
+        every[:, chosen] = values
+        return every
+
+    lengths = study.space.lengths
+    angles = np.array([kind in ("alpha", "theta", "beta") for kind, _ in study.space.indices()])
+    none = np.full(len(drawn.true), np.nan)
+    identified, identified1 = of_all(many.parameters), of_all(stage1.parameters)
+    # Scale of the arm: the factor that best maps the true lengths onto the identified ones. Rows are contiguous, so
+    # that each is summed in the same order however many there are.
+    true = np.ascontiguousarray(np.where(lengths, drawn.true, 0.0))
+    scale, scale_after = (
+        np.ascontiguousarray(values * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
+        for values in (identified1, identified)
+    )
+
+    def largest_errors(values: np.ndarray) -> list[np.ndarray]:
+        return [np.abs((values - drawn.true)[:, which]).max(axis=1, initial=0.0) for which in (lengths, angles)]
+
+    length_error, angle_error = largest_errors(identified) if scaled else (none, none)
+    length_error1, angle_error1 = largest_errors(identified1)
+    return {
+        "converged": np.asarray(many.converged, dtype=np.int8),
+        "reason": np.asarray(numbers_of(many.result), dtype=np.int8),
+        "steps": many.steps.astype(np.int32),
+        "k": none if many.k is None else many.k,
+        "scale": scale,
+        "scale_error": scale_after - 1 if scaled else none,
+        "de_stage1": stage1.de,
+        "deltam_stage1": stage1.deltam,
+        "length_error_stage1": length_error1,
+        "angle_error_stage1": angle_error1,
+        "de": many.de if scaled else none,
+        "deltam": many.deltam if scaled else none,
+        "length_error": length_error,
+        "angle_error": angle_error,
+        "truth_inside": np.all((drawn.true >= drawn.lower) & (drawn.true <= drawn.upper), axis=1).astype(np.int8),
+        "active": of_all(many.active, np.zeros(len(fixed), np.int8)),
+        "estimate": identified,
+        "true": drawn.true,
+    }
+
+
+class _Recorded(NamedTuple):
+    """What all trials share."""
+
+    truth: ObservedTruth  # by the nominal arm
+    space: Parameters
+    inverses: list[Float[np.ndarray, "m n r"]]  # least changes of the readings for each residual
+    geometry: Float[np.ndarray, " g"]
+
+
+@lru_cache(maxsize=4)
+def _recorded(study: Study) -> _Recorded:
+    assert study.capture is not None
+    arm = study.space.base
+    arm, space, observed = to_numpy((arm, study.space, Observed.of(study.capture, arm)))
+    geometry = np.asarray(fit_geometry(arm, observed, {}, None).geometry)
+    truth = ObservedTruth.at(study.capture, space, space.vector(), observed.split(geometry))
+    units = reading_units(space.base.geometry)
+    by_units = [np.moveaxis(np.asarray(part.by_readings) * units[:, None], -1, 0) for part in truth.parts]
+    return _Recorded(truth, space, [np.linalg.pinv(matrix, rcond=1e-6) for matrix in by_units], geometry)
+
+
+def _draw_observed(
+    study: Study, setting: Setting, cells: Int[np.ndarray, " t"], trials: Int[np.ndarray, " t"]
+) -> tuple[DrawnTrials, Capture]:
+    """Trials ``trials`` of cells ``cells``, and their captures as a batch. Each has random numbers of its own."""
+    recorded = _recorded(study)
+    seed = study.specification.seed
+    rows = []
+    for cell, trial in zip(cells.tolist(), trials.tolist(), strict=True):
+        values = CellValues(*(column[cell] for column in study.cell_values))
+        rows.append(_trial(study, setting, recorded, values, np.random.default_rng([seed, cell, trial])))
+    true, start, q, shifts, certified, lengths = zip(*rows, strict=True)
+    truth = recorded.truth
+    readings, value = np.stack(q), np.stack(lengths)
+    stacked = {name: np.stack([values[name] for values in certified]) for name in certified[0]}
+    observations = [
+        shifted(observation, readings[:, poses], np.stack([shift[i] for shift in shifts]), stacked)
+        for i, (observation, poses) in enumerate(zip(truth.observed.observations, truth.observed.slices, strict=True))
+    ]
+    u = np.broadcast_to(np.asarray(truth.observed.u), value.shape)
+    captures = truth.batch(observations, value)
+    lower, upper = study.cell_values.lower[cells], study.cell_values.upper[cells]
+    return DrawnTrials(readings, np.stack(true), lower, upper, np.stack(start), value, u), captures
+
+
+def _trial(
+    study: Study, setting: Setting, recorded: _Recorded, values: CellValues, random: np.random.Generator
+) -> tuple[Any, ...]:
+    """True parameters, start, readings, shifts of the residuals, certified values and reference lengths."""
+    truth, nominal = recorded.truth, np.asarray(recorded.space.vector())
+    normal = random.normal(size=len(nominal))
+    true = nominal + values.width * np.where(values.normal, normal, erf(normal / np.sqrt(2)))
+    start = nominal
+    fraction = random.uniform(size=len(nominal))
+    if setting.random_start:
+        fixed = np.array([name == setting.hold for name in study.space.names])
+        bounded = np.isfinite(values.lower) & np.isfinite(values.upper)  # coefficients of corrections are not
+        lower, upper = (np.where(bounded, side, nominal) for side in (values.lower, values.upper))
+        start = np.where(fixed, nominal, lower + fraction * (upper - lower))
+    q, left = _taken(recorded, true)
+    read = _read(recorded.space.base, q, truth.reading, values, random)
+    errors = truth.errors_of_rows(1, float(values.seating), random)
+    shifts = [error[0] - rows for error, rows in zip(errors, left, strict=True)]
+    certified = {name: drawn[0] for name, drawn in truth.values(1, random).items()}
+    return true, start, read, shifts, certified, truth.lengths(1, random)[0]
+
+
+def _taken(
+    recorded: _Recorded, true: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, "M n"], list[Float[np.ndarray, "r m"]]]:
+    """Configurations in which the true arm has the least residuals that it can have, and these."""
+    observed, z = recorded.truth.observed, np.concatenate([true, recorded.geometry])
+    q, units = np.asarray(observed.q).copy(), reading_units(recorded.space.base.geometry)
+    reading = recorded.truth.reading
+    counts = np.bincount(reading)
+    for number in range(_ROUNDS + 1):
+        now = observed.moved(recorded.space.base, q)
+        values = [rows.values for rows in rows_at(recorded.space, now, z).rows]
+        left = [np.asarray(rows) for rows in now.by_observation(values)]
+        if number == _ROUNDS:
+            break
+        for rows, inverse, values in zip(observed.slices, recorded.inverses, left, strict=True):
+            step = np.einsum("mnr,rm->mn", inverse, values)
+            q[rows] -= units * np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+        # Poses that were read at once are still one configuration: their mean.
+        sums = np.stack([np.bincount(reading, weights=column) for column in q.T], axis=1)
+        q = (sums / counts[:, None])[reading] if len(counts) < len(reading) else q
+    return q, left
+
+
+def _read(
+    arm: Arm,
+    q: Float[np.ndarray, "M n"],
+    reading: Int[np.ndarray, " M"],
+    values: CellValues,
+    random: np.random.Generator,
+) -> Float[np.ndarray, "M n"]:
+    """What the encoders show: eccentricity (a first harmonic of the angle), noise and rounding."""
+    eccentricity, encoder, step = (
+        np.array(by_joint(arm, *map(float, pair)))
+        for pair in (
+            (values.eccentricity, 0.0),
+            (values.encoder, values.linear_encoder),
+            (values.resolution, values.linear_resolution),
+        )
+    )
+    harmonics = eccentricity * random.normal(size=(2, q.shape[1]))
+    q = q + harmonics[0] * np.sin(q) + harmonics[1] * np.cos(q)
+    q = q + encoder * random.normal(size=(reading.max() + 1, q.shape[1]))[reading]
+    return np.where(step > 0, np.round(q / np.where(step > 0, step, 1.0)) * step, q)

@@ -10,7 +10,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC
-from ..data.arm_classes import ArmNoise
+from ..data.noise import ArmNoise
 from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
 from ..kinematics.corrected_arm import function_values, loads_of

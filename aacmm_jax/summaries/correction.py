@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from ..core.text import pluralise, shorten
 from ..core.units import DEG
 from ..kinematics.arm import Arm, by_joint
-from ..kinematics.correction import FULL_POSE, ReadingsAtPoses, least_motion
+from ..kinematics.inverse_kinematics import FULL_POSE, ReadingsAtPoses, least_motion
 
 _SINGULAR = 3.0  # mm a rad: 1 mm takes 20 deg of the joints; axes of a wrist are within half a degree of each other
 _LARGE_CHANGE = 5.0  # deg: ten times what link errors of 1 mm and 1 mrad take where no axes align

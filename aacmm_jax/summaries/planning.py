@@ -11,9 +11,9 @@ from ..acceptance.standards import PLANNED
 from ..data.noise import linear_encoder_mm
 from ..kinematics.collisions import Cell
 from ..planning.design import Plan
-from ..planning.information import MORE, Prediction
 from ..planning.kit import KitPlan
 from ..planning.motion import Motion
+from ..planning.problem import MORE, Prediction
 from .calibration import reference_length_rows
 
 

@@ -34,6 +34,10 @@ class ObservationRows(NamedTuple):
     measured: Float[AnyArray, "m r r"]  # covariance of what was measured
     root: Float[AnyArray, "m r r"]  # inverse Cholesky factor of the covariance of the rows
     weight: Float[AnyArray, " m"]  # by a robust loss
+    white: Float[AnyArray, "r m"]  # whitened residuals
+    by_head: Float[AnyArray, "h r m"]  # whitened derivatives by parameters and shared geometry
+    by_private: Float[AnyArray, "k r m"]  # and by the geometry that it alone uses
+    private: np.ndarray  # indices of that among all geometry
 
 
 class Linearisation(NamedTuple):
@@ -121,68 +125,49 @@ class Linearisation(NamedTuple):
 
     def parts(self) -> list[ObservationRows]:
         """The rows, observation by observation."""
-        xp, observed, rows = namespace(self.z), self.observed, self.point.rows
-        weights = [
-            xp.ones(block.white.shape[1]) if weight is None else weight
-            for block, weight in zip(self.blocks[: len(rows)], self.weights, strict=False)
-        ]
-        by_group = (
-            [part.values for part in rows],
-            [part.by_tip for part in rows],
-            [error.by_readings for error in self.errors],
-            [error.by_seat for error in self.errors],
-            [xp.moveaxis(part.measured, 0, -1) for part in rows],
-            [xp.moveaxis(root, 0, -1) for root in self.whitening.roots],
-            weights,
-        )
-        columns = [observed.by_observation(arrays) for arrays in by_group]
-        for index in (4, 5):  # matrices, of which the pose is the first axis again
-            columns[index] = [xp.moveaxis(matrices, -1, 0) for matrices in columns[index]]
-        return [
-            ObservationRows(*values) for values in zip(observed.observations, observed.slices, *columns, strict=True)
-        ]
+        xp, observed, parts = namespace(self.z), self.observed, {}
+        groups = zip(observed.layout.groups, self.point.rows, self.errors, self.whitening.roots, strict=True)
+        for (group, rows, error, root), block, weight in zip(groups, self.blocks, self.weights, strict=False):
+            weight = xp.ones(block.white.shape[1]) if weight is None else weight
+            roles = [role for role in group.roles if role.private]
+            size, first = sum(role.size for role in roles), 0
+            assert block.by_head is not None
+            assert root is not None
+            for i, (number, count) in enumerate(zip(group.members, group.counts, strict=True)):
+                at, first = slice(first, first + count), first + count
+                by_private, private = xp.zeros((0, *block.white[:, at].shape)), np.zeros(0, dtype=int)
+                if block.by_own is not None:
+                    by_private = block.by_own[group.start[i] : group.start[i] + size, :, at]
+                    private = np.concatenate([private, *(np.arange(role.size) + role.first[i] for role in roles)])
+                parts[number] = ObservationRows(
+                    observed.observations[number],
+                    observed.slices[number],
+                    rows.values[..., at],
+                    rows.by_tip[..., at],
+                    error.by_readings[..., at],
+                    error.by_seat[..., at],
+                    rows.measured[at],
+                    root[at],
+                    weight[at],
+                    block.white[:, at],
+                    block.by_head[..., at],
+                    by_private,
+                    private,
+                )
+        return [parts[number] for number in range(len(parts))]
 
     def white(self) -> list[Float[AnyArray, "_ _"]]:
         """Whitened residuals of each observation."""
         groups = len(self.observed.layout.groups)
         return self.observed.by_observation([block.white for block in self.blocks[:groups]])
 
-    def by_head(self) -> list[Float[AnyArray, "h _ _"]]:
-        """Whitened derivatives of each observation by parameters and shared geometry."""
-        groups = len(self.observed.layout.groups)
-        return self.observed.by_observation([_present(block.by_head) for block in self.blocks[:groups]])
-
-    def by_private(self) -> list[Float[AnyArray, "_ _ _"]]:
-        """Whitened derivatives of each observation by the private geometry that it alone uses."""
-        derivatives: list[AnyArray] = [np.zeros((0, 0, 0))] * len(self.observed.observations)
-        for group, block in zip(self.observed.layout.groups, self.blocks, strict=False):
-            size = sum(role.size for role in group.roles if role.private)
-            first = 0
-            for i, (number, count) in enumerate(zip(group.members, group.counts, strict=True)):
-                poses = slice(first, first + count)
-                if block.by_own is None:
-                    derivatives[number] = namespace(block.white).zeros((0, *block.white[:, poses].shape))
-                else:
-                    derivatives[number] = block.by_own[group.start[i] : group.start[i] + size, :, poses]
-                first += count
-        return derivatives
-
-    def private(self) -> list[np.ndarray]:
-        """Indices of the private geometry of each observation, in the order of `by_private`."""
-        indices: list[np.ndarray] = [np.zeros(0, dtype=int)] * len(self.observed.observations)
-        for group in self.observed.layout.groups:
-            for i, number in enumerate(group.members):
-                parts = [np.arange(role.size) + role.first[i] for role in group.roles if role.private]
-                indices[number] = np.concatenate(parts) if parts else indices[number]
-        return indices
-
     def dense(self) -> list[Float[AnyArray, "z _ _"]]:
         """Whitened derivatives of each observation by all unknowns; as large as all of them together."""
         derivatives = []
-        for head, private, index in zip(self.by_head(), self.by_private(), self.private(), strict=True):
-            whole = namespace(head).zeros((self.z.shape[0], *head.shape[1:]))
-            whole = set_at(whole, slice(0, self.height), head)
-            derivatives.append(set_at(whole, len(self.space.names) + index, private) if len(index) else whole)
+        for part in self.parts():
+            whole = namespace(part.by_head).zeros((self.z.shape[0], *part.white.shape))
+            whole = set_at(whole, slice(0, self.height), part.by_head)
+            derivatives.append(set_at(whole, len(self.space.names) + part.private, part.by_private))
         return derivatives
 
     def relations(self) -> tuple[Float[np.ndarray, "l z"], Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
@@ -202,8 +187,3 @@ class Linearisation(NamedTuple):
             residuals.append(np.asarray(parts[name] - value))
             u.append(np.asarray(u_of_row))
         return np.concatenate(rows), np.concatenate(residuals), np.concatenate(u)
-
-
-def _present(rows: Float[AnyArray, "h r m"] | None) -> Float[AnyArray, "h r m"]:
-    assert rows is not None  # those of poses always depend on the parameters
-    return rows

@@ -1,8 +1,7 @@
 """A study is killed by SIGKILL at random moments, resumed each time, and compared to the bit with one that was not.
 
-The command runs in a process of its own; half of the kills hit a study in threads, half one in processes
-(``--dask local``). ``calibrate``, ``report`` and ``export`` are killed as well: the output of each is then what it
-was before, or what the command makes when it is not killed, but for the time of writing.
+The command runs in a process of its own. ``calibrate``, ``report`` and ``export`` are killed as well: the output of
+each is then what it was before, or what the command makes when it is not killed, but for the time of writing.
 """
 
 import os
@@ -21,8 +20,6 @@ import aacmm_jax as aj
 from .outcomes import HANG, LOST, SAME, SILENT, UNEXPECTED, Attempt
 
 SECONDS = 600
-WAYS = {"threads": (), "processes": ("--dask", "local")}
-
 
 # Commands, the last words of which are their outputs.
 COMMANDS = {
@@ -73,21 +70,20 @@ def attack(folder: Path, seed: int, count: int, trials: int = 1000, chunk: int =
     whole, arguments = folder / "whole.h5", ("--trials", trials, "--chunk", chunk)
     started(folder, "-o", whole, *arguments).communicate()
     blocks = 20 * trials // chunk
-    for (way, more), kills in zip(WAYS.items(), (count - count // 2, count // 2), strict=True):
-        path = folder / way / "study.h5"
-        path.parent.mkdir()
-        for number in range(kills):
-            process = started(folder, "-o", path, *arguments, *more)
-            killed(process, path, blocks * number // kills, random.uniform(0, 0.3))
-            if not path.exists():
-                yield Attempt(f"{way}: killed", SAME if number == 0 else LOST, "no file")
-                continue
-            try:
-                kept = int((aj.study.open_study(path).converged.values >= 0).sum())
-                yield Attempt(f"{way}: killed", SAME, f"{kept} trials kept")
-            except Exception as error:
-                yield Attempt(f"{way}: killed", LOST, f"{type(error).__name__}: {error}")
-        yield _resumed(whole, path, started(folder, "-o", path, *arguments, *more), way)
+    path = folder / "killed" / "study.h5"
+    path.parent.mkdir()
+    for number in range(count):
+        process = started(folder, "-o", path, *arguments)
+        killed(process, path, blocks * number // count, random.uniform(0, 0.3))
+        if not path.exists():
+            yield Attempt("killed", SAME if number == 0 else LOST, "no file")
+            continue
+        try:
+            kept = int((aj.study.open_study(path).converged.values >= 0).sum())
+            yield Attempt("killed", SAME, f"{kept} trials kept")
+        except Exception as error:
+            yield Attempt("killed", LOST, f"{type(error).__name__}: {error}")
+    yield _resumed(whole, path, started(folder, "-o", path, *arguments), "study")
     yield from commands(folder / "commands", random, max(count // 4, 1))
 
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import h5py
 
 import aacmm_jax as aj
-from aacmm_jax.study import store
-from aacmm_jax.study.blocks import Layout, parts_of
+from aacmm_jax.study.blocks import VARIABLES, computed_with
+from aacmm_jax.study.store import Results, parts_of, write_block
 
 from .kills import differences
 from .outcomes import DONE, REFUSED, SAME, SILENT, UNEXPECTED, Attempt, is_sentence
@@ -77,13 +77,13 @@ class Place:
     def unfinished(self, owner: int, *, poisoned: bool = False) -> Path:
         """A study of a user without its last block, in the shared folder; ``poisoned``: with other numbers."""
         path, study = self.shared / "s.h5", aj.study.read_study(self.sample / "study.toml")
-        layout = Layout.of(study, BLOCK)
-        store.create(path, study, layout)
+        stored = Results(path, study, BLOCK, computed_with())
+        stored.create()
         with h5py.File(self.sample / "study.h5") as whole:
-            for block in list(layout.blocks())[:-1]:
-                results = {name: whole["trials"][name][block.slices] for name in store.VARIABLES}
+            for block in stored.blocks[:-1]:
+                results = {name: whole["trials"][name][block.slices] for name in VARIABLES}
                 results["estimate"] = results["estimate"] + poisoned
-                store.write_part(path, block, results, layout)
+                write_block(stored.file_of(block), results)
         own(path, owner)
         own(parts_of(path), owner)
         return path
@@ -194,21 +194,20 @@ PLANTED = (
 def against_studies(place: Place) -> Iterator[Attempt]:
     """Studies that are started, continued or read where something is planted."""
     for plant in PLANTED:
-        for way in ((), ("--dask", "local", "--workers", "1"))[: 1 + (plant is plant_block)]:
-            place.clear()
-            (precious := place.home / "precious").write_text("precious")
-            own(precious, USER)
-            plant(place)
-            before = listed(place.shared)
-            code, errors = place.run("study", place.sample / "study.toml", "-o", place.shared / "s.h5", *way)
-            what = f"{plant.__doc__} {' '.join(way)}: {errors}"
-            if precious.read_text() != "precious" or (code == 2 and listed(place.shared) != before):
-                yield Attempt("planted", SILENT, f"changed: {what}")
-            elif code == 2:
-                yield Attempt("planted", REFUSED if is_sentence(errors.strip()) else UNEXPECTED, what)
-            else:  # what is right was computed all the same
-                different = differences(place.sample / "study.h5", place.shared / "s.h5")
-                yield Attempt("planted", SILENT if code or different else SAME, what)
+        place.clear()
+        (precious := place.home / "precious").write_text("precious")
+        own(precious, USER)
+        plant(place)
+        before = listed(place.shared)
+        code, errors = place.run("study", place.sample / "study.toml", "-o", place.shared / "s.h5")
+        what = f"{plant.__doc__}: {errors}"
+        if precious.read_text() != "precious" or (code == 2 and listed(place.shared) != before):
+            yield Attempt("planted", SILENT, f"changed: {what}")
+        elif code == 2:
+            yield Attempt("planted", REFUSED if is_sentence(errors.strip()) else UNEXPECTED, what)
+        else:  # what is right was computed all the same
+            different = differences(place.sample / "study.h5", place.shared / "s.h5")
+            yield Attempt("planted", SILENT if code or different else SAME, what)
     for owner, plant, believed in (
         ("a colleague's study", plant_study, True),
         ("a folder of another user", plant_folder_beside, False),
@@ -240,10 +239,9 @@ def against_modules(place: Place) -> Iterator[Attempt]:
     home = place.home
     for words in (
         ("demo", home / "demo"),
-        ("study", place.sample / "study.toml", "-o", home / "threads.h5"),
-        ("study", place.sample / "study.toml", "-o", home / "processes.h5", "--dask", "local", "--workers", "2"),
-        ("report", home / "processes.h5", "-o", home / "study.html"),
-        ("show", home / "processes.h5", "--figures", home / "figures"),
+        ("study", place.sample / "study.toml", "-o", home / "study.h5"),
+        ("report", home / "study.h5", "-o", home / "study.html"),
+        ("show", home / "study.h5", "--figures", home / "figures"),
     ):
         code, errors = place.run(*words)
         ran = sorted(item.name for item in place.shared.glob("ran-*"))
@@ -268,7 +266,7 @@ def against_temporary_files(place: Place) -> Iterator[Attempt]:
                 "--socket",
                 "A=400,200,300",
             ),
-            "study": ("study", specification, "-o", out / "s.h5", "--dask", "local", "--workers", "1"),
+            "study": ("study", specification, "-o", out / "s.h5", "--workers", "1"),
             "report": ("report", place.sample / "study.h5", "-o", out / "r.html"),
         }
         if mode is not None:

@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from aacmm_jax.study import computed_with
+from aacmm_jax.study import blocks
 
 from .kills import differences
 from .outcomes import DONE, OTHER, REFUSED, SAME, SILENT, UNEXPECTED, Attempt, is_sentence
@@ -161,7 +161,7 @@ def groups(tried: list[tuple[str, str]]) -> list[list[tuple[str, str]]]:
     by_name: dict[str, list[tuple[str, str]]] = {}
     for name, value in tried:
         by_name.setdefault(name, []).append((name, value))
-    kept = {*map(str.upper, computed_with._SETTINGS), *computed_with._ENVIRONMENT, computed_with._FLAGS, *ALONE}
+    kept = {*map(str.upper, blocks._SETTINGS), *blocks._ENVIRONMENT, blocks._FLAGS, *ALONE}
     alone = [[one] for name, values in by_name.items() if name in kept for one in values]
     others = [one for name, values in by_name.items() if name not in kept for one in values]
     found: list[list[tuple[str, str]]] = []

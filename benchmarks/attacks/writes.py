@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.study import store
-from aacmm_jax.study.blocks import Layout
+from aacmm_jax.study.blocks import computed_with
+from aacmm_jax.study.store import Results
 
 from .outcomes import LOST, REFUSED, SAME, UNEXPECTED, Attempt, ending, exact
 from .samples import BLOCK, READERS, make, study_results
@@ -56,7 +56,7 @@ def targets(folder: Path) -> dict[str, Target]:
         shutil.copytree(folder / "parts" / "study.h5.parts", f"{path}.parts", dirs_exist_ok=True)
 
     def finish(study: Any, path: Path) -> None:
-        store.finish(path, study, Layout.of(study, BLOCK))
+        Results(path, study, BLOCK, computed_with()).finish()
 
     load_arm = partial(aj.load_arm, "cheng2018-simulation")
     return {

@@ -6,7 +6,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import truth_of
-from aacmm_jax.calibration.sampling import _RepeatedTask
+from aacmm_jax.calibration.sampling import Repeated
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.model.observed import Observed
@@ -36,7 +36,7 @@ def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
     """Whitened residuals of drawn data, by the arm and the geometry about which they are drawn, have variance 1."""
     capture, result = calibrated(paper_arm, bounds, SIMULATED[kind])
     truth = truth_of(result, capture)
-    batch = truth.drawn(10, NOISE, np.random.default_rng(0))
+    batch = truth.drawn(10, NOISE, np.random.default_rng(0))[0]
     space = to_numpy(aj.Parameters(result.arm, FEW))  # NumPy compiles nothing
     z = np.concatenate([result.parameters, *(truth.geometry[name] for name in truth.observed.blocks)])
     squares = []
@@ -50,7 +50,7 @@ def test_residuals_scatter_as_the_weights_say(paper_arm, bounds, kind):
 
 def test_certified_values_are_drawn_once_for_all_that_share_them(paper_arm, bounds):
     capture, result = calibrated(paper_arm, bounds, SIMULATED["bars"])
-    batch = truth_of(result, capture).drawn(300, NOISE, np.random.default_rng(0))
+    batch = truth_of(result, capture).drawn(300, NOISE, np.random.default_rng(0))[0]
     name = "coordinates of bar"
     values = [observation.drawn[name] for observation in batch.observations]
     assert len(values) == 3
@@ -94,7 +94,7 @@ def test_drawn_solves_scatter_as_the_linear_result(repeated):
     """The Monte Carlo's own trials, fewer than its adaptive blocks."""
     capture, result = repeated
     truth = truth_of(result, capture)
-    found, failed = _RepeatedTask.of(result, capture, None).solved(truth.drawn(200, NOISE, np.random.default_rng(1)))
+    found, failed = Repeated.of(result, capture, None).solved(truth.drawn(200, NOISE, np.random.default_rng(1))[0])
     assert failed == 0
     u = np.sqrt(np.diag(result.covariance))
     ratio = found[:, : len(FEW)].std(axis=0, ddof=1) / u

@@ -385,7 +385,7 @@ def test_decisions_in_the_words_of_the_certificate(value, decision, word):
     from aacmm_jax.acceptance.results import MetricValue
     from aacmm_jax.certificate.acceptance_results import _conformity
 
-    assert _conformity(MetricValue("x", value, 0.01, None, 0.05, decision), 0.05) == word
+    assert _conformity(MetricValue("x", value, 0.01, None, 0.05, decision)) == word
 
 
 def test_a_conformity_rests_on_results(record, full, evaluation):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.cli.correct_command import in_first_frame
-from aacmm_jax.kinematics.correction import corrected_readings
+from aacmm_jax.kinematics.inverse_kinematics import corrected_readings
 from aacmm_jax.summaries.correction import correction_summary
 
 from ..conftest import command_line

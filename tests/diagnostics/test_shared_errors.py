@@ -1,6 +1,7 @@
 """Errors that poses share are found, and widen the uncertainty; clean calibrations stay as they are."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -8,10 +9,11 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.redrawn import trials_of
-from aacmm_jax.calibration.sampling import _RepeatedTask
+from aacmm_jax.calibration.redrawn import draw_shared, truth_of
+from aacmm_jax.calibration.sampling import Repeated
 from aacmm_jax.core.distributions import student_quantile
-from aacmm_jax.data.arm_classes import ArmNoise
+from aacmm_jax.core.numpy_or_jax import to_numpy
+from aacmm_jax.data.noise import ArmNoise
 from aacmm_jax.diagnostics.findings import amendable
 from aacmm_jax.diagnostics.group_test import Block
 from aacmm_jax.diagnostics.random_effects import Effects, one_variance
@@ -185,12 +187,12 @@ def test_monte_carlo_agrees_with_the_covariance(poses, made):
     capture = captured(poses, 1, **made)
     result = calibrated(poses, capture, "two-stage")
     assert result.shared is not None
-    task = _RepeatedTask.of(result, capture, tuple(q[:20] for q in volume(poses)))
-    trials = trials_of(result, capture, result.noise, task.u)
-    captures, coefficients = trials.drawn(500, np.random.default_rng(0), 1.0)
-    values, failed = task.solved(captures, coefficients=coefficients)
+    task = Repeated.of(result, capture, tuple(q[:20] for q in volume(poses)))
+    shared = partial(draw_shared, to_numpy(result.shared), result.arm, capture)
+    captures, errors = truth_of(result, capture).drawn(500, result.noise, np.random.default_rng(0), shared=shared)
+    values, failed = task.solved(captures, coefficients=errors.coefficients)
     assert failed == 0
-    linear = aj.uncertainty_of(result).expanded_length(task.start, task.end)
+    linear = aj.uncertainty_of(result).expanded_length(*task.ends)
     found = values[:, -20:]
     assert 0.9 < np.median(np.quantile(np.abs(found - np.median(found, axis=0)), 0.95, axis=0) / linear) < 1.12
 

@@ -27,7 +27,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "acceptance/procedure_items.py": ("socket_in_zone",),
     "report/study.py": ("_warnings",),
     "solver/reason.py": ("Reason",),
-    "core/compilation_cache.py": ("set_up",),
+    "core/jax_setup.py": ("set_up",),
 }
 # Parts of sentences, by their beginning, and what is no warning.
 PARTS = (

@@ -13,7 +13,7 @@ from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.files import load_cell
 from aacmm_jax.files.cells import bounding_capsule, mesh_path
 from aacmm_jax.kinematics import Box, HalfSpace, Post, clearances
-from aacmm_jax.kinematics.body import capsule_ends, frames_at
+from aacmm_jax.kinematics.collisions import capsule_ends
 from tests.example_counts import example_count
 
 CELL = """\
@@ -116,7 +116,7 @@ def test_shapes_of_a_urdf_are_held_by_capsules(tmp_path, name):
     assert body.names == ("base", "one", "two/1", "two/2")
     assert body.pairs.tolist() == [[0, 2], [0, 3]]
     q = np.random.default_rng(1).uniform(-2, 2, (5, 2))
-    starts, ends = (np.moveaxis(part, -1, 0) for part in capsule_ends(body, frames_at(arm, q)))
+    starts, ends = (np.moveaxis(part, -1, 0) for part in capsule_ends(body, arm, q))
     angles = np.linspace(0, 2 * np.pi, 40)
     rim = 50 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     base = np.concatenate([np.hstack([rim, np.full((40, 1), z)]) for z in (0, 200)])

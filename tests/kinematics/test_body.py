@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aacmm_jax.kinematics.body import distance_from_box, segment_distance
+from aacmm_jax.kinematics.collisions import distance_from_box, segment_distance
 
 COORDINATE = st.integers(-6, 6).map(lambda x: 20.0 * x)  # on a grid, so that parallel and touching ones come often
 POINT = st.tuples(COORDINATE, COORDINATE, COORDINATE)

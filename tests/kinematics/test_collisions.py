@@ -9,10 +9,8 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.core.numpy_or_jax import to_jax, to_numpy
 from aacmm_jax.kinematics import Box, Cell, Cone, HalfSpace, Post, body_along_links, clearances
-from aacmm_jax.kinematics.body import capsule_ends, frames_at
-from aacmm_jax.kinematics.collisions import checked_cell, is_clear, nearest_contact
-from aacmm_jax.kinematics.cones import cones_of, into_cones, tilts
-from aacmm_jax.kinematics.workspace import skeleton
+from aacmm_jax.kinematics.collisions import capsule_ends, checked_cell, is_clear, nearest_contact
+from aacmm_jax.kinematics.workspace import cones_of, into_cones, skeleton, tilts
 
 UP = (0.0, 0.0, 1.0)
 
@@ -39,11 +37,11 @@ def test_capsules_are_along_the_skeleton(panda, beta):
     q = configurations(arm)
     body = body_along_links(arm, 60.0, 8.0)
     corners = skeleton(arm, q)
-    for name, start, end in zip(body.names, *capsule_ends(body, frames_at(arm, q)), strict=True):
+    for name, start, end in zip(body.names, *capsule_ends(body, arm, q), strict=True):
         ends = [start.T] if name == "probe" else [start.T, end.T]
         for at in ends:
             assert np.linalg.norm(corners - at[:, None], axis=2).min(axis=1).max() < 1e-9
-    tool = capsule_ends(body, frames_at(arm, q))[1][-1].T
+    tool = capsule_ends(body, arm, q)[1][-1].T
     np.testing.assert_allclose(np.linalg.norm(tool - corners[:, -1], axis=1), 16.0, atol=1e-9)
 
 

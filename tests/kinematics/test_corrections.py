@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.redrawn import trials_of
+from aacmm_jax.calibration.redrawn import truth_of
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.diagnostics.missing_terms import FoundTerm, wider_model
 from aacmm_jax.kinematics import parameter_names, with_corrections
@@ -229,8 +229,8 @@ def test_expansion_at_one_temperature_is_a_scale():
 def test_redrawn_readings_keep_their_temperature():
     capture, bounds = warm_capture(15, 25)
     result = aj.calibrate(bounds.space.base, capture, bounds)
-    trials = trials_of(result, capture, aj.Noise(encoder_arcsec=2, seating=0.005), np.full(2, 0.001))
-    drawn = np.asarray(trials.drawn(2, np.random.default_rng(0), np.ones((2, 1, 1)))[0].q)
+    noise, random = aj.Noise(encoder_arcsec=2, seating=0.005), np.random.default_rng(0)
+    drawn = np.asarray(truth_of(result, capture).drawn(2, noise, random)[0].q)
     np.testing.assert_array_equal(drawn[..., 6], np.broadcast_to(capture.q[:, 6], (2, 120)))
     assert np.all(np.ptp(drawn[..., :6], axis=0) > 0)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.joint_model import with_joint_model
 from aacmm_jax.calibration.prediction import unseen_errors
 from aacmm_jax.calibration.record import record_of
 from aacmm_jax.data import observations as kinds
@@ -23,6 +22,7 @@ from aacmm_jax.pipeline.model_ladder import (
     default_models,
     log_evidence,
 )
+from aacmm_jax.pipeline.single import with_joint_model
 
 NOISE = aj.Noise(encoder_arcsec=10, seating=0.02)
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)

@@ -9,9 +9,9 @@ from aacmm_jax.data import observations as kinds
 from aacmm_jax.files.plans import plan_manifest, save_plan
 from aacmm_jax.kinematics.workspace import search_region
 from aacmm_jax.planning import KitItem, KitPlan, kit_placement, plan_kit
-from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, _best, covariance_of, exchange
-from aacmm_jax.planning.information import DesignProblem, Prediction
+from aacmm_jax.planning.designs import Candidates, Objective, _best, covariance_of, exchange
 from aacmm_jax.planning.kit_placement import candidates_of_kit, least_poses
+from aacmm_jax.planning.problem import DesignProblem, Prediction
 from aacmm_jax.summaries.planning import kit_plan_summary
 
 from ..calibration.test_observed import BAR, BOX, FRAME, NOISE, SIMULATED
@@ -119,7 +119,10 @@ def test_a_whole_plan(paper_arm, space, monkeypatch):
 )
 def test_candidates_have_the_certified_values_that_were_stated(problem, simulated):
     """Not those of a certificate drawn at random: the plan's manifest repeats them."""
-    assert float(kit_placement.set_up(problem.region, simulated, 4).diameter) == 50.0
+    assert (
+        float(kit_placement.set_up(problem.region, kit_placement.Thing(KitItem(simulated), simulated), 4).diameter)
+        == 50.0
+    )
 
 
 def test_files_of_every_kind_can_be_imported(paper_arm, tmp_path):

@@ -10,8 +10,8 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.files.plans import plan_csv, plan_manifest, save_plan
 from aacmm_jax.planning import placement as placements
-from aacmm_jax.planning.fedorov_exchange import Candidates, Objective, covariance_of, exchange, relaxed_value
-from aacmm_jax.planning.options import PlacementRegion
+from aacmm_jax.planning.designs import Candidates, Objective, covariance_of, exchange, relaxed_value
+from aacmm_jax.planning.problem import DesignProblem, PlanOptions
 from aacmm_jax.summaries.planning import plan_summary
 
 FUNCTIONS = np.random.default_rng(5).normal(size=(12, 3))
@@ -185,8 +185,10 @@ def test_placements_keep_off_the_end_of_the_reach(paper_arm):
     along = reach.shoulder + reach.radius * np.outer([0.94, 0.96, 1.0], [1.0, 0.0, 0.0])
     defaults = inspect.signature(aj.planning.plan).parameters["farthest"].default
     for ranges in (None, {"x": (-5000.0, 5000.0)}):
-        assert PlacementRegion.of(paper_arm, ranges, defaults).contains(along).tolist() == [True, False, False]
-        assert PlacementRegion.of(paper_arm, ranges, 1.0).contains(along).tolist() == [True, True, True]
+        problem = DesignProblem.of(paper_arm, PlanOptions(region=ranges))
+        assert problem.contains(along).tolist() == [True, False, False]
+        problem = DesignProblem.of(paper_arm, PlanOptions(region=ranges, farthest=1.0))
+        assert problem.contains(along).tolist() == [True, True, True]
     assert inspect.signature(aj.planning.plan_kit).parameters["farthest"].default == defaults
 
 

@@ -14,7 +14,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.plot import charts, svg
-from aacmm_jax.plot.uncertainty import tried_shades
+from aacmm_jax.plot.lengths import tried_shades
 from aacmm_jax.report import elements, write_report
 from aacmm_jax.report.html_page import _origin
 from aacmm_jax.summaries.tables import Table, decimals_for, format_number, number
@@ -289,7 +289,7 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
 def test_a_report_says_what_was_left_out(observed_record):
     from aacmm_jax.calibration.record import Removed
     from aacmm_jax.diagnostics.contradictions import removal
-    from aacmm_jax.report.tables import removed_tables
+    from aacmm_jax.report.elements import removed_tables
 
     removed = Removed("station", "T2", ("T2/day", "T2/night"), 45.6, (6, 60), 1e-9, 0.2, 0.1, "theta_3", 12.0)
     record = observed_record._replace(removed=(removed,))
@@ -356,7 +356,7 @@ def test_lengths_of_a_report_by_arm_and_with_expanded_uncertainty(written):
 
 def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
     """A table of thousands of rows is cut, not written out cell by cell for minutes."""
-    from aacmm_jax.report.tables import residual_chart
+    from aacmm_jax.report.elements import residual_chart
 
     arm = written.record.calibrated.arm
     q = np.tile(np.asarray(written.record.recording.capture.q), (120, 1)) + 1e-5 * np.random.default_rng(0).normal(
@@ -373,8 +373,7 @@ def test_a_report_of_very_many_poses_stays_small(written, tmp_path):
 
 def test_poses_alone_in_their_socket_show_no_scatter(written):
     from aacmm_jax.plot.residuals import distances_in
-    from aacmm_jax.report.arm_view import view_of_arm
-    from aacmm_jax.report.tables import residual_chart, socket_table
+    from aacmm_jax.report.elements import residual_chart, socket_table, view_of_arm
 
     arm, q = written.record.calibrated.arm, written.record.recording.capture.q
     capture = aj.Capture({"A": q[:10], "B": q[10:11]})

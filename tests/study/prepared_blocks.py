@@ -11,13 +11,14 @@ import h5py
 import numpy as np
 
 from aacmm_jax.study import runner
+from aacmm_jax.study.blocks import VARIABLES
 
 
 def prepared(study, block, **_) -> dict[str, np.ndarray]:
     Path(os.environ["STARTED"]).touch()
     time.sleep(float(os.environ["SECONDS"]))
     with h5py.File(os.environ["WHOLE"]) as whole:
-        return {name: whole["trials"][name][block.slices] for name in runner.store.VARIABLES}
+        return {name: whole["trials"][name][block.slices] for name in VARIABLES}
 
 
 if __name__ in ("__main__", "__mp_main__"):  # the command's process, and those that it starts

@@ -11,7 +11,8 @@ import h5py
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.study.blocks import parts_of
+from aacmm_jax.study.blocks import VARIABLES, computed_with
+from aacmm_jax.study.store import Results, parts_of, write_block
 
 ROOT = Path(__file__).resolve().parents[2]
 CAPTURE = {"positions_mm": [[400, 200, 300], [300, -300, 400]], "poses": 12, "pool": 4096}
@@ -49,6 +50,21 @@ def made(**tables: object) -> "aj.study.Study":
     known = {"arm": "cheng2018-simulation", "trials": 64, "seed": 3, "capture": CAPTURE, "deviation": DEVIATION}
     tables = known | {"reference": REFERENCE} | tables
     return aj.study.make_study(**{name: table for name, table in tables.items() if table is not None})
+
+
+def begun(path: Path, study: "aj.study.Study", chunk: int = CHUNK, settings: str | None = None) -> Results:
+    """The file of a study that has just begun."""
+    results = Results(path, study, chunk, settings or computed_with())
+    results.create()
+    return results
+
+
+def written_in_blocks(home: Path, study: "aj.study.Study", path: Path, chunk: int) -> None:
+    """A study with the results of the one that was run, each block in a file."""
+    results = begun(path, study, chunk)
+    with h5py.File(home / "whole.h5") as whole:
+        for block in results.blocks:
+            write_block(results.file_of(block), {name: whole["trials"][name][block.slices] for name in VARIABLES})
 
 
 def same(one: Path, other: Path) -> None:

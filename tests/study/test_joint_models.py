@@ -11,7 +11,8 @@ from aacmm_jax.files.arms import specification_toml
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.study import make_study
 from aacmm_jax.study.blocks import Block
-from aacmm_jax.study.statistics import cell_summary, factor_title
+from aacmm_jax.study.results import cell_summary
+from aacmm_jax.study.tables import factor_title
 from aacmm_jax.study.trial_simulation import _read_where
 from aacmm_jax.study.trials import draw_trials, run_block
 from tests.study.small_study import CAPTURE, DEVIATION, NOISE, REFERENCE
@@ -32,13 +33,13 @@ def test_what_a_cell_identifies():
     assert [cell["identification.model"] for cell in made.cells] == ["dh", "dh", "harmonics=1", "harmonics=1"]
     assert len(made.space.names) == 21 + 12 + 6
     found = [made.identified(setting) for setting in made.settings]
-    assert [len(one.space.names) for one in found] == [21, 21, 33, 33]
+    assert [len(space.names) for space, _ in found] == [21, 21, 33, 33]
     assert [setting.method for setting in made.settings] == ["two-stage", "joint", "two-stage", "joint"]
-    assert [one.prior is None for one in found] == [True, False, True, False]
+    assert [prior is None for _, prior in found] == [True, False, True, False]
     made = study(identification={"model": "dh,harmonics=1-3"})
     (default,) = made.settings
     assert default.method == "joint"
-    groups = made.identified(default).prior.groups
+    groups = made.identified(default)[1].groups
     assert groups == ("lengths", "angles", "harmonics=1", "harmonics=2-3")
     assert factor_title("deviation.gravity_mrad_per_m") == "compliance under gravity [mrad/m]"
 
@@ -62,14 +63,14 @@ def test_arm_files_with_corrections_and_priors(tmp_path, paper_arm):
     (tmp_path / "a.toml").write_text(specification_toml(nominal) + "\n[priors]\nsd = { gear = 2e-3 }\n")
     own = study({"gear_ppm": 100}, arm=str(tmp_path / "a.toml"))
     (setting,) = own.settings
-    found = own.identified(setting)
-    assert found.prior.groups == ("gear",)
-    assert float(found.space.vector()[found.space.names.index("gear_2")]) == 1e-3
+    space, prior = own.identified(setting)
+    assert prior.groups == ("gear",)
+    assert float(space.vector()[space.names.index("gear_2")]) == 1e-3
     assert float(own.space.vector()[own.space.names.index("gear_2")]) == 1e-3
     other = study({"gear_ppm": 100}, arm=str(tmp_path / "a.toml"), identification={"model": "dh", "prior": "none"})
-    found = other.identified(other.settings[0])
-    assert "gear_2" not in found.space.names
-    assert float(found.space.base.coefficients[1]) == 0.0
+    space, _ = other.identified(other.settings[0])
+    assert "gear_2" not in space.names
+    assert float(space.base.coefficients[1]) == 0.0
     assert own.digest != other.digest
 
 

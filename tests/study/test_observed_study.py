@@ -11,9 +11,8 @@ from aacmm_jax.data import observations as kinds
 from aacmm_jax.model.observed import Observed
 from aacmm_jax.model.rows import rows_at
 from aacmm_jax.study.blocks import Block
-from aacmm_jax.study.observed_trials import _recorded
-from aacmm_jax.study.statistics import study_summary
-from aacmm_jax.study.trials import draw_trials, run_block
+from aacmm_jax.study.results import study_summary
+from aacmm_jax.study.trials import _recorded, draw_trials, run_block
 
 from ..calibration.test_observed import BOX, FRAME, NOISE, SIMULATED
 

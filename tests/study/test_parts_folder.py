@@ -7,11 +7,9 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.core.file_owners import keeps_owners
-from aacmm_jax.study import store
-from aacmm_jax.study.blocks import Layout, parts_of
-from aacmm_jax.study.store import check_ours, check_readable
+from aacmm_jax.study.store import check_owners, parts_of
 
-from .test_store import written_in_blocks
+from .small_study import begun, written_in_blocks
 
 OTHER = 65534
 root = pytest.mark.skipif(
@@ -83,7 +81,7 @@ def test_what_others_could_have_written_is_refused(case, home, study, tmp_path):
 def test_nobody_else_may_write_into_a_new_folder(study, tmp_path, umask):
     former = os.umask(umask)
     try:
-        store.create(tmp_path / "s.h5", study, Layout.of(study, 16))
+        begun(tmp_path / "s.h5", study)
     finally:
         os.umask(former)
     assert parts_of(tmp_path / "s.h5").stat().st_mode & 0o777 == 0o755 & ~umask
@@ -105,7 +103,7 @@ def test_a_file_system_without_owners_is_a_warning(home, study, tmp_path, monkey
     parts_of(path).chmod(0o777)
     monkeypatch.setattr("aacmm_jax.study.store.keeps_owners", lambda folder: False)
     with pytest.warns(UserWarning, match="does not keep who owns a file"):
-        check_ours(path)
+        check_owners(path)
     with pytest.warns(UserWarning, match="does not keep who owns a file"):
         aj.study.Results.of(path)
 
@@ -120,7 +118,7 @@ def test_a_folder_that_another_user_made_first_is_left_as_it_is(study, tmp_path)
     parts.mkdir()
     (parts / "old.npz").touch()
     give(parts)
-    for check in (check_ours, lambda path: store.create(path, study, Layout.of(study, 16))):
+    for check in (check_owners, lambda path: begun(path, study)):
         with pytest.raises(aj.InputError, match=r"s\.h5\.parts belongs to nobody"):
             check(tmp_path / "s.h5")
     assert os.listdir(parts) == ["old.npz"]
@@ -128,6 +126,6 @@ def test_a_folder_that_another_user_made_first_is_left_as_it_is(study, tmp_path)
 
 def test_without_a_folder_there_is_nothing_to_check(tmp_path):
     (tmp_path / "s.h5").touch()
-    check_ours(tmp_path / "s.h5")
-    check_readable(tmp_path / "s.h5")
+    check_owners(tmp_path / "s.h5")
+    check_owners(tmp_path / "s.h5", reading=True)
     shutil.rmtree(tmp_path)

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.study import store
-from aacmm_jax.study.blocks import Layout
-from aacmm_jax.study.statistics import concise, distribution, level_title, statistic
+from aacmm_jax.study.results import concise, distribution, statistic
+from aacmm_jax.study.tables import level_title
 from tests.refusals import assert_refused
 
-from .small_study import CHUNK, NOISE, REFERENCE, made
+from .small_study import CHUNK, NOISE, REFERENCE, begun, made
 
 matplotlib.use("Agg")
 TRIALS = 24
@@ -45,19 +44,19 @@ def path(tmp_path_factory):
 )
 def test_results_that_no_trial_has_are_refused(path, monkeypatch, value, names, says):
     """As from a file that was edited, with its digests made anew."""
-    results, rows_of = aj.study.Results.of(path), store.rows_of
+    results, rows_of = aj.study.Results.of(path), aj.study.Results.rows
 
     def edited(*arguments, failed=False):
         for part, rows in rows_of(*arguments):
             rows = {key: np.full_like(x, value) if key in names else x for key, x in rows.items()}
             yield part, rows | ({"converged": np.zeros_like(rows["converged"])} if failed else {})
 
-    monkeypatch.setattr(store, "rows_of", edited)
+    monkeypatch.setattr(aj.study.Results, "rows", edited)
     for name in names:
         assert_refused(partial(results.column, name, 0), says)
     assert_refused(lambda: list(results.errors(0)), says)
     if not np.isfinite(value):  # which a trial that failed may have
-        monkeypatch.setattr(store, "rows_of", lambda *arguments: edited(*arguments, failed=True))
+        monkeypatch.setattr(aj.study.Results, "rows", lambda *arguments: edited(*arguments, failed=True))
         assert not np.isfinite(results.column(names[0], 0)).any()
 
 
@@ -210,7 +209,7 @@ def test_levels_that_differ_little_are_told_apart():
 
 
 def test_a_study_that_has_just_begun_is_shown(aacmm, study, tmp_path):
-    store.create(tmp_path / "s.h5", study, Layout.of(study, 1000))
+    begun(tmp_path / "s.h5", study, 1000)
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--figures", "f").stdout
     assert "No trial has ended yet" in aacmm("show", "s.h5", "--cell", 3).stdout
 

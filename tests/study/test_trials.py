@@ -258,7 +258,7 @@ def test_a_trial_depends_on_its_key_alone(whole):
     """To the bit, whatever block a trial is in."""
     study, count, results = whole
     for block in (Block(1, 2, 0, count), Block(0, 1, 3, 7), Block(1, 2, count - 1, count)):
-        part = run_block(study, block, workers=1)
+        part = run_block(study, block, device=jax.local_devices()[0])
         for name, values in part.items():
             cells, trials = slice(block.first_cell, block.last_cell), slice(block.first_trial, block.last_trial)
             np.testing.assert_array_equal(values, results[name][cells, trials])

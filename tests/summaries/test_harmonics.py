@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.joint_model import function_of_joint
+from aacmm_jax.calibration.record import function_of_joint
 from aacmm_jax.cli import calibration_views
 from aacmm_jax.cli.display import display
 from aacmm_jax.report.calibration import calibration_report

@@ -1,7 +1,7 @@
-"""Fedorov's exchange (1972): from many candidate poses, those whose information makes an objective small."""
+"""Optimal designs: of many candidate poses, those whose information makes an objective small (Fedorov 1972)."""
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 from ..core.errors import InputError
 
 Kind = Literal["functions", "trace", "determinant"]
+Layout = TypeVar("Layout")
+Poses = TypeVar("Poses")
 _RELAXATION = 0.7  # exponent; 0.5 never makes variances larger, 1 never determinants
 
 
@@ -86,28 +88,30 @@ def exchange(
     """Indices of ``count`` candidates, at least ``least`` in every socket (one number, or one each): added greedily,
     then exchanged one by one until a whole sweep improves nothing (Fedorov 1972). ``progress`` is called with the
     fraction done."""
-    chosen: list[int] = []
-    taken = np.zeros(len(candidates.owner), dtype=bool)
+    owner, rows = candidates.owner, candidates.rows
+    available = np.ones(len(owner), dtype=bool)
     information = candidates.base.copy()
-    for number in range(count):
-        allowed = ~taken & _allowed(candidates, chosen, count, least)
+    chosen: list[int] = []
+
+    def take(others: list[int]) -> int:
+        """Take the candidate that goes best with the others, so that every socket can still get its least number."""
+        nonlocal information
+        short = np.maximum(least - np.bincount(owner[np.array(others, dtype=int)], minlength=owner.max() + 1), 0)
+        allowed = available & (short > 0)[owner] if short.sum() >= count - len(others) else available
         best = _best(candidates, information, objective, allowed)
-        chosen.append(best)
-        taken[best] = True
-        information += candidates.rows[best].T @ candidates.rows[best]
+        available[best] = False
+        information += rows[best].T @ rows[best]
+        return best
+
+    for number in range(count):
+        chosen.append(take(chosen))
         progress(0.3 * (number + 1) / count)
     best_value, best_chosen = objective.value(covariance_of(information, candidates.parameters)), list(chosen)
     for sweep in range(sweeps):
         for i in range(count):
-            old = chosen[i]
-            rest = chosen[:i] + chosen[i + 1 :]
-            information -= candidates.rows[old].T @ candidates.rows[old]
-            taken[old] = False
-            allowed = ~taken & _allowed(candidates, rest, count, least)
-            new = _best(candidates, information, objective, allowed)
-            chosen[i] = new
-            taken[new] = True
-            information += candidates.rows[new].T @ candidates.rows[new]
+            information -= rows[chosen[i]].T @ rows[chosen[i]]
+            available[chosen[i]] = True
+            chosen[i] = take(chosen[:i] + chosen[i + 1 :])
         value = objective.value(covariance_of(information, candidates.parameters))
         progress(0.3 + 0.7 * (sweep + 1) / sweeps)
         if value >= best_value - 1e-3:
@@ -129,37 +133,21 @@ def relaxed_value(candidates: Candidates, count: int, objective: Objective, iter
     for iteration in range(iterations + 1):
         covariance = np.linalg.inv(candidates.base + (flat * np.repeat(times, each)[:, None]).T @ flat)
         if iteration < iterations:
-            root = _root(objective.gradient(covariance[:p, :p]))
+            gradient = objective.gradient(covariance[:p, :p])
+            try:
+                root = np.linalg.cholesky(gradient)
+            except np.linalg.LinAlgError:  # singular, where lengths do not depend on a parameter
+                values, vectors = np.linalg.eigh(gradient)
+                root = vectors * np.sqrt(np.maximum(values, 0.0))
             gain = np.sum((flat @ (covariance[:, :p] @ root)).reshape(len(times), -1) ** 2, axis=1)
             times *= gain**_RELAXATION
             times *= count / times.sum()
     return objective.value(covariance[:p, :p])
 
 
-def _root(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """A root of a semidefinite matrix; it is singular where lengths do not depend on a parameter."""
-    try:
-        return np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(matrix)
-        return vectors * np.sqrt(np.maximum(values, 0.0))
-
-
 def covariance_of(information: Float[np.ndarray, "P P"], parameters: int) -> Float[np.ndarray, "p p"]:
     """Covariance of the parameters, the sockets' positions eliminated."""
     return np.linalg.inv(information)[:parameters, :parameters]
-
-
-def _allowed(
-    candidates: Candidates, chosen: list[int], count: int, least: int | Int[np.ndarray, " s"]
-) -> Bool[np.ndarray, " c"]:
-    """Candidates that may be taken next, so that every socket can still get its least number."""
-    sockets = candidates.owner.max() + 1
-    present = np.bincount(candidates.owner[chosen], minlength=sockets) if chosen else np.zeros(sockets, dtype=int)
-    short = np.maximum(least - present, 0)
-    if short.sum() >= count - len(chosen):
-        return (short > 0)[candidates.owner]
-    return np.ones(len(candidates.owner), dtype=bool)
 
 
 def _best(
@@ -198,3 +186,33 @@ def _products(
     c, r, k = rows.shape
     moved = (rows.reshape(c * r, k) @ matrix).reshape(c, r, k)
     return moved, one * np.eye(r) + np.einsum("crk,csk->crs", moved, rows)
+
+
+def best_layout(
+    shortlist: Sequence[Layout],
+    poses_in: Callable[[Layout, Layout | None, Poses | None], Poses | None],
+    score: Callable[[Layout, Poses], float],
+    neighbour: Callable[[Layout], Layout | None],
+    tries: int,
+    report: Callable[[float], None],
+) -> Layout:
+    """The layout with the lowest score among some good ones and, then, neighbours of the best so far.
+
+    ``poses_in(layout, best, poses)`` are poses in a layout, which may reuse those in the best; None where it is not
+    reached. ``report`` is called with the fraction done.
+    """
+    best, best_poses, best_score = None, None, np.inf
+    for number in range(len(shortlist) + tries):
+        report(0.4 + 0.6 * number / (len(shortlist) + tries))
+        if number < len(shortlist):
+            layout, poses = shortlist[number], poses_in(shortlist[number], None, None)
+        elif best is None:
+            break
+        else:
+            layout = neighbour(best)
+            poses = None if layout is None else poses_in(layout, best, best_poses)
+        value = np.inf if layout is None or poses is None else score(layout, poses)
+        if value < best_score:
+            best, best_poses, best_score = layout, poses, value
+    report(1.0)
+    return shortlist[0] if best is None else best

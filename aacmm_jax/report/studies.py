@@ -1,0 +1,115 @@
+"""The reports of many calibrations: of a Monte Carlo study, and of compared models, inside and outside, by region."""
+
+from typing import Any
+
+import numpy as np
+
+from ..core.text import pluralise
+from ..plot.charts import Chart, Marks, Plot, linear, names
+from ..plot.parameters import models_chart
+from ..plot.study import metric_plots
+from ..study.results import study_summary
+from ..study.store import Results
+from ..study.tables import cell_table, factor_title, label, level_text, metric_table, metric_title, parameter_table
+from ..summaries.result_tables import MODELS_MEANING, model_tables
+from ..summaries.tables import format_number, number
+from .elements import Report, Section
+
+_SHOWN = (
+    *("length_error", "angle_error", "de", "deltam", "scale_error"),
+    *("length_error_stage1", "angle_error_stage1", "de_stage1", "deltam_stage1", "k"),
+)
+_NAMED = 6
+_PERCENTILES = "Marks are medians, bars reach from the 5th to the 95th percentile of the converged trials."
+_MODELS = (
+    "Each model was calibrated with all poses (inside), and without each region in turn, which it then predicted "
+    "(outside). Neighbouring poses have similar errors, so that only regions that were left out whole show how a model "
+    "extrapolates. Of the model that is best outside, and simpler ones that regions cannot tell from it, the "
+    "simplest that makes the measurement about as probable (evidence) is recommended."
+)
+
+
+def study_report(results: Results) -> Report:
+    """The report, except for the origin of its file."""
+    summary = study_summary(results)
+    cells, warnings, ran = summary["results"], _warnings(summary), summary["trials_run"]
+    converged = sum(cell["trials_run"] * (cell["converged"]["value"] or 0.0) for cell in cells)
+    fraction = converged / ran if ran else 0.0
+    factors = (
+        f"{factor_title(name)}: {', '.join(map(level_text, levels))}" for name, levels in summary["factors"].items()
+    )
+    parameters, sections = parameter_table(summary)._replace(folded=True), []
+    for name in (name for name in _SHOWN if any(name in cell["figures"] for cell in cells)):
+        title = metric_title(name) if name == "k" else metric_title(name)[0].upper() + metric_title(name)[1:]
+        table, plots = metric_table(summary, name, title), metric_plots(results, name)
+        sections.append(Section(f"figure-{name}", title, [Chart(f"chart-{name}", title, _PERCENTILES, plots, table)]))
+    mark = "good" if summary["finished"] and fraction > 0.999 and not warnings else "unsure"
+    return Report(
+        title=f"Study {summary['name']}".strip() + f" of {summary['arm'] or 'an arm'}",
+        subtitle=f"{summary['cells']} cell{'' if summary['cells'] == 1 else 's'} of {summary['trials']:,} simulated "
+        "calibrations",
+        verdict=f"{'Finished' if summary['finished'] else 'Not finished'}: {ran:,} trials run, "
+        f"{100 * fraction:.4g} % converged",
+        verdict_mark="bad" if ran and not converged else mark,
+        warnings=warnings,
+        facts=[("Factors", "; ".join(factors) or "none varied"), ("Seed", str(summary["seed"]))],
+        sections=[
+            Section("cells", "Cells", [cell_table(summary)]),
+            *sections,
+            *([Section("parameters", "Parameters", [parameters])] if parameters.rows else []),
+        ],
+    )
+
+
+def _warnings(summary: dict[str, Any]) -> list[str]:
+    warnings = []
+    if not summary["finished"]:
+        warnings.append(
+            "The study is not finished; the same command continues it. Metrics are of the trials that were run."
+        )
+    for key, least, says in (
+        ("converged", 0.99, "Not all trials converged, and metrics are of those that did"),
+        ("truth_inside", 1.0, "The true arm lies within the bounds in some of the trials only"),
+    ):
+        shares = [(cell, cell[key]["value"] or 0.0) for cell in summary["results"] if cell["trials_run"]]
+        named = [f"{label(summary, cell)} ({100 * share:.3g} %)" for cell, share in shares if share < least]
+        if named:
+            more = f"; and {len(named) - _NAMED} more cells" if len(named) > _NAMED else ""
+            warnings.append(f"{says}: {'; '.join(named[:_NAMED])}{more}.")
+    return warnings
+
+
+def models_report(summary: dict[str, Any]) -> Report:
+    """The report of compared models (`files.load_compared_models`), except for the origin of its file."""
+    models = summary["models"]
+    chosen = next(row for row in models if row["model"] == summary["recommended"])
+    doubtful = bool(summary["warnings"]) or not chosen["converged"]
+    by_name, by_region = model_tables(summary)
+    regions, rms = summary["regions"], [[region["rms"] for region in row["regions"]] for row in models]
+    rms = np.array(rms, dtype=float)
+    axes = names("region that was left out", regions), linear("RMS error [mm]", rms, zero=True)
+    plots = []
+    for row, errors in zip(models, rms, strict=True):
+        words = [f"{region}: {format_number(value)} mm" for region, value in zip(regions, errors.tolist(), strict=True)]
+        tone = "accent" if row["model"] == summary["recommended"] else "main"
+        marks = Marks("", np.arange(len(errors)), errors, "dot", tone, words, size=7)
+        plots.append(Plot(*axes, (marks,), title=row["model"], height=170))
+    title = "Errors by region"
+    says = "The RMS error of each region, predicted from all the others; the recommended model in the other colour."
+    return Report(
+        title=f"Models of the joints compared, {summary['arm'] or 'an arm'}",
+        subtitle=f"{pluralise(len(models), 'model')} on {pluralise(summary['poses'], 'pose')}; "
+        f"{pluralise(len(regions), 'region')} left out one by one",
+        verdict=" ".join(summary["findings"]),
+        verdict_mark="unsure" if doubtful else "good",
+        warnings=list(summary["warnings"]),
+        facts=[
+            ("Recommended model", chosen["model"]),
+            ("Its RMS error in unseen regions", f"{format_number(chosen['rms_outside'])}\u00a0mm"),
+            ("(error / predicted standard deviation)², mean outside", number(chosen["ratio"], 2).text),
+        ],
+        sections=[
+            Section("models", "Errors inside and outside", [_MODELS, models_chart(summary), by_name, MODELS_MEANING]),
+            Section("regions", title, [Chart("regions", title, says, tuple(plots), by_region)]),
+        ],
+    )
