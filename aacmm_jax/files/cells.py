@@ -109,12 +109,11 @@ def load_cell(
         ('shoulder', 'upper_arm', 'forearm') ['table'] 20.0
     """
     content: Any = _CellFile() if file is None else read_toml(file, _CellFile)
-    rows = ((HalfSpace, content.half_space), (Box, content.box), (Post, content.capsule))
-    obstacles: list[Any] = [
-        kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in row})
-        for kind, tables in rows
-        for row in tables
-    ]
+    rows: Any = ((HalfSpace, content.half_space), (Box, content.box), (Post, content.capsule))
+    obstacles: list[Any] = []
+    for kind, tables in rows:
+        for row in tables:
+            obstacles.append(kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in row}))
     radius = content.body.radius if radius is None else radius
     with contextlib.nullcontext() if file is None else naming(file):
         for obstacle in obstacles:

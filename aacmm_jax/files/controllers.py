@@ -187,7 +187,7 @@ def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> st
 
 
 def _beta(geometry: Geometry) -> Float[np.ndarray, " n"]:
-    return np.zeros_like(geometry.theta) if geometry.beta is None else geometry.beta
+    return np.zeros(len(geometry.theta)) if geometry.beta is None else np.asarray(geometry.beta)
 
 
 def _row(values: Iterable[float], separator: str = ",") -> str:
