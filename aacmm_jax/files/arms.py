@@ -10,8 +10,8 @@ import numpy as np
 from ..core.arrays import Numbers
 from ..core.errors import InputError, naming, nearest
 from ..core.text import printable
-from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture
+from ..data.noise import ArmNoise
 from ..kinematics.arm import Arm, correction_names, is_length
 from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.corrected_arm import loads_of

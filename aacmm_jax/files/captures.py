@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError, naming
-from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
-from ..data.copies import UNKNOWN, Repeated
+from ..data.capture_data import UNKNOWN, Repeated
+from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
-from ..data.recording import Recording
-from ..data.sphere import ProbedSphere, checked_sphere
+from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, readings_unit
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single

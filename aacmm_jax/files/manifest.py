@@ -13,12 +13,10 @@ import numpy as np
 from ..acceptance.results import Measured
 from ..core.errors import InputError, naming, nearest
 from ..core.text import shorten
-from ..data.capture import Capture, ReferenceLength, check_readings
-from ..data.joined_captures import join_sessions
+from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation
-from ..data.recording import Recording
-from ..data.sphere import ProbedSphere, checked_sphere
+from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile
