@@ -202,9 +202,9 @@ def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
     if content == "points":
         return {name: tuple(map(float, point)) for name, point in value.items()}
     if content == "count":
-        Range(least=1, most=MOST_POSES)(value, what, sizes)
+        Range(least=1, most=MOST_POSES)(value, what)
     elif content == "number" and value is not None and not np.ndim(value) and not entry.dimensions:
-        (Range(above=0) if entry.positive else Range(least=0))(value, what, sizes)
+        (Range(above=0) if entry.positive else Range(least=0))(value, what)
     return value
 
 
