@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..calibration.left_out import LEVEL
+from ..calibration.prediction import LEVEL
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from .tables import two_digits
