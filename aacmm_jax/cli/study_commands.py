@@ -44,9 +44,6 @@ def study(
     shards: bool = flag(
         "--shards", "Dask workers write their trials themselves, to the output's folder, which they share."
     ),
-    keep_parts: bool = flag(
-        "--keep-parts", "Leave the workers' files in their folder at the end: for results too large to copy."
-    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Run a Monte Carlo study of simulated calibrations.
@@ -73,7 +70,7 @@ def study(
     if workers is not None and dask is not None:
         raise InputError("a running Dask cluster has its own workers; leave --workers out.")
 
-    settings = {"chunk": chunk, "shards": shards, "keep_parts": keep_parts}
+    settings = {"chunk": chunk, "shards": shards}
     with _leaving_threads():
         outcome = _run(asked, output, dask, workers, settings)
         summary = {
