@@ -26,11 +26,11 @@ from .core import units as units
 from .core.errors import IdentifiabilityWarning as IdentifiabilityWarning
 from .core.errors import InputError as InputError
 from .data.capture import Capture as Capture
-from .data.joined_captures import join_sessions as join_sessions
-from .data.joined_captures import stack_captures as stack_captures
+from .data.capture import join_sessions as join_sessions
+from .data.capture import stack_captures as stack_captures
+from .data.capture_data import ReferenceLength as ReferenceLength
 from .data.noise import Noise as Noise
 from .data.recording import Recording as Recording
-from .data.reference_length import ReferenceLength as ReferenceLength
 from .data.simulation import simulate as simulate
 from .diagnostics.findings import warnings_of as warnings_of
 from .files.arms import load_arm as load_arm

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import aacmm_jax as aj
-from aacmm_jax.data.arm_classes import small_arm_noise
+from aacmm_jax.data.noise import small_arm_noise
 
 HERE = Path(__file__).parent
 POSES, SEEDS, CANDIDATES = (12, 17, 25, 40, 70), (0,), 800

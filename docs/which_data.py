@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
-from aacmm_jax.data.arm_classes import SEATING, class_noise
+from aacmm_jax.data.noise import SEATING, class_noise
 from aacmm_jax.uncertainty.target_parameters import determined_parameters
 from aacmm_jax.uncertainty.volume import default_length
 

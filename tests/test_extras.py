@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.core import extras
+from aacmm_jax.core import errors as extras
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml").read_text())["project"]
 

@@ -302,8 +302,11 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
         ({"encoder_arcsec": -2.0}, ["encoder_arcsec is -2", "zero or positive"]),
         ({"resolution_arcsec": -1.0}, ["resolution_arcsec is -1"]),
         ({"seating": np.nan}, ["seating is nan"]),
-        ({"poses": 0}, ["socket 'A' is given 0 poses", "at least one"]),
-        ({"poses": {"A": 3}, "sockets": {"A": (400, 200, 300), "B": (500, 200, 300)}}, ["socket 'B' is given 0 poses"]),
+        ({"poses": 0}, ["number of poses of socket 'A' is 0", "at least 1"]),
+        (
+            {"poses": {"A": 3}, "sockets": {"A": (400, 200, 300), "B": (500, 200, 300)}},
+            ["number of poses of socket 'B' is 0"],
+        ),
         ({"poses": {"A": 3, "plate": 2}}, ["unknown socket 'plate'", "known are A."]),
         ({"sockets": {}}, ["at least one socket"]),
         ({"sockets": {"A": (400.0, 200.0)}}, ["socket 'A' has shape (2,)", "three coordinates", "mm"]),

@@ -53,12 +53,12 @@ import sys
 import tests.conftest  # as pytest does, before anything else
 import aacmm_jax as aj, jax.numpy as jnp, jaxtyping, numpy as np
 
-assert "aacmm_jax.model.metrics" not in sys.modules
+assert "aacmm_jax.model.sockets" not in sys.modules
 measured = aj.model.repeatability
-assert "aacmm_jax.model.metrics" in sys.modules
+assert "aacmm_jax.model.sockets" in sys.modules
 assert float(measured(jnp.zeros((4, 3)), (4,)).de) == 0.0
 try:
-    sys.modules["aacmm_jax.model.metrics"].pose_outliers(np.zeros((4, 2)), (4,))
+    sys.modules["aacmm_jax.model.sockets"].pose_outliers(np.zeros((4, 2)), (4,))
 except jaxtyping.TypeCheckError:
     print("caught")
 """

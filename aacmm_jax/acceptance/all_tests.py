@@ -14,8 +14,7 @@ import numpy as np
 
 from ..core.arguments import Range, checked, checked_arguments
 from ..core.errors import InputError, nearest
-from ..data.recording import Recording
-from ..data.sphere import checked_sphere
+from ..data.recording import Recording, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach
 from .geometry import points_of, postures_of

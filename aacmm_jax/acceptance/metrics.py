@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError, naming
-from ..data.sphere import ProbedSphere, SphereTest
+from ..data.recording import ProbedSphere, SphereTest
 from .geometry import EXACT_POINTS, enclosing_sphere, fit_sphere, points_of
 from .judgement import Influences
 from .results import Measured, Metric, MetricValue, metric_value, percent

@@ -11,8 +11,7 @@ from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
-from ..data.recording import Recording
-from ..data.sphere import ProbedSphere, SphereTest
+from ..data.recording import ProbedSphere, Recording, SphereTest
 from ..kinematics.arm import Arm, is_single
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.parameters import ArmSpecification

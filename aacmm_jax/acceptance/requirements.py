@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..data.sphere import ProbedSphere, SphereTest
+from ..data.recording import ProbedSphere, SphereTest
 from . import metrics
 from .geometry import (
     EXACT_POINTS,

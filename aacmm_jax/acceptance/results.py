@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.capture import ReferenceLength
-from ..data.sphere import ProbedSphere
+from ..data.recording import ProbedSphere
 from ..kinematics.workspace import Reach
 from .judgement import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
 from .standards import EDITIONS, SYMBOLS

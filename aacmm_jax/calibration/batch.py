@@ -31,17 +31,9 @@ from ..model.robust import Loss
 from ..solver.reason import numbers_of, reasons
 from .batch_kernel import Form, Problems, selected, solve_chunk
 from .results import ManyCalibrations, ManyIdentifications
-from .scale_anchor import Method
+from .scale_anchor import Method, method_of
 from .stages import divided
-from .task import (
-    Solving,
-    anchor_of,
-    check_data,
-    checked_noise_model,
-    configurations,
-    method_of,
-    without_lengths,
-)
+from .task import Solving, anchor_of, check_data, checked_noise_model, configurations, without_lengths
 
 # Slots per loop. On a CPU the Jacobian columns of all slots should fit the second-level cache (measured from 20 to
 # 7,000 poses: five times slower where they do not); a GPU needs thousands.
@@ -119,8 +111,8 @@ def identify_many(
         [0.0124 0.0124 0.0124] [ True  True  True]
     """
     given = BatchOptions(**options)
-    bounds, space = _checked_box("identify", arm, capture, lower, upper, start, given)
-    return _batch_of(arm, capture, bounds, start, space, given, with_lengths=False).identify()
+    problems, space, size = _laid_out("identify", arm, capture, lower, upper, start, given)
+    return _Batch(problems, _form(problems, space, given, False), size, space, given).identify()
 
 
 @checked_arguments
@@ -156,31 +148,18 @@ def calibrate_many(
         [0.99924 0.99922] [ True  True]
     """
     given = BatchOptions(**options)
-    bounds, space = _checked_box("calibrate", arm, capture, lower, upper, start, given)
-    method, at_once = method_of(arm, capture, space, given.solving, method, given.covariance)
+    problems, space, size = _laid_out("calibrate", arm, capture, lower, upper, start, given)
+    at_once = given.covariance or given.solving.all_at_once
+    method, at_once = method_of(arm, capture, space, given.noise, method, at_once)
+    given = given._replace(hold=None) if at_once else given._replace(covariance=False)
+    batch = _Batch(problems, _form(problems, space, given, at_once), size, space, given)
+    stage1 = batch.identify()
     if at_once:
-        given = given._replace(hold=None)
-        many = _batch_of(arm, capture, bounds, start, space, given, with_lengths=True).identify()
-        return _of_joint(many, many, None)
-    given = given._replace(covariance=False)
-    batch = _batch_of(arm, capture, bounds, start, space, given, with_lengths=False)
-    return _in_two_stages(batch, batch.identify(), method)
-
-
-def _of_joint(
-    many: ManyIdentifications, stage1: ManyIdentifications, k: Float[np.ndarray, " b"] | None
-) -> ManyCalibrations:
-    names = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi", "prior")
-    fields = {name: getattr(many, name) for name in names}
-    return ManyCalibrations(k=k, stage1=stage1, method="joint", divided=np.zeros(len(many.de), dtype=bool), **fields)
-
-
-def _in_two_stages(batch: "_Batch", stage1: ManyIdentifications, method: Method) -> ManyCalibrations:
-    """Stage 1 divided by k, and solved at once where something stands against that, or all with "joint"."""
+        return _of_joint(stage1, stage1, None)
+    # Stage 1 divided by k, and solved at once where something stands against that, or all with "joint".
     assert stage1.k is not None
     anchor, shape = batch.form.anchor, stage1.parameters.shape
-    sides = (np.broadcast_to(side, shape) for side in (stage1.bounds.lower, stage1.bounds.upper))
-    bounds = Bounds(stage1.space, *sides)
+    bounds = Bounds(space, *(np.broadcast_to(side, shape) for side in (stage1.bounds.lower, stage1.bounds.upper)))
     parameters, against = divided(anchor, bounds, stage1.active, stage1.parameters, stage1.k)
     # Rows are contiguous, so that what is summed over one is summed in the same order in every batch.
     parameters = np.array(parameters, order="C")
@@ -194,22 +173,28 @@ def _in_two_stages(batch: "_Batch", stage1: ManyIdentifications, method: Method)
         "de": stage1.de / factor,
         "deltam": stage1.deltam / factor,
         "steps": np.array(stage1.steps),
-        "reason": np.array(numbers_of(stage1.result)),
         "active": np.array(bounds.active(parameters) if anchor.can_scale else stage1.active),
     }
-    rows = np.flatnonzero(against)
+    reason, rows = np.array(numbers_of(stage1.result)), np.flatnonzero(against)
     if len(rows):
         many = batch.jointly(rows, parameters[rows])
         for name in ("parameters", "de", "deltam", "active"):
             columns[name][rows] = getattr(many, name)
         columns["steps"][rows] += many.steps
-        columns["reason"][rows] = numbers_of(many.result)
-    result = to_jax(reasons(np.asarray(columns.pop("reason"))))
-    kept = ~np.asarray(against)
-    return ManyCalibrations(k=stage1.k, result=result, stage1=stage1, method=method, divided=kept, **columns)
+        reason[rows] = numbers_of(many.result)
+    result, is_divided = to_jax(reasons(reason)), ~np.asarray(against)
+    return ManyCalibrations(k=stage1.k, result=result, stage1=stage1, method=method, divided=is_divided, **columns)
 
 
-def _checked_box(
+def _of_joint(
+    many: ManyIdentifications, stage1: ManyIdentifications, k: Float[np.ndarray, " b"] | None
+) -> ManyCalibrations:
+    names = ("parameters", "de", "deltam", "steps", "result", "active", "covariance", "reduced_chi", "prior")
+    fields = {name: getattr(many, name) for name in names}
+    return ManyCalibrations(k=k, stage1=stage1, method="joint", divided=np.zeros(len(many.de), dtype=bool), **fields)
+
+
+def _laid_out(
     single: str,
     arm: Arm,
     capture: Capture,
@@ -217,25 +202,55 @@ def _checked_box(
     upper: Numbers | None,
     start: Numbers | None,
     options: BatchOptions,
-) -> tuple[tuple[Numbers, Numbers], Parameters]:
-    """Lower and upper bounds, and the free parameters."""
+) -> tuple[Problems, Parameters, int]:
+    """The problems, their free parameters and their number; checked. ``single`` solves one of them."""
     # A batch is distributed over threads by its values, so that it cannot be traced.
     if not is_concrete(*jax.tree.leaves((arm, capture, lower, upper, start))):
         raise InputError(
             f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call it outside, "
             f"or use jax.vmap of {single} there."
         )
-    if not isinstance(lower, Bounds):
-        if upper is None:
-            raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
-        return (lower, upper), Parameters.free_of(arm) if options.space is None else options.space
-    for what, given in (("upper bounds", upper), ("a space", options.space)):
-        if given is not None:
+    if isinstance(lower, Bounds):
+        for what, given in (("upper bounds", upper), ("a space", options.space)):
+            if given is not None:
+                raise InputError(
+                    f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by "
+                    "its name: start=...)."
+                )
+        lower, upper, space = lower.lower, lower.upper, lower.space
+    elif upper is None:
+        raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
+    else:
+        space = Parameters.free_of(arm) if options.space is None else options.space
+    check_finite(noise=options.noise)
+    check_columns(arm, capture.columns)
+    p = len(space.names)
+    sides = {"start": space.vector(arm) if start is None else start, "lower": lower, "upper": upper}
+    boxes = {what: np.asarray(as_array(value, what)) for what, value in sides.items()}
+    for what, value in boxes.items():
+        if value.ndim not in (1, 2) or value.shape[-1] != p:
             raise InputError(
-                f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by "
-                "its name: start=...)."
+                f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free."
             )
-    return (lower.lower, lower.upper), lower.space
+    sizes = {value.shape[0] for value in boxes.values() if value.ndim > 1}
+    sizes |= {leaf.shape[0] for leaf in jax.tree.leaves(arm) if leaf.ndim > 1}
+    sizes |= {capture.q.shape[0]} if capture.q.ndim > 2 else set()
+    sizes |= {np.shape(length.value)[0] for length in capture.lengths if np.ndim(length.value)}
+    numbers = " and ".join(map(str, sorted(sizes)))
+    for wrong, says in (
+        (not sizes, "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or "
+         "use identify."),
+        (sizes == {0}, "the batch is empty; give at least one problem."),
+        (len(sizes) > 1, f"batches of {numbers} problems do not fit together; give each the same number."),
+    ):  # fmt: skip
+        if wrong:
+            raise InputError(says)
+    for row, i in np.argwhere(~(np.atleast_2d(boxes["lower"]) <= np.atleast_2d(boxes["upper"]))):
+        raise InputError(
+            f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
+        )
+    space = based_on(space, arm)
+    return Problems(*to_numpy((space.base, capture)), **boxes, near=None), space, sizes.pop()
 
 
 class _Batch(NamedTuple):
@@ -259,7 +274,10 @@ class _Batch(NamedTuple):
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
             workers = max(workers, cores)
         slots, workers = options.slots or slots, options.workers or workers
-        chunks = _chunks(self.size, slots, workers, options.chunk)
+        # As few chunks as keep all workers busy, since slots idle at the end of each.
+        calls = min(-(-self.size // (slots * _ROUNDS * workers)) * workers, -(-self.size // slots))
+        chunk = options.chunk or -(-self.size // calls)
+        chunks = [range(first, min(first + chunk, self.size)) for first in range(0, self.size, chunk)]
         # Whole rounds of the slots, their number a power of two: each size is compiled once, so there should be few.
         capacity = slots * 2 ** math.ceil(math.log2(-(-max(map(len, chunks)) // slots)))
         form = self.form._replace(slots=slots, capacity=capacity)
@@ -290,25 +308,6 @@ class _Batch(NamedTuple):
         return self._replace(problems=part, form=form, size=len(rows)).identify()
 
 
-def _batch_of(
-    arm: Arm,
-    capture: Capture,
-    bounds: tuple[Numbers, Numbers],
-    start: Numbers | None,
-    space: Parameters,
-    options: BatchOptions,
-    *,
-    with_lengths: bool,
-) -> _Batch:
-    """Everything checked and laid out; reference lengths take part in the least squares ``with_lengths``."""
-    check_finite(noise=options.noise)
-    check_columns(arm, capture.columns)
-    box, size = _lay_out(arm, capture, bounds, start, space)
-    space = based_on(space, arm)
-    problems = Problems(*to_numpy((space.base, capture)), *box, near=None)
-    return _Batch(problems, _form(problems, space, options, with_lengths), size, space, options)
-
-
 def _form(problems: Problems, space: Parameters, options: BatchOptions, with_lengths: bool) -> Form:
     """What is the same for all problems. Raises `InputError` where the data cannot determine the unknowns."""
     arm, capture, start, lower, upper, near = problems
@@ -333,20 +332,8 @@ def _form(problems: Problems, space: Parameters, options: BatchOptions, with_len
         pose=configurations(observed.q) if options.covariance else tuple(range(observed.q.shape[0])),
         max_steps=options.max_steps,
         covariance=options.covariance,
-        slots=0,
-        capacity=0,
         axes=axes,
     )
-
-
-def _chunks(size: int, slots: int, workers: int, chunk: int | None) -> list[range]:
-    """The batch in chunks: of the given size, or as few as keep all workers busy, since slots idle at the end of
-    each."""
-    if chunk is None:
-        rounds = -(-size // (slots * _ROUNDS))
-        calls = min(-(-rounds // workers) * workers, -(-size // slots))
-        chunk = -(-size // calls)
-    return [range(first, min(first + chunk, size)) for first in range(0, size, chunk)]
 
 
 def _run(run: Callable, chunks: Sequence[range], devices: Sequence[Any], workers: int) -> list:
@@ -366,36 +353,3 @@ def _run(run: Callable, chunks: Sequence[range], devices: Sequence[Any], workers
 
     with ThreadPoolExecutor(workers) as pool:
         return list(pool.map(work, range(len(chunks))))
-
-
-def _lay_out(
-    arm: Arm, capture: Capture, bounds: tuple[Numbers, Numbers], start: Numbers | None, space: Parameters
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
-    """Start, lower and upper bounds, and the size of the batch. Raises `InputError` where shapes do not fit."""
-    p = len(space.names)
-    given = {"start": space.vector(arm) if start is None else start, "lower": bounds[0], "upper": bounds[1]}
-    boxes = {what: np.asarray(as_array(value, what)) for what, value in given.items()}
-    for what, value in boxes.items():
-        if value.ndim not in (1, 2) or value.shape[-1] != p:
-            raise InputError(
-                f"{what} has shape {value.shape}; give ({p},) or (batch, {p}), since {p} parameters are free."
-            )
-    sizes = {value.shape[0] for value in boxes.values() if value.ndim > 1}
-    sizes |= {leaf.shape[0] for leaf in jax.tree.leaves(arm) if leaf.ndim > 1}
-    sizes |= {capture.q.shape[0]} if capture.q.ndim > 2 else set()
-    sizes |= {np.shape(length.value)[0] for length in capture.lengths if np.ndim(length.value)}
-    if not sizes:
-        raise InputError(
-            "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use "
-            "identify."
-        )
-    if sizes == {0}:
-        raise InputError("the batch is empty; give at least one problem.")
-    if len(sizes) > 1:
-        numbers = " and ".join(map(str, sorted(sizes)))
-        raise InputError(f"batches of {numbers} problems do not fit together; give each the same number.")
-    for row, i in np.argwhere(~(np.atleast_2d(boxes["lower"]) <= np.atleast_2d(boxes["upper"]))):
-        raise InputError(
-            f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
-        )
-    return (boxes["start"], boxes["lower"], boxes["upper"]), sizes.pop()

@@ -230,8 +230,8 @@ def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task
     spare = jnp.maximum(task.observed.equations - (z.shape[0] if of_prior is None else of_prior.effective), 1.0)
     k = None
     if problem.capture.lengths and not form.with_lengths:
-        own = [sigma**2 * matrices for matrices in own_covariances(task.observed, state.point, whitening)]
-        k = scale_and_weights(ends_between(task.observed, z[len(free) :], own, problem.capture))[0].value
+        covariances = [sigma**2 * matrices for matrices in own_covariances(task.observed, state.point, whitening)]
+        k = scale_and_weights(ends_between(task.observed, z[len(free) :], covariances, problem.capture))[0].value
     tips = repeatability_of(state, task.observed)
     side = Bounds(begun.space, *(side[: len(free)] for side in begun.sides)).active(z[: len(free)])
     fields = {

@@ -24,9 +24,8 @@ from ..data.noise import Noise
 from ..data.observations.held import position_of
 from ..kinematics.arm import Arm, check_columns
 from ..kinematics.parameters import Bounds, Parameters
-from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
-from ..model.socket_sums import to_poses
+from ..model.sockets import Repeatability, no_repeatability, repeatability, to_poses
 from ..uncertainty.linear_propagation import variances_of_functions
 from ..uncertainty.linearisation import Linearisation
 from .solve import minimised

@@ -1,5 +1,5 @@
-"""How a calibrated arm agrees with a capture that it was not identified from: errors found, and errors that its
-uncertainty and the noise predict.
+"""How a calibrated arm agrees with poses that it was not identified from: errors found, and errors that its uncertainty
+and the noise predict; and a cross-validation, which leaves groups of poses out one after the other.
 
 The errors of what was measured are normal with some covariance V, so their sum of squares has the mean tr V and the
 variance 2 tr V^2: about that of tr V / f times a chi-square variable with f = (tr V)^2 / tr V^2 degrees of freedom
@@ -9,7 +9,7 @@ with n degrees of freedom, the ratio of found to predicted has the F distributio
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -17,22 +17,23 @@ from jaxtyping import Float
 
 from ..core.distributions import chance
 from ..core.numpy_or_jax import AnyArray, to_numpy
-from ..data.capture import Capture
-from ..data.copies import visits_of
+from ..core.text import common_labels
+from ..data.capture import Capture, visits_of
 from ..data.observations.held import position_of
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.degrees_of_freedom import LEVEL, Law, coverage_factor, degrees_of_freedom
+from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .evaluation import fit_geometry
+from .evaluation import POSITION_ROWS, fit_geometry
 from .task import without_lengths
 
+LEVEL = 0.01  # probability below which errors beyond their prediction are not put down to chance
+_HALF = LEVEL / 2  # for single groups of a cross-validation; the other half is for all of them together
 _NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero
-_POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
 _LEAST_LENGTH_U = 1e-6  # mm: an error of a millionth of a millimetre is rounding
 
@@ -61,8 +62,9 @@ class _Part(NamedTuple):
     """Sums of squares of one observation: found, and of what the trace of V, and that of its square, consist."""
 
     poses: int  # 0 for the only pose of a socket, which shows no scatter
-    found: float  # mm^2
-    angles: float  # rad^2; NaN where no orientation was measured
+    squares: float  # mm^2
+    turned: int  # poses with an orientation
+    angles: float  # rad^2
     normalised: float  # of the residuals in standard deviations
     rows: int  # of them
     trace: float
@@ -86,31 +88,28 @@ class UnseenErrors(NamedTuple):
         """Standard uncertainty of the error of every reference length, mm."""
         return np.sqrt(np.diagonal(self.length_covariance))
 
-    def expanded(self, level: float = LEVEL) -> Float[np.ndarray, " l"]:
-        """Expanded uncertainty of the error of every reference length, mm."""
+    def expanded(self, level: float = 0.95) -> Float[np.ndarray, " l"]:
+        """Its expanded uncertainty, mm."""
         return coverage_factor(level, self.length_parts, self.law) * self.length_u
 
     def of(self, names: Iterable[str]) -> Agreement:
         """Some sockets and observations together."""
         parts = [self.parts[name] for name in names if self.parts[name].poses]
-        poses = sum(part.poses for part in parts)
-        if not poses:
+        if not parts:
             return NOTHING
-        trace, effective = sum(part.trace for part in parts), math.nan
-        if 0 < trace < math.inf:
-            both = np.sum([part.shared for part in parts], axis=0) @ self.common
-            effective = trace**2 / (sum(part.square for part in parts) + float(np.sum(both * both.T)))
-        turned = [part for part in parts if math.isfinite(part.angles)]
+        sums: list[Any] = [sum(column) for column in zip(*parts, strict=True)]
+        whole, effective = _Part(*sums), math.nan
+        if 0 < whole.trace < math.inf:
+            both = whole.shared @ self.common
+            effective = whole.trace**2 / (whole.square + float(np.sum(both * both.T)))
         return Agreement(
-            count=poses,
-            rms=math.sqrt(sum(part.found for part in parts) / poses),
-            predicted=math.sqrt(trace / poses),
+            count=whole.poses,
+            rms=math.sqrt(whole.squares / whole.poses),
+            predicted=math.sqrt(whole.trace / whole.poses),
             degrees_of_freedom=effective,
             noise_degrees_of_freedom=self.noise_degrees_of_freedom,
-            reduced_chi=math.sqrt(sum(part.normalised for part in parts) / sum(part.rows for part in parts)),
-            rms_angle=math.sqrt(sum(part.angles for part in turned) / sum(part.poses for part in turned))
-            if turned
-            else math.nan,
+            reduced_chi=math.sqrt(whole.normalised / whole.rows),
+            rms_angle=math.sqrt(whole.angles / whole.turned) if whole.turned else math.nan,
         )
 
     def of_lengths(self, which: Iterable[int] | None = None) -> Agreement:
@@ -152,10 +151,9 @@ def unseen_errors(uncertainty: Uncertainty, capture: Capture) -> UnseenErrors:
         [-0.003 -0.001] [0.005 0.008]
     """
     uncertainty, capture = to_numpy((to_numpy(uncertainty).complete, capture))
-    problem = _Unseen.of(uncertainty, capture)
+    problem, freedom = _Unseen.of(uncertainty, capture), uncertainty.scatter_degrees_of_freedom
     parts = {part.observation.name: _part_of(problem, number, part) for number, part in enumerate(problem.parts)}
-    lengths = _of_lengths(problem, capture)
-    return UnseenErrors(parts, problem.common, *lengths, uncertainty.scatter_degrees_of_freedom)
+    return UnseenErrors(parts, problem.common, *_of_lengths(problem, capture), freedom)
 
 
 class _Unseen(NamedTuple):
@@ -171,8 +169,7 @@ class _Unseen(NamedTuple):
     linear: Linearisation
     influence: Influence
     parts: list[ObservationRows]
-    white: Sequence[Float[AnyArray, "_ _"]]
-    own: Sequence[Float[AnyArray, "_ _ _"]]  # U of each observation's own geometry
+    private: Sequence[Float[AnyArray, "_ _ _"]]  # U of each observation's own geometry
     joined: Sequence[Float[AnyArray, "w _ _"]]  # W but for these: of the shared geometry, and K A
     common: Float[np.ndarray, "w w"]  # S for these
     basis: Float[np.ndarray, "s b"]  # of the shared geometry's numbers, with which its columns are orthonormal
@@ -189,68 +186,57 @@ class _Unseen(NamedTuple):
         fitted = fit_geometry(uncertainty.arm, observed, {}, noise)
         space, p = uncertainty.space, len(uncertainty.space.names)
         z = np.concatenate([np.asarray(space.vector()), np.asarray(fitted.geometry)])
-        least = max(_LEAST * float(fitted.sigma), 1e-12)
-        linear = Linearisation.at(observed, space, z, noise=noise, least=least)
+        linear = Linearisation.at(observed, space, z, noise=noise, least=max(_LEAST * float(fitted.sigma), 1e-12))
         influence, groups = linear.influence(), len(observed.layout.groups)
-        scale = np.asarray(space.scale)[:, None, None]
-        of_shared, of_parameters = (
-            [np.asarray(r)[part] for r in influence.rows] for part in (slice(p, None), slice(p))
-        )
+        of_shared = [np.asarray(rows)[p:] for rows in influence.rows]
+        of_parameters = [np.asarray(rows)[:p] / np.asarray(space.scale)[:, None, None] for rows in influence.rows]
         values, vectors = np.linalg.eigh(sum(flat(rows) @ flat(rows).T for rows in of_shared))
         large = values > _NULL * values.max(initial=0.0)
         basis = vectors[:, large] / np.sqrt(values[large])
         of_shared = [np.einsum("sb,srm->brm", basis, rows) for rows in of_shared]
-        of_parameters = [rows / scale for rows in of_parameters]
-        along = np.sum([flat(b) @ flat(a).T for b, a in zip(of_shared, of_parameters, strict=True)], axis=0)
-        joined = [
-            np.concatenate([b, a - np.einsum("bp,brm->prm", along, b)])
-            for b, a in zip(of_shared[:groups], of_parameters[:groups], strict=True)
-        ]
-        common = np.zeros((len(basis.T) + p,) * 2)
-        common[: len(basis.T), : len(basis.T)] = -np.eye(len(basis.T))
-        common[len(basis.T) :, len(basis.T) :] = uncertainty.covariance
-        own = [_own_basis(influence, number) for number in range(groups)]
-        by_observation = observed.by_observation
-        return cls(
-            uncertainty, linear, influence, linear.parts(), linear.white(), by_observation(own), by_observation(joined),
-            common, basis, along,
-        )  # fmt: skip
-
-
-def _own_basis(influence: Influence, number: int) -> Float[np.ndarray, "k r m"]:
-    """Orthonormal columns of the private geometry of a group's components."""
-    rows, block = influence.own_rows(number), influence.blocks[number]
-    if rows is None:
-        return np.zeros((0, *block.white.shape))
-    values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
-    roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
-    return np.asarray(followed(np.asarray(rows), np.swapaxes(roots, 1, 2), block.sizes))
+        pairs = list(zip(of_shared, of_parameters, strict=True))
+        along = np.sum([flat(b) @ flat(a).T for b, a in pairs], axis=0)
+        joined = [np.concatenate([b, a - np.einsum("bp,brm->prm", along, b)]) for b, a in pairs[:groups]]
+        count, private = len(basis.T), []
+        common = np.zeros((count + p,) * 2)
+        common[:count, :count], common[count:, count:] = -np.eye(count), uncertainty.covariance
+        for number, block in enumerate(influence.blocks[:groups]):
+            rows = influence.own_rows(number)
+            if rows is None:
+                private.append(np.zeros((0, *block.white.shape)))
+                continue
+            values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
+            roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
+            private.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
+        private, joined = observed.by_observation(private), observed.by_observation(joined)
+        return cls(uncertainty, linear, influence, linear.parts(), private, joined, common, basis, along)
 
 
 def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
-    values, observation = np.asarray(part.values), part.observation
+    values = np.asarray(part.values)
     r, m = values.shape
-    own, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.own, problem.joined))  # (m, w, r)
-    to_mm = np.linalg.inv(np.asarray(part.root))[:, :_POSITION_ROWS]
+    private, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.private, problem.joined))
+    to_mm = np.linalg.inv(np.asarray(part.root))[:, :POSITION_ROWS]
     weights = np.einsum("mca,mcb->mab", to_mm, to_mm)
     common, p = problem.common, len(problem.uncertainty.space.names)
     by_common = np.einsum("mwa,wv->mva", joined, common)
-    errors = np.einsum("mva,mvb->mab", by_common, joined) - np.einsum("mka,mkb->mab", own, own)
+    errors = np.einsum("mva,mvb->mab", by_common, joined) - np.einsum("mka,mkb->mab", private, private)
     along = np.swapaxes(joined[:, joined.shape[1] - p :], 1, 2)
     is_open = not np.all(np.isfinite(problem.uncertainty.covariance_of_functions(to_mm @ along)))
-    weighted, of_own = joined @ weights, own @ weights
-    alone, crossed = np.einsum("mka,mla->kl", of_own, own), np.einsum("mka,mwa->kw", of_own, joined)
+    of_private = private @ weights
+    alone, crossed = np.einsum("mka,mla->kl", of_private, private), np.einsum("mka,mwa->kw", of_private, joined)
     square = np.sum(weights**2) + 2 * np.einsum("mab,mbc,mca->", weights, weights, errors)
     square = square + np.sum(alone * alone.T) - 2 * np.sum((crossed @ common) * crossed)
     return _Part(
-        poses=0 if observation.kind == "socket" and m == 1 else m,
-        found=float(np.sum(values[:_POSITION_ROWS] ** 2)),
-        angles=float(np.sum(values[_POSITION_ROWS:] ** 2)) if r > _POSITION_ROWS else math.nan,
-        normalised=float(np.sum(np.asarray(problem.white[number]) ** 2)),
+        poses=0 if part.observation.kind == "socket" and m == 1 else m,
+        squares=float(np.sum(values[:POSITION_ROWS] ** 2)),
+        turned=m if r > POSITION_ROWS else 0,
+        angles=float(np.sum(values[POSITION_ROWS:] ** 2)),
+        normalised=float(np.sum(np.asarray(part.white) ** 2)),
         rows=r * m,
         trace=math.inf if is_open else float(np.einsum("maa->", weights) + np.sum(weights * errors)),
         square=float(square),
-        shared=np.einsum("mwa,mva->wv", weighted, joined),
+        shared=np.einsum("mwa,mva->wv", joined @ weights, joined),
     )
 
 
@@ -272,7 +258,7 @@ def _of_lengths(
     pull = by_head[:, p:] @ problem.basis
     along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
     pairs = zip(components, influence.own, strict=True)
-    scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, own, part) for part, own in pairs], axis=0)
+    scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, inverse, part) for part, inverse in pairs], axis=0)
     covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
     error = np.asarray(measured) - np.array([float(length.value) for length in capture.lengths])
     # What they rest on: the parts of the calibration's uncertainty, of which the first contains the scatter of the
@@ -292,11 +278,140 @@ def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> Float
     within, between = float(shared.sd_of(VISITS, SUCCESSIVE)) ** 2, float(shared.sd_of(PLACES)) ** 2
     visits, length = visits_of(capture), float(shared.correlation_length)
 
-    def part_of_mean(name: str, size: int) -> float:
+    variances = []
+    for name, size in zip(capture.names, capture.sizes, strict=True):
+        part_of_mean, order = 1.0, np.arange(size)
         if name in visits:
-            return float(np.sum((np.unique(visits[name], return_counts=True)[1] / size) ** 2))
-        order = np.arange(size)
-        return float(np.mean(np.exp(-np.abs(order[:, None] - order) / length))) if np.isfinite(length) else 1.0
+            part_of_mean = float(np.sum((np.unique(visits[name], return_counts=True)[1] / size) ** 2))
+        elif np.isfinite(length):
+            part_of_mean = float(np.mean(np.exp(-np.abs(order[:, None] - order) / length)))
+        variances.append(between + within * (part_of_mean - 1 / size))
+    return np.array(variances)
 
-    parts = np.array([part_of_mean(name, size) for name, size in zip(capture.names, capture.sizes, strict=True)])
-    return between + within * (parts - 1 / np.asarray(capture.sizes, dtype=float))
+
+class LeftOut(NamedTuple):
+    """One group of sockets and observations that an arm was not identified from; mm. Predictions are infinite where the
+    other groups leave a direction open that matters."""
+
+    sockets: tuple[str, ...]  # names, also of observations
+    poses: int  # in sockets with more than one
+    rms: float  # distance from the socket's centroid or the fitted geometry, found
+    rms_predicted: float  # what the uncertainty predicts
+    length_error: Float[np.ndarray, " l"]
+    length_u: Float[np.ndarray, " l"]  # standard uncertainty of that error, predicted
+    converged: bool
+    # Effective degrees of freedom of both predictions (`prediction`), and of the noise that they rest on. Where they
+    # are not known, those of independent errors.
+    rms_degrees_of_freedom: float = math.nan
+    length_degrees_of_freedom: float = math.nan
+    noise_degrees_of_freedom: float = math.inf
+
+    @property
+    def normalised_lengths(self) -> np.ndarray:
+        """Errors of the lengths that the other groups can predict, in their own standard uncertainties."""
+        predicted = np.isfinite(self.length_u) & (self.length_u > 0)
+        return self.length_error[predicted] / self.length_u[predicted]
+
+    @property
+    def length_ratio(self) -> float:
+        """Root mean square of these; NaN where there is none."""
+        normalised = self.normalised_lengths
+        return float(np.sqrt(np.mean(normalised**2))) if len(normalised) else math.nan
+
+    @property
+    def comparisons(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Of the poses, then of the lengths: how many, found and predicted root mean squares, degrees of freedom."""
+        poses, lengths = self.rms_degrees_of_freedom, self.length_degrees_of_freedom
+        count = float(len(self.normalised_lengths))
+        of_poses = self.poses, self.rms, self.rms_predicted, poses if math.isfinite(poses) else 3.0 * self.poses
+        return of_poses, (count, self.length_ratio, 1.0, lengths if math.isfinite(lengths) else count)
+
+    @property
+    def probabilities(self) -> list[float]:
+        """Of such errors of poses, and of lengths, by chance where the predictions are right; NaN where unknown."""
+        return [chance(*parts[1:], self.noise_degrees_of_freedom) for parts in self.comparisons]
+
+
+class CrossValidation(NamedTuple):
+    """Every group of sockets left out once. The metrics pool the groups that the others can predict.
+
+    Example:
+        >>> left_out = aj.cross_validate(arm, two_bars, bounds)
+        >>> for group in left_out.groups:
+        ...     print(group.sockets, f"{group.rms:.3f} mm, predicted {group.rms_predicted:.3f} mm")
+        ('A', 'B') 0.015 mm, predicted 0.018 mm
+        ('C', 'D') 0.017 mm, predicted 0.014 mm
+    """
+
+    groups: tuple[LeftOut, ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """Each group in a few words."""
+        return common_labels([group.sockets for group in self.groups])
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance from the socket's centroid over the poses of all groups, mm."""
+        return self._pooled("rms")
+
+    @property
+    def rms_predicted(self) -> float:
+        """What the uncertainties of the calibrations without them predicted, mm."""
+        return self._pooled("rms_predicted")
+
+    @property
+    def length_rms(self) -> float:
+        """Root mean square error of the reference lengths, mm."""
+        return self._pooled("length_error")
+
+    @property
+    def length_u(self) -> float:
+        """Root mean square of the predicted standard uncertainties of these errors, mm."""
+        return self._pooled("length_u")
+
+    def _pooled(self, name: str) -> float:
+        """Over the poses, or over the lengths, of all groups that the others can predict."""
+        if name.startswith("length"):
+            values, u = (np.concatenate([getattr(group, n) for group in self.groups]) for n in (name, "length_u"))
+            return float(np.sqrt(np.mean(values[np.isfinite(u)] ** 2))) if np.isfinite(u).any() else math.nan
+        counted = [group for group in self.groups if group.poses and np.isfinite(group.rms_predicted)]
+        squares = sum(group.poses * getattr(group, name) ** 2 for group in counted)
+        return math.sqrt(squares / sum(group.poses for group in counted)) if counted else math.nan
+
+    @property
+    def open(self) -> int:
+        """How many groups the others cannot predict, because without them something is not determined."""
+        return sum(not np.all(np.isfinite(group.length_u)) or group.rms_predicted == np.inf for group in self.groups)
+
+    @property
+    def excess(self) -> float:
+        """The larger of two ratios of errors to their prediction, of the poses and of the lengths; about 1 is right."""
+        pairs = [(self.rms, self.rms_predicted), (self.length_rms, self.length_u)]
+        return max((rms / expected for rms, expected in pairs if expected > 0 and np.isfinite(rms)), default=math.nan)
+
+    @property
+    def disagreeing(self) -> tuple[int, ...]:
+        """Numbers, from 0, of the groups whose errors exceed their prediction by more than chance does in one case of
+        two hundred, over all groups together; the most improbable first."""
+        probabilities = [[p for p in group.probabilities if math.isfinite(p)] for group in self.groups]
+        least = {i: min(of_group) for i, of_group in enumerate(probabilities) if of_group}
+        count = sum(map(len, probabilities))
+        return tuple(i for i in sorted(least, key=least.__getitem__) if least[i] < _HALF / count)
+
+    @property
+    def surprising(self) -> bool:
+        """Whether the errors of a group, or of all groups together, exceed their prediction by more than chance does
+        in one case of a hundred."""
+        pooled, of_noise = [], min(group.noise_degrees_of_freedom for group in self.groups)
+        for parts in zip(*(group.comparisons for group in self.groups), strict=True):
+            usable = [part for part in parts if part[0] and part[3] > 0 and 0 < part[2] < math.inf]
+            if usable:
+                # A sum of squares of independent parts with means T and degrees of freedom f has
+                # (sum T)^2 / sum (T^2 / f) of them (Satterthwaite).
+                count, rms, predicted, freedom = np.array(usable).T
+                means = count * predicted**2
+                ratio = math.sqrt(np.sum(count * rms**2) / means.sum())
+                pooled.append(chance(ratio, 1.0, float(means.sum() ** 2 / np.sum(means**2 / freedom)), of_noise))
+        probabilities = [probability for probability in pooled if math.isfinite(probability)]
+        return bool(self.disagreeing) or any(probability < _HALF / len(probabilities) for probability in probabilities)

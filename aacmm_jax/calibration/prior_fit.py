@@ -27,7 +27,6 @@ from ..uncertainty.evidence import (
     effective_parameters,
     eliminated,
     learned_log_variances,
-    slope_of_expectation,
 )
 from .results import PriorMetrics
 from .task import NEAR, Begun, Fit, State, Task, fit, state_at, whitening_at
@@ -52,7 +51,7 @@ class OfPrior(NamedTuple):
     rows: PriorRows
     metrics: PriorMetrics
     effective: Float[AnyArray, ""]  # how many unknowns the data determine
-    by_scales: "ByScales | None"
+    by_scales: Callable[[AnyArray], AnyArray] | None  # `PriorProblem.by_scales`, where scales are learned
 
 
 def weights(task: Task, begun: Begun, state: State, loss: Loss | None) -> Whitening:
@@ -106,7 +105,7 @@ class PriorProblem(NamedTuple):
     def first_scales(self) -> Float[AnyArray, " s"]:
         """The scales before anything is learned; those that are given keep these values."""
         xp, prior = namespace(self.reference.sigma, self.prior), self.prior
-        first = np.array([own[0] for own in prior.members])
+        first = np.array([members[0] for members in prior.members])
         variances = 2 * xp.log(xp.maximum((prior.sd / self.begun.steps[: prior.sd.shape[0]])[first], _LEAST_GIVEN))
         return xp.concatenate([_log_sigma(self.reference.sigma), variances])
 
@@ -162,7 +161,7 @@ class PriorProblem(NamedTuple):
         xp, model, sd, variances = namespace(scales, z), self.model(scales, z), self.sd(scales), scales[1:]
         effective, groups = effective_parameters(model, sd), self.groups
         slope = xp.asarray(groups.members) @ ((model.deviation / sd) ** 2 - effective)
-        slope = slope + slope_of_expectation(groups, variances)
+        slope = slope + groups.slope(variances)
         smallest = stop_gradient(variances) <= _LEAST_LOG + 1e-9
         of_groups = xp.where(smallest, variances - _LEAST_LOG, slope)
         of_groups = xp.where(xp.asarray(self.learned), of_groups, variances - groups.first)
@@ -172,29 +171,48 @@ class PriorProblem(NamedTuple):
         """Which groups are learned, and deviate from their mean."""
         return namespace(scales).asarray(self.learned) & (scales[1:] > _LEAST_LOG + 1e-9)
 
-    def by_scales(self, scales: Float[AnyArray, " s"], model: PriorModel) -> "ByScales":
-        """How the unknowns follow learned scales."""
+    def by_scales(self, scales: Float[AnyArray, " s"], model: PriorModel) -> Callable[[AnyArray], AnyArray]:
+        """What the uncertainty of learned scales adds to the covariance of the unknowns, of the inverse G of their
+        information (Kass and Steffey 1989, JASA 84, 717-726).
+
+        The expectation of the covariance, and the covariance of the expectation. A variance that is learned from the
+        deviations of few parameters has an inverse gamma distribution, of shape 1 / c where c is the variance of its
+        logarithm, so that its expectation is 1 / (1 - c) times what the evidence makes most probable. Where the prior
+        is all that is known of a parameter, this is the variance of Student's t, with 2 / c degrees of freedom. Scales
+        that are expected have a distribution of their own, and predictions with them are cautious enough as they are
+        (the UR10 of `benchmarks/NOTES.md`).
+        """
         xp, index = namespace(scales, model), self.prior.index
         covariance = covariance_of_log_variances(model, self.groups, scales[1:], self.moving(scales))
         members, information = xp.asarray(self.prior.membership), 1 / self.sd(scales) ** 2
         pull = (model.deviation * information)[:, None] * members.T
-        alone = xp.asarray(~self.groups.expected)
-        spread = xp.where(alone, xp.minimum(xp.diagonal(covariance), _MOST_SPREAD), 0.0)
+        spread = xp.minimum(xp.diagonal(covariance), _MOST_SPREAD)
+        spread = xp.where(xp.asarray(~self.groups.expected), spread, 0.0)
         height = self.prior.mean.shape[0] + self.task.observed.layout.shared
+        # Information of the prior, less that of one with the expectation of its variance.
         lost = xp.where(model.pinned, 0.0, information * (spread @ members))
-        lost = set_at(xp.zeros(height), index, lost)
-        return ByScales(set_at(xp.zeros((height, pull.shape[1])), index, pull), covariance, lost)
+        lost, pull = set_at(xp.zeros(height), index, lost), set_at(xp.zeros((height, pull.shape[1])), index, pull)
+
+        def added(inverse: Float[AnyArray, "h h"]) -> Float[AnyArray, "h h"]:
+            moved = inverse @ pull
+            # (G^-1 - L)^-1 - G, with the information L that is lost.
+            root = xp.where(lost > 0, xp.sqrt(xp.where(lost > 0, lost, 1.0)), 0.0)
+            half = inverse * root[None, :]
+            left = xp.asarray(np.eye(len(root))) - root[:, None] * half
+            return moved @ covariance @ moved.T + half @ inverse_positive_definite(left) @ half.T
+
+        return added
 
     def metrics(self, scales: Float[AnyArray, " s"], effective: Float[AnyArray, " k"]) -> PriorMetrics:
         """What the result says of the prior."""
         xp, prior = namespace(scales, effective), self.prior
-        first = np.array([own[0] for own in prior.members])
+        first = np.array([members[0] for members in prior.members])
         in_units, of_groups = np.array([unit != MIXED for unit in prior.units]), xp.exp(0.5 * scales[1:])
         return PriorMetrics(
             groups=prior.groups,
             learned=prior.learned,
             units=prior.units,
-            parameters=tuple(len(own) for own in prior.members),
+            parameters=tuple(len(members) for members in prior.members),
             sd=xp.where(in_units, of_groups * self.begun.steps[first], of_groups),
             effective=xp.asarray(prior.membership) @ effective,
             supported=~xp.asarray(self.learned) | self.moving(scales),
@@ -209,80 +227,45 @@ def _log_sigma(sigma: Float[AnyArray, ""]) -> Float[AnyArray, " 1"]:
     return xp.log(xp.maximum(sigma, 1e-9))[None]
 
 
-class ByScales(NamedTuple):
-    """What the uncertainty of learned scales adds to that of the unknowns (Kass and Steffey 1989, JASA 84, 717-726).
+class Rounds(NamedTuple):
+    """A fixed-point iteration of scales, extrapolated along its last rounds (Anderson 1965; Walker and Ni 2011)."""
 
-    The expectation of the covariance, and the covariance of the expectation. A variance that is learned from the
-    deviations of few parameters has an inverse gamma distribution, of shape 1 / c where c is the variance of its
-    logarithm, so that its expectation is 1 / (1 - c) times what the evidence makes most probable. Where the prior is
-    all that is known of a parameter, this is the variance of Student's t, with 2 / c degrees of freedom. Scales that
-    are expected have a distribution of their own, and predictions with them are cautious enough as they are (the UR10
-    of `benchmarks/NOTES.md`).
-    """
-
-    pull: Float[AnyArray, "h g"]  # of the prior on the head of the unknowns, by log variances, in natural steps
-    covariance: Float[AnyArray, "g g"]  # of the log variances
-    lost: Float[AnyArray, " h"]  # information of the prior, less that of one with the expectation of its variance
-
-    def added(self, inverse: Float[AnyArray, "h h"]) -> Float[AnyArray, "h h"]:
-        """To the covariance, given the inverse of the information."""
-        xp = namespace(inverse, self)
-        moved = inverse @ self.pull
-        # (G^-1 - L)^-1 - G, with the information L that is lost.
-        some = self.lost > 0
-        root = xp.where(some, xp.sqrt(xp.where(some, self.lost, 1.0)), 0.0)
-        half = inverse * root[None, :]
-        left = xp.asarray(np.eye(len(root))) - root[:, None] * half
-        return moved @ self.covariance @ moved.T + half @ inverse_positive_definite(left) @ half.T
-
-
-class _History(NamedTuple):
-    """The last rounds of a fixed-point iteration, to extrapolate from (Anderson 1965; Walker and Ni 2011).
-
-    Of each round: how much the scales that it began with led to changed since the round before, and their residuals,
-    which are what the round changed.
-    """
-
-    count: AnyArray  # rounds near the fixed point
-    new: Float[AnyArray, " s"]
-    residual: Float[AnyArray, " s"]
+    scales: Float[AnyArray, " s"]
+    count: AnyArray
+    change: AnyArray  # of the scales in the last round
+    near: AnyArray  # rounds near the fixed point
+    new: Float[AnyArray, " s"]  # what the scales of the last round led to,
+    residual: Float[AnyArray, " s"]  # and what it changed; of each round, both less those of the round before:
     of_new: Float[AnyArray, "m s"]
     of_residual: Float[AnyArray, "m s"]
 
     @classmethod
-    def empty(cls, scales: Float[AnyArray, " s"]) -> "_History":
+    def begun(cls, scales: Float[AnyArray, " s"]) -> "Rounds":
+        """Before the first round."""
         xp, none = namespace(scales), namespace(scales).zeros((_REMEMBERED, *scales.shape))
-        return cls(xp.zeros((), dtype=np.int64), scales, scales, none, none)
+        zero = xp.zeros((), dtype=np.int64)
+        return cls(scales, zero, xp.asarray(np.inf), zero, scales, scales, none, none)
 
-    def continued(self, scales: Float[AnyArray, " s"], new: Float[AnyArray, " s"]) -> "_History":
-        """With one more round; rounds far from the fixed point say nothing of it, and are forgotten."""
-        xp, residual = namespace(scales, new), new - scales
-        near = xp.max(xp.abs(residual)) < _NEAR
-        follows = near & (self.count > 0)
-        rows = [
+    def after(self, new: Float[AnyArray, " s"], least: Any = -np.inf) -> "Rounds":
+        """One more round, in which the scales led to others; none becomes smaller than its least."""
+        xp, residual = namespace(self.scales, new), new - self.scales
+        change = xp.max(xp.abs(residual))
+        # Rounds far from the fixed point say nothing of it, and are forgotten.
+        follows = (change < _NEAR) & (self.near > 0)
+        of_new, of_residual = (
             xp.where(follows, xp.concatenate([(now - before)[None], older[:-1]]), 0.0)
             for now, before, older in ((new, self.new, self.of_new), (residual, self.residual, self.of_residual))
-        ]
-        return _History(xp.where(near, self.count + 1, 0), new, residual, rows[0], rows[1])
-
-    def extrapolated(self) -> Float[AnyArray, " s"]:
-        """Where the residual would vanish if it were linear along the rounds, as far as they tell."""
-        xp = namespace(self.new)
-        gram = self.of_residual @ self.of_residual.T
-        least = 1e-12 * xp.trace(gram) + 1e-300
-        weights = solve_positive_definite(
-            gram + least * xp.asarray(np.eye(_REMEMBERED)), self.of_residual @ self.residual
         )
-        return self.new - xp.where(xp.all(xp.isfinite(weights)), weights, 0.0) @ self.of_new
-
-
-class _Rounds(NamedTuple):
-    count: AnyArray
-    scales: Float[AnyArray, " s"]
-    z: Float[AnyArray, " z"]
-    evaluations: AnyArray
-    change: AnyArray  # of the scales in the last round
-    history: _History
+        # Where the residual would vanish if it were linear along the rounds, as far as they tell.
+        gram = of_residual @ of_residual.T
+        gram = gram + (1e-12 * xp.trace(gram) + 1e-300) * xp.asarray(np.eye(_REMEMBERED))
+        weights = solve_positive_definite(gram, of_residual @ residual)
+        extrapolated = new - xp.where(xp.all(xp.isfinite(weights)), weights, 0.0) @ of_new
+        # Few data can lead to and fro between two sets of scales.
+        damped = xp.where(self.count < _UNDAMPED, new, 0.5 * (new + self.scales))
+        scales = xp.where(change < _NEAR, xp.maximum(extrapolated, least), damped)
+        near = xp.where(change < _NEAR, self.near + 1, 0)
+        return Rounds(scales, self.count + 1, change, near, new, residual, of_new, of_residual)
 
 
 def _settled(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[AnyArray, " s"], Fit]:
@@ -292,31 +275,24 @@ def _settled(problem: PriorProblem, z: Float[AnyArray, " z"]) -> tuple[Float[Any
     """
     xp, differentiable = namespace(z, problem.task), problem.task.differentiable
     tolerance = _TOLERANCE if xp is np or differentiable else _BATCH_TOLERANCE
-    none = xp.zeros((), dtype=np.int64)
     # Constants of differentiation, which passes through the fixed point alone.
     constant, begin = stop_gradient((problem, z))
     least = np.concatenate([[-np.inf], np.where(problem.learned, _LEAST_LOG, -np.inf)])
 
-    def again(state: _Rounds) -> _Rounds:
-        solution = constant.fit(state.scales, state.z, differentiable=False)
-        new = constant.updated(state.scales, solution.parameters)
-        history = state.history.continued(state.scales, new)
-        change = xp.max(xp.abs(new - state.scales))
-        # Few data can lead to and fro between two sets of scales.
-        damped = xp.where(state.count < _UNDAMPED, new, 0.5 * (new + state.scales))
-        after = xp.where(change < _NEAR, xp.maximum(history.extrapolated(), least), damped)
-        evaluations = state.evaluations + solution.steps
-        return _Rounds(state.count + 1, after, solution.parameters, evaluations, change, history)
+    def again(state: tuple[Rounds, AnyArray, AnyArray]) -> tuple[Rounds, AnyArray, AnyArray]:
+        rounds, z, evaluations = state
+        solution = constant.fit(rounds.scales, z, differentiable=False)
+        new = constant.updated(rounds.scales, solution.parameters)
+        return rounds.after(new, least), solution.parameters, evaluations + solution.steps
 
     def solve(_: Any, first: Float[AnyArray, " s"]) -> tuple[Any, tuple[Any, Any, Any]]:
-        first = stop_gradient(first)
-        ended = while_loop(
-            lambda state: (state.count < _ROUNDS) & (state.change > tolerance),
+        rounds, last, evaluations = while_loop(
+            lambda state: (state[0].count < _ROUNDS) & (state[0].change > tolerance),
             again,
-            _Rounds(none, first, begin, none, xp.asarray(np.inf), _History.empty(first)),
+            (Rounds.begun(stop_gradient(first)), begin, xp.zeros((), dtype=np.int64)),
         )
         # As a float: custom_root gives this a tangent of its own type, which an integer must not have.
-        return ended.scales, (ended.z, xp.asarray(ended.evaluations, dtype=float), ended.change)
+        return rounds.scales, (last, xp.asarray(evaluations, dtype=float), rounds.change)
 
     def mismatch(scales: Float[AnyArray, " s"]) -> Float[AnyArray, " s"]:
         return problem.mismatch(scales, problem.fit(scales, stop_gradient(z), differentiable=True).parameters)

@@ -22,7 +22,7 @@ from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.shared_errors import SharedErrors
 from .evaluation import Evaluation, evaluate
-from .left_out import CrossValidation
+from .prediction import CrossValidation
 from .results import (
     Calibration,
     Identification,

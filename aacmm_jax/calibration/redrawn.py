@@ -27,7 +27,7 @@ from ..kinematics.corrections import term_of
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
-from ..model.socket_sums import membership
+from ..model.sockets import membership
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
@@ -132,10 +132,10 @@ def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M 
             roots.append(sd * (visits[:, None] == [number for number in np.unique(visits) if number >= 0]))
         elif kind == SUCCESSIVE:
             root = np.zeros((total, total))
-            for own in map(np.flatnonzero, belongs):
-                order = np.arange(len(own))
+            for poses in map(np.flatnonzero, belongs):
+                order = np.arange(len(poses))
                 kernel = np.exp(-np.abs(order[:, None] - order) / float(shared.correlation_length))
-                root[np.ix_(own, own)] = sd * np.linalg.cholesky(kernel)
+                root[np.ix_(poses, poses)] = sd * np.linalg.cholesky(kernel)
             roots.append(root)
     return roots
 
@@ -374,8 +374,8 @@ def batch_of_captures(capture: Capture, q: Numbers, values: Numbers, u: Numbers 
     """
     lengths = range(len(capture.lengths))
     if u is None:
-        own = [np.asarray(length.u) for length in capture.lengths]
-        u = np.broadcast_to(np.stack(own), np.shape(values)) if own else np.zeros((len(np.asarray(q)), 0))
+        stated = [np.asarray(length.u) for length in capture.lengths]
+        u = np.broadcast_to(np.stack(stated), np.shape(values)) if stated else np.zeros((len(np.asarray(q)), 0))
     leaves = lambda c: [c.q, *(c.lengths[i].value for i in lengths), *(c.lengths[i].u for i in lengths)]  # noqa: E731
     columns = [np.asarray(column)[:, i] for column in (values, u) for i in lengths]
     return eqx.tree_at(leaves, capture, [np.asarray(q), *columns])

@@ -21,8 +21,8 @@ from ..data.noise import Noise, at_tip
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds, Parameters
 from ..kinematics.workspace import total_link_length
-from ..model.metrics import Repeatability
 from ..model.scale import Scale
+from ..model.sockets import Repeatability
 from ..solver.reason import Reason
 from ..uncertainty.covariance import NoiseModel, ParameterCovariance
 from ..uncertainty.shared_errors import SharedErrors

@@ -103,31 +103,30 @@ def scale_anchor(
     if concrete and (fixed or slides):
         with jax.ensure_compile_time_eval():
             single = arm if is_single(arm) else jax.tree.map(lambda leaf: leaf.reshape(-1, leaf.shape[-1])[0], arm)
-        if longest is not None and hold in (None, "longest"):
-            poses = _known_poses(single, capture) if slides else None
-            if poses is None:
-                # How the free parameters, and a common relative change of the fixed lengths, move the tips, mm.
-                values, split, steps = (
-                    [value_of(single, name) for name in fixed],
-                    len(space.names),
-                    natural_steps(space.names),
-                )
-                both = _columns_of_both(single, space, fixed)
-                scaling = [(rows[:, :split] * steps, rows[:, split:] @ np.array(values)) for rows in both]
-            else:
-                scaling = _of_slides(single, space, longest, poses)
-            least = min(_left_of_scaling(*part) for part in scaling)
-            # Of a tip coordinate, mm, as the noise has it for a tip at half of the arm's reach.
-            scatter = _SCATTER
-            if noise is not None and is_concrete(noise.encoder, noise.seating):
-                scatter = math.hypot(*at_tip(noise, single, total_link_length(single) / 2))
-            u = scatter / (math.sqrt(_EQUATIONS) * max(least, 1e-300))
-            travels = np.zeros(arm.joints) if poses is None else np.ptp(np.asarray(poses.q), axis=0)
-            moving = tuple(name for name in slides if travels[int(name[2:]) - 1] > 1.0)  # mm
-            set_by = (moving or fixed) if u <= _LARGEST_UNCERTAINTY else ()
-            without_anchor = bool(slides) and u <= _LARGEST_OF_SLIDES
+            both = [] if slides else _columns_of_both(single, space, fixed)
+            if longest is not None and hold in (None, "longest"):
+                moving = fixed
+                if slides:
+                    scaling, moving = _of_slides(single, space, longest, capture)
+                else:
+                    # How the free parameters, and a common relative change of the fixed lengths, move the tips, mm.
+                    values, p = np.array([value_of(single, name) for name in fixed]), len(space.names)
+                    scaling = [(rows[:, :p] * natural_steps(space.names), rows[:, p:] @ values) for rows in both]
+                # A change of what scales is imitated by the free parameters as well as they can. What is left is what
+                # repeatability sees of the scale, mm RMS for a relative change of 1. The nominal arm may be in a
+                # special position that the real one does not share, so the smaller of two residuals counts: at the
+                # nominal arm, and at a neighbouring one.
+                left = [wanted - free @ np.linalg.lstsq(free, wanted, rcond=1e-10)[0] for free, wanted in scaling]
+                least = min(float(np.sqrt(np.mean(residual**2))) for residual in left)
+                # Of a tip coordinate, mm, as the noise has it for a tip at half of the arm's reach.
+                scatter = _SCATTER
+                if noise is not None and is_concrete(noise.encoder, noise.seating):
+                    scatter = math.hypot(*at_tip(noise, single, total_link_length(single) / 2))
+                u = scatter / (math.sqrt(_EQUATIONS) * max(least, 1e-300))
+                set_by = (moving or fixed) if u <= _LARGEST_UNCERTAINTY else ()
+                without_anchor = bool(slides) and u <= _LARGEST_OF_SLIDES
         if not slides:
-            partners = _partners(arm, _columns_of_both(single, space, fixed), space, fixed)
+            partners = _partners(arm, both, space, fixed)
     if hold == "longest":
         hold = None if set_by or without_anchor else longest
     return ScaleAnchor(hold, hold is not None or (concrete and bool(lengths)), set_by, partners)
@@ -155,19 +154,35 @@ def fixes_scale(capture: Capture) -> bool:
     return bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
 
 
-def scale_from_slides(arm: Arm, capture: Capture, space: Parameters, noise: Noise | None) -> bool:
-    """Whether slides of prismatic joints determine the scale of a capture that has nothing else to fix it."""
-    if not arm.prismatic or fixes_scale(capture) or not space.lengths.any():
-        return False
-    return scale_anchor(space, arm, "longest", noise, capture).hold is None
-
-
 def default_method(arm: Arm, general: bool) -> Method:
     """How an arm is calibrated where nobody says: in two stages, but at once where more than lengths fixes the scale.
 
     ``general``: whether there are observations besides sockets and lengths, or a robust loss.
     """
     return "joint" if general or arm.prismatic else "two-stage"
+
+
+def method_of(
+    arm: Arm, capture: Capture, space: Parameters, noise: Noise | None, method: Method | None, at_once: bool
+) -> tuple[Method, bool]:
+    """The method of a calibration, and whether everything is solved at once from the beginning: where more than sockets
+    and lengths take part, or ``at_once``. Raises `InputError` for another method, and where nothing fixes the scale."""
+    # Whether slides of prismatic joints determine the scale, where nothing else does.
+    by_slides = bool(arm.prismatic) and not fixes_scale(capture) and bool(space.lengths.any())
+    by_slides = by_slides and scale_anchor(space, arm, "longest", noise, capture).hold is None
+    at_once = at_once or bool(capture.observations) or by_slides
+    method = default_method(arm, at_once) if method is None else method
+    if method == "two-stage" and at_once:
+        raise InputError(
+            "method='two-stage' is for sockets with reference lengths, without a robust loss, a prior and covariances "
+            "of batches; use method='joint'."
+        )
+    if not by_slides and not fixes_scale(capture):
+        raise InputError(
+            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
+            "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
+        )
+    return method, at_once
 
 
 def warn_of_known_scale(set_by: tuple[str, ...], prismatic: bool) -> None:
@@ -212,46 +227,32 @@ def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> lis
     common: of the nominal arm and of a neighbouring one, which has no special position."""
     names, matrices = (*space.names, *fixed), []
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints))
-    with jax.ensure_compile_time_eval():
-        for variant in (arm, neighbouring_arm(arm, space.names)):
-            columns = jacobian_at(variant, q, names)
-            matrices.append((columns - columns.mean(axis=0)).reshape(-1, len(names)))
+    for variant in (arm, neighbouring_arm(arm, space.names)):
+        columns = jacobian_at(variant, q, names)
+        matrices.append((columns - columns.mean(axis=0)).reshape(-1, len(names)))
     return matrices
 
 
-def _of_slides(arm: Arm, space: Parameters, longest: str, poses: SocketPoses) -> list[tuple[np.ndarray, np.ndarray]]:
-    """How the other free parameters, and a relative change of the longest length, move the tips of every socket apart:
-    at the poses of a capture, brought to their sockets."""
-    others, matrices = [name for name in space.names if name != longest], []
-    with jax.ensure_compile_time_eval():
-        for variant in (to_numpy(arm), neighbouring_arm(arm, space.names)):
-            q = project_to_centroids(variant, poses, targets_of=arm)
-            rows = equations(variant, poses, (*others, longest), q)[0].reshape(-1, len(space.names))
-            matrices.append((rows[:, :-1] * natural_steps(others), rows[:, -1] * value_of(arm, longest)))
-    return matrices
-
-
-def _known_poses(arm: Arm, capture: SocketPoses | None) -> SocketPoses:
-    """The poses of a capture, of the first of a batch of captures; else poses all over the workspace."""
+def _of_slides(
+    arm: Arm, space: Parameters, longest: str, capture: SocketPoses | None
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], tuple[str, ...]]:
+    """How the other free parameters, and a relative change of the longest length, move the tips of every socket apart;
+    and which slides move. At the poses of a capture, of the first of a batch, brought to their sockets; else at poses
+    all over the workspace."""
     if capture is not None and capture.sizes and is_concrete(capture.q):
         q = np.asarray(capture.q)
-        return PosesInSockets(q.reshape(-1, *q.shape[-2:])[0], tuple(capture.sizes))
-    if arm.limits is None:
+        poses = PosesInSockets(q.reshape(-1, *q.shape[-2:])[0], tuple(capture.sizes))
+    else:
         prismatic = np.isin(np.arange(1, arm.joints + 1), arm.prismatic)
-        arm = arm.replace(limits=np.where(prismatic[:, None], [-500.0, 500.0], [-np.pi, np.pi]).tolist())
-    with jax.ensure_compile_time_eval():
-        return generic_poses(arm)
-
-
-def _left_of_scaling(free: Float[np.ndarray, "rows k"], scaling: Float[np.ndarray, " rows"]) -> float:
-    """What repeatability sees of the scale, mm RMS for a relative change of 1.
-
-    A change of what scales is imitated by the free parameters as well as they can; the residual is what is left. The
-    nominal arm may be in a special position that the real one does not share, so the smaller of two residuals counts:
-    at the nominal arm, and at a neighbouring one.
-    """
-    residual = scaling - free @ np.linalg.lstsq(free, scaling, rcond=1e-10)[0]
-    return float(np.sqrt(np.mean(residual**2)))
+        limits = np.where(prismatic[:, None], [-500.0, 500.0], [-np.pi, np.pi]).tolist()
+        poses = generic_poses(arm.replace(limits=limits) if arm.limits is None else arm)
+    others, matrices = [name for name in space.names if name != longest], []
+    for variant in (to_numpy(arm), neighbouring_arm(arm, space.names)):
+        q = project_to_centroids(variant, poses, targets_of=arm)
+        rows = equations(variant, poses, (*others, longest), q)[0].reshape(-1, len(space.names))
+        matrices.append((rows[:, :-1] * natural_steps(others), rows[:, -1] * value_of(arm, longest)))
+    travels = np.ptp(np.asarray(poses.q), axis=0)
+    return matrices, tuple(f"q_{joint}" for joint in arm.prismatic if travels[joint - 1] > 1.0)  # mm
 
 
 def _partners(arm: Arm, columns: list[np.ndarray], space: Parameters, fixed: tuple[str, ...]) -> Partners | None:

@@ -22,8 +22,8 @@ from ..core.numpy_or_jax import AnyArray, added_to, namespace, set_at
 from ..data.noise import Noise
 from ..kinematics.parameters import Bounds
 from ..model.elimination import with_linear_geometry
-from ..model.metrics import Repeatability, no_repeatability, repeatability
 from ..model.observed import Observed
+from ..model.sockets import Repeatability, no_repeatability, repeatability
 from ..uncertainty import linear_propagation as propagation
 from ..uncertainty.covariance import STATED, ParameterCovariance
 from ..uncertainty.degrees_of_freedom import Components
@@ -59,7 +59,7 @@ class Solution(NamedTuple):
         xp, names, height = namespace(linear.z), linear.space.names, linear.height
         steps = xp.where(influence.fixed[: len(names)], 0.0, linear.steps[: len(names)])
         head = xp.concatenate([xp.diag(steps), xp.zeros((len(names), height - len(names)))], axis=1)
-        components = [xp.zeros((len(names), *own.shape[:2])) for own in influence.own]
+        components = [xp.zeros((len(names), *inverse.shape[:2])) for inverse in influence.own]
         index = np.array([space.names.index(name) for name in names])
         of_free = propagation.rows_of_functions(influence, head, components)
         return [set_at(xp.zeros((len(space.names), *rows.shape[1:])), index, rows) for rows in of_free]
@@ -112,7 +112,7 @@ def concluded(
         covariances = propagation.row_covariances(linear.point.rows, linear.errors, whitening, noise)
         rows = [influence.weighted_rows(number) for number in range(len(groups))]
         shared = propagation.of_shared_readings(rows, linear.errors, whitening, noise, reading)
-    by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales.added(influence.inverse)
+    by_scales = None if of_prior is None or of_prior.by_scales is None else of_prior.by_scales(influence.inverse)
     unknowns = propagation.propagated(influence, covariances, shared, by_scales)
     spent = p + count if of_prior is None else of_prior.effective
     metrics = _metrics(task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent)
@@ -155,9 +155,9 @@ def _noise_of(task: Task, linear: Linearisation, influence: propagation.Influenc
         return noise_from(Moments(xp.zeros(()), state.sigma**2))
     if whitening.prior is not None:
         # The prior's rows are weight (x - mean), so that its information is weight^2; in natural steps.
-        own = np.arange(whitening.prior.mean.shape[0])
-        squares = xp.where(influence.fixed[own], 0.0, whitening.prior.weight * linear.steps[own]) ** 2
-        prior = added_to(xp.zeros((linear.height, linear.height)), (own, own), squares)
+        index = np.arange(whitening.prior.mean.shape[0])
+        squares = xp.where(influence.fixed[index], 0.0, whitening.prior.weight * linear.steps[index]) ** 2
+        prior = added_to(xp.zeros((linear.height, linear.height)), (index, index), squares)
     robust = task.loss is not None
     return noise_from(moments(influence, state.point.rows, state.errors, whitening, state.sigma, robust, prior))
 
@@ -192,12 +192,12 @@ def _of_geometry(
     xp, observed, p = namespace(linear.z), linear.observed, len(linear.space.names)
     by_class = [(covariance.head[None, p:, p:], influence.determined[None, p:])]
     by_class += [(matrix, ~is_open) for matrix, is_open in zip(covariance.components, influence.open, strict=True)]
-    known = [xp.where(seen[:, :, None] & seen[:, None, :], matrix, np.nan) for matrix, seen in by_class]
+    scaled = [xp.where(seen[:, :, None] & seen[:, None, :], matrix, np.nan) for matrix, seen in by_class]
     matrices = {}
     for name, rows in observed.positions.items():
         number, component, first = observed.layout.component_of(int(rows[0]))
-        own, steps = slice(first, first + len(rows)), observed.steps[rows]
-        matrices[name] = known[1 + number][component, own, own] * (steps[:, None] * steps[None, :])
+        part, steps = slice(first, first + len(rows)), observed.steps[rows]
+        matrices[name] = scaled[1 + number][component, part, part] * (steps[:, None] * steps[None, :])
     return matrices
 
 

@@ -37,7 +37,7 @@ from ..solver.levenberg_marquardt import Rules, minimise
 from ..solver.reason import GRADIENT, Reason, reasons
 from ..uncertainty import tip_errors
 from ..uncertainty.covariance import NoiseModel
-from .scale_anchor import Method, ScaleAnchor, default_method, fixes_scale, scale_anchor, scale_from_slides
+from .scale_anchor import ScaleAnchor, fixes_scale, scale_anchor
 
 _LEAST_TURN = 0.05  # of a component of the last frame's axes, with which a target's place can be told
 # The boxes of this problem are small against its curvature, so the first steps can be nearly Gauss-Newton's.
@@ -59,6 +59,11 @@ class Solving(NamedTuple):
     prior: Prior | None = None
     replace_noise: bool = True
     max_steps: Count = 300
+
+    @property
+    def all_at_once(self) -> bool:
+        """Whether a division by k would ignore part of it."""
+        return self.robust is not None or self.prior is not None
 
     @property
     def may_replace_noise(self) -> bool:
@@ -163,28 +168,6 @@ def anchor_of(
 def without_lengths(capture: Capture) -> Capture:
     """The capture without its reference lengths, as stage 1 solves it."""
     return eqx.tree_at(lambda c: c.lengths, capture, (), is_leaf=lambda leaf: isinstance(leaf, tuple))
-
-
-def method_of(
-    arm: Arm, capture: Capture, space: Parameters, solving: Solving, method: Method | None, at_once: bool = False
-) -> tuple[Method, bool]:
-    """The method of a calibration, and whether everything is solved at once from the beginning: where more than sockets
-    and lengths take part, or ``at_once``. Raises `InputError` for another method, and where nothing fixes the scale."""
-    by_slides = scale_from_slides(arm, capture, space, solving.noise)
-    more = (at_once, capture.observations, solving.robust is not None, solving.prior is not None, by_slides)
-    general = any(map(bool, more))
-    method = default_method(arm, general) if method is None else method
-    if method == "two-stage" and general:
-        raise InputError(
-            "method='two-stage' is for sockets with reference lengths, without a robust loss, a prior and covariances "
-            "of batches; use method='joint'."
-        )
-    if not by_slides and not fixes_scale(capture):
-        raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
-            "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
-        )
-    return method, general
 
 
 def checked_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joints: int) -> NoiseModel:
@@ -414,5 +397,4 @@ def fit(task: Task, args: Args, z: Float[AnyArray, " n"], begun: Begun, rules: R
 
     solver = BoundedLevenbergMarquardt(**rules._asdict())
     solution = least_squares(observed_rows, z, args, normal=observed_model, solver=solver, throw=False, **box)
-    stats = solution.stats
-    return Fit(solution.value, stats["num_steps"], stats["reason"], stats["optimality"])
+    return Fit(solution.value, *(solution.stats[name] for name in ("num_steps", "reason", "optimality")))

@@ -81,22 +81,18 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
-        _fail_without_jax()
+        from ..core.jax_setup import check_backend
+
+        try:
+            check_backend()
+        except RuntimeError as without_jax:
+            _fail(str(without_jax), 2)
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             _discard_output()
             _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
         _fail(f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.", 1)
     finally:
         gc.freeze()
-
-
-def _fail_without_jax() -> None:
-    from ..core.backend import check_backend
-
-    try:
-        check_backend()
-    except RuntimeError as error:
-        _fail(str(error), 2)
 
 
 def _interrupted() -> NoReturn:

@@ -5,15 +5,20 @@ import inspect
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import typer
 import typer.core
 
-from ..core.backend import prepare_command
 from ..core.errors import InputError
+from ..core.jax_setup import prepare_command
 from ..core.text import in_short, is_number, printable, quoted
+
+
+class Stopped(Exception):
+    """Work was interrupted, and what is done is kept; the message says how to continue."""
 
 
 class _Commands(typer.core.TyperGroup):
@@ -39,35 +44,6 @@ def _said_in_short() -> Iterator[None]:
         raise
 
 
-def check_numbers(arguments: Sequence[str]) -> None:
-    """Refuse values of numeric options that only Python takes for numbers (1_0, digits of other scripts), and NaN."""
-    callbacks: list[Any] = [info.callback for info in app.registered_commands if arguments[:1] == [_name(info)]]
-    numeric = set()
-    for callback in callbacks:
-        parameters = inspect.signature(callback).parameters
-        for name, hint in get_type_hints(callback).items():
-            if {int, float} & {hint, *get_args(hint)}:
-                numeric |= set(parameters[name].default.param_decls or [f"--{name.replace('_', '-')}"])
-    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        option, equals, value = argument.partition("=")
-        value = value if equals else following
-        plain = is_number(value) and math.isfinite(float(value))
-        if option in numeric and _is_pythons(value) and not plain:
-            raise InputError(f"{option} {quoted(value)} is not a finite number; write plain decimal digits.")
-
-
-def _name(info: Any) -> str:
-    return info.name or info.callback.__name__.replace("_", "-")
-
-
-def _is_pythons(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
@@ -82,17 +58,8 @@ app = typer.Typer(
 )
 
 
-def examples(*commands: str) -> str:
-    """The end of a command's help: examples as they are typed, one a line, not wrapped."""
-    word = "Examples" if len(commands) > 1 else "Example"
-    lines = [line for command in commands for line in command.splitlines()]
-    return "\n".join(["\b", f"{word}:", *(f"  {line}" for line in lines)])
-
-
 def _version(wanted: bool) -> bool:
     if wanted:
-        from importlib import metadata
-
         typer.echo(metadata.version("aacmm_jax"))
         raise typer.Exit()
     return wanted
@@ -103,6 +70,34 @@ def prepare(
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     """Calibrate articulated-arm coordinate measuring machines and other serial arms."""
+
+
+def check_numbers(arguments: Sequence[str]) -> None:
+    """Refuse values of numeric options that only Python takes for numbers (1_0, digits of other scripts), and NaN."""
+    numeric = set()
+    for info in app.registered_commands:
+        callback: Any = info.callback
+        if arguments[:1] == [info.name or callback.__name__.replace("_", "-")]:
+            parameters = inspect.signature(callback).parameters
+            for name, hint in get_type_hints(callback).items():
+                if {int, float} & {hint, *get_args(hint)}:
+                    numeric |= set(parameters[name].default.param_decls or [f"--{name.replace('_', '-')}"])
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        option, equals, value = argument.partition("=")
+        value = value if equals else following
+        try:
+            finite = math.isfinite(float(value))
+        except ValueError:
+            continue  # what is no number to Python either, typer refuses
+        if option in numeric and not (finite and is_number(value)):
+            raise InputError(f"{option} {quoted(value)} is not a finite number; write plain decimal digits.")
+
+
+def examples(*commands: str) -> str:
+    """The end of a command's help: examples as they are typed, one a line, not wrapped."""
+    word = "Examples" if len(commands) > 1 else "Example"
+    lines = [line for command in commands for line in command.splitlines()]
+    return "\n".join(["\b", f"{word}:", *(f"  {line}" for line in lines)])
 
 
 def prepare_jax() -> None:
@@ -117,9 +112,7 @@ def with_spinner(what: str, work: Callable[[], Any]) -> Any:
     from rich.console import Console
 
     console = Console(stderr=True)
-    if not console.is_terminal:
-        return work()
-    with console.status(f"{what} ..."):
+    with console.status(f"{what} ...") if console.is_terminal else contextlib.nullcontext():
         return work()
 
 
@@ -147,7 +140,3 @@ def warn_of_unusable(calibration: Path, record: Any) -> None:
     if not record.converged or record.implausible_residual:
         reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
         typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
-
-
-class Stopped(Exception):
-    """Work was interrupted, and what is done is kept; the message says how to continue."""

@@ -4,14 +4,21 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+import typer
+
+from .. import data, diagnostics, files, plot, summaries
 from ..core.errors import InputError
-from ..files.outputs import together
-from ..summaries.tables import Styled, formatted, listed, number, warnings_of, written_of
+from ..core.text import pluralise
+from ..files.inputs import InputFile
+from ..files.outputs import together, write_text
+from ..summaries.tables import Styled, View, formatted, listed, number, warnings_of, written_of
 from . import calibration_views, options
 from .app import app, examples, show_summary, with_spinner
-from .calibration_views import View
 from .options import argument, numbers_option, option
-from .plan_assumptions import assumed_noise
+from .plan_commands import assumed_noise
+
+_CAPTURES = (".toml", ".h5")  # others are tables
 
 
 @app.command(
@@ -60,29 +67,25 @@ def arm(
     if new is not None:
         if file is not None or check is not None or figure is not None:
             raise InputError("--new writes a template and reads no arm; leave out the arm, --check and --figure.")
-        _template(new, 6 if joints is None else joints, as_json)
+        _write_template(new, 6 if joints is None else joints, as_json)
         return
     if file is None:
         raise InputError("name an arm: a file or a shipped arm; or write a template with --new my-arm.toml.")
     if joints is not None:
         raise InputError("--joints is for a template; give it with --new.")
-    from ..files.arms import load_specification
-
-    if figure is not None:
-        from ..plot.figures import check_format
-
-        check_format(figure)
+    options.check_figure(figure)
     with together(figure):
         tool = None if probe is None else numbers_option("--probe", probe, "X,Y,Z in mm", 3)
-        specification = load_specification(file, base=base, tip=tip, probe=tool)
+        specification = files.load_specification(file, base=base, tip=tip, probe=tool)
     if check is not None:
         if figure is not None or encoder_arcsec is not None or seating_mm is not None:
             raise InputError("--check compares readings alone; leave out --figure, --encoder-arcsec and --seating-mm.")
         if model is not None:
             raise InputError("--check compares readings alone; leave out --model.")
-        from .reading_checks import check_arm
-
-        check_arm(specification, check, unit, as_json)
+        summary = _checked(specification, check, unit)
+        show_summary(summary, as_json, reading_check)
+        if not summary["explained"]:
+            raise typer.Exit(1)
         return
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
@@ -90,15 +93,26 @@ def arm(
         from ..files.joint_options import with_model
 
         specification = with_model(specification, model)
+    frame = first_frame(specification)
     with together(figure):
-        usual = assumed_noise(file, {"base": base, "tip": tip}, (encoder_arcsec, seating_mm, None))
-    summary = _surveyed(specification, figure, usual, model)
+        usual = assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)
+        look = summaries.arm_survey.arm_survey
+        summary = with_spinner("Looking at the arm", lambda: look(specification, usual, base=frame, model=model))
+        if frame is not None:
+            summary["urdf"]["first_frame_in_base_mm"] = frame.tolist()
+        if figure is not None:
+            plot.save_arm_figure(specification.arm, figure, title=specification.name, base=frame)
+            summary["written"] = str(figure)
     show_summary(summary, as_json, survey)
 
 
-def _template(path: Path, joints: int, as_json: bool) -> None:
+def first_frame(specification: Any) -> Any:
+    """The first frame of an arm in the base link of its URDF; None for other arms."""
+    return None if specification.urdf is None else files.urdf_chain(specification.urdf).base
+
+
+def _write_template(path: Path, joints: int, as_json: bool) -> None:
     from ..files.arm_tables import arm_template
-    from ..files.outputs import write_text
 
     with together(path):
         if os.path.lexists(path):
@@ -108,24 +122,100 @@ def _template(path: Path, joints: int, as_json: bool) -> None:
     show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. Look at it: aacmm arm {path}"])
 
 
-def _surveyed(specification: Any, figure: Path | None, usual: Any, model: str | None) -> dict[str, Any]:
-    from ..summaries.arm_survey import arm_survey
+def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
+    """What a check of a manifest, a capture or a table finds."""
+    suffix = path.suffix.lower()
+    if suffix not in _CAPTURES:
+        return _checked_table(specification, path, unit)
+    if unit is not None:
+        raise InputError(f"--unit is for a table, but {path} says the unit of its readings; leave it out.")
+    recording = files.read_manifest(path) if suffix == ".toml" else files.load_capture(InputFile(path))
+    joints = recording.nominal.arm.joints
+    if joints != specification.arm.joints:
+        raise InputError(
+            f"{path} has readings of {joints} joints, but the arm has {specification.arm.joints}; name its arm."
+        )
+    return checked_recording(specification, recording, path if suffix == ".toml" else None)
 
-    base = None
-    if specification.urdf is not None:
-        from ..files.urdf import urdf_chain
 
-        base = urdf_chain(specification.urdf).base
-    with together(figure):
-        summary = with_spinner("Looking at the arm", lambda: arm_survey(specification, usual, base=base, model=model))
-        if base is not None:
-            summary["urdf"]["first_frame_in_base_mm"] = base.tolist()
-        if figure is not None:
-            from ..plot.arm import save_arm_figure
+def _checked_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
+    from ..files.pose_tables import read_poses
 
-            save_arm_figure(specification.arm, figure, title=specification.name, base=base)
-            summary["written"] = str(figure)
+    table, frame = read_poses(InputFile(path), specification.arm, unit=unit, recorded=True), first_frame(specification)
+    positions = None if table.poses is None else table.poses[:, :3, 3]
+    rotations = table.poses[:, :3, :3] if table.poses is not None and table.oriented else None
+    if positions is not None and frame is not None:
+        frame = np.linalg.inv(frame)
+        positions = positions @ frame[:3, :3].T + frame[:3, 3]
+        rotations = None if rotations is None else frame[:3, :3] @ rotations
+    tips = {"sockets": table.sockets if positions is None else None, "positions": positions, "rotations": rotations}
+    check = with_spinner("Comparing", lambda: diagnostics.check_readings(specification.arm, table.q, **tips))
+    if positions is not None:
+        seen = data.observations.MeasuredPoints("table", table.q, positions, station="table")
+        capture = data.Capture({}, observations=[seen])
+    else:
+        owner = np.array(table.sockets)
+        capture = data.Capture({name: table.q[owner == name] for name in dict.fromkeys(owner.tolist())})
+    return _check_summary(specification, check, capture, table.unit, table.length_unit)
+
+
+def checked_recording(specification: Any, recording: Any, manifest: Path | None) -> dict[str, Any]:
+    """What a check of a recording finds, with the lines of its manifest that correct it, where it has one."""
+    from ..diagnostics.reading_check import check_capture
+    from ..files.reading_checks import compare_reading_sets, positions_unit, reading_sets_sentence
+
+    check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))
+    unit = "rad" if manifest is None else None
+    of_file = {"nominal": recording.nominal, "manifest": manifest}
+    summary = _check_summary(specification, check, recording.capture, unit, positions_unit(manifest), **of_file)
+    if manifest is not None:
+        sets = with_spinner("Calibrating", lambda: compare_reading_sets(manifest, recording))
+        summary |= {"reading_sets": sets, "reading_sets_sentence": reading_sets_sentence(sets, check.poses)}
     return summary
+
+
+def _check_summary(
+    specification: Any,
+    check: Any,
+    capture: Any,
+    unit: str | None,
+    positions: str,
+    *,
+    nominal: Any = None,
+    manifest: Path | None = None,
+) -> dict[str, Any]:
+    from ..diagnostics.joint_travel import standing_rows
+    from ..diagnostics.reading_words import reading_check_summary
+    from ..files.reading_checks import angles_toml, units_toml
+
+    angles = check.explained and check.best.hypothesis._replace(length=1.0).changes
+    return reading_check_summary(check, specification.name, unit=unit, positions=positions) | {
+        "angles": angles_toml(check.best, unit, manifest) if angles else None,
+        "units": units_toml(check.best, positions) if check.explained else None,
+        "standing": standing_rows(specification.arm, capture, nominal),
+        "reading_sets": [],
+        "reading_sets_sentence": "",
+    }
+
+
+def reading_check(summary: dict[str, Any]) -> View:
+    """Readings compared with an arm."""
+    from ..diagnostics.reading_words import alternatives_sentence
+
+    yield Styled(summary["sentence"], "green" if summary["fits"] else "yellow" if summary["explained"] else "red")
+    outside = (summary["found"] or summary["given"])["readings_outside_limits"]
+    yield from filter(None, (
+        summary["tip"],
+        summary["unit"] and f"Readings were taken to be in {summary['unit']}.",
+        outside and f"{pluralise(outside, 'reading')} are outside the joint limits.",
+        alternatives_sentence(summary["alternatives"], summary["known_positions"]),
+        *(Styled(row["says"], "yellow") for row in summary["standing"]),
+        summary["reading_sets_sentence"],
+    ))  # fmt: skip
+    for key, where in (("units", ", in the table of the measured positions"), ("angles", "")):
+        if summary[key] is not None:
+            yield f"\nIn the manifest{where}:\n{summary[key]}".rstrip("\n")
+    yield f"\n{pluralise(summary['poses'], 'pose')}, {summary['hypotheses']:,} possibilities tried."
 
 
 def survey(summary: dict[str, Any]) -> View:
@@ -152,7 +242,6 @@ def survey(summary: dict[str, Any]) -> View:
         yield from _determined(summary)
     for arm_class in summary["needed"]:
         yield from _needed(arm_class)
-    if summary["needed"]:
         yield f"\n{summary['advice']}"
     yield from written_of(summary)
 
@@ -187,16 +276,11 @@ def _needed(arm_class: dict[str, Any]) -> View:
     """What a first capture with so many poses reaches."""
     title = "U of a length that a calibration from random poses adds"
     yield ["\n", Styled(title), f" [mm, k = 2]: {arm_class['class']}"]
-    rows = [
-        (
-            row["data"],
-            *(None if u is None else 2 * u for u in row["u_mm"].values()),
-            row["enough_poses"] or None,
-        )
-        for row in arm_class["rows"]
-    ]
-    counts = (f"{count} poses" for count in arm_class["rows"][0]["u_mm"])
-    yield listed("", rows, ("data", *counts, "enough"))
+    columns: dict[str, Any] = {"data": "data"}
+    for count in arm_class["rows"][0]["u_mm"]:
+        columns[f"{count} poses"] = lambda row, count=count: row["u_mm"][count] and 2 * row["u_mm"][count]
+    columns["enough"] = lambda row: row["enough_poses"] or None
+    yield listed("", arm_class["rows"], columns)
     yield (
         f"Medians over the volume, of encoders of {arm_class['encoder_arcsec']:.3g} arcsec and a seat of "
         f"{arm_class['seating_mm']:.3g} mm ({arm_class['noise_source']}), reference lengths of "

@@ -7,16 +7,15 @@ from typing import Any, Literal
 
 import typer
 
+from .. import data, files, kinematics, pipeline, plot, summaries
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.text import number as number_of
 from ..core.units import DEG
+from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import reading, together
 from ..model.loss_names import LossName
-from ..summaries.result_tables import MODELS_MEANING, model_tables
-from ..summaries.tables import Styled, warnings_of, written_of
-from . import options
+from . import calibration_views, options
 from .app import app, examples, show_summary, with_spinner
-from .calibration_views import View, calibration
 from .options import argument, bad_option, flag, names_option, option, output, seed
 
 
@@ -113,83 +112,57 @@ def calibrate(
     of one arm.
     """
     from ..diagnostics.usability import does_not_fit
-    from ..files.calibrations import save_calibration
     from ..files.joint_options import with_model
-    from ..pipeline.capture_calibration import CaptureOptions, calibrate_capture
-    from ..summaries.calibration import calibration_summary
+    from ..pipeline.capture_calibration import calibrate_capture
 
-    chosen = CaptureOptions(
-        method=method,
-        robust=robust,
-        scale=scale,
-        only_poses=only_poses,
-        seed=seed,
+    # Options that have the name and the values of an argument of `calibrate_capture` are passed as they are.
+    alike = {name: value for name, value in locals().items() if name in pipeline.CaptureOptions._fields}
+    chosen = pipeline.CaptureOptions(**alike)._replace(
         hold=None if hold == "none" else hold,
-        noise=known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
+        noise=_known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
         replace_noise=not keep_noise,
-        shared_errors=shared_errors,
-        cross_validate=cross_validate,
         leave_out=tuple(leave_out or ()),
-        monte_carlo=monte_carlo,
-        strict=strict,
-        remove_contradicting=remove_contradicting,
-        max_steps=max_steps,
         stage=with_spinner,
     )
     with together(output, figure):
         for file in capture:
             reading(file)
-        if figure is not None:
-            from ..plot.figures import check_format
-
-            check_format(figure)
+        options.check_figure(figure)
         recording = _recording(capture, same_probe)
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         nominal = recording.nominal if model is None else with_model(recording.nominal, model)
-        nominal = _bounded(nominal, (held, free), length_bound_mm, angle_bound_deg, bound or [])
+        fixed = nominal.held if held is None else names_option(held)
+        freed = [*(name for name in nominal.free if name not in (fixed or ())), *names_option(free or "")]
+        nominal = nominal._replace(held=fixed, free=tuple(dict.fromkeys(freed)))
+        nominal = _bounded(nominal, length_bound_mm, angle_bound_deg, bound or [])
         chosen = chosen._replace(prior=_prior(nominal, prior, model))
         record = calibrate_capture(recording._replace(nominal=nominal), **chosen._asdict())
-        summary = calibration_summary(record)
-        save_calibration(output, record, summary)
+        summary = summaries.calibration.calibration_summary(record)
+        files.save_calibration(output, record, summary)
         if figure is not None:
-            from ..plot import save_calibration_figure
-
-            save_calibration_figure(record, figure)
-    show_summary(summary | {"written": str(output)}, as_json, calibration)
+            plot.save_calibration_figure(record, figure)
+    show_summary(summary | {"written": str(output)}, as_json, calibration_views.calibration)
     if not record.converged or not record.plausible_scale or record.implausible_residual or does_not_fit(record):
         raise typer.Exit(1)
 
 
-def _recording(files: Sequence[Path], same_probe: bool) -> Any:
+def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
     """The recording of a file, or of several as the sessions of one arm, with the digests of the files."""
-    from ..files.captures import load_capture
-    from ..files.inputs import InputFile, fingerprint
-    from ..pipeline.capture_calibration import join_recordings
-
-    if same_probe and len(files) == 1:
+    if same_probe and len(paths) == 1:
         raise InputError("--same-probe is for several captures; name them, or leave it out.")
     sessions = {}
-    for file in files:
-        recording = load_capture(read := InputFile(file))
-        if file.stem in sessions:
-            raise InputError(f"two captures have the name '{file.stem}', which names their session; rename one.")
-        sessions[file.stem] = recording._replace(sources=(fingerprint(read), *recording.sources))
-    return join_recordings(sessions, same_probe=same_probe)
+    for path in paths:
+        recording = files.load_capture(read := InputFile(path))
+        if path.stem in sessions:
+            raise InputError(f"two captures have the name '{path.stem}', which names their session; rename one.")
+        sessions[path.stem] = recording._replace(sources=(fingerprint(read), *recording.sources))
+    return pipeline.join_recordings(sessions, same_probe=same_probe)
 
 
-def _bounded(
-    nominal: Any,
-    names: tuple[str | None, str | None],
-    length_mm: float | None,
-    angle_deg: float | None,
-    bounds: Sequence[str],
-) -> Any:
-    """The arm with the parameters that are fixed and free, and their bounds, as its file or the command line says."""
+def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bounds: Sequence[str]) -> Any:
+    """The arm with the bounds of its parameters, as its file or the command line says."""
     from ..kinematics.arm import is_length
 
-    held = nominal.held if names[0] is None else names_option(names[0])
-    free = [name for name in nominal.free if name not in (held or ())]
-    nominal = nominal._replace(held=held, free=tuple(dict.fromkeys([*free, *names_option(names[1] or "")])))
     widths: dict[str, float] = {}
     for text in bounds:
         name, _, width = text.partition("=")
@@ -210,27 +183,22 @@ def _bounded(
 
 def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
     """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
-    if text is None and nominal.prior is None and model is not None and nominal.arm.corrections is not None:
-        from ..kinematics.priors import default_prior
+    if text is not None:
+        from ..files.joint_options import prior_of_text
 
-        return default_prior(nominal.arm)
-    if text is None:
-        return nominal.prior
-    from ..files.joint_options import prior_of_text
-
-    return prior_of_text(text, nominal.arm)
+        return prior_of_text(text, nominal.arm)
+    of_model = nominal.prior is None and model is not None and nominal.arm.corrections is not None
+    return kinematics.default_prior(nominal.arm) if of_model else nominal.prior
 
 
-def known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None) -> Any:
+def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None) -> Any:
     """The noise that is known: encoders and seat, or None."""
-    from ..data.noise import Noise
-
     if encoder_arcsec is None and seating_mm is None and linear_encoder_mm is None:
         return None
     if encoder_arcsec is None or seating_mm is None:
         missing = "--seating-mm" if seating_mm is None else "--encoder-arcsec"
         raise InputError(f"{missing} is missing; give both standard deviations, or neither to have both estimated.")
-    return Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
+    return data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
 
 
 @app.command(
@@ -269,49 +237,29 @@ def compare_models(
     Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
     """
     from ..data.capture import draw_poses
-    from ..files.captures import load_capture
-    from ..files.compared_models import save_compared_models
-    from ..files.inputs import InputFile, fingerprint
     from ..files.joint_options import masses_of
     from ..pipeline.model_ladder import compare_models as run
-    from ..summaries.compared_models import compared_models_summary
 
     with together(output):
         reading(capture)
-        recording = load_capture(read := InputFile(capture))
+        recording = files.load_capture(read := InputFile(capture))
     chosen = None if models is None else tuple(model.strip() for model in models.split(";"))
     if chosen is not None and not all(chosen):
         raise InputError(f"--models '{models}' names an empty model; separate models by one semicolon each.")
     part, nominal = recording.capture.select(only or None, without or ()), recording.nominal
     if only_poses is not None:
         part = draw_poses(part, only_poses, seed)[0]
-    noise = known_noise(encoder_arcsec, seating_mm, linear_encoder_mm)
+    noise = _known_noise(encoder_arcsec, seating_mm, linear_encoder_mm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         compared = with_spinner("Comparing models", lambda: run(
             nominal.arm, part, nominal.bounds(), models=chosen, regions=leave_out, noise=noise, **masses_of(nominal)
         ))  # fmt: skip
-    poses = len(part.owner) + sum(observation.q.shape[0] for observation in part.observations)
-    summary = compared_models_summary(compared, nominal.name) | {"poses": poses}
+    summary = summaries.compared_models.compared_models_summary(compared, nominal.name)
+    summary["poses"] = len(part.readings)
     if output is not None:
-        save_compared_models(output, summary, [fingerprint(read)], None if only_poses is None else seed)
+        files.save_compared_models(output, summary, [fingerprint(read)], None if only_poses is None else seed)
         summary["written"] = str(output)
-    show_summary(summary, as_json, compared_models)
+    show_summary(summary, as_json, summaries.compared_models.compared_models)
     if not compared.recommended.result.converged:
         raise typer.Exit(1)
-
-
-def compared_models(summary: dict[str, Any]) -> View:
-    """Compared models."""
-    yield [
-        Styled(summary["arm"]),
-        f": {len(summary['models'])} models on {summary['poses']} poses, "
-        f"{len(summary['regions'])} regions left out one by one",
-    ]
-    yield from warnings_of(summary)
-    yield from summary["findings"]
-    by_name, by_region = model_tables(summary)
-    yield by_name
-    yield MODELS_MEANING
-    yield by_region
-    yield from written_of(summary)

@@ -1,183 +1,145 @@
 """What people see of arms, captures, calibrations and the demonstration; every heading names its unit."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.text import pluralise, shorten
 from ..core.units import DEG, people_read, people_read_change
-from ..summaries.harmonics import listed_apart
-from ..summaries.result_tables import (
-    BY_CONSTRUCTION,
-    STAGES,
-    agreement_tables,
-    geometry_table,
-    harmonics_table,
-    metrics_table,
-    other_poses_table,
-    parameter_table,
-    prior_table,
-    truth_table,
-    validation_tables,
-    volume_table,
-    weights_table,
-)
-from ..summaries.tables import (
-    Line,
-    Styled,
-    Table,
-    decimals_for,
-    encoders_in_words,
-    factor_words,
-    formatted,
-    lengths_sentence,
-    listed,
-    number,
-    observed_words,
-    quantity_words,
-    seat_in_words,
-    shared_sentence,
-    tried_sentence,
-    verdict_of,
-    warnings_of,
-    written_of,
-)
+from ..summaries import result_tables as tables
+from ..summaries import tables as words
+from ..summaries.result_tables import BY_CONSTRUCTION, STAGES, listed_apart
+from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatted, listed, number
 
-View = Iterator[Line | Table]
 _MOST_PARTS = 12  # rows of a table
 
 
 def arm(summary: dict[str, Any]) -> View:
     """One arm: its table and what its file proposes."""
-    joints = summary["joints"]
+    joints, urdf = summary["joints"], summary["urdf"]
     slides = any(row["kind"] == "prismatic" for row in joints)
 
     def limits(row: dict[str, Any]) -> str | None:
-        of_slide = row["kind"] == "prismatic"
-        low_high, factor = (row["limits_mm"], 1.0) if of_slide else (row["limits_rad"], 1 / DEG)
-        unit = "" if not slides else " mm" if of_slide else " deg"
-        return low_high and f"{factor * low_high[0]:.0f} to {factor * low_high[1]:.0f}{unit}"
+        ends, size, unit = (
+            (row["limits_rad"], DEG, "deg") if row["limits_mm"] is None else (row["limits_mm"], 1.0, "mm")
+        )
+        return ends and f"{ends[0] / size:.0f} to {ends[1] / size:.0f}" + (f" {unit}" if slides else "")
 
-    beta = {"beta [deg]": lambda row: (row["beta_rad"] or 0.0) / DEG}
     yield listed(f"{summary['name']} (standard D-H)", joints, {
         "joint": "joint",
         "alpha [deg]": lambda row: row["alpha_rad"] / DEG,
         "a [mm]": "a_mm",
         "d [mm]": "d_mm",
         "theta [deg]": lambda row: row["theta_rad"] / DEG,
-        **(beta if any(row["beta_rad"] is not None for row in joints) else {}),
+        "beta [deg]": (lambda row: (row["beta_rad"] or 0.0) / DEG)
+        if any(row["beta_rad"] is not None for row in joints)
+        else None,
         "limits of the reading" if slides else "limits [deg]": limits,
     })  # fmt: skip
     yield f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
-    yield from _corrections(summary["corrections"])
-    if summary["urdf"] is not None:
-        base, frame = summary["urdf"]["base"], summary["urdf"]["first_frame_in_base_mm"]
-        where = f"in the frame of {base}"
-        if any(x != (row == column) for row, values in enumerate(frame) for column, x in enumerate(values)):
-            z, origin = (", ".join(f"{values[column]:.6g}" for values in frame[:3]) for column in (2, 3))
-            where = f"in a frame at ({origin}) mm in {base}, with its z axis along ({z})"
-        yield f"From a URDF: {base} to {summary['urdf']['tip']}; positions are {where}."
-
-
-def _corrections(rows: Sequence[Mapping[str, Any]]) -> View:
-    """The coefficients of an arm's corrections that are known, and what the others are."""
-    calibrated = [row for row in rows if row["value"] != 0]
+    calibrated = [row for row in summary["corrections"] if row["value"] != 0]
     if calibrated:
-        units = [
-            people_read_change(row["unit"]) if row["unit"] == "rad" else people_read(row["unit"]) for row in calibrated
-        ]
-        cells = [
-            (row["coefficient"], f"{scale * row['value']:.4g}", unit, row["of"])
-            for row, (scale, unit) in zip(calibrated, units, strict=True)
-        ]
+        cells = []
+        for row in calibrated:
+            scale, unit = people_read_change("rad") if row["unit"] == "rad" else people_read(row["unit"])
+            cells.append((row["coefficient"], f"{scale * row['value']:.4g}", unit, row["of"]))
         yield listed("Joint corrections", cells, ("coefficient", "value", "unit", ""))
     zero: dict[str, list[str]] = {}
-    for row in rows:
+    for row in summary["corrections"]:
         if row["value"] == 0 and row["of"]:  # not the direction of gravity
             zero.setdefault(row["of"], []).append(row["coefficient"])
     for kind, names in zero.items():
         amount = pluralise(len(names), "coefficient")
         yield f"Joint corrections of 0, until they are calibrated: {amount}, {kind} ({shorten(names)})."
+    if urdf is not None:
+        base, frame = urdf["base"], urdf["first_frame_in_base_mm"]
+        where = f"in the frame of {base}"
+        if any(x != (row == column) for row, values in enumerate(frame) for column, x in enumerate(values)):
+            z, origin = (", ".join(f"{values[column]:.6g}" for values in frame[:3]) for column in (2, 3))
+            where = f"in a frame at ({origin}) mm in {base}, with its z axis along ({z})"
+        yield f"From a URDF: {base} to {urdf['tip']}; positions are {where}."
 
 
 def capture(summary: dict[str, Any]) -> View:
     """One capture."""
-    others = sum(row["kind"] != "socket" for row in summary["observations"])
-    sockets = len(summary["sockets"]) + len(summary["observations"]) - others  # of sessions with an own probe, too
+    observations = summary["observations"]
+    others = sum(row["kind"] != "socket" for row in observations)
+    sockets = len(summary["sockets"]) + len(observations) - others  # of sessions with an own probe, too
+    observed = words.observed_words(sockets, others, len(summary["lengths"]))
     yield [
         Styled(summary["arm"]),
-        f": {pluralise(summary['poses'], 'pose')} of {pluralise(summary['joints'], 'joint')} in "
-        f"{observed_words(sockets, others, len(summary['lengths']))}" + (", simulated" if summary["simulated"] else ""),
+        f": {pluralise(summary['poses'], 'pose')} of {pluralise(summary['joints'], 'joint')} in {observed}"
+        + (", simulated" if summary["simulated"] else ""),
     ]
-    yield from warnings_of(summary)
+    yield from words.warnings_of(summary)
     if summary["sockets"]:
         yield listed("", summary["sockets"], {"socket": "socket", "poses": "poses"})
-    if summary["observations"]:
+    if observations:
         columns: dict[str, Any] = {key: key for key in ("observation", "kind", "target", "poses")}
         columns["unknown geometry"] = lambda row: ", ".join(row["unknowns"])
-        yield listed("Other observations", summary["observations"], columns)
-    for row in summary["observations"]:
-        stated = [f"{number['quantity']} {quantity_words(number)}" for number in (*row["certified"], *row["stated"])]
+        yield listed("Other observations", observations, columns)
+    for row in observations:
+        quantities = (*row["certified"], *row["stated"])
+        stated = [f"{quantity['quantity']} {words.quantity_words(quantity)}" for quantity in quantities]
         if stated:
             yield f"{row['observation']}: {shorten(stated, _MOST_PARTS)}."
     slides = any("lowest_mm" in row for row in summary["ranges"])
 
     def reading(row: dict[str, Any], end: str) -> Any:
-        if f"{end}_mm" in row:
-            return f"{row[f'{end}_mm']:.3f} mm"
-        value = row[f"{end}_rad"] / DEG
-        return f"{value:.3f} deg" if slides else number(value, 3)
+        value, unit = (row[f"{end}_mm"], "mm") if f"{end}_mm" in row else (row[f"{end}_rad"] / DEG, "deg")
+        return f"{value:.3f} {unit}" if slides else number(value, 3)
 
-    unit = "" if slides else " [deg]"
-    ends = {f"{end}{unit}": lambda row, end=end: reading(row, end) for end in ("lowest", "highest")}
-    yield listed("Readings", summary["ranges"], {"joint": "joint"} | ends)
+    ends = {end: end if slides else f"{end} [deg]" for end in ("lowest", "highest")}
+    columns = {heading: lambda row, end=end: reading(row, end) for end, heading in ends.items()}
+    yield listed("Readings", summary["ranges"], {"joint": "joint"} | columns)
     if summary["temperature_C"] is not None:
         low, high = summary["temperature_C"]
         yield f"Temperature: {low:.2f} to {high:.2f} C."
     if summary["lengths"]:
         columns = {"from": "from", "to": "to", "value [mm]": "value_mm", "u [mm]": "u_mm"}
         yield listed("Reference lengths", summary["lengths"], columns)
-    yield from written_of(summary)
+    yield from words.written_of(summary)
 
 
 def calibration(summary: dict[str, Any]) -> View:
     """One calibration: warnings first."""
     yield solve(summary)
-    yield from verdict_of(summary)
+    yield from words.verdict_of(summary)
     if summary.get("lengths_tested"):
-        yield lengths_sentence(summary["lengths_tested"])
+        yield words.lengths_sentence(summary["lengths_tested"])
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
     if summary["scale_k"] is not None:
         u = summary["scale_u"] or 0.0
         yield f"Scale of stage 1: k = {summary['scale_k']:.{decimals_for(u, 8)}f}, u(k) = {u:.1e} ({anchor})"
-    yield from warnings_of(summary)
+    yield from words.warnings_of(summary)
     if summary["cross_validation"] is not None:
-        yield from validation_tables(summary["cross_validation"])
+        yield from tables.validation_tables(summary["cross_validation"])
     if summary.get("sessions"):
         columns = {"session": "session", "poses": "poses", "together": "rms_mm", "alone": "rms_alone_mm"}
         yield listed("Sessions, RMS distance of poses from their geometry [mm]", summary["sessions"], columns)
     yield from _observations(summary)
-    stages = {stage: words for stage, words in STAGES.items() if stage != "stage1" or summary["method"] != "joint"}
+    stages = {stage: name for stage, name in STAGES.items() if stage != "stage1" or summary["method"] != "joint"}
     fixed_scale = summary["fixed_by_one_length"]
     if summary["nominal"]:
-        yield metrics_table("On the poses it was identified from [mm]", summary, stages, fixed_scale=fixed_scale)
+        title = "On the poses it was identified from [mm]"
+        yield tables.metrics_table(title, summary, stages, fixed_scale=fixed_scale)
     if "truth" in summary:
-        yield truth_table(summary["truth"])
+        yield tables.truth_table(summary["truth"])
     apart, harmonics = listed_apart(summary["parameters"])
-    yield parameter_table("Parameters", apart)
+    yield tables.parameter_table("Parameters", apart)
     if harmonics:
-        yield harmonics_table(harmonics)
+        yield tables.harmonics_table(harmonics)
         yield "Every coefficient: --json, or aacmm export --format csv."
     if summary["held"]:
         yield f"Fixed at their nominal values: {', '.join(summary['held'])}."
     if summary.get("prior"):
-        yield prior_table(summary["prior"])
+        yield tables.prior_table(summary["prior"])
     if summary["lengths"]:
         yield lengths(summary["lengths"], fixed_scale=fixed_scale)
     yield from _uncertainty(summary)
     if summary.get("shared_errors"):
-        yield shared_sentence(summary["shared_errors"])
-    yield from written_of(summary)
+        yield words.shared_sentence(summary["shared_errors"])
+    yield from words.written_of(summary)
 
 
 def solve(summary: dict[str, Any]) -> Line:
@@ -187,20 +149,19 @@ def solve(summary: dict[str, Any]) -> Line:
         ended = Styled("ended with a residual that no arm has,", "red")
     rows = summary["observations"]  # with observations of other kinds, or a probe for each session: sockets too
     sockets = {*summary["sockets_used"], *(row["observation"] for row in rows if row["kind"] == "socket")}
-    others = sum(row["kind"] != "socket" for row in rows)
+    observed = words.observed_words(len(sockets), sum(row["kind"] != "socket" for row in rows))
     steps, poses = pluralise(summary["steps"], "step"), pluralise(summary["poses"], "pose")
-    words = f" in {steps} on {poses} in {observed_words(len(sockets), others)}"
-    return [Styled(summary["arm"]), f", {summary['method']}: ", ended, words]
+    return [Styled(summary["arm"]), f", {summary['method']}: ", ended, f" in {steps} on {poses} in {observed}"]
 
 
 def _observations(summary: dict[str, Any]) -> View:
     """Observations, the geometry found, poses that lost weight, and poses that were left out at random."""
     factor = summary["uncertainty"]["coverage_factor_geometry_95"]
     if summary["observations"]:
-        yield from agreement_tables(summary)
+        yield from tables.agreement_tables(summary)
         parts = [row for row in summary["geometry"] if not row["part"].startswith("position of ")][:_MOST_PARTS]
         if parts:
-            yield geometry_table(parts, factor)
+            yield tables.geometry_table(parts, factor)
         hidden = len(summary["geometry"]) - len(parts)
         if hidden:
             yield f"{pluralise(hidden, 'more part')} of the geometry, positions of sockets too: --json."
@@ -211,31 +172,23 @@ def _observations(summary: dict[str, Any]) -> View:
         least = f"; the {_MOST_PARTS} of least weight, all by --json" if len(rows) > _MOST_PARTS else ""
         yield f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half the weight or less{least}."
         if rows:
-            yield weights_table(summary, _MOST_PARTS)
+            yield tables.weights_table(summary, _MOST_PARTS)
     if "other_poses" in summary:
-        yield other_poses_table(summary["other_poses"])
-
-
-def orientations(rows: Sequence[dict[str, Any]]) -> View:
-    """Residuals of orientations, where an observation has them."""
-    for row in rows:
-        if row["rms_angle_rad"] is not None:
-            yield f"Orientation of {row['observation']}: RMS {row['rms_angle_rad'] / DEG:.4f} deg."
+        yield tables.other_poses_table(summary["other_poses"])
 
 
 def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
     """Where the base is in each frame of known coordinates, with its expanded uncertainty."""
     rows = []
     for frame in frames[:_MOST_PARTS]:
-        for name, what, quantity, scale in (
+        for name, title, quantity, scale in (
             (frame["in"], "position [mm]", "position_{}mm", 1.0),
             ("", "rotation vector [deg]", "rotation_{}rad", 1 / DEG),
         ):
             expanded = [None if u is None else factor * scale * u for u in frame[quantity.format("u_")]]
-            decimals = [decimals_for(u) for u in expanded]
-            values = zip(frame[quantity.format("")], decimals, strict=True)
-            rows.append((name, what, *(number(scale * x, digits, rounded=True) for x, digits in values)))
-            rows.append(("", "U", *(number(u, digits) for u, digits in zip(expanded, decimals, strict=True))))
+            pairs = list(zip(frame[quantity.format("")], expanded, strict=True))
+            rows.append((name, title, *(number(scale * x, decimals_for(u), rounded=True) for x, u in pairs)))
+            rows.append(("", "U", *(number(u, decimals_for(u)) for u in expanded)))
     title = "Base frame as seen from frames with known coordinates, U (95 %)"
     return listed(title, rows, ("in", "", "x", "y", "z"))
 
@@ -243,27 +196,28 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
 def _uncertainty(summary: dict[str, Any]) -> View:
     """The expanded uncertainty (95 %) over the volume, the noise that it follows from, and what the data determine."""
     part = summary["uncertainty"]
-    factors = ", ".join(filter(None, ("95 %", factor_words(part["volume"]))))
-    yield volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
+    factors = ", ".join(filter(None, ("95 %", words.factor_words(part["volume"]))))
+    yield tables.volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
     yield "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
     if part.get("tried"):
-        yield tried_sentence(part["tried"])
-    noise = f"{encoders_in_words(part)}, {seat_in_words(summary)} {1e3 * part['seating_mm']:.3g} um"
+        yield words.tried_sentence(part["tried"])
+    seating = 1e3 * part["seating_mm"]
+    noise = f"{words.encoders_in_words(part)}, {words.seat_in_words(summary)} {seating:.3g} um"
     joints = ", ".join(str(row["joint"]) for row in part.get("noisy_encoders", ()))
     replaced = f", but for joint {joints}" if joints else ""
     source = {
         "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times what it predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (only their combination is well determined).",
-        "common": f"One variance for all poses: {1e3 * part['seating_mm']:.3g} um a coordinate.",
+        "common": f"One variance for all poses: {seating:.3g} um a coordinate.",
         "robust": "The variance of each pose is taken from its own residual (robust noise model).",
     }[part["form"]]
     pairs = [f"{row['one']} with {row['other']} ({row['r']:+.3f})" for row in part["correlated"][:6]]
     yield source + (f" Strongly correlated: {', '.join(pairs)}." if pairs else "")
     rest = " (the priors determine the rest)" if summary.get("prior") and part["rank"] < part["parameters"] else ""
+    indices = ", ".join(f"{name} = {value:.3g}" for name, value in part["indices"].items())
     yield (
         f"Observability: rank {part['rank']} of {part['parameters']}{rest}, "
-        f"condition {part['condition'] or math.inf:.3g}, "
-        + ", ".join(f"{name} = {value:.3g}" for name, value in part["indices"].items())
+        f"condition {part['condition'] or math.inf:.3g}, {indices}"
     )
     if summary["monte_carlo"]:
         yield f"Monte Carlo (JCGM 101): {summary['monte_carlo']}"
@@ -285,26 +239,33 @@ def demo(summary: dict[str, Any]) -> View:
     }
     cells = [(text, *(summary[stage][key] for stage in STAGES)) for text, key in rows.items()]
     yield listed("Lengths and repeatability", cells, ("", *STAGES.values()))
-    yield truth_table(summary)
+    yield tables.truth_table(summary)
     yield (
         f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 sees repeatability only and leaves "
         "every length off by this one factor; stage 2 divides it out."
     )
     yield f"Files in {summary['folder']}: {', '.join(summary['files'])}"
-    for reason in summary["left_out"].values():
-        yield f"Not made: {reason}"
+    yield from (f"Not made: {reason}" for reason in summary["left_out"].values())
 
 
-def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False) -> Table:
-    """Reference lengths; ``fixed_scale``: a single one fixed the scale, so that its error is zero by construction."""
+def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False, predicted: bool = False) -> Table:
+    """Reference lengths; ``fixed_scale``: a single one fixed the scale, so that its error is zero by construction.
+    ``predicted``: held-out ones, whose U contains the uncertainty of the calibration and of the length, and the noise.
+    """
+    u = "expanded_mm" if predicted else "error_u_mm"
 
     def read(key: str) -> Any:
-        return lambda row: number(row[key], decimals_for(row["error_u_mm"]))
+        return lambda row: number(row[key], decimals_for(row[u]))
 
-    return listed("Reference lengths [mm]", rows, {
+    def ratio(row: Mapping[str, Any]) -> Any:
+        value = None if fixed_scale else row["error_over_expanded"]
+        return number(value, 2, signed=True, mark="bad" if value is not None and abs(value) > 1 else "")
+
+    return listed("Reference lengths [mm]" + ("; U: 95 %" if predicted else ""), rows, {
         "between": lambda row: f"{row['from']} - {row['to']}",
         "value": "value_mm",
         "measured": read("measured_mm"),
         "error": (lambda row: BY_CONSTRUCTION) if fixed_scale else read("error_mm"),
-        "u of error": read("error_u_mm"),
+        "U" if predicted else "u of error": read(u),
+        "error / U": ratio if predicted else None,
     })  # fmt: skip

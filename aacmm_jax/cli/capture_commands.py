@@ -1,17 +1,20 @@
 """Commands that make captures: ``demo``, ``simulate``, ``import``."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import typer
 
+from .. import acceptance as acceptance_tests
+from .. import data, files, kinematics, summaries
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
 from ..files.outputs import together
-from . import options
+from . import calibration_views, options
 from .app import app, examples, show_summary, with_spinner
+from .arm_command import checked_recording, reading_check
 from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
 
 _U_ARTEFACT = 0.001  # mm
@@ -29,7 +32,6 @@ def demo(
 
     The arm of Cheng et al. 2018, with realistic noise.
     """
-    from . import calibration_views
     from .demo import run
 
     summary = with_spinner("Simulating and calibrating", lambda: run(folder, seed))
@@ -45,7 +47,7 @@ def demo(
 )
 def simulate(
     arm: str = options.NOMINAL_ARM,
-    output: Path = options.CAPTURE_OUTPUT,
+    output: Path = output("FILE.h5", "Capture to write (HDF5)."),
     socket: list[str] | None = option("NAME=X,Y,Z", "Simulate a socket at this position, mm; repeatable."),
     poses: list[str] | None = option(
         "[NAME=]N", f"Number of poses in each socket, or in the named one; repeatable. Default: {_POSES}."
@@ -81,79 +83,70 @@ def simulate(
     as_json: bool = options.JSON,
 ) -> None:
     """Make a capture with a simulated arm."""
-    from ..data.noise import Noise
-    from ..data.recording import Recording
-    from ..data.simulation import simulate as run
-    from ..files.arms import load_specification, usual_noise
-    from ..files.captures import save_capture
-    from ..summaries.calibration import capture_summary
-    from . import calibration_views
-
     with together(output):
-        nominal = load_specification(arm, base=base, tip=tip)
-        true = _true_arm(arm, nominal, true_arm, (base, tip), (deviate_length_mm, deviate_angle_deg * DEG), seed)
-        noise = Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
+        nominal = files.load_specification(arm, base=base, tip=tip)
+        true = nominal
+        if true_arm:
+            true_base, true_tip = (base, tip) if true_arm.lower().endswith(".urdf") else (None, None)
+            true = files.load_specification(true_arm, base=true_base, tip=true_tip)
+        if true.arm.joints != nominal.arm.joints:
+            raise InputError(
+                f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; choose a "
+                "true arm with as many."
+            )
+        if deviate_length_mm or deviate_angle_deg:
+            deviation = {"length": deviate_length_mm, "angle": deviate_angle_deg * DEG}
+            drawn = kinematics.perturbed_arm(true.space(), **deviation, seed=seed)
+            true = true._replace(arm=drawn, name=f"{true.name}, deviated")
+        noise = data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
         if acceptance is not None:
             if socket or poses or length or resolution_arcsec or linear_resolution_mm or temperature_c:
                 raise InputError(
                     "--acceptance brings its own sockets, poses and lengths, at 20 C; leave out --socket, --poses, "
                     "--length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
                 )
-            recording = with_spinner("Simulating", lambda: _tested(nominal, true, acceptance, noise, seed))
+            u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
+            recording = with_spinner("Simulating", lambda: acceptance_tests.simulate_procedure(
+                acceptance_tests.plan_procedure(nominal.arm, acceptance), nominal, true, noise=noise, **u, seed=seed
+            ))  # fmt: skip
         else:
             points, form = sockets_option(socket), "one number or two, LOWEST,HIGHEST in C"
             warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)
             if not points:
                 raise InputError("there is no socket; give --socket NAME=X,Y,Z, or --acceptance.")
-            capture = with_spinner("Simulating", lambda: run(
+            capture = with_spinner("Simulating", lambda: data.simulate(
                 true.arm,
                 points,
                 poses=_poses_option(poses or (), points),
                 lengths=[length_option(text) for text in length or ()],
                 noise=noise,
-                resolution_arcsec=resolution_arcsec,
-                linear_resolution=linear_resolution_mm,
+                resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
                 temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
                 seed=seed,
             ))  # fmt: skip
             if temperature_c is not None:
-                nominal = load_specification(arm, base=base, tip=tip, capture=capture)
-            recording = Recording(capture, nominal, true, seed)
-        recording = recording._replace(usual=usual_noise(arm, base=base, tip=tip))
-        summary = capture_summary(recording)
-        save_capture(output, recording, summary)
+                nominal = files.load_specification(arm, base=base, tip=tip, capture=capture)
+            recording = data.Recording(capture, nominal, true, seed)
+        recording = recording._replace(usual=files.usual_noise(arm, base=base, tip=tip))
+        summary = summaries.calibration.capture_summary(recording)
+        files.save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, calibration_views.capture)
 
 
-def _true_arm(
-    arm: str, nominal: Any, true_arm: str | None, links: tuple, deviation: tuple[float, float], seed: int
-) -> Any:
-    """The arm that is simulated: another one than the nominal, a random one, or both."""
-    from ..files.arms import load_specification
-    from ..kinematics.parameters import perturbed_arm
-
-    true = nominal
-    if true_arm:
-        base, tip = links if true_arm.lower().endswith(".urdf") else (None, None)
-        true = load_specification(true_arm, base=base, tip=tip)
-    if true.arm.joints != nominal.arm.joints:
-        raise InputError(
-            f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; choose a true "
-            "arm with as many."
-        )
-    length, angle = deviation
-    if not length and not angle:
-        return true
-    drawn = perturbed_arm(true.space(), length=length, angle=angle, seed=seed)
-    return true._replace(arm=drawn, name=f"{true.name}, deviated")
-
-
-def _tested(nominal: Any, true: Any, standard: Any, noise: Any, seed: int) -> Any:
-    """The recording of an acceptance test."""
-    from ..acceptance.procedure import plan_procedure, simulate_procedure
-
-    u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
-    return simulate_procedure(plan_procedure(nominal.arm, standard), nominal, true, noise=noise, **u, seed=seed)
+def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, int]:
+    """Poses by socket, from ``N`` and ``NAME=N``."""
+    counts = dict.fromkeys(sockets, _POSES)
+    for text in texts:
+        name, equals, count = text.rpartition("=")
+        if not (count.isascii() and count.isdecimal() and len(count) < _DIGITS):
+            bad_option("--poses", quoted(text)[1:-1], "N, or NAME=N for one socket")
+        if not equals:
+            counts = dict.fromkeys(counts, int(count))
+        elif name not in counts:
+            raise InputError(f"--poses {text} names the unknown socket '{name}'; known are {', '.join(counts)}.")
+        else:
+            counts[name] = int(count)
+    return counts
 
 
 @app.command(
@@ -174,40 +167,16 @@ def import_(
     """Read recorded joint readings into a capture."""
     if output is None and not check:
         raise InputError("name the capture to write with -o FILE.h5, or look at the readings with --check.")
-    from ..files.captures import save_capture
-    from ..files.manifest import read_manifest
-    from ..summaries.calibration import capture_summary
-    from . import calibration_views
-
     with together(output):
-        recording = read_manifest(manifest)
-        summary = capture_summary(recording)
+        recording = files.read_manifest(manifest)
+        summary = summaries.calibration.capture_summary(recording)
         if output is not None:
-            save_capture(output, recording, summary)
-    summary |= {} if output is None else {"written": str(output)}
+            files.save_capture(output, recording, summary)
+            summary["written"] = str(output)
     if not check:
         show_summary(summary, as_json, calibration_views.capture)
         return
-    from .reading_checks import check_recording
-    from .reading_checks import view as checked
-
-    summary["check"] = check_recording(recording.nominal, recording, manifest)
-    show_summary(summary, as_json, lambda s: (*calibration_views.capture(s), "", *checked(s["check"])))
+    summary["check"] = checked_recording(recording.nominal, recording, manifest)
+    show_summary(summary, as_json, lambda s: (*calibration_views.capture(s), "", *reading_check(s["check"])))
     if not summary["check"]["explained"]:
         raise typer.Exit(1)
-
-
-def _poses_option(texts: Sequence[str], sockets: Iterable[str]) -> dict[str, int]:
-    """Poses by socket, from ``N`` and ``NAME=N``."""
-    counts = dict.fromkeys(sockets, _POSES)
-    for text in texts:
-        name, equals, count = text.rpartition("=")
-        if not (count.isascii() and count.isdecimal() and len(count) < _DIGITS):
-            bad_option("--poses", quoted(text)[1:-1], "N, or NAME=N for one socket")
-        if not equals:
-            counts = dict.fromkeys(counts, int(count))
-        elif name not in counts:
-            raise InputError(f"--poses {text} names the unknown socket '{name}'; known are {', '.join(counts)}.")
-        else:
-            counts[name] = int(count)
-    return counts

@@ -6,17 +6,13 @@ from typing import Any, Literal
 import numpy as np
 import typer
 
+from .. import files, kinematics, summaries
 from ..core.errors import InputError
-from ..core.text import pluralise
 from ..files.inputs import InputFile
-from ..files.outputs import together
-from ..summaries.tables import formatted, listed, warnings_of, written_of
+from ..files.outputs import together, write_text
 from . import options
 from .app import app, examples, show_summary, warn_of_unusable
-from .calibration_views import View
 from .options import argument, names_option, numbers_option, option, output
-
-_MOST_ROWS = 20  # that are printed
 
 
 @app.command(
@@ -75,30 +71,28 @@ def correct(
     reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
     """
     from ..core.numpy_or_jax import to_numpy
-    from ..files.calibrations import load_calibration
-    from ..files.commanded_poses import corrected_csv, read_commanded_poses
-    from ..files.outputs import write_text
-    from ..kinematics.inverse_kinematics import corrected_readings, readings_at_poses
-    from ..summaries.correction import correction_summary
+    from ..files.pose_tables import corrected_csv, read_poses
 
     begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with a reading for each joint")
     picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]
     with together(output):
-        record = load_calibration(InputFile(calibration))
+        record = files.load_calibration(InputFile(calibration))
         nominal, calibrated = to_numpy((record.recording.nominal.arm, record.calibrated.arm))
         if probe is not None:
             tool = numbers_option("--probe", probe, "X,Y,Z in mm", 3)
             nominal, calibrated = nominal.replace(probe=tool), calibrated.replace(probe=tool)
-        commanded = read_commanded_poses(
+        commanded = read_poses(
             InputFile(poses), nominal, unit=unit, near=begin, columns=picked, length_unit=length_unit
         )
         q = _at_temperature(commanded, calibrated, temperature)
         if commanded.poses is None:
-            corrected = corrected_readings(nominal, calibrated, q)
+            corrected = kinematics.corrected_readings(nominal, calibrated, q)
         else:
-            corrected = readings_at_poses(calibrated, q, in_first_frame(record, commanded.poses), nominal.limits)
-        given = {"unit": commanded.unit, "of_readings": commanded.poses is None}
-        summary = correction_summary(nominal, calibrated, q, corrected, **given)
+            targets = in_first_frame(record, commanded.poses)
+            corrected = kinematics.readings_at_poses(calibrated, q, targets, nominal.limits)
+        summary = summaries.correction.correction_summary(
+            nominal, calibrated, q, corrected, unit=commanded.unit, of_readings=commanded.poses is None
+        )
         summary["probe_mm"] = [np.asarray(arm.probe).tolist() for arm in (nominal, calibrated)]
         if commanded.temperature is not None and q.shape[1] == calibrated.joints:
             summary["warnings"].append(
@@ -108,14 +102,14 @@ def correct(
         write_text(output, corrected_csv(commanded, np.asarray(corrected.q), np.asarray(corrected.reached)))
         summary["written"] = str(output)
     warn_of_unusable(calibration, record)
-    show_summary(summary, as_json, corrections)
+    show_summary(summary, as_json, summaries.correction.corrections)
     if summary["not_reached"]:
         raise typer.Exit(1)
 
 
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
-    from ..data.reference_length import check_temperatures
+    from ..data.capture_data import check_temperatures
     from ..files.manifest_rows import with_temperature
     from ..kinematics.arm import correction_names
     from ..kinematics.corrections import Expansion
@@ -128,52 +122,13 @@ def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) 
         raise InputError(
             "the arm was calibrated with its thermal expansion; give --temperature, or a column temperature_C."
         )
-    q = with_temperature(commanded.q, commanded.temperature, temperature, str(commanded.table.path))
-    where = "--temperature" if commanded.temperature is None else str(commanded.table.path)
-    check_temperatures(where, q[:, calibrated.joints :])
+    table = str(commanded.table.path)
+    q = with_temperature(commanded.q, commanded.temperature, temperature, table)
+    check_temperatures("--temperature" if commanded.temperature is None else table, q[:, calibrated.joints :])
     return q
 
 
 def in_first_frame(record: Any, poses: np.ndarray) -> np.ndarray:
     """Poses in the frame in which the Denavit-Hartenberg chain begins; of a URDF they are given in its base link."""
-    nominal = record.recording.nominal
-    if nominal.urdf is None:
-        return poses
-    from ..files.urdf import urdf_chain
-
-    return np.linalg.inv(urdf_chain(nominal.urdf).base) @ poses
-
-
-def corrections(summary: dict[str, Any]) -> View:
-    """How far poses are reached with corrected readings, and how much readings change."""
-    yield from warnings_of(summary)
-    meant, has = (", ".join(f"{x:.3f}" for x in probe) for probe in summary["probe_mm"])
-    if meant == has:
-        yield f"The tip is at ({has}) mm in the last frame."
-    else:
-        yield (
-            f"The controller means the tip at ({meant}) mm in the last frame, the calibrated arm's is at ({has}) mm: "
-            "right for the probe of the calibration. State another tool with --probe X,Y,Z."
-        )
-    rows, missed = summary["rows"], summary["not_reached"]
-    yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} reached with corrected readings."
-    if len(missed) < rows:
-        # Of the arithmetic, not of the arm: how far it is really off is what an evaluation with unseen data says.
-        distance = formatted(summary["largest_distance_mm"])
-        yield f"Largest distance from a pose with them, if the arm is as calibrated: {distance} mm."
-    if summary["largest_distance_before_mm"] is not None:
-        yield f"Without the correction: {formatted(summary['largest_distance_before_mm'])} mm."
-    for key, what, unit in (("largest_change", "reading", "deg"), ("largest_slide", "slide", "mm")):
-        row = summary[key]
-        if row is not None:
-            where = f"(joint {row['joint']}, row {row['row']})"
-            yield f"Largest change of a {what}: {row[f'change_{unit}']:.4f} {unit} {where}."
-    if missed:
-        first = f", the first {_MOST_ROWS}, all by --json" if len(missed) > _MOST_ROWS else ""
-        yield listed(f"Not reached{first}", missed[:_MOST_ROWS], {
-            "row": "row",
-            "distance left [mm]": "distance_mm",
-            "angle left [deg]": "angle_deg",
-            "joints at a limit": lambda row: ", ".join(map(str, row["joints_at_limit"])) or "-",
-        })  # fmt: skip
-    yield from written_of(summary)
+    urdf = record.recording.nominal.urdf
+    return poses if urdf is None else np.linalg.inv(files.urdf_chain(urdf).base) @ poses

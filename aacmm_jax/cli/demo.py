@@ -6,33 +6,25 @@ from typing import Any
 
 import numpy as np
 
+from .. import data, files, kinematics, plot
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord
-from ..core.errors import InputError
-from ..core.extras import MissingExtra, require
+from ..core.errors import InputError, MissingExtra, require
 from ..core.text import shorten
-from ..data.noise import Noise
-from ..data.recording import Recording
-from ..data.simulation import simulate
-from ..files.arms import load_specification, save_arm, usual_noise
-from ..files.calibrations import save_calibration
-from ..files.captures import load_capture, save_capture
 from ..files.inputs import fingerprint
 from ..files.outputs import together
-from ..kinematics.parameters import ArmSpecification, perturbed_arm
 from ..pipeline.capture_calibration import calibrate_capture
 from ..summaries.calibration import calibration_summary, capture_summary
 
 _ARM, _TRUE = "cheng2018-simulation", ", true"  # what the name of the true arm ends in
 _DEVIATION_MM, _DEVIATION_DEG = 1.0, 0.1
-_NOISE = Noise(encoder_arcsec=2.0, seating=0.005)
+_NOISE = data.Noise(encoder_arcsec=2.0, seating=0.005)
 _LENGTH_U_MM = 0.002
 _SOCKETS, _POSES = {"A": (400.0, 200.0, 300.0), "B": (700.0, 500.0, 500.0)}, {"A": 70, "B": 10}
 _CHECKS, _CHECK_MM = 30, 300.0
-_DATA = ("capture.h5", "calibration.h5", "nominal.toml", "true.toml", "calibrated.toml")
-_FIGURE, _REPORT = "calibration.png", "report.html"
+_CAPTURE, _CALIBRATION, _FIGURE, _REPORT = "capture.h5", "calibration.h5", "calibration.png", "report.html"
 _EXTRAS = {_FIGURE: "plot", _REPORT: "report"}  # what these files need
-_FILES = (*_DATA, *_EXTRAS)
+_FILES = (_CAPTURE, _CALIBRATION, "nominal.toml", "true.toml", "calibrated.toml", *_EXTRAS)
 
 
 def run(folder: Path, seed: int) -> dict[str, Any]:
@@ -40,28 +32,52 @@ def run(folder: Path, seed: int) -> dict[str, Any]:
     the extra that figure or report need, the summary says so, and the rest is made."""
     from ..report import write_report
 
-    nominal = load_specification(_ARM)
-    _prepare(folder, nominal.name + _TRUE)
-    left_out = _left_out()
-    for name in left_out:
-        (folder / name).unlink(missing_ok=True)  # of an earlier demonstration
-    made = [name for name in _FILES if name not in left_out]
-    with together(*(folder / name for name in made if name != _REPORT)):
-        summary = _made(folder, nominal, seed, figure=_FIGURE in made)
-    if _REPORT in made:
-        write_report(folder / "calibration.h5", folder / _REPORT)  # of a file that has to be there
-    return summary | {"folder": str(folder), "files": made, "left_out": left_out}
-
-
-def _left_out() -> dict[str, str]:
-    """The files whose extra is not installed, and what is said of each."""
-    missing = {}
+    nominal = files.load_specification(_ARM)
+    true_name, left_out = nominal.name + _TRUE, {}
+    _prepare(folder, true_name)
     for name, extra in _EXTRAS.items():
         try:
             require(extra, name)
         except MissingExtra as error:
-            missing[name] = str(error)
-    return missing
+            left_out[name] = str(error)
+            (folder / name).unlink(missing_ok=True)  # of an earlier demonstration
+    made = [name for name in _FILES if name not in left_out]
+    with together(*(folder / name for name in made if name != _REPORT)):
+        deviation = {"length": _DEVIATION_MM, "angle": math.radians(_DEVIATION_DEG)}
+        true = nominal._replace(arm=kinematics.perturbed_arm(nominal.space(), **deviation, seed=seed), name=true_name)
+        lengths = [("A", "B", _LENGTH_U_MM)]
+        capture = data.simulate(true.arm, _SOCKETS, poses=_POSES, lengths=lengths, noise=_NOISE, seed=seed)
+        recording = data.Recording(capture, nominal, true, seed, usual=files.usual_noise(_ARM))
+        files.save_capture(folder / _CAPTURE, recording, capture_summary(recording))
+        record = calibrate_capture(recording._replace(sources=(fingerprint(folder / _CAPTURE),)))
+        whole = calibration_summary(record)
+        files.save_calibration(folder / _CALIBRATION, record, whole)
+        for name, specification in (("nominal", nominal), ("true", true), ("calibrated", record.calibrated)):
+            files.save_arm(specification.arm, folder / f"{name}.toml", name=specification.name)
+        if _FIGURE in made:
+            plot.save_calibration_figure(record, folder / _FIGURE)
+        checks = _checks(record, seed)
+    if _REPORT in made:
+        write_report(folder / _CALIBRATION, folder / _REPORT)  # of a file that has to be there
+    return {
+        "kind": "demo",
+        "poses": capture.sizes[0],
+        "more_poses": capture.sizes[1],
+        "deviation_mm": _DEVIATION_MM,
+        "deviation_deg": _DEVIATION_DEG,
+        "encoder_arcsec": float(_NOISE.encoder_arcsec),
+        "seating_um": 1e3 * float(_NOISE.seating),
+        "length_mm": float(capture.lengths[0].value),
+        "length_u_um": 1e3 * _LENGTH_U_MM,
+        "checks": _CHECKS,
+        "check_length_mm": _CHECK_MM,
+        "scale_k": record.k,
+        "scale_u": record.u_k,
+        **{stage: whole[stage] | whole["truth"][stage] | {"check_rms_mm": rms} for stage, rms in checks.items()},
+        "folder": str(folder),
+        "files": made,
+        "left_out": left_out,
+    }
 
 
 def _prepare(folder: Path, true_name: str) -> None:
@@ -76,7 +92,7 @@ def _prepare(folder: Path, true_name: str) -> None:
     foreign = sorted(there - set(_FILES))
     if not foreign and there:
         try:
-            true = load_capture(folder / _FILES[0]).true
+            true = files.load_capture(folder / _CAPTURE).true
         except InputError:
             true = None
         foreign = [] if true is not None and true.name == true_name else sorted(there)
@@ -84,25 +100,6 @@ def _prepare(folder: Path, true_name: str) -> None:
         raise InputError(
             f"{folder} holds files that are not of a demonstration ({shorten(foreign)}); name a new or an empty folder."
         )
-
-
-def _made(folder: Path, nominal: ArmSpecification, seed: int, *, figure: bool) -> dict[str, Any]:
-    drawn = perturbed_arm(nominal.space(), length=_DEVIATION_MM, angle=math.radians(_DEVIATION_DEG), seed=seed)
-    true = nominal._replace(arm=drawn, name=nominal.name + _TRUE)
-    lengths = [("A", "B", _LENGTH_U_MM)]
-    capture = simulate(true.arm, _SOCKETS, poses=_POSES, lengths=lengths, noise=_NOISE, seed=seed)
-    recording = Recording(capture, nominal, true, seed, usual=usual_noise(_ARM))
-    save_capture(folder / "capture.h5", recording, capture_summary(recording))
-    record = calibrate_capture(recording._replace(sources=(fingerprint(folder / "capture.h5"),)))
-    whole = calibration_summary(record)
-    save_calibration(folder / "calibration.h5", record, whole)
-    for file, specification in (("nominal", nominal), ("true", true), ("calibrated", record.calibrated)):
-        save_arm(specification.arm, folder / f"{file}.toml", name=specification.name)
-    if figure:
-        from ..plot import save_calibration_figure
-
-        save_calibration_figure(record, folder / _FIGURE)
-    return _summary(record, whole, _checks(record, seed))
 
 
 def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:
@@ -117,32 +114,9 @@ def _checks(record: CalibrationRecord, seed: int) -> dict[str, float]:
     pairs = [(f"{i}-", f"{i}+") for i in range(_CHECKS)]
     assert record.recording.true is not None
     true = record.recording.true.arm
-    capture = simulate(true, sockets, poses=1, lengths=pairs, noise=_NOISE, seed=seed + 1)
+    capture = data.simulate(true, sockets, poses=1, lengths=pairs, noise=_NOISE, seed=seed + 1)
     arms = {"nominal": record.recording.nominal, "stage1": record.stage1, "calibrated": record.calibrated}
     return {
         stage: float(np.sqrt(np.mean(np.asarray(evaluate(specification.arm, capture).error) ** 2)))
         for stage, specification in arms.items()
-    }
-
-
-def _summary(record: CalibrationRecord, whole: dict[str, Any], checks: dict[str, float]) -> dict[str, Any]:
-    length = record.recording.capture.lengths[0]
-    return {
-        "kind": "demo",
-        "poses": record.recording.capture.sizes[0],
-        "more_poses": record.recording.capture.sizes[1],
-        "deviation_mm": _DEVIATION_MM,
-        "deviation_deg": _DEVIATION_DEG,
-        "encoder_arcsec": float(_NOISE.encoder_arcsec),
-        "seating_um": 1e3 * float(_NOISE.seating),
-        "length_mm": float(length.value),
-        "length_u_um": 1e3 * _LENGTH_U_MM,
-        "checks": _CHECKS,
-        "check_length_mm": _CHECK_MM,
-        "scale_k": record.k,
-        "scale_u": record.u_k,
-        **{
-            stage: whole[stage] | whole["truth"][stage] | {"check_rms_mm": checks[stage]}
-            for stage in ("nominal", "stage1", "calibrated")
-        },
     }

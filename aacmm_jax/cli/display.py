@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from ..summaries.tables import STYLES, Cell, Line, Styled, Table
+from ..summaries.tables import STYLES, Line, Styled, Table
 
 _DEFAULT = 110  # columns of what is not a terminal, where COLUMNS does not say
 _LEAST = 20  # columns: fewer than these cannot be meant
@@ -42,47 +42,33 @@ def print_table(console: Console, table: Table) -> None:
     Cells wrap between words where the console is narrow. Where even that is not enough, the columns are printed in
     several blocks, each of which begins with the first ``keys`` columns.
     """
-    cells = table.cells
-    rows = [[Text(heading) for heading in table.headings], *([_text(cell) for cell in row] for row in cells)]
-    columns = list(zip(*rows, strict=True))
-    numeric = [any(row[i].value is not None for row in cells) for i in range(len(columns))]
-    texts = [[cell.plain for cell in column] for column in columns]
-    natural = [max(cell_len(line) for cell in cells for line in cell.split("\n")) for cells in texts]
-    words = [max((cell_len(word) for cell in cells for word in cell.split()), default=0) for cells in texts]
+    cells, columns = table.cells, range(len(table.headings))
+    rows = [[Text(cell.text.translate(_PLAIN).strip(), STYLES.get(cell.mark, "")) for cell in row] for row in cells]
+    texts = [[table.headings[i], *(row[i].plain for row in rows)] for i in columns]
+    natural = [max(cell_len(line) for text in column for line in text.split("\n")) for column in texts]
+    words = [max((cell_len(word) for text in column for word in text.split()), default=0) for column in texts]
     least = [min(word, _LONGEST_WORD) for word in words]
-    for number, block in enumerate(_blocks(least, console.width, table.keys)):
-        widths = _fitted([natural[i] for i in block], [least[i] for i in block], console.width)
-        title = Text(f"\n{table.title}") if table.title and number == 0 else None
+    blocks = [list(range(table.keys))]
+    for i in columns[table.keys :]:
+        width = sum(least[j] + _GAP for j in (*blocks[-1], i)) - _GAP
+        if width > console.width and len(blocks[-1]) > table.keys:
+            blocks.append(list(range(table.keys)))
+        blocks[-1].append(i)
+    for block in blocks:
+        widths = {i: natural[i] for i in block}
+        # The widest column that can be narrower gives way until all fit.
+        while sum(widths.values()) + _GAP * (len(widths) - 1) > console.width:
+            wider = [i for i in block if widths[i] > least[i]]
+            if not wider:
+                break
+            widths[max(wider, key=lambda i: widths[i])] -= 1
+        title = Text(f"\n{table.title}") if table.title and block is blocks[0] else None
         part = RichTable(title=title, title_justify="left", title_style="bold", box=None)
         part.pad_edge, part.padding = False, (0, _GAP, 0, 0)
-        for i, width in zip(block, widths, strict=True):
-            part.add_column(columns[i][0], justify="right" if numeric[i] else "left", width=width, overflow="fold")
-        for row in rows[1:]:
+        for i in block:
+            numeric = any(row[i].value is not None for row in cells)
+            justify = "right" if numeric else "left"
+            part.add_column(Text(table.headings[i]), justify=justify, width=widths[i], overflow="fold")
+        for row in rows:
             part.add_row(*(row[i] for i in block))
         console.print(part, no_wrap=False)
-
-
-def _text(cell: Cell) -> Text:
-    return Text(cell.text.translate(_PLAIN).strip(), STYLES.get(cell.mark, ""))
-
-
-def _blocks(least: list[int], available: int, keys: int) -> list[list[int]]:
-    """Columns that fit side by side; the first ones are in every block."""
-    blocks, current = [], list(range(keys))
-    for i in range(keys, len(least)):
-        if len(current) > keys and sum(least[j] + _GAP for j in (*current, i)) - _GAP > available:
-            blocks.append(current)
-            current = list(range(keys))
-        current.append(i)
-    return [*blocks, current]
-
-
-def _fitted(natural: list[int], least: list[int], available: int) -> list[int]:
-    """Widths of columns: the natural ones, the widest reduced until all fit."""
-    widths = list(natural)
-    while sum(widths) + _GAP * (len(widths) - 1) > available:
-        wider = [i for i in range(len(widths)) if widths[i] > least[i]]
-        if not wider:
-            break
-        widths[max(wider, key=lambda i: widths[i])] -= 1
-    return widths

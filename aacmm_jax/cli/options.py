@@ -3,13 +3,14 @@
 import csv
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
 
 from ..core.errors import InputError
+from ..core.jax_setup import LARGEST_INTEGER
 from ..core.text import is_control, number, quoted
-from ..core.x64 import LARGEST_INTEGER
 
 
 def argument(metavar: str, help: str, default: Any = ...) -> Any:
@@ -18,8 +19,7 @@ def argument(metavar: str, help: str, default: Any = ...) -> Any:
 
 
 def option(metavar: str | None, help: str, *names: str, default: Any = None, **limits: Any) -> Any:
-    """An option of a command: the word for its value (None: its choices), what it does, and its names if they are not
-    the parameter's."""
+    """An option: the word for its value (None: its choices), what it does, and its names if not the parameter's."""
     return typer.Option(default, *names, metavar=metavar, help=help, **limits)
 
 
@@ -42,10 +42,11 @@ def seed(of: str) -> Any:
 JSON = flag("--json", "Print one JSON object on standard output, and nothing else.")
 ONLY = option("PATTERN", "Use only the sockets that match this shell pattern; repeatable.")
 WITHOUT = option("PATTERN", "Leave out the sockets that match this shell pattern; repeatable.")
-CAPTURE_OUTPUT = output("FILE.h5", "Capture to write (HDF5).")
+CALIBRATION_FILE = argument("CALIBRATION.h5", "Calibration, written by calibrate.")
 NOMINAL_ARM = argument(
     "ARM", "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm."
 )
+ABOUT = option("FILE.toml", "Administrative data of a certificate: laboratory, customer, item, persons, dates.")
 BASE_LINK = option("LINK", "Link of a URDF that does not move. Default: its root.", "--base")
 TIP_LINK = option("LINK", "Link at the end of a URDF. Default: the only one with no link after it.", "--tip")
 _ENCODER = "the standard deviation of a joint reading"
@@ -65,37 +66,19 @@ REFERENCE_LENGTHS = option(
     "Reference length between two sockets, u in mm; repeatable. Quote a name with a comma: '\"a, b\",C'.",
     "--length",
 )
-CALIBRATION_FILE = argument("CALIBRATION.h5", "Calibration, written by calibrate.")
 
 
-def numbers_option(name: str, text: str, form: str, count: int | None = None) -> tuple[float, ...]:
-    """Finite numbers that an option lists, separated by commas."""
-    try:
-        values = tuple(number(part.strip()) for part in text.split(","))
-    except ValueError:
-        bad_option(name, text, form)
-    if count not in (None, len(values)):
-        bad_option(name, text, form)
-    if not all(map(math.isfinite, values)):
-        raise InputError(f"{name} '{text}' holds a value that is not finite; give finite numbers.")
-    return values
+def bad_option(option: str, text: str, form: str) -> NoReturn:
+    """Refuse the value of an option."""
+    raise InputError(f"{option} '{text}' is not of the form {form}.")
 
 
-def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
-    """Sockets from ``NAME=X,Y,Z``, mm."""
-    points: dict[str, tuple[float, ...]] = {}
-    for text in texts or ():
-        name, _, point = text.rpartition("=")
-        try:
-            x, y, z = (number(part.strip()) for part in point.split(","))
-        except ValueError:
-            bad_option("--socket", text, "NAME=X,Y,Z in mm, for example A=400,200,300")
-        if any(is_control(character) for character in name):
-            raise InputError(f"--socket {quoted(text)} has a control character in its name; leave it out.")
-        if name in points:
-            raise InputError(f"socket '{name}' is given twice in --socket; give each its own name.")
-        points[name] = (x, y, z)
-    return points
+def check_figure(path: Path | None) -> None:
+    """Refuse a figure that cannot be drawn, before any work."""
+    if path is not None:
+        from ..plot.figures import check_format
+
+        check_format(path)
 
 
 def names_option(text: str) -> tuple[str, ...]:
@@ -103,18 +86,63 @@ def names_option(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
+def numbers_option(name: str, text: str, form: str, count: int | None = None) -> tuple[float, ...]:
+    """Finite numbers that an option lists, separated by commas."""
+    values = _numbers(name, text, text, form)
+    if count not in (None, len(values)):
+        bad_option(name, text, form)
+    if not all(map(math.isfinite, values)):
+        raise InputError(f"{name} '{text}' holds a value that is not finite; give finite numbers.")
+    return values
+
+
+def _numbers(option: str, text: str, values: str, form: str) -> tuple[float, ...]:
+    """The numbers in a part (``values``) of what is given for an option."""
+    try:
+        return tuple(number(part.strip()) for part in values.split(","))
+    except ValueError:
+        bad_option(option, text, form)
+
+
+def numbers_by_socket(
+    option: str, texts: Sequence[str] | None, count: int, form: str
+) -> dict[str | None, tuple[float, ...]]:
+    """So many numbers by the name of a socket, None for all: ``NAME=1,2,3`` or ``1,2,3``."""
+    by_name: dict[str | None, tuple[float, ...]] = {}
+    for text in texts or ():
+        name, equals, values = text.rpartition("=")
+        key = name if equals else None
+        numbers = _numbers(option, text, values, form)
+        if len(numbers) != count:
+            bad_option(option, text, form)
+        if key in by_name:
+            raise InputError(f"{option} is given twice for {'all sockets' if key is None else repr(key)}; give one.")
+        by_name[key] = numbers
+    return by_name
+
+
+def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
+    """Sockets from ``NAME=X,Y,Z``, mm."""
+    points: dict[str, tuple[float, ...]] = {}
+    for text in texts or ():
+        name, _, point = text.rpartition("=")
+        form = "NAME=X,Y,Z in mm, for example A=400,200,300"
+        coordinates = _numbers("--socket", text, point, form)
+        if len(coordinates) != 3:
+            bad_option("--socket", text, form)
+        if any(is_control(character) for character in name):
+            raise InputError(f"--socket {quoted(text)} has a control character in its name; leave it out.")
+        if name in points:
+            raise InputError(f"socket '{name}' is given twice in --socket; give each its own name.")
+        points[name] = coordinates
+    return points
+
+
 def length_option(text: str) -> tuple:
     """A reference length from ``A,B`` or ``A,B,U``, mm; a name with a comma in it is put in double quotes."""
+    form = "A,B or A,B,U with u in mm"
     start, end, *rest = [*next(csv.reader([text]), []), "", ""]
-    u = rest[:-2]
-    try:
-        if not start or not end or len(u) > 1:
-            raise ValueError
-        return (start, end, *(number(part.strip()) for part in u))
-    except ValueError:
-        bad_option("--length", text, "A,B or A,B,U with u in mm")
-
-
-def bad_option(option: str, text: str, form: str) -> NoReturn:
-    """Refuse the value of an option."""
-    raise InputError(f"{option} '{text}' is not of the form {form}.")
+    u = _numbers("--length", text, ",".join(rest[:-2]), form) if rest[:-2] else ()
+    if not start or not end or len(u) > 1:
+        bad_option("--length", text, form)
+    return (start, end, *u)

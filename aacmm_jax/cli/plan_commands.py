@@ -1,23 +1,37 @@
 """The command ``plan``."""
 
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import typer
 
+from .. import acceptance as acceptance_tests
+from .. import data, files, kinematics, planning, summaries
 from ..core.errors import InputError
-from ..core.text import number
+from ..core.text import listed, number
 from ..core.units import DEG
-from ..files.outputs import together
+from ..files.outputs import together, write_text
 from . import options
 from .app import app, examples, show_summary, with_spinner
-from .options import bad_option, flag, length_option, names_option, option, output, seed, sockets_option
-from .plan_assumptions import planned_arm
+from .options import (
+    bad_option,
+    flag,
+    length_option,
+    names_option,
+    numbers_by_socket,
+    option,
+    output,
+    seed,
+    sockets_option,
+)
 
 _CONTEXT: Any = typer.Context.__base__  # what Typer passes: its own class is a subclass that nothing is of
 _SOCKETS, _FARTHEST = 4, 0.95
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 # Options that each way of planning takes besides those of all: of a calibration with sockets, of one with a kit, and
 # of an acceptance test.
@@ -149,134 +163,135 @@ def plan(
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
-    from ..files.kits import read_kit
     from ..files.plans import plan_csv, plan_manifest
-    from ..planning.design import plan as run
-    from ..planning.kit import plan_kit
-    from ..summaries.planning import kit_plan_summary, plan_summary, procedure_summary
-    from . import evaluation_views, plan_views
 
-    links = {"base": base, "tip": tip}
+    given = dict(locals())  # all options by name
+    words, links = summaries.planning, {"base": base, "tip": tip}
     with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
-        specification = _specification(arm, links, held, model)
-    _check_options(context, kit is not None, acceptance is not None)
-    files = _Files(output, manifest, arm, specification.urdf, angles)
-    if acceptance is not None:
-        from ..acceptance.procedure import plan_procedure
+        specification = files.load_specification(arm, base=base, tip=tip)
+        if held is not None:
+            fixed = names_option(held)
+            others = tuple(name for name in specification.free if name not in fixed)
+            specification = specification._replace(held=fixed, free=others)
+        if model is not None:
+            from ..files.joint_options import with_model
 
-        planned = with_spinner("Planning", lambda: plan_procedure(
+            specification = with_model(specification, model)
+    _check_options(context, kit is not None, acceptance is not None)
+    planned: Any
+    if acceptance is not None:
+        planned = with_spinner("Planning", lambda: acceptance_tests.plan_procedure(
             specification.arm, acceptance, above=above_mm, margin=margin_deg * DEG, diameter=sphere_mm,
             stylus=stylus_mm, seed=seed, bars=bar_mm or None, measuring_range=range_mm,
         ))  # fmt: skip
-        summary = procedure_summary(planned, specification.name)
-        summary["written"] = files.write(planned, plan_csv, plan_manifest)
-        show_summary(summary, as_json, evaluation_views.procedure)
-        return
-    points = _given_sockets(socket, sockets, length, region)
-    names = list(points) or [chr(ord("A") + i) for i in range(min(sockets or _SOCKETS, 26))]
+        summarise, view, stated = words.procedure_summary, words.procedure, {}
+    else:
+        planned, stated = _planned(specification, given, links)
+        summarise, view = (words.plan_summary, words.plan) if kit is None else (words.kit_plan_summary, words.kit_plan)
     with together(output, manifest):
-        things = None if kit is None else read_kit(kit)
-        assumed = planned_arm(
-            arm, links, (encoder_arcsec, seating_mm, linear_encoder_mm), (cone_deg, normal), tool_axis, retract_mm,
-            (cell, collisions, link_radius_mm), names,
-        )  # fmt: skip
-    chosen = assumed.options._replace(
-        space=specification.space(),
-        criterion=criterion,
-        region=_region(region),
-        farthest=_FARTHEST if farthest is None else farthest,
-        margin=margin_deg * DEG,
-        above=above_mm,
-        unconstrained=unconstrained,
-        candidates=candidates,
-        check_length=check_length_mm,
-        seed=seed,
-    )
-    planned: Any
-    with plan_views.progress() as progress:
-        settings = {"poses": poses, **chosen._replace(progress=progress)._asdict()}
-        if things is not None:
-            planned, summarise = plan_kit(specification.arm, things, **settings), kit_plan_summary
-        else:
-            placed = {"sockets": points or sockets or _SOCKETS, "length": _range(length_mm), "u": u_mm}
-            placed |= {"lengths": [length_option(text) for text in length or ()], "cone": assumed.cone}
-            planned, summarise = run(specification.arm, **placed, **settings), plan_summary
-    stated = assumed.stated | {"angles": angles, "model": model}
-    summary = (
-        summarise(planned, specification.name) | stated | {"written": files.write(planned, plan_csv, plan_manifest)}
-    )
-    show_summary(summary, as_json, plan_views.plan if kit is None else plan_views.kit_plan)
-
-
-def _specification(arm: str, links: Mapping[str, Any], held: str | None, model: str | None) -> Any:
-    from ..files.arms import load_specification
-
-    specification = load_specification(arm, **links)
-    if held is not None:
-        fixed = names_option(held)
-        free = tuple(name for name in specification.free if name not in fixed)
-        specification = specification._replace(held=fixed, free=free)
-    if model is None:
-        return specification
-    from ..files.joint_options import with_model
-
-    return with_model(specification, model)
+        write_text(output, plan_csv(planned, angles))
+        if manifest is not None:
+            # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
+            urdf = specification.urdf if arm.lower().endswith(".urdf") else None
+            write_text(manifest, plan_manifest(planned, arm_for(manifest, arm), urdf, angles))
+    written = f"{output}" if manifest is None else f"{output}, {manifest}"
+    show_summary(summarise(planned, specification.name) | stated | {"written": written}, as_json, view)
 
 
 def _check_options(context: Any, kit: bool, acceptance: bool) -> None:
     """Refuse options that the way of planning would ignore."""
-    taken = _OF_ACCEPTANCE if acceptance else _OF_CALIBRATIONS | ({"kit"} if kit else _OF_SOCKETS)
-    sources = {name: context.get_parameter_source(name) for name in context.params if name not in _OF_ALL | taken}
+    taken = _OF_ALL | (_OF_ACCEPTANCE if acceptance else _OF_CALIBRATIONS | ({"kit"} if kit else _OF_SOCKETS))
+    sources = {name: context.get_parameter_source(name) for name in context.params if name not in taken}
     ignored = [
         f"--{name.replace('_', '-')}" for name, source in sources.items() if source and source.name == "COMMANDLINE"
     ]
     if not ignored:
         return
-    listed = " and ".join([", ".join(ignored[:-1]), ignored[-1]] if len(ignored) > 1 else ignored)
+    names = listed(ignored)
     if acceptance:
-        raise InputError(f"--acceptance has its own poses, sockets and bars and ignores {listed}; leave out {listed}.")
+        raise InputError(f"--acceptance has its own poses, sockets and bars and ignores {names}; leave out {names}.")
     if kit:
-        raise InputError(f"--kit names what is used and where it is, and ignores {listed}; leave out {listed}.")
-    raise InputError(f"{listed} {'is' if len(ignored) == 1 else 'are'} for acceptance tests; give --acceptance too.")
+        raise InputError(f"--kit names what is used and where it is, and ignores {names}; leave out {names}.")
+    raise InputError(f"{names} {'is' if len(ignored) == 1 else 'are'} for acceptance tests; give --acceptance too.")
 
 
-def _given_sockets(
-    socket: list[str] | None, sockets: int | None, length: list[str] | None, region: list[str] | None
-) -> dict[str, tuple[float, ...]]:
-    """The sockets whose positions are given, if any."""
-    if socket and sockets is not None:
+def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """The plan of a calibration as options say (``given``, by name), and what its summary states of its assumptions;
+    what is not given follows from the class of the arm."""
+    from ..data.noise import CLASSES
+
+    if given["socket"] and given["sockets"] is not None:
         raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
-    if length and not socket:
+    if given["length"] and not given["socket"]:
         raise InputError(
             "--length is between sockets of --socket; to have a reference length positioned, use --length-mm."
         )
-    if region and socket:
+    if given["region"] and given["socket"]:
         raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
-    return sockets_option(socket)
+    points, count = sockets_option(given["socket"]), given["sockets"] or _SOCKETS
+    names = list(points) or [chr(ord("A") + i) for i in range(min(count, 26))]
+    cell, radius, axis = given["cell"], given["link_radius_mm"], given["tool_axis"]
+    with together(given["output"], given["manifest"]):
+        things = None if given["kit"] is None else files.read_kit(given["kit"])
+        noise = assumed_noise(
+            given["arm"], links, given["encoder_arcsec"], given["seating_mm"], given["linear_encoder_mm"]
+        )
+        to_check = given["collisions"] or cell is not None or radius is not None
+        loaded = files.load_cell(given["arm"], cell, **links, radius=radius) if to_check else None
+        if axis.removeprefix("-") not in _AXES:
+            bad_option("--tool-axis", axis, "x, y, z, -x, -y or -z")
+        cones = _cones(given, CLASSES[noise.arm_class].cone, names)
+    usual = planning.PlanOptions.usual(noise)
+    sign = -1.0 if axis.startswith("-") else 1.0
+    chosen = usual._replace(
+        tool_axis=tuple(sign * x + 0.0 for x in _AXES[axis.removeprefix("-")]),
+        cell=None if loaded is None else loaded.cell,
+        retract=usual.retract if given["retract_mm"] is None else given["retract_mm"],
+        space=specification.space(),
+        region=_region(given["region"]),
+        farthest=_FARTHEST if given["farthest"] is None else given["farthest"],
+        margin=given["margin_deg"] * DEG,
+        above=given["above_mm"],
+        check_length=given["check_length_mm"],
+        **{name: given[name] for name in ("criterion", "unconstrained", "candidates", "seed")},
+    )
+    stated = {"noise_source": noise.source, "notes": [] if loaded is None else list(loaded.notes)}
+    stated |= {"angles": given["angles"], "model": given["model"]}
+    with _progress() as progress:
+        settings = {"poses": given["poses"], **chosen._replace(progress=progress)._asdict()}
+        if things is not None:
+            return planning.plan_kit(specification.arm, things, **settings), stated
+        placed = {"sockets": points or count, "length": _range(given["length_mm"]), "u": given["u_mm"]}
+        placed |= {"lengths": [length_option(text) for text in given["length"] or ()], "cone": cones}
+        return planning.plan(specification.arm, **placed, **settings), stated
 
 
-class _Files(NamedTuple):
-    """Where a plan and its manifest are written."""
+def assumed_noise(
+    arm: str, links: Mapping[str, Any], encoder: float | None, seating: float | None, linear: float | None = None
+) -> Any:
+    """The noise of an arm that has not been calibrated (`ArmNoise`): what options give, arcsec and mm, else what its
+    file states, else that of its class."""
+    assumed = files.load_noise(arm, **links)
+    stated = data.Noise(
+        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
+        seating=assumed.noise.seating if seating is None else seating,
+        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
+    )
+    return assumed._replace(noise=stated, source=assumed.source if encoder is None else "as given")
 
-    output: Path
-    manifest: Path | None
-    arm: str
-    urdf: Any  # of the arm
-    angles: Any
 
-    def write(self, planned: Any, poses: Callable, manifest_text: Callable) -> str:
-        """Write the poses and, where it is asked for, the manifest, which names the arm; returns what was written."""
-        from ..files.outputs import write_text
+def _cones(given: Mapping[str, Any], default: float, sockets: list[str]) -> Any:
+    """One cone for all sockets, or one for each where some are named."""
+    tilts = numbers_by_socket("--cone-deg", given["cone_deg"], 1, "DEG or NAME=DEG")
+    normals = numbers_by_socket("--normal", given["normal"], 3, "X,Y,Z or NAME=X,Y,Z")
 
-        # A manifest names the links with the arm; an arm file (TOML) names those of its URDF itself.
-        urdf = self.urdf if self.arm.lower().endswith(".urdf") else None
-        text = poses(planned, self.angles)
-        with together(self.output, self.manifest):
-            write_text(self.output, text)
-            if self.manifest is None:
-                return str(self.output)
-            write_text(self.manifest, manifest_text(planned, arm_for(self.manifest, self.arm), urdf, self.angles))
-            return f"{self.output}, {self.manifest}"
+    def cone(name: str | None) -> Any:
+        tilt, normal = tilts.get(name, tilts.get(None)), normals.get(name, normals.get(None, (0.0, 0.0, 1.0)))
+        x, y, z = normal
+        return kinematics.Cone(default if tilt is None else math.radians(tilt[0]), (x, y, z))
+
+    named = [name for name in (*tilts, *normals) if name is not None]
+    return {name: cone(name) for name in dict.fromkeys([*sockets, *sorted(named)])} if named else cone(None)
 
 
 def arm_for(manifest: Path, arm: str) -> str:
@@ -297,7 +312,7 @@ def _range(text: str) -> tuple[float, float]:
         bad_option("--length-mm", text, "L or L:M, in mm")
 
 
-def _region(texts: Sequence[str] | None) -> dict[str, tuple[float, float]] | None:
+def _region(texts: list[str] | None) -> dict[str, tuple[float, float]] | None:
     """Ranges of coordinates, from ``AXIS=LOW:HIGH``."""
     region: dict[str, tuple[float, float]] = {}
     for text in texts or ():
@@ -312,3 +327,24 @@ def _region(texts: Sequence[str] | None) -> dict[str, tuple[float, float]] | Non
         except ValueError:
             bad_option("--region", text, "AXIS=LOW:HIGH, in mm; for example z=0:800")
     return region or None
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, float], None]]:
+    """A bar on standard error, where that is a terminal; yields the callback that moves it."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda what, fraction: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(what: str, fraction: float) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=1.0)
+            bar.update(tasks[what], completed=fraction)
+
+        yield report

@@ -6,28 +6,26 @@ from typing import Any, Literal
 
 import typer
 
+from .. import acceptance as acceptance_tests
+from .. import files, summaries
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
 from ..files.sense import check_shown
-from . import options
+from . import calibration_views, evaluation_views, options
 from .app import app, examples, prepare_jax, show_summary, with_spinner
+from .arm_command import first_frame
 from .options import argument, option, output
 
 _ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
-ABOUT = option("FILE.toml", "Administrative data of a certificate: laboratory, customer, item, persons, dates.")
-# How each kind of file is read, its summary, and what people see of it: functions by module, imported when needed.
+# What reads each kind of file, what makes its summary, and what people see of it.
 _KINDS = {
-    "capture": ("captures.load_capture", "calibration.capture_summary", "calibration_views.capture"),
-    "calibration": (
-        "calibrations.load_calibration",
-        "calibration.calibration_summary",
-        "calibration_views.calibration",
-    ),
-    "evaluation": ("evaluations.load_evaluation", "evaluation.evaluation_summary", "evaluation_views.evaluation"),
-    "points": ("evaluations.load_evaluation", "evaluation.points_summary", "evaluation_views.points"),
+    "capture": ("load_capture", "calibration.capture_summary", calibration_views.capture),
+    "calibration": ("load_calibration", "calibration.calibration_summary", calibration_views.calibration),
+    "evaluation": ("load_evaluation", "evaluation.evaluation_summary", evaluation_views.evaluation),
+    "points": ("load_evaluation", "evaluation.points_summary", evaluation_views.points),
 }
 
 
@@ -84,74 +82,56 @@ def evaluate(
     Errors on data that the calibration has not used are printed next to those that its uncertainty predicts. A manifest
     of points is tested without a calibration.
     """
-    from ..acceptance.judgement import Influences, limit_of_text, read_expansions, read_limits
-    from ..acceptance.results import METRICS
-    from . import evaluation_views
+    from ..acceptance.judgement import limit_of_text, read_expansions, read_limits
 
     u_test, bodies = limit_of_text(test_u_mm, f"--test-u-mm {test_u_mm}"), read_expansions(expansion or [])
     of_test = {
-        "limits": read_limits(mpe or [], METRICS),
+        "limits": read_limits(mpe or [], acceptance_tests.METRICS),
         "u_test": u_test.fixed,
-        "influences": Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
+        "influences": acceptance_tests.Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
         "rule": rule,
     }
     maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
     maxima = {name: value for name, value in maxima.items() if value is not None}
-    if capture is None:
-        if maxima or only or without:
-            raise InputError(
-                "a manifest of points takes no --max-..., --only and --without; name a calibration and a capture for "
-                "these options."
-            )
-        summary = _evaluated_points(calibration, output, acceptance, range_mm, of_test)
-        show_summary(summary, as_json, evaluation_views.points)
-    else:
-        of_test |= {"maxima": maxima, "standards": acceptance}
-        summary = _evaluated(calibration, capture, output, (only, without), range_mm, of_test)
-        show_summary(summary, as_json, evaluation_views.evaluation)
-    undecided = [test for test in summary["acceptance"] if test["decision"] in ("fails", "undecided")]
-    if summary["failed"] or undecided:
+    if capture is None and (maxima or only or without):
+        raise InputError(
+            "a manifest of points takes no --max-..., --only and --without; name a calibration and a capture for "
+            "these options."
+        )
+    with together(output):
+        if capture is None:
+            summary = _evaluated_points(calibration, output, acceptance, range_mm, of_test)
+        else:
+            of_test |= {"maxima": maxima, "standards": acceptance}
+            paths, choice = (InputFile(calibration), InputFile(capture)), (only or None, without or ())
+            summary = _evaluated(paths, output, choice, range_mm, of_test)
+    summary |= {} if output is None else {"written": str(output)}
+    show_summary(summary, as_json, evaluation_views.points if capture is None else evaluation_views.evaluation)
+    if summary["failed"] or any(test["decision"] in ("fails", "undecided") for test in summary["acceptance"]):
         raise typer.Exit(1)
 
 
 def _evaluated(
-    calibration: Path,
-    capture: Path,
+    paths: tuple[InputFile, InputFile],
     output: Path | None,
     choice: tuple,
     measuring_range: float | None,
     of_test: dict[str, Any],
 ) -> dict[str, Any]:
-    """Evaluate a calibration on a capture; the summary."""
-    from ..acceptance.record import evaluation_of
+    """Evaluate a calibration on a part of a capture; the summary."""
     from ..diagnostics.findings import findings_of, sentences
-    from ..files.calibrations import load_calibration
-    from ..files.captures import load_capture
-    from ..files.evaluations import save_evaluation
-    from ..summaries.evaluation import evaluation_summary
 
-    with together(output):
-        read = InputFile(calibration), InputFile(capture)
-        record, recording = load_calibration(read[0]), load_capture(read[1])
-        recording = recording._replace(
-            capture=recording.capture.select(choice[0] or None, choice[1] or ()),
-            sources=(*map(fingerprint, read), *recording.sources),
-            measuring_range=measuring_range or recording.measuring_range,
-        )
-        stored = read_summary(read[0], ("calibration",))[1]
-        warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
-        evaluation = evaluation_of(record, recording, **of_test)._replace(calibration_warnings=tuple(warnings))
-        summary = with_spinner("Evaluating", lambda: evaluation_summary(evaluation))
-        if not summary["acceptance"]:
-            _refuse_options_of_tests(of_test, measuring_range)
-        if output is not None:
-            save_evaluation(output, evaluation, summary)
-            summary["written"] = str(output)
-    return summary
-
-
-def _refuse_options_of_tests(of_test: dict[str, Any], measuring_range: float | None) -> None:
-    """Raise `InputError` where options are given that only acceptance tests have, and none was made."""
+    record, recording = files.load_calibration(paths[0]), files.load_capture(paths[1])
+    recording = recording._replace(
+        capture=recording.capture.select(*choice),
+        sources=(*map(fingerprint, paths), *recording.sources),
+        measuring_range=measuring_range or recording.measuring_range,
+    )
+    stored = read_summary(paths[0], ("calibration",))[1]
+    warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
+    evaluation = acceptance_tests.evaluation_of(record, recording, **of_test)
+    evaluation = evaluation._replace(calibration_warnings=tuple(warnings))
+    summary = with_spinner("Evaluating", lambda: summaries.evaluation.evaluation_summary(evaluation))
     influences = of_test["influences"]
     given = {
         "--rule": of_test["rule"] is not None,
@@ -159,11 +139,14 @@ def _refuse_options_of_tests(of_test: dict[str, Any], measuring_range: float | N
         "--expansion": influences.artefact is not None or influences.arm is not None,
         "--range-mm": measuring_range is not None,
     }
-    if any(given.values()):
+    if not summary["acceptance"] and any(given.values()):
         raise InputError(
             f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only; this "
             "capture supports none, or none was requested: name them with --acceptance, or leave the option out."
         )
+    if output is not None:
+        files.save_evaluation(output, evaluation, summary)
+    return summary
 
 
 def _evaluated_points(
@@ -174,25 +157,19 @@ def _evaluated_points(
     of_test: dict[str, Any],
 ) -> dict[str, Any]:
     """Run the acceptance tests of a manifest of points; the summary."""
-    from ..acceptance.record import PointsRecord
     from ..acceptance.standards import STANDARDS, checked_standards
-    from ..files.evaluations import save_evaluation
-    from ..files.manifest import read_points
-    from ..summaries.evaluation import points_summary
 
     if manifest.suffix != ".toml":
         raise InputError(
             f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
         )
-    with together(output):
-        chosen = checked_standards(STANDARDS if standards is None else standards)
-        measured = read_points(manifest)
-        measured = measured._replace(measuring_range=measuring_range or measured.measuring_range)
-        record = PointsRecord(measured, standards=chosen, **of_test)
-        summary = points_summary(record)
-        if output is not None:
-            save_evaluation(output, record, summary)
-            summary["written"] = str(output)
+    chosen = checked_standards(STANDARDS if standards is None else standards)
+    measured = files.read_points(manifest)
+    measured = measured._replace(measuring_range=measuring_range or measured.measuring_range)
+    record = acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
+    summary = summaries.evaluation.points_summary(record)
+    if output is not None:
+        files.save_evaluation(output, record, summary)
     return summary
 
 
@@ -200,19 +177,17 @@ def _evaluated_points(
 def report(
     file: Path = argument("FILE.h5", "File to report: a calibration, evaluation, study or model comparison."),
     output: Path = output("FILE.html", "Report to write: one HTML file that needs no network connection."),
-    about: Path | None = ABOUT,
+    about: Path | None = options.ABOUT,
     as_json: bool = options.JSON,
 ) -> None:
     """Write a report of a result as one HTML file.
 
     It holds warnings, results, uncertainties, charts and tables, and can be printed.
     """
-    from ..files.administrative_data import read_administrative_data
     from ..report import write_report
-    from . import evaluation_views
 
     with together(output):
-        stated = None if about is None else read_administrative_data(about)
+        stated = None if about is None else files.read_administrative_data(about)
         summary = with_spinner("Writing the report", lambda: write_report(file, output, stated))
     show_summary(summary, as_json, evaluation_views.report)
 
@@ -233,7 +208,12 @@ def show(
     """Print the content of a file."""
     path = Path(file)
     if path.suffix in _ARM_SUFFIXES and not (os.path.isfile(path) and path.suffix == ""):
-        _show_arm(file, base, tip, as_json)
+        prepare_jax()
+        specification = files.load_specification(file, base=base, tip=tip)
+        summary = summaries.calibration.arm_summary(specification)
+        if specification.urdf is not None:
+            summary["urdf"]["first_frame_in_base_mm"] = first_frame(specification).tolist()
+        show_summary(summary, as_json, calibration_views.arm)
         return
     if base is not None or tip is not None:
         raise InputError(f"--base and --tip are links of a URDF, and {file} is none; leave them out.")
@@ -248,41 +228,15 @@ def show(
     if cell is not None or figures is not None:
         raise InputError(f"{file} holds a {kind}; --cell and --figures are for studies.")
     if kind == "model comparison":  # whose tables hold all of it
-        from ..files.compared_models import load_compared_models
-        from .calibration_commands import compared_models
-
         prepare_jax()
-        show_summary(dict(load_compared_models(path)), as_json, compared_models)
+        summary, view = dict(files.load_compared_models(path)), summaries.compared_models.compared_models
+        show_summary(summary, as_json, view)
         return
-    if kind == "evaluation" and attributes.get("of") == "points":
-        kind = "points"
-    load, summarise, view = _KINDS[kind]
+    load, summarise, view = _KINDS["points" if attributes.get("of") == "points" else kind]
     if summary is None:  # of a file that was written through Python, or by another version
         prepare_jax()
-        summary = _imported("summaries", summarise)(_imported("files", load)(path))
+        module, _, function = summarise.partition(".")
+        summary = getattr(getattr(summaries, module), function)(getattr(files, load)(path))
     else:
-        check_shown(path, attributes["kind"], summary)
-    show_summary(summary, as_json, _imported("cli", view))
-
-
-def _imported(folder: str, name: str) -> Any:
-    """A function of a module that is imported only now."""
-    from importlib import import_module
-
-    module, _, function = name.partition(".")
-    return getattr(import_module(f"...{folder}.{module}", __name__), function)
-
-
-def _show_arm(file: str, base: str | None, tip: str | None, as_json: bool) -> None:
-    from ..files.arms import load_specification
-    from ..summaries.calibration import arm_summary
-    from . import calibration_views
-
-    prepare_jax()
-    specification = load_specification(file, base=base, tip=tip)
-    summary = arm_summary(specification)
-    if specification.urdf is not None:
-        from ..files.urdf import urdf_chain
-
-        summary["urdf"]["first_frame_in_base_mm"] = urdf_chain(specification.urdf).base.tolist()
-    show_summary(summary, as_json, calibration_views.arm)
+        check_shown(path, kind, summary)
+    show_summary(summary, as_json, view)

@@ -10,12 +10,12 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+from .. import plot
 from ..core.errors import InputError
 from ..files.outputs import together
-from ..summaries.tables import Styled
+from ..summaries.tables import Styled, View
 from . import INTERRUPTED, INTERRUPTED_SENTENCE, options
 from .app import Stopped, app, examples, show_summary, with_spinner
-from .calibration_views import View
 from .options import argument, flag, option, output
 
 
@@ -50,29 +50,40 @@ def study(
 
     The same command continues a study that was interrupted.
     """
+    from ..study.definition import Study
+    from ..study.runner import dask_executor, run_study
+    from ..study.sources import read_study
     from ..study.store import read
 
     if resume and not os.path.exists(output):  # where `Path.exists` raises, of a name too long to be one
         raise InputError(
             f"{output} does not exist, so there is nothing to resume; leave --resume out to start a study."
         )
+    changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
     if specification is None:
         if not resume:
             raise InputError("name a specification, or use --resume to continue the study in the output file.")
-        if trials is not None or seed is not None:
+        if changes:
             raise InputError("--trials and --seed stay those of the study; leave them out with --resume.")
         asked = read(output).study
     else:
         with together(output):  # refuses an output that the specification reads
-            asked = _asked(specification, trials, seed)
+            asked = read_study(specification)
+            if changes:
+                from ..files.toml import validated
+
+                stated = asked.specification.model_dump(exclude_unset=True) | changes
+                changed = validated(type(asked.specification), stated, specification)
+                asked = Study(changed, asked.nominal, asked.recording)
     if shards and dask is None:
         raise InputError("--shards is for the workers of --dask; leave it out, or name a cluster.")
     if workers is not None and dask is not None:
         raise InputError("a running Dask cluster has its own workers; leave --workers out.")
-
-    settings = {"chunk": chunk, "shards": shards}
     with _leaving_threads():
-        outcome = _run(asked, output, dask, workers, settings)
+        here = nullcontext((None, workers))
+        with _progress_display() as show, here if dask is None else dask_executor(dask) as (executor, count):
+            settings = {"executor": executor, "workers": count, "watch": show}
+            outcome = run_study(asked, output, chunk=chunk, shards=shards, **settings)
         summary = {
             "kind": "study",
             "written": str(output),
@@ -87,32 +98,6 @@ def study(
                 f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. "
                 f"Continue with: aacmm study --resume -o {shlex.quote(str(output))}"
             )
-
-
-def _asked(specification: str, trials: int | None, seed: int | None) -> Any:
-    from ..files.toml import validated
-    from ..study.definition import Study
-    from ..study.sources import read_study
-
-    asked = read_study(specification)
-    changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
-    if not changes:
-        return asked
-    changed = validated(
-        type(asked.specification), asked.specification.model_dump(exclude_unset=True) | changes, specification
-    )
-    return Study(changed, asked.nominal, asked.recording)
-
-
-def _run(asked: Any, output: Path, dask: str | None, workers: int | None, settings: dict[str, Any]) -> Any:
-    from ..study.runner import dask_executor, run_study
-
-    here = nullcontext((None, workers))
-    with (
-        _progress_display() as show,
-        here if dask is None else dask_executor(dask) as (executor, count),
-    ):
-        return run_study(asked, output, executor=executor, workers=count, watch=show, **settings)
 
 
 @contextmanager
@@ -178,7 +163,6 @@ def _ended(summary: dict[str, Any]) -> list[str]:
 
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
     """Print a study's results, and draw its figures."""
-    from ..plot import save_study_figures
     from ..study.results import study_summary
     from ..study.store import Results
 
@@ -188,7 +172,7 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
     summary = with_spinner("Reading", lambda: study_summary(results, cell))
     if figures is not None:
         with together():
-            paths = with_spinner("Drawing", lambda: save_study_figures(results, figures))
+            paths = with_spinner("Drawing", lambda: plot.save_study_figures(results, figures))
         summary["figures_written"] = [str(path) for path in paths]
     show_summary(summary, as_json, study_view)
 

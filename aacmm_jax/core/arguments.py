@@ -43,7 +43,7 @@ import dataclasses
 import inspect
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import cache, wraps
+from functools import partial, wraps
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, overload
 
@@ -58,8 +58,8 @@ from .text import pluralise
 
 Function = TypeVar("Function", bound=Callable)
 Sizes = dict[str, int]  # of dimensions, by name
-# Takes a value, its name for messages, and sizes; returns the value as it is used, or raises `InputError`.
-Check = Callable[..., Any]
+# Takes a value and its name for messages; returns the value as it is used, or raises `InputError`. Rules are such.
+Check = Callable[[Any, str], Any]
 
 
 class Range(NamedTuple):
@@ -72,20 +72,18 @@ class Range(NamedTuple):
     unit: str = ""
     infinite: bool = False  # whether infinite numbers pass as well
 
-    def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
+    def __call__(self, value: Any, what: str) -> Any:
         """The value, or `InputError`."""
         if is_concrete(value):
             x = np.asarray(value, dtype=float)
             inside = (self.least <= x) & (x <= self.most) & (self.above < x) & (self.infinite | (x < self.below))
             inside &= np.isfinite(x) | (self.infinite & ~np.isnan(x))
-            _check_each(x, inside, what, f"it must be {self._in_words()}", f" {self.unit}" if self.unit else "")
+            limits = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
+            words = [f"{word} {limit:g}" for word, limit in limits.items() if math.isfinite(limit)]
+            usual = {"at least 0": "zero or positive", "above 0": "positive"}
+            wanted = " and ".join(usual.get(word, word) for word in words) or "finite"
+            _check_each(x, inside, what, f"it must be {wanted}", f" {self.unit}" if self.unit else "")
         return value
-
-    def _in_words(self) -> str:
-        limits = {"at least": self.least, "above": self.above, "at most": self.most, "below": self.below}
-        words = [f"{word} {limit:g}" for word, limit in limits.items() if math.isfinite(limit)]
-        usual = {"at least 0": "zero or positive", "above 0": "positive"}
-        return " and ".join(usual.get(word, word) for word in words) or "finite"
 
 
 class OneOf(NamedTuple):
@@ -93,7 +91,7 @@ class OneOf(NamedTuple):
 
     names: Collection[Any]
 
-    def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
+    def __call__(self, value: Any, what: str) -> Any:
         """The value, or `InputError`."""
         # Only of what compares as a whole: NumPy's arrays compare number by number.
         if not (isinstance(value, str | int | float) and value in self.names):
@@ -104,7 +102,7 @@ class OneOf(NamedTuple):
 def _passing(test: Callable[[Any], bool], wanted: str) -> Check:
     """The check that a value passes a test; ``wanted`` says what would."""
 
-    def check(value: Any, what: str, sizes: Any = None) -> Any:
+    def check(value: Any, what: str) -> Any:
         if not test(value):
             raise InputError(f"{what} is {shown(value)}; give {wanted}.")
         return value
@@ -120,20 +118,23 @@ def _is_number(value: Any) -> bool:
     return number and not (is_concrete(value) and math.isnan(float(value)))
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_)
-
-
 def _is_line(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip()) and value.splitlines() == [value]
 
 
-# A name for each, so that a value can also be checked by hand: ``whole_number(value, "what it is")``.
-truth_value = _passing(lambda value: isinstance(value, bool | np.bool_), "True or False")
-whole_number = _passing(_is_whole, "a whole number")
+# Those with a public name also check a value by hand: ``whole_number(value, "what it is")``.
+whole_number = _passing(
+    lambda value: isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_), "a whole number"
+)
 real_number = _passing(_is_number, "a number")  # not NaN; traced values pass
-text = _passing(lambda value: isinstance(value, str), "text")
-_SCALARS = {bool: truth_value, int: whole_number, float: real_number, str: text}
+_SCALARS = {
+    bool: _passing(lambda value: isinstance(value, bool | np.bool_), "True or False"),
+    int: whole_number,
+    float: real_number,
+    str: _passing(lambda value: isinstance(value, str), "text"),
+}
+_LISTS = (Sequence, Iterable, Collection, list, tuple)
+_PACKAGE = __name__.partition(".")[0]
 
 ONE_LINE = _passing(_is_line, "text of one line")  # a rule, and so are these
 NOT_EMPTY = _passing(lambda value: 0 not in np.shape(value), "at least one")
@@ -157,16 +158,14 @@ def checked_arguments(function: Any = None, *, where: str = "") -> Any:
     if function is None:
         return lambda function: checked_arguments(function, where=where)  # pyright: ignore[reportCallIssue]
     signature = inspect.signature(function)
-    checks = {name: _check_of(parameter.annotation) for name, parameter in signature.parameters.items()}
+    annotations = {name: parameter.annotation for name, parameter in signature.parameters.items()}
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         bound, sizes = signature.bind(*args, **kwargs), {}
         ending = f" of {' '.join(where.format_map(bound.arguments).split())}" if where else ""
         for name, value in bound.arguments.items():
-            check = checks[name]
-            if check is not None:
-                bound.arguments[name] = check(value, f"{name}{ending}", sizes)
+            bound.arguments[name] = checked(value, annotations[name], f"{name}{ending}", sizes)
         return function(*bound.args, **bound.kwargs)
 
     return call
@@ -188,170 +187,121 @@ def with_options(options: type[tuple]) -> Callable[[Function], Function]:
     return decorate
 
 
-def checked(value: Any, annotation: Any, what: str, sizes: Sizes | None = None) -> Any:
-    """A value as an annotation says (see above), or `InputError` that calls it ``what``.
-
-    ``sizes`` holds the sizes of dimensions by name; those that this value determines are added.
-    """
-    try:
-        check = _known_check(annotation)
-    except TypeError:  # names in a dictionary, say, cannot be looked up
-        check = _check_of(annotation)
-    return value if check is None else check(value, what, {} if sizes is None else sizes)
-
-
 def checked_fields(thing: Any, where: str = "") -> Any:
     """A NamedTuple or dataclass with each field as its annotation says, or `InputError`.
 
     A dataclass (`equinox.Module`: in ``__check_init__``) is changed itself. ``where`` says what a field is of.
     """
     sizes: Sizes = {}
-    for name, check in _field_checks(type(thing)).items():
-        value = getattr(thing, name)
-        result = check(value, f"{name} of {where}" if where else name, sizes)
-        if result is not value and isinstance(thing, tuple):
-            thing = thing._replace(**{name: result})  # pyright: ignore[reportAttributeAccessIssue]
-        elif result is not value:
-            object.__setattr__(thing, name, result)
+    annotations = type(thing).__annotations__
+    if dataclasses.is_dataclass(thing):
+        annotations = {field.name: field.type for field in dataclasses.fields(thing)}
+    for name, annotation in annotations.items():
+        value = checked(getattr(thing, name), annotation, f"{name} of {where}" if where else name, sizes)
+        if isinstance(thing, tuple):
+            thing = thing._replace(**{name: value})  # pyright: ignore[reportAttributeAccessIssue]
+        else:
+            object.__setattr__(thing, name, value)
     return thing
 
 
-@cache
-def _field_checks(kind: type) -> dict[str, Check]:
-    if dataclasses.is_dataclass(kind):
-        annotations = {field.name: field.type for field in dataclasses.fields(kind)}
-    else:
-        annotations = kind.__annotations__
-    checks = {name: _check_of(annotation) for name, annotation in annotations.items()}
-    return {name: check for name, check in checks.items() if check is not None}
+def checked(value: Any, annotation: Any, what: str, sizes: Sizes | None = None, finite: bool = True) -> Any:
+    """A value as an annotation says (see above), or `InputError` that calls it ``what``.
 
-
-def _check_of(annotation: Any) -> Check | None:
-    """The check that an annotation states, None where it states none."""
+    ``sizes`` holds the sizes of dimensions by name; those that this value determines are added. ``finite`` says whether
+    arrays must be.
+    """
+    sizes = {} if sizes is None else sizes
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        return _with_rules(_check_of(arguments[0]), [rule for rule in arguments[1:] if callable(rule)])
-    if origin is Literal:
-        return OneOf(arguments)
-    if origin in (Union, UnionType):
-        return _of_alternatives(arguments)
-    if origin in (Sequence, Iterable, Collection, list) or (origin is tuple and arguments[1:] == (...,)):
-        return _of_items(_check_of(arguments[0]))
-    if origin in (Mapping, dict):
-        return _of_values(_check_of(arguments[1]))
-    if _is_array(annotation) or _is_class(annotation):
-        return _of_alternatives((annotation,))
-    return _SCALARS.get(annotation) if isinstance(annotation, type) else None
-
-
-_known_check = cache(_check_of)  # of a value that is checked again and again: 0.1 ms each
-
-
-def _is_array(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, AbstractArray)
-
-
-def _is_class(annotation: Any) -> bool:
-    """Whether it is a class of this package."""
-    return isinstance(annotation, type) and annotation.__module__.partition(".")[0] == __name__.partition(".")[0]
-
-
-def _with_rules(check: Check | None, rules: list[Check]) -> Check:
-    if isinstance(check, _ArrayCheck) and ANY_NUMBER in rules:
-        check = check._replace(finite=False)
-
-    def call(value: Any, what: str, sizes: Sizes) -> Any:
-        for step in rules if check is None else (check, *rules):
-            value = step(value, what, sizes)
-        return value
-
-    return call
-
-
-def _of_alternatives(annotations: Sequence[Any]) -> Check | None:
-    """What passes one of several annotations; arrays of several shapes count as one, and so do several classes."""
-    arrays, classes = [x for x in annotations if _is_array(x)], tuple(x for x in annotations if _is_class(x))
-    checks: list[Any] = [
-        _check_of(x)
-        for x in annotations
-        if x not in (*arrays, *classes, NoneType, np.generic)  # part of `AnyArray`
-    ]
-    if arrays:
-        shapes = tuple(dict.fromkeys(array.dim_str for array in arrays))
-        libraries = {np if array.array_type is np.ndarray else jnp for array in arrays}
-        checks.append(_ArrayCheck(shapes, libraries.pop() if len(libraries) == 1 else None))
-    if classes:
-        wanted = " or ".join(_with_article(kind.__name__) for kind in classes)
-        checks.append(_passing(lambda value: isinstance(value, classes), wanted))
-
-    def call(value: Any, what: str, sizes: Sizes) -> Any:
-        if value is None and NoneType in annotations:
-            return None
-        sentences = []
-        for check in checks:
-            try:
-                return check(value, what, sizes)
-            except InputError as error:
-                sentences.append(str(error))
-        others = [f", or {sentence.rpartition('; ')[2].removeprefix('give ')}" for sentence in sentences[1:]]
-        raise InputError("".join([text.removesuffix(".") for text in (sentences[0], *others)]) + ".")
-
-    if None in checks:
-        return None
-    return checks[0] if len(checks) == 1 and NoneType not in annotations else call
-
-
-def _of_items(check: Check | None) -> Check:
-    def call(value: Any, what: str, sizes: Sizes) -> Any:
+        rules = [rule for rule in arguments[1:] if callable(rule)]
+        value = checked(value, arguments[0], what, sizes, finite and ANY_NUMBER not in rules)
+        for rule in rules:
+            value = rule(value, what)
+    elif origin is Literal:
+        OneOf(arguments)(value, what)
+    elif origin in (Union, UnionType):
+        return _checked_as_one_of(value, arguments, what, sizes, finite)
+    elif origin in _LISTS and _is_checked(annotation):
         if isinstance(value, str):  # whose items are characters
             raise InputError(f"{what} is {shown(value)}; give a list.")
-        return tuple(_each(dict(enumerate(items_of(value, what))), check, what, sizes).values())
-
-    return call
-
-
-def _of_values(check: Check | None) -> Check:
-    def call(value: Any, what: str, sizes: Sizes) -> Any:
+        return tuple(_checked_values(dict(enumerate(items_of(value, what))), arguments[0], what, sizes).values())
+    elif origin in (Mapping, dict):
         if not isinstance(value, Mapping):
             raise InputError(f"{what} is {_with_article(type(value).__name__)}; give a dictionary.")
-        return value if check is None else _each(value, check, what, sizes)
+        return _checked_values(value, arguments[1], what, sizes)
+    elif isinstance(annotation, type) and annotation in _SCALARS:
+        _SCALARS[annotation](value, what)
+    elif isinstance(annotation, type) and (issubclass(annotation, AbstractArray) or _is_of_package(annotation)):
+        return _checked_as_one_of(value, (annotation,), what, sizes, finite)
+    return value
 
-    return call
+
+def _is_of_package(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] == _PACKAGE
 
 
-def _each(values: Mapping[Any, Any], check: Check | None, what: str, sizes: Sizes) -> Mapping[Any, Any]:
-    """Each of several values as a check returns it."""
-    if check is None:
-        return values
+def _is_checked(annotation: Any) -> bool:
+    """Whether an annotation, which is neither an array nor a class of this package, states a check."""
+    origin = get_origin(annotation)
+    if origin is tuple:
+        return get_args(annotation)[1:] == (...,)
+    return origin in (Annotated, Literal, Mapping, dict, *_LISTS) if origin else annotation in _SCALARS
+
+
+def _checked_as_one_of(value: Any, annotations: Sequence[Any], what: str, sizes: Sizes, finite: bool) -> Any:
+    """What passes one of several annotations; arrays of several shapes count as one, and so do several classes."""
+    if value is None and NoneType in annotations:
+        return None
+    types = [kind for kind in annotations if isinstance(kind, type)]
+    arrays = [kind for kind in types if issubclass(kind, AbstractArray)]
+    classes = tuple(kind for kind in types if kind not in arrays and _is_of_package(kind))
+    others = [x for x in annotations if x not in (*arrays, *classes, NoneType, np.generic)]  # part of `AnyArray`
+    if not all(map(_is_checked, others)):
+        return value
+    checks: list[Callable[[], Any]] = [partial(checked, value, x, what, sizes, finite) for x in others]
+    if arrays:
+        checks.append(partial(_checked_array, value, arrays, what, sizes, finite))
+    if classes:
+        wanted = " or ".join(_with_article(kind.__name__) for kind in classes)
+        checks.append(partial(_passing(lambda value: isinstance(value, classes), wanted), value, what))
+    sentences = []
+    for check in checks:
+        try:
+            return check()
+        except InputError as error:
+            sentences.append(str(error).removesuffix("."))
+    others = [f", or {sentence.rpartition('; ')[2].removeprefix('give ')}" for sentence in sentences[1:]]
+    raise InputError("".join([*sentences[:1], *others]) + ".")
+
+
+def _checked_values(values: Mapping[Any, Any], annotation: Any, what: str, sizes: Sizes) -> dict[Any, Any]:
+    """Each of several values as an annotation says."""
     try:
-        return {key: check(value, what, sizes) for key, value in values.items()}
+        return {key: checked(value, annotation, what, sizes) for key, value in values.items()}
     except InputError:  # once more, to say which: names take longer to make than most checks
-        return {key: check(value, _item(what, key), sizes) for key, value in values.items()}
+        return {key: checked(value, annotation, _item(what, key), sizes) for key, value in values.items()}
 
 
-class _ArrayCheck(NamedTuple):
-    """Real numbers of one of some shapes, each as jaxtyping writes it: names, sizes, ``*name`` and ``...``."""
-
-    shapes: tuple[str, ...]
-    library: Any  # that its result is of: numpy, jax.numpy, or None for that of the value
-    finite: bool = True
-
-    def __call__(self, value: Any, what: str, sizes: Sizes) -> Any:
-        array = as_array(value, what, like=() if self.library is jnp else np.zeros(0))
-        for shape in self.shapes:
-            named = _sizes_by_name(shape.split(), array.shape, sizes)
-            if named is not None:
-                sizes.update(named)
-                break
-        else:
-            wanted = ", or ".join(_shape_in_words(shape.split(), sizes) for shape in self.shapes)
-            raise InputError(f"{what} has shape {array.shape}; give {wanted}.")
-        if not is_concrete(array):
-            return array
-        numbers = np.asarray(array)
-        if self.finite:
-            _check_each(numbers, np.isfinite(numbers), what, "give finite numbers", dimensions=shape.split())
-        return numbers if self.library is np else array
+def _checked_array(value: Any, arrays: Sequence[Any], what: str, sizes: Sizes, finite: bool) -> Any:
+    """Real numbers in one of the shapes that jaxtyping writes as names, sizes, ``*name`` and ``...``."""
+    libraries = {np if array.array_type is np.ndarray else jnp for array in arrays}
+    array = as_array(value, what, like=() if libraries == {jnp} else np.zeros(0))
+    shapes = [shape.split() for shape in dict.fromkeys(array.dim_str for array in arrays)]
+    for names in shapes:
+        named = _sizes_by_name(names, array.shape, sizes)
+        if named is not None:
+            sizes.update(named)
+            break
+    else:
+        wanted = ", or ".join(_shape_in_words(names, sizes) for names in shapes)
+        raise InputError(f"{what} has shape {array.shape}; give {wanted}.")
+    if not is_concrete(array):
+        return array
+    numbers = np.asarray(array)
+    if finite:
+        _check_each(numbers, np.isfinite(numbers), what, "give finite numbers", dimensions=names)
+    return numbers if libraries == {np} else array
 
 
 def _item(what: str, *index: Any) -> str:

@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike
 
 from . import _compat
 from .errors import InputError
+from .jax_setup import check_x64
 from .numpy_or_jax import AnyArray, namespace
-from .x64 import check_x64
 
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]

@@ -1,61 +1,55 @@
-"""Quantiles and tail probabilities, from ``scipy.special``: ``scipy.stats`` takes a second to import.
+"""Quantiles and tail probabilities, from ``scipy.special``: ``scipy.stats`` takes a second to import."""
 
-This takes 0.2 s still, so it is imported where it is used.
-"""
+from typing import Any
 
 import numpy as np
 
 _NORMAL = 1e6  # degrees of freedom from which Student's t is normal to all digits that matter
 
 
+def _special() -> Any:
+    from scipy import special  # takes 0.2 s still
+
+    return special
+
+
 def student_quantile(probability: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray:
     """Quantile of Student's t; of the normal distribution where the degrees of freedom are infinite."""
-    from scipy import special
-
     infinite = np.isinf(degrees_of_freedom)
-    finite = special.stdtrit(np.where(infinite, 1.0, degrees_of_freedom), probability)
-    return np.where(infinite, special.ndtri(probability), finite)
+    finite = _special().stdtrit(np.where(infinite, 1.0, degrees_of_freedom), probability)
+    return np.where(infinite, _special().ndtri(probability), finite)
 
 
 def student_tail(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
     """Probability that a variable of Student's t is farther from 0 than a value; normal for infinite degrees."""
-    from scipy import special
-
     many = np.asarray(degrees_of_freedom) > _NORMAL
-    tail = special.stdtr(np.where(many, 1.0, degrees_of_freedom), -np.abs(value))
-    return 2 * np.where(many, special.ndtr(-np.abs(value)), tail)
+    tail = _special().stdtr(np.where(many, 1.0, degrees_of_freedom), -np.abs(value))
+    return 2 * np.where(many, _special().ndtr(-np.abs(value)), tail)
 
 
 def student_density(value: np.ndarray, degrees_of_freedom: np.ndarray) -> np.ndarray:
     """Density of Student's t; normal for infinite degrees of freedom."""
-    from scipy import special
-
     many = np.asarray(degrees_of_freedom) > _NORMAL
     half = 0.5 * np.where(many, 1.0, degrees_of_freedom)
-    factor = np.exp(special.gammaln(half + 0.5) - special.gammaln(half)) / np.sqrt(2 * np.pi * half)
+    gammaln = _special().gammaln
+    factor = np.exp(gammaln(half + 0.5) - gammaln(half)) / np.sqrt(2 * np.pi * half)
     density = factor * np.exp(-(half + 0.5) * np.log1p(value**2 / (2 * half)))
     return np.where(many, np.exp(-0.5 * value**2) / np.sqrt(2 * np.pi), density)
 
 
 def chi_square_quantile(probability: float, degrees_of_freedom: float) -> float:
     """Quantile of the chi-square distribution."""
-    from scipy import special
-
-    return float(special.chdtri(degrees_of_freedom, 1 - probability))
+    return float(_special().chdtri(degrees_of_freedom, 1 - probability))
 
 
 def chi_square_tail(value: float, degrees_of_freedom: float) -> float:
     """Probability that a chi-square variable exceeds a value."""
-    from scipy import special
-
-    return float(special.chdtrc(degrees_of_freedom, value))
+    return float(_special().chdtrc(degrees_of_freedom, value))
 
 
 def f_tail(value: float, numerator: float, denominator: float) -> float:
     """Probability that a variable with the F distribution exceeds a value."""
-    from scipy import special
-
-    return float(special.fdtrc(numerator, denominator, value))
+    return float(_special().fdtrc(numerator, denominator, value))
 
 
 def chance(rms: float, predicted: float, degrees_of_freedom: float, of_prediction: float) -> float:

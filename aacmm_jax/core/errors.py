@@ -1,12 +1,15 @@
-"""The exception and the warning of the package, and a hint for misspelt words."""
+"""The exceptions and the warning of the package, a hint for misspelt words, and one for packages of an extra."""
 
 import difflib
+import importlib.util
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from .text import in_short, quoted
 
 _COMPARED = 200  # characters of a word: comparing takes their square
+# By extra of pyproject.toml, the package whose presence says whether it is installed.
+_PACKAGES = {"plot": "matplotlib", "report": "jinja2", "data": "xarray", "dask": "distributed"}
 
 
 class InputError(ValueError):
@@ -24,6 +27,18 @@ class InputError(ValueError):
 
     def __init__(self, sentence: str = ""):
         super().__init__(in_short(sentence))
+
+
+class MissingExtra(InputError, ImportError):
+    """Something asked for needs an extra that is not installed; the message has the command that installs it."""
+
+
+def require(extra: str, use: str) -> None:
+    """Raise `MissingExtra` where an extra is not installed; ``use`` is what needs it, as the subject of the message."""
+    package = _PACKAGES[extra]
+    if importlib.util.find_spec(package) is None:
+        # Double quotes are right in every shell, cmd.exe included.
+        raise MissingExtra(f'{use} needs {package}; install it with: pip install "aacmm_jax[{extra}]"')
 
 
 class IdentifiabilityWarning(UserWarning):

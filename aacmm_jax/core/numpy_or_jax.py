@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ._compat import is_traced
-from .x64 import check_x64
+from .jax_setup import check_x64
 
 # An array of either library; NumPy's sums over all axes are scalars, `np.generic`, that a type checker knows no
 # arithmetic of.
@@ -146,16 +146,6 @@ def added_to(array: AnyArray, index: Any, value: Any) -> Any:
         return jnp.asarray(array).at[index].add(value)
     array[index] += value
     return array
-
-
-def broadcast_after_first(values: AnyArray, batch: tuple[int, ...]) -> AnyArray:
-    """``(k, ...)`` broadcast to ``(k, *batch)``."""
-    if values.shape[1:] == batch:
-        return values
-    missing = (1,) * (len(batch) + 1 - values.ndim)
-    return namespace(values).broadcast_to(
-        values.reshape(values.shape[:1] + missing + values.shape[1:]), (len(values), *batch)
-    )
 
 
 def stop_gradient(tree: Tree) -> Tree:

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from . import _compat
 from .arguments import Range, checked, whole_number
 from .errors import InputError
-from .x64 import LARGEST_INTEGER, check_x64
+from .jax_setup import LARGEST_INTEGER, check_x64
 
 
 def random_key(seed: int | Array) -> Array:

@@ -1,9 +1,9 @@
 from . import observations as observations
 from .capture import Capture as Capture
-from .joined_captures import join_sessions as join_sessions
-from .joined_captures import stack_captures as stack_captures
+from .capture import join_sessions as join_sessions
+from .capture import stack_captures as stack_captures
+from .capture_data import ReferenceLength as ReferenceLength
 from .noise import Noise as Noise
+from .recording import ProbedSphere as ProbedSphere
 from .recording import Recording as Recording
-from .reference_length import ReferenceLength as ReferenceLength
 from .simulation import simulate as simulate
-from .sphere import ProbedSphere as ProbedSphere

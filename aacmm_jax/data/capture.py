@@ -2,27 +2,38 @@
 
 import fnmatch
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..core.arguments import items_of, shown
+from ..core.arguments import checked_arguments, items_of, shown
 from ..core.arrays import Numbers, is_concrete, joined
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, namespace
 from ..core.random_keys import random_generator
 from ..core.text import shorten
-from ..kinematics.arm import Arm, by_joint
-from .copies import NOTHING_REPEATED, Repeated, check_different, checked_visits, visits_of, without_copies
-from .observations.declared import checked_name, checked_readings
+from ..kinematics.arm import Arm
+from .capture_data import (
+    NOTHING_REPEATED,
+    UNKNOWN,
+    ReferenceLength,
+    Repeated,
+    check_different,
+    check_revolutions,
+    check_temperatures,
+    checked_parts,
+    described,
+    different_lengths,
+    different_poses,
+    numbered_visits,
+)
+from .observations.declared import checked_name
 from .observations.held import Socket, sockets_of
 from .observations.observation import AbstractObservation
-from .reference_length import ReferenceLength, check_temperatures
-
-# Encoders of joints without limits count a few revolutions at most; larger readings are degrees taken for radians.
-_MOST_RADIANS = 8 * np.pi
 
 
 class Capture(eqx.Module):
@@ -78,25 +89,26 @@ class Capture(eqx.Module):
         visits: Mapping[str, Numbers] | None = None,
     ):
         # Sockets are observations like any other; they alone are kept as one array, since there may be thousands.
-        seats = _checked_sockets(sockets)
-        given = (*seats, *_checked_observations(observations, sockets))
-        _check_columns(given)
-        different = [without_copies(part) for part in given]
-        check_different(different)
-        seated = different[: len(sockets)]
-        self.q = joined([part.q for part in seated]) if seated else jnp.zeros((0, given[0].q.shape[-1]))
-        self.names = tuple(part.name for part in seated)
-        self.sizes = tuple(part.q.shape[0] for part in seated)
-        self.observations = tuple(different[len(sockets) :])
+        given = checked_parts(sockets, observations)
+        rows = [different_poses(part) for part in given]
+        parts = [part if kept is None else part.select(kept) for part, kept in zip(given, rows, strict=True)]
+        check_different(parts)
+        seats, self.observations = parts[: len(sockets)], tuple(parts[len(sockets) :])
+        self.q = joined([part.q for part in seats]) if seats else jnp.zeros((0, given[0].q.shape[-1]))
+        self.names = tuple(part.name for part in seats)
+        self.sizes = tuple(part.q.shape[0] for part in seats)
         ends = [*self.names, *(part.name for part in self.observations if isinstance(part, Socket))]
-        self.lengths, copies = _different_lengths(_checked_lengths(lengths, ends))
-        left_out = {one.name: one.q.shape[0] - kept.q.shape[0] for one, kept in zip(given, different, strict=True)}
-        self.repeated = repeated.and_also(left_out, copies)
+        self.lengths, copies = different_lengths(lengths, ends)
+        counts = dict(repeated.poses)
+        for before, part in zip(given, parts, strict=True):
+            counts[part.name] = counts.get(part.name, 0) + before.q.shape[0] - part.q.shape[0]
+        left_out = tuple((name, count) for name, count in counts.items() if count)
+        self.repeated = Repeated(left_out, (*repeated.lengths, *copies))
         names = (checked_name(session, "a session") for session in items_of(sessions, "sessions"))
         self.sessions = tuple(dict.fromkeys(names))
-        for part in different if self.sessions else ():
+        for part in parts if self.sessions else ():
             self.session_of(part.name)
-        self.visits = checked_visits(visits, seats)
+        self.visits = numbered_visits(visits, given[: len(sockets)], rows)
 
     @property
     def parts(self) -> tuple[AbstractObservation, ...]:
@@ -155,21 +167,40 @@ class Capture(eqx.Module):
             InputError: Where a pattern matches nothing, nothing remains, or the capture is a batch.
         """
         check_one_capture(self)
-        only = [only] if isinstance(only, str) else only
-        only = None if only is None else items_of(only, "only")
-        without = [without] if isinstance(without, str) else items_of(without, "without")
         names = names_in(self)
-        kept = names if only is None else _matching(names, only)
-        dropped = _matching(names, without)
+        kept = names if only is None else _matching(names, only, "only")
+        dropped = _matching(names, without, "without")
         kept = [name for name in kept if name not in dropped]
         if not kept:
             raise InputError("no socket is left after the selection; widen it.")
-        return part_of(self, kept, repeated=self.repeated.of(kept))
+        poses, lengths = self.repeated
+        copies = tuple((start, end) for start, end in lengths if start in kept and end in kept)
+        return part_of(self, kept, repeated=Repeated(tuple(row for row in poses if row[0] in kept), copies))
+
+
+def _matching(names: Sequence[str], patterns: Iterable[str] | str, what: str) -> list[str]:
+    chosen: set[str] = set()
+    for pattern in [patterns] if isinstance(patterns, str) else items_of(patterns, what):
+        if not isinstance(pattern, str):
+            raise InputError(f"a pattern is {shown(pattern)}; give names of sockets, or shell patterns.")
+        matches = {name for name in names if name == pattern or fnmatch.fnmatchcase(name, pattern)}
+        if not matches:
+            raise InputError(f"no socket matches '{pattern}'{nearest(pattern, names)}")
+        chosen |= matches
+    return [name for name in names if name in chosen]
 
 
 def names_in(capture: Capture) -> tuple[str, ...]:
     """Names of the sockets and the other observations of a capture."""
     return (*capture.names, *(observation.name for observation in capture.observations))
+
+
+def visits_of(capture: Capture) -> dict[str, Int[np.ndarray, " m"]]:
+    """The visit of each pose of the sockets of a capture whose visits are known."""
+    if capture.visits is None:
+        return {}
+    parts = np.split(np.array(capture.visits, dtype=int), np.cumsum(capture.sizes)[:-1])
+    return {name: rows for name, rows in zip(capture.names, parts, strict=True) if np.all(rows != UNKNOWN)}
 
 
 def part_of(
@@ -180,16 +211,12 @@ def part_of(
 ) -> Capture:
     """Sockets and other observations by their exact names, which `Capture.select` would take for patterns, with the
     reference lengths between them; of those in ``rows`` only these poses."""
-    rows = rows or {}
-    parts = [part if part.name not in rows else part.select(rows[part.name]) for part in capture.parts]
+    rows, visits = rows or {}, visits_of(capture)
+    parts = [part.select(rows[part.name]) if part.name in rows else part for part in capture.parts]
     sockets = {part.name: part.q for part in parts[: len(capture.names)] if part.name in names}
     others = [part for part in parts[len(capture.names) :] if part.name in names]
     lengths = [length for length in capture.lengths if length.start in names and length.end in names]
-    visits = {
-        name: visit[rows[name]] if name in rows else visit
-        for name, visit in visits_of(capture).items()
-        if name in sockets
-    }
+    visits = {name: visit[rows.get(name, slice(None))] for name, visit in visits.items() if name in sockets}
     return Capture(sockets, lengths, others, repeated, capture.sessions, visits)
 
 
@@ -205,7 +232,7 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
         A capture of the drawn poses, and one of the others; each with the reference lengths whose two sockets it has.
 
     Raises:
-        InputError: The capture is a batch, or has not more poses than these.
+        InputError: The capture is a batch, or has not more poses than ``count``.
     """
     check_one_capture(capture)
     sizes = {part.name: part.q.shape[0] for part in capture.parts}
@@ -220,6 +247,94 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
     return first, second
 
 
+@checked_arguments
+def join_sessions(captures: Mapping[str, Capture], *, own_probe: bool = True) -> Capture:
+    """Join captures that one arm took in several sessions, with its probe remounted in between, or on another base.
+
+    Sockets, artefacts and stations of different sessions are different ones; what is unknown of the arm is the same.
+
+    Args:
+        captures: Name of a session -> its capture. Names of sockets and observations become ``session/name``.
+        own_probe: Whether every session after the first has a probe of its own, whose place in the last frame is
+            unknown; False where the probe stayed as it was.
+
+    Returns:
+        One capture of all sessions, to calibrate as a whole.
+
+    Raises:
+        InputError: A capture is a batch, or one has targets in more than one session.
+
+    Example:
+        >>> monday = aj.simulate(true, {"A": (400, 200, 300)}, poses=5, seed=1)
+        >>> friday = aj.simulate(true, {"A": (500, 200, 300)}, poses=5, seed=2)
+        >>> both = aj.join_sessions({"monday": monday, "friday": friday})
+        >>> print(both.names, [observation.name for observation in both.observations])
+        ('monday/A',) ['friday/A']
+    """
+    if not isinstance(captures, Mapping) or not captures:
+        raise InputError("the sessions must be a dictionary of captures by name: {'Monday': capture, ...}.")
+    sockets: dict[str, Numbers] = {}
+    visits: dict[str, Numbers] = {}
+    lengths: list[ReferenceLength] = []
+    observations: list[AbstractObservation] = []
+    for number, (session, capture) in enumerate(captures.items()):
+        if not isinstance(capture, Capture):
+            raise InputError(f"session '{session}' is a {type(capture).__name__}; give an aj.Capture.")
+        check_one_capture(capture)
+        checked_name(session, "a session")
+        probe = f"probe of {session}" if number and own_probe else ""
+        parts = [part.in_session(session, probe) for part in capture.parts]
+        seated = 0 if probe else len(capture.names)  # sockets with another tip are observations
+        sockets |= {part.name: part.q for part in parts[:seated]}
+        observations += parts[seated:]
+        visits |= {f"{session}/{name}": rows for name, rows in visits_of(capture).items() if not probe}
+        for length in capture.lengths:
+            ends = f"{session}/{length.start}", f"{session}/{length.end}"
+            lengths.append(ReferenceLength(*ends, length.value, length.u))
+    return Capture(sockets, lengths, observations, sessions=tuple(captures), visits=visits)
+
+
+def stack_captures(captures: Iterable[Capture]) -> Capture:
+    """Stack captures into a batch for `identify_many`.
+
+    Args:
+        captures: Captures with the same sockets, numbers of poses, joints and reference lengths.
+
+    Returns:
+        A capture whose ``q`` is ``(batch, N, n)`` and whose lengths are ``(batch,)``; rad and mm.
+
+    Raises:
+        InputError: Where there is none, one is a batch, or they differ in shape.
+
+    Example:
+        >>> drawn = [aj.simulate(true, sockets, poses=10, noise=noise, seed=seed) for seed in (1, 2, 3)]
+        >>> print(aj.stack_captures(drawn).q.shape)
+        (3, 20, 6)
+    """
+    captures = items_of(captures, "captures")
+    if not captures:
+        raise InputError("there is no capture to stack; give at least one.")
+    for capture in captures:
+        if not isinstance(capture, Capture):
+            raise InputError(f"a capture to stack is a {type(capture).__name__}; give a list of aj.Capture.")
+        check_one_capture(capture)
+    # Copies that were left out, sessions and visits may differ; those of the first are kept.
+    first, shapes = captures[0], set()
+    arrays = [(capture.q, capture.lengths, capture.observations) for capture in captures]
+    for capture, part in zip(captures, arrays, strict=True):
+        leaves, structure = jax.tree.flatten(part)
+        shapes.add((capture.names, capture.sizes, structure, tuple(np.shape(leaf) for leaf in leaves)))
+    if len(shapes) != 1:
+        raise InputError(
+            "captures of a batch must have the same sockets, numbers of poses, joints, lengths and observations."
+        )
+
+    def stacked(*leaves: Any) -> Any:
+        return np.stack(leaves) if is_concrete(*leaves) else jnp.stack(leaves)
+
+    return eqx.tree_at(lambda c: (c.q, c.lengths, c.observations), first, jax.tree.map(stacked, *arrays))
+
+
 def check_one_capture(capture: Capture) -> None:
     """Raise `InputError` for a batch of `stack_captures`."""
     if capture.q.ndim != 2:
@@ -228,123 +343,10 @@ def check_one_capture(capture: Capture) -> None:
         )
 
 
-def check_sockets_only(capture: Capture, what: str) -> None:
-    """Raise `InputError` for a capture with observations besides sockets and lengths, which ``what`` does not know."""
-    if capture.observations:
-        names = shorten([observation.name for observation in capture.observations])
-        raise InputError(
-            f"{what} takes sockets and reference lengths only, but the capture has other observations ({names}); make "
-            "a capture without them."
-        )
-
-
-def _matching(names: Sequence[str], patterns: Iterable[str]) -> list[str]:
-    chosen: set[str] = set()
-    for pattern in patterns:
-        if not isinstance(pattern, str):
-            raise InputError(f"a pattern is {shown(pattern)}; give names of sockets, or shell patterns.")
-        chosen_now = {name for name in names if name == pattern or fnmatch.fnmatchcase(name, pattern)}
-        if not chosen_now:
-            raise InputError(f"no socket matches '{pattern}'{nearest(pattern, names)}")
-        chosen |= chosen_now
-    return [name for name in names if name in chosen]
-
-
-def _checked_sockets(sockets: Mapping[str, Numbers]) -> tuple[Socket, ...]:
-    if not isinstance(sockets, Mapping):
-        raise InputError(
-            f"the sockets are a {type(sockets).__name__}; give a dictionary of names and readings: "
-            '{"A": q}, q of shape (poses, joints).'
-        )
-    for name in sockets:
-        checked_name(name, "a socket")
-    return sockets_of({name: checked_readings(f"socket '{name}'", q) for name, q in sockets.items()})
-
-
-def _checked_observations(
-    observations: Iterable[AbstractObservation] | AbstractObservation, sockets: Collection[str]
-) -> tuple[AbstractObservation, ...]:
-    single = isinstance(observations, AbstractObservation)
-    checked = (observations,) if single else tuple(items_of(observations, "observations"))
-    for observation in checked:
-        if not isinstance(observation, AbstractObservation):
-            raise InputError(f"{observation!r} is no observation; give one of aj.data.observations, such as a Sphere.")
-    names = [observation.name for observation in checked]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"two observations have the name '{name}'; give each a name of its own.")
-        if name in sockets:
-            raise InputError(f"a socket and an observation have the name '{name}'; give each a name of its own.")
-    if not checked and not sockets:
-        raise InputError("a capture needs at least one socket with poses, or another observation.")
-    return checked
-
-
-def _check_columns(parts: Sequence[AbstractObservation]) -> None:
-    """All readings are of one arm."""
-    width = parts[0].q.shape[-1]
-    for part in parts:
-        if part.q.shape[-1] != width:
-            raise InputError(
-                f"{_described(part)} has {part.q.shape[-1]} columns, but {_described(parts[0])} has {width}; give one "
-                "column a joint, and the temperature after them to all or to none."
-            )
-
-
-def _described(part: AbstractObservation) -> str:
-    return f"{'socket' if isinstance(part, Socket) else 'observation'} '{part.name}'"
-
-
-def _checked_lengths(
-    lengths: Iterable[ReferenceLength] | ReferenceLength, sockets: Sequence[str]
-) -> tuple[ReferenceLength, ...]:
-    checked = (lengths,) if isinstance(lengths, ReferenceLength) else tuple(items_of(lengths, "lengths"))
-    for length in checked:
-        if not isinstance(length, ReferenceLength):
-            raise InputError(f"{shown(length)} is no reference length; give aj.ReferenceLength(start, end, value, u).")
-        for end in (length.start, length.end):
-            if end not in sockets:
-                raise InputError(
-                    f"reference length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
-                    f"{nearest(end, sockets)}"
-                )
-    return checked
-
-
-def _different_lengths(
-    lengths: tuple[ReferenceLength, ...],
-) -> tuple[tuple[ReferenceLength, ...], tuple[tuple[str, str], ...]]:
-    """The first of each reference length, and the ends of those that repeat it, perhaps in the other direction."""
-    different, copies, seen = [], [], set()
-    for length in lengths:
-        key = None
-        if is_concrete(length.value, length.u) and not np.ndim(length.value):
-            key = frozenset((length.start, length.end)), float(length.value), float(length.u)
-        if key is not None and key in seen:
-            copies.append((length.start, length.end))
-            continue
-        seen.add(key)
-        different.append(length)
-    return tuple(different), tuple(copies)
-
-
 def check_readings(capture: Capture, arm: Arm, *, advice: str = "convert with numpy.deg2rad") -> None:
     """Raise `InputError` where known readings of an arm's revolute joints look like degrees, with advice on them."""
     joints, columns = arm.joints, arm.columns
     for part in capture.parts:
         if is_concrete(part.q) and part.q.shape[-1] in (joints, columns):
-            check_temperatures(_described(part), np.asarray(part.q)[..., joints:])
-            check_revolutions(_described(part), part.q, arm, advice)
-
-
-def check_revolutions(where: str, readings: AnyArray, arm: Arm, advice: str) -> None:
-    """Raise `InputError` where readings of revolute joints look like degrees."""
-    angular = np.array(by_joint(arm, True, False))
-    joints = len(angular)
-    size = np.where(angular, np.abs(np.asarray(readings)[..., :joints]), 0.0).reshape(-1, joints)
-    if size.size and size.max() > _MOST_RADIANS:
-        row, column = np.argwhere(size == size.max())[0] + 1
-        raise InputError(
-            f"{where} pose {row} joint {column} is {size.max():g} rad, more than four revolutions: these look like "
-            f"degrees; {advice}."
-        )
+            check_temperatures(described(part), np.asarray(part.q)[..., joints:])
+            check_revolutions(described(part), part.q, arm, advice)

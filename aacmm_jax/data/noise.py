@@ -1,6 +1,11 @@
-"""The noise of a measurement: errors of the encoders, and of the tip in its seat."""
+"""The noise of a measurement, errors of the encoders and of the tip in its seat, and what is usual for classes of arms.
 
-from typing import Annotated
+A calibration estimates its noise from the data, and compares it with what is usual; plans for an arm that has not been
+calibrated assume it.
+"""
+
+import math
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -11,13 +16,11 @@ from ..core.arrays import Numbers, is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, numpy_if_known, to_jax, to_numpy
 from ..core.units import ARCSEC
-from ..kinematics.arm import Arm
-from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass
+from ..kinematics.arm import Arm, joint_limits
+from ..kinematics.chain import Geometry, JointKinds, JointMotion, forward_pass, joint_motion
 from ..kinematics.jacobian import reading_columns
 
 _MOST = {"encoder_arcsec": 36_000.0, "linear_encoder": 100.0, "seating": 100.0}  # ten degrees; mm
-
-
 _ONE = Annotated[Float[AnyArray, ""], Range(least=0)]
 _ONE_OR_EACH = Annotated[Float[AnyArray, ""] | Float[AnyArray, " joints"], NOT_EMPTY, Range(least=0)]
 
@@ -76,13 +79,9 @@ class Noise(eqx.Module):
         return np.concatenate([of_joints, np.zeros(columns - joints)])
 
     def check(self, joints: int) -> None:
-        """Check that this noise can weight the poses of an arm.
+        """Check that this noise can weight the poses of an arm with so many joints.
 
-        Args:
-            joints: Number of joints of the arm.
-
-        Raises:
-            InputError: Where all noise is zero, some is absurdly large, or encoders and joints differ in number.
+        Raises `InputError` where all noise is zero, some is absurdly large, or encoders and joints differ in number.
         """
         given = self._given(self.encoder_arcsec)
         if is_concrete(*(values for _, values in given)) and not any(np.any(np.asarray(values)) for _, values in given):
@@ -96,14 +95,7 @@ class Noise(eqx.Module):
         self.check_joints(joints)
 
     def check_joints(self, joints: int) -> None:
-        """Check the number of encoders.
-
-        Args:
-            joints: Number of joints of the arm.
-
-        Raises:
-            InputError: Where the encoders have neither one value nor one a joint.
-        """
+        """Raise `InputError` where the encoders have neither one value nor one a joint."""
         for what, values in self._given(self.encoder):
             if values.ndim and values.shape != (joints,):
                 raise InputError(
@@ -162,3 +154,82 @@ def encoder_covariances(
     deviations = xp.broadcast_to(encoder, (columns.shape[0],))
     columns = columns * deviations.reshape(-1, *(1,) * (columns.ndim - 1))
     return xp.sum(columns[..., :, None, :] * columns[..., None, :, :], axis=0)
+
+
+SEATING = 0.005  # mm: a ball in a kinematic seat
+_SAMPLES = 2000
+# ISO 9283: repeatability is the mean distance from the barycentre plus three of its standard deviations. Distances of
+# three normal components of standard deviation s have the mean 2 s sqrt(2 / pi) and the variance (3 - 8 / pi) s^2.
+_REPEATABILITY = 2 * math.sqrt(2 / math.pi) + 3 * math.sqrt(3 - 8 / math.pi)
+
+
+class ArmClass(NamedTuple):
+    """What arms of a class have in common, where nothing is known of the single one."""
+
+    repeatability: float | None  # pose repeatability of ISO 9283, mm; None where the encoders are known instead
+    cone: float  # half angle of the cone from which the tool comes to a socket, rad
+    retract: float  # distance of the approach point from the socket, mm
+    source: str
+
+
+class ArmNoise(NamedTuple):
+    """What is usual for an arm: its class and its noise, and where the numbers come from.
+
+    Example:
+        >>> usual = aj.files.load_noise("panda")
+        >>> print(usual.arm_class, f"{usual.noise.encoder_arcsec:.1f} arcsec, {usual.noise.seating} mm")
+        robot 9.0 arcsec, 0.005 mm
+    """
+
+    arm_class: str
+    noise: Noise
+    source: str
+
+
+CLASSES = {
+    # A person turns the probe in its seat as the standards' tests ask for, and takes it there by hand.
+    "measuring arm": ArmClass(None, math.pi, 0.0, "encoders of a small commercial arm"),
+    # The middle of makers' data sheets for six and seven axes of 0.5 to 1.5 m; 55 deg is what recorded captures keep.
+    "robot": ArmClass(0.05, math.radians(60), 50.0, "typical of data sheets of industrial and collaborative robots"),
+    "hobby arm": ArmClass(1.0, math.radians(60), 50.0, "typical of arms with hobby servos"),
+}
+
+
+def small_arm_noise() -> Noise:
+    """The noise of a small commercial measuring arm."""
+    return Noise(encoder_arcsec=2.0, seating=SEATING)
+
+
+def class_noise(arm: Arm, name: str) -> Noise:
+    """The noise that plans assume of an arm of a class; `InputError` where there is no such class."""
+    if name not in CLASSES:
+        raise InputError(f"there is no class of arms '{name}'; give one of {', '.join(CLASSES)}.")
+    repeatability = CLASSES[name].repeatability
+    return small_arm_noise() if repeatability is None else noise_of_repeatability(arm, repeatability)
+
+
+def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEATING) -> Noise:
+    """The noise of readings that explains a published pose repeatability.
+
+    All encoders have the same standard deviation s (of a prismatic joint at 1 m, see `Noise`); the tip of a
+    configuration then scatters by s^2 trace(J J^T) / 3 a coordinate, on average over the joint limits.
+
+    Args:
+        arm: One arm.
+        repeatability: Pose repeatability (RP of ISO 9283), mm.
+        seating: Standard deviation of the tip in its seat, mm.
+
+    Raises:
+        InputError: The repeatability is not above 0.
+    """
+    if not (math.isfinite(repeatability) and repeatability > 0):
+        raise InputError(f"a repeatability of {repeatability:g} mm is none; give a number above 0.")
+    limits = np.asarray(joint_limits(arm, None))
+    q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
+    geometry = to_numpy(arm.geometry)
+    one = noise_of(np.asarray(1.0), np.asarray(0.0)).of_readings(geometry.kinds)
+    scattered = np.asarray(encoder_covariances(geometry, joint_motion(geometry, q), one))
+    lever = math.sqrt(float(np.mean(np.trace(scattered))) / 3)
+    if lever == 0:
+        raise InputError("no joint moves the tip of this arm, so its repeatability says nothing of the readings.")
+    return noise_of(np.asarray(repeatability / _REPEATABILITY / lever), np.asarray(seating))

@@ -1,11 +1,61 @@
-"""A recording: a capture, its nominal arm, the true arm of a simulation, and its origin."""
+"""A recording: a capture, its arm, what else was recorded with it, and where it comes from."""
 
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
+from ..core.arguments import NOT_EMPTY, Name, Range, checked_fields
+from ..core.errors import InputError
 from ..kinematics.parameters import ArmSpecification
-from .arm_classes import ArmNoise
 from .capture import Capture
-from .sphere import ProbedSphere
+from .noise import ArmNoise
+
+SphereTest = Literal["effective-diameter", "probing", "articulation"]
+NotNegativeMm = Annotated[float, Range(least=0, unit="mm")]
+
+
+class ProbedSphere(NamedTuple):
+    """A reference sphere as it was probed for an acceptance test; it takes no part in a calibration.
+
+    Args:
+        name: Name of the sphere.
+        test: The test that it is for.
+        groups: Joint readings ``(m, n)``, rad, or centres of the probe ``(m, 3)``, mm; one group for each sphere that
+            is fitted: the repeats of ASME's effective diameter, the 25 points of ISO's probing test, or the
+            orientations of its articulation test.
+        diameter: Calibrated diameter, mm.
+        u: Standard uncertainty (k = 1) of the diameter, mm.
+        stylus: Diameter of the probe's ball, mm; 0 where the points are on the sphere itself.
+        form: Calibrated form error of the sphere, mm.
+        u_form: Standard uncertainty (k = 1) of the form error, mm.
+
+    Example:
+        >>> nine = np.array(aj.simulate(true, {"A": (400, 200, 300)}, poses=9, seed=1).sockets["A"])
+        >>> sphere = aj.data.ProbedSphere("sphere", "effective-diameter", (nine,), diameter=25.0, u=0.0005)
+        >>> print(len(sphere.groups), sphere.groups[0].shape)
+        1 (9, 6)
+    """
+
+    name: Name
+    test: SphereTest
+    groups: tuple[Annotated[Float[np.ndarray, "_ columns"], NOT_EMPTY], ...]
+    diameter: Annotated[float, Range(above=0, unit="mm")]
+    u: NotNegativeMm = 0.0
+    stylus: NotNegativeMm = 0.0
+    form: NotNegativeMm = 0.0
+    u_form: NotNegativeMm = 0.0
+
+
+def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSphere:
+    """The same sphere with its groups as arrays, or `InputError` that names the sphere."""
+    checked = checked_fields(sphere, f"sphere '{sphere.name}'")
+    if not checked.groups:
+        raise InputError(f"sphere '{sphere.name}' has no probed points; give at least one group.")
+    width = checked.groups[0].shape[1]
+    if columns not in (None, width):
+        raise InputError(f"groups of sphere '{sphere.name}' have {width} columns; give {columns}.")
+    return checked
 
 
 class Recording(NamedTuple):

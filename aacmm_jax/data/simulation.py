@@ -1,14 +1,13 @@
 """Simulated captures: poses of an arm that reach given points, with noise of the encoders and of the seat."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arguments import check_finite, checked_arguments, items_of, real_number, shown
+from ..core.arguments import Range, check_finite, checked, checked_arguments, items_of, real_number, shown
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import AnyArray, to_numpy
@@ -18,11 +17,13 @@ from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.chain import length_scale
 from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from ..kinematics.inverse_kinematics import random_configurations
-from .capture import Capture, ReferenceLength
+from .capture import Capture
+from .capture_data import ReferenceLength, check_temperatures
 from .noise import Noise
 from .observations.declared import MOST_POSES
 from .observations.observation import AbstractObservation, AbstractSimulated
-from .reference_length import check_temperatures
+
+_RESOLUTION = Annotated[Float[AnyArray, ""] | Float[AnyArray, " 2"], Range(least=0)]
 
 
 @checked_arguments
@@ -33,10 +34,9 @@ def simulate(
     poses: int | Mapping[str, int] = 70,
     lengths: Iterable[ReferenceLength | tuple] = (),
     noise: Noise | None = None,
-    encoder_arcsec: float | None = None,
-    seating: float | None = None,
-    resolution_arcsec: float = 0.0,
-    linear_resolution: float = 0.0,
+    encoder_arcsec: Numbers | None = None,
+    seating: Numbers | None = None,
+    resolution_arcsec: float | Sequence[float] = 0.0,
     limits: Sequence[Sequence[float]] | None = None,
     observations: Iterable[AbstractSimulated] = (),
     temperature: Numbers | None = None,
@@ -57,8 +57,8 @@ def simulate(
             joints too (``Noise.linear_encoder``).
         encoder_arcsec: Short form of ``Noise(encoder_arcsec=...)``.
         seating: Short form of ``Noise(seating=...)``, mm.
-        resolution_arcsec: Readings are rounded to multiples of it; 0 for none.
-        linear_resolution: The same of prismatic joints, mm.
+        resolution_arcsec: Readings are rounded to multiples of it; 0 for none. A second number is that of prismatic
+            joints, mm.
         limits: Lowest and highest reading of each joint, ``(n, 2)``, rad, or mm of prismatic joints; by default the
             arm's own, else +-pi (a prismatic joint has no default).
         observations: Other observations to record (`data.observations`), with their true geometry.
@@ -80,7 +80,11 @@ def simulate(
         >>> print(f"{ideal.lengths[0].value:.4f} mm")
         469.0416 mm
     """
-    noise = _noise(noise, encoder_arcsec, seating, resolution_arcsec, linear_resolution)
+    short = {"encoder_arcsec": encoder_arcsec, "seating": seating}
+    given = {name: value for name, value in short.items() if value is not None}
+    if noise is not None and given:
+        raise InputError(f"simulate is given noise and {' and '.join(given)}; put all of it into noise.")
+    noise = Noise(**given) if noise is None else noise
     if not is_single(arm):
         raise InputError("simulate takes one arm, not a batch; take one of it first.")
     check_finite(arm=arm, noise=noise)
@@ -93,19 +97,20 @@ def simulate(
     arm, noise = to_numpy((arm, noise))
     points = {name: socket_point(name, point) for name, point in sockets.items()}
     counts = _counts(points, poses)
-    linear = np.zeros(arm.joints, dtype=bool) if arm.geometry.kinds is None else arm.geometry.kinds.mask()
-    step = np.where(linear, linear_resolution, resolution_arcsec * ARCSEC)
+    angular, linear = np.append(np.asarray(checked(resolution_arcsec, _RESOLUTION, "resolution_arcsec")), 0.0)[:2]
+    slides = np.zeros(arm.joints, dtype=bool) if arm.geometry.kinds is None else arm.geometry.kinds.mask()
+    step = np.where(slides, linear, angular * ARCSEC)
     recorder = _Recorder(arm, noise, limits_array, step, temperatures, random_generator(seed))
     reach_key, seat_key, encoder_key, length_key = jax.random.split(random_key(seed), 4)
     places = np.array([np.asarray(point) for point in points.values()]).reshape(-1, 3)
     exact = np.repeat(places, list(counts.values()), axis=0)
     references = _reference_lengths(points, lengths, length_key)
-    labels = [f"socket '{name}'" for name, count in counts.items() for _ in range(count)]
+    labels = np.repeat([f"socket '{name}'" for name in counts], list(counts.values())).tolist()
     angles = recorder.read(recorder.configurations(arm, exact, reach_key, seat_key, labels), encoder_key)
-    keys = [jax.random.fold_in(random_key(seed), number) for number in range(len(simulated))]
-    others = [recorder.recorded(one, key) for one, key in zip(simulated, keys, strict=True)]
     ends = np.cumsum(list(counts.values()))
     readings = {name: angles[end - count : end] for (name, count), end in zip(counts.items(), ends, strict=True)}
+    keys = [jax.random.fold_in(random_key(seed), number) for number in range(len(simulated))]
+    others = [recorder.recorded(thing, key) for thing, key in zip(simulated, keys, strict=True)]
     return Capture(readings, references, others)
 
 
@@ -151,8 +156,7 @@ class _Recorder(NamedTuple):
         exact = simulated.tips(random)
         labels = [f"observation '{simulated.name}'"] * len(exact)
         angles = self.configurations(holding, exact, reach_key, seat_key, labels)
-        # An instrument sees the tip where it is; what is owed to the seat moves the tip, and not what it is compared
-        # with.
+        # An instrument sees the tip where it is: the seat's error moves the tip, and not what it is compared with.
         transforms = np.asarray(holding.pose(angles)).copy()
         transforms[:, :3, 3] = exact
         return simulated.recorded(self.read(angles, encoder_key), transforms, random)
@@ -167,25 +171,6 @@ def _checked_temperatures(arm: Arm, given: Numbers | None) -> Float[np.ndarray, 
         raise InputError("temperature must be one number, or the lowest and the highest; C.")
     check_temperatures("the simulation", values)
     return np.broadcast_to(values, (2,))
-
-
-def _noise(noise: Any, encoder_arcsec: Any, seating: Any, resolution_arcsec: Any, linear_resolution: Any) -> Noise:
-    """The noise in either form, checked."""
-    short = {"encoder_arcsec": encoder_arcsec, "seating": seating}
-    given = {name: value for name, value in short.items() if value is not None}
-    resolutions = {"resolution_arcsec": resolution_arcsec, "linear_resolution": linear_resolution}
-    for what, value in {**given, **resolutions}.items():
-        if np.ndim(value):
-            raise InputError(
-                f"{what} has shape {np.shape(value)}; give one number, or noise=aj.Noise(...) for one a joint."
-            )
-        if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"{what} is {value:g}; noise must be zero or positive.")
-    if noise is None:
-        return Noise(**given)
-    if given:
-        raise InputError(f"simulate is given noise and {' and '.join(given)}; put all of it into noise.")
-    return noise
 
 
 def socket_point(name: str, point: Numbers) -> Float[AnyArray, " 3"]:
@@ -204,10 +189,7 @@ def _counts(points: Mapping[str, AnyArray], poses: int | Mapping[str, int]) -> d
         if name not in points:
             raise InputError(f"poses are given for the unknown socket '{name}'{nearest(name, points)}")
     for name, count in counts.items():
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise InputError(f"socket '{name}' is given {count} poses; give at least one, and a whole number.")
-        if count > MOST_POSES:
-            raise InputError(f"socket '{name}' is given {count:,} poses, more than {MOST_POSES:,}; give fewer.")
+        checked(count, Annotated[int, Range(least=1, most=MOST_POSES)], f"number of poses of socket '{name}'")
     return counts
 
 
@@ -221,15 +203,12 @@ def _reference_lengths(points: Mapping[str, AnyArray], lengths: Iterable, key: A
             raise InputError(
                 f"reference length {shown(length)} must be (socket, socket) or (socket, socket, u), u in mm."
             )
-        start, end = length[:2]
+        (start, end), u = length[:2], length[2] if len(length) == 3 else 0.0
+        where = f"reference length '{start}' to '{end}'"
         for name in (start, end):
             if not isinstance(name, str) or name not in points:
-                raise InputError(
-                    f"reference length '{start}' to '{end}' names the unknown socket '{name}'"
-                    f"{nearest(str(name), points)}"
-                )
-        u = length[2] if len(length) == 3 else 0.0
-        real_number(u, f"u of reference length '{start}' to '{end}'")
+                raise InputError(f"{where} names the unknown socket '{name}'{nearest(str(name), points)}")
+        real_number(u, f"u of {where}")
         draw = float(random_numbers("normal", jax.random.fold_in(key, number), ()))
         true = float(np.linalg.norm(np.asarray(points[start]) - np.asarray(points[end])))
         drawn.append(ReferenceLength(start, end, true + u * draw, u))

@@ -24,9 +24,8 @@ from ..core.arrays import is_concrete
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.units import ARCSEC
-from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture
-from ..data.noise import Noise
+from ..data.noise import ArmNoise, Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
 from .equations import EXACT, Equations, Rows, equations_of, in_chunks, residual_rms

@@ -5,8 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..calibration.left_out import LEVEL, CrossValidation
-from ..calibration.prediction import Agreement
+from ..calibration.prediction import LEVEL, Agreement, CrossValidation
 from ..core.text import shorten
 from .findings import Case, Finding
 

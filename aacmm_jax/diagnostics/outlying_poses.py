@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..core.text import shorten
-from ..model.metrics import pose_outliers
+from ..model.sockets import pose_outliers
 from .findings import Case, Finding
 
 ORDER, NEEDS = 90, "scale"

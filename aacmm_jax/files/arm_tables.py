@@ -10,8 +10,7 @@ from pydantic import AfterValidator, Field, FiniteFloat, NonNegativeFloat, Posit
 
 from ..core.errors import InputError
 from ..core.units import DEG, LENGTH_UNITS
-from ..data.arm_classes import CLASSES, SEATING, ArmNoise, class_noise, noise_of_repeatability
-from ..data.noise import Noise
+from ..data.noise import CLASSES, SEATING, ArmNoise, Noise, class_noise, noise_of_repeatability
 from ..kinematics.arm import Arm
 from ..kinematics.corrected_arm import corrected_like, with_corrections
 from ..kinematics.priors import Prior, possible_names, unit_of_group

@@ -10,8 +10,8 @@ import numpy as np
 from ..core.arrays import Numbers
 from ..core.errors import InputError, naming, nearest
 from ..core.text import printable
-from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture
+from ..data.noise import ArmNoise
 from ..kinematics.arm import Arm, correction_names, is_length
 from ..kinematics.axes_to_dh import without_far_frames
 from ..kinematics.corrected_arm import loads_of
@@ -60,9 +60,6 @@ def load_arm(
         tip: Of a URDF: the link at the end; by default the only one that has no link after it.
         probe: A tool's tip ``(3,)`` in the frame of the last link, mm; by default that frame's origin. Not of an arm
             file that states one.
-
-    Raises:
-        InputError: There is neither, or the file is not an arm's.
 
     Example:
         >>> panda = aj.load_arm("panda")

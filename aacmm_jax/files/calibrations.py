@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
-from ..calibration.left_out import CrossValidation, LeftOut
+from ..calibration.prediction import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord, OtherPoses, Removed
 from ..calibration.results import NoisyEncoder, ObservedMetrics, PriorMetrics
 from ..data.capture import Capture

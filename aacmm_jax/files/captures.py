@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import InputError, naming
-from ..data.arm_classes import ArmNoise
 from ..data.capture import Capture, ReferenceLength, check_one_capture, check_readings
-from ..data.copies import UNKNOWN, Repeated
+from ..data.capture_data import UNKNOWN, Repeated
+from ..data.noise import ArmNoise
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation, kinds
-from ..data.recording import Recording
-from ..data.sphere import ProbedSphere, checked_sphere
+from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.arm import Arm, correction_names, readings_unit
 from ..kinematics.corrected_arm import loads_of
 from ..kinematics.parameters import ArmSpecification, UrdfSource, single
@@ -37,9 +36,6 @@ def save_capture(path: str | os.PathLike, recording: Recording, summary: Mapping
         recording: the capture, with its nominal arm.
         summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
-    Raises:
-        InputError: the file cannot be written, or a name holds a character that no file can hold.
-
     Example:
         >>> aj.files.save_capture("capture.h5", recording)
         >>> print(np.array_equal(aj.files.load_capture("capture.h5").capture.q, capture.q))
@@ -53,9 +49,6 @@ def load_capture(path: str | os.PathLike) -> Recording:
 
     Args:
         path: the file to read.
-
-    Raises:
-        InputError: the file does not exist, is damaged, is not of this kind, or was written by another version.
 
     Example:
         >>> aj.files.save_capture("capture.h5", recording)

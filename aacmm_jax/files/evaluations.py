@@ -38,9 +38,6 @@ def save_evaluation(
         record: the evaluation, from `acceptance.evaluation_of`; or points with their limits.
         summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
-    Raises:
-        InputError: the file cannot be written, or a name holds a character that no file can hold.
-
     Example:
         >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal))
         >>> aj.files.save_evaluation("evaluation.h5", evaluation)
@@ -105,9 +102,6 @@ def load_evaluation(path: str | os.PathLike) -> Any:
 
     Returns:
         The record, from which the results are computed again.
-
-    Raises:
-        InputError: the file does not exist, is damaged, is not of this kind, or was written by another version.
 
     Example:
         >>> points = {"cone": true.position(capture.sockets["A"])}

@@ -28,7 +28,7 @@ from ..data.capture import ReferenceLength
 from ..data.observations.declared import Entry
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation, kinds
-from ..data.sphere import SphereTest
+from ..data.recording import SphereTest
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.corrections import REFERENCE_TEMPERATURE
 from .text_lines import Column

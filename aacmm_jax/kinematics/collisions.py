@@ -119,7 +119,7 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     """Capsules about an arm's offsets d, lengths a and its probe, as the D-H table has them.
 
     That is the body of an arm whose links are where its table's frames are; of a robot with links beside its axes, its
-    URDF's shapes are nearer to the truth (`files.urdf_body`). The tool's capsule ends two radii before the tip, so that
+    URDF's shapes are nearer to the truth (`files.load_cell`). The tool's capsule ends two radii before the tip, so that
     it clears a surface that the tip is in up to a tilt of 60 deg. Capsules that little of the arm joins touch at their
     joint, and are no pair.
 

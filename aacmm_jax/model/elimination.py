@@ -27,7 +27,7 @@ from .layout import Group
 from .observed import Observed
 from .robust import Loss
 from .rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at
-from .socket_sums import (
+from .sockets import (
     counts,
     means_over_sockets,
     membership,

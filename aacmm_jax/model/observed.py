@@ -25,7 +25,7 @@ from ..kinematics.chain import ForwardPass, Geometry, JointMotion, forward_pass,
 from ..kinematics.parameters import Parameters
 from ..solver.arrow import split
 from .layout import Group, Layout, layout_of, unknowns_of
-from .socket_sums import means_over_sockets
+from .sockets import means_over_sockets
 
 _STEPS = {"mm": 1.0, "rad": 1e-3}  # natural steps, as those of the arm's parameters
 

@@ -27,7 +27,7 @@ from ..kinematics.parameters import Parameters
 from ..solver.arrow import split
 from .layout import Group, Layout
 from .observed import Observed, tips_of
-from .socket_sums import to_poses
+from .sockets import to_poses
 
 
 class PriorRows(NamedTuple):

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from ..core.arguments import NOT_EMPTY, NotNegative, Range, check_finite, checked_arguments
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
-from ..data.capture import Capture, check_one_capture, check_readings, check_sockets_only
+from ..core.text import shorten
+from ..data.capture import Capture, check_one_capture, check_readings
 from ..kinematics.arm import Arm, is_length, is_single, parameter_names
 from ..kinematics.parameters import Parameters
-from .metrics import repeatability
-from .socket_sums import means_over_sockets
+from .sockets import means_over_sockets, repeatability
 
 Length = Range(above=0, unit="mm")
 # Names of fixed lengths that free ones can replace, and for each free parameter its weight in place of each of them.
@@ -126,7 +126,12 @@ def fix_scale(
         raise InputError("the arm is a batch, but one scale is fixed here; map over its arms with jax.vmap.")
     scatter = None if sigma is None else namespace(sigma).asarray(sigma, dtype=float)
     check_one_capture(capture)
-    check_sockets_only(capture, "fix_scale")
+    if capture.observations:
+        names = shorten([observation.name for observation in capture.observations])
+        raise InputError(
+            f"fix_scale takes sockets and reference lengths only, but the capture has other observations ({names}); "
+            "make a capture without them."
+        )
     check_readings(capture, arm)
     return to_jax(_fixed(*to_numpy((arm, capture, scatter))))
 

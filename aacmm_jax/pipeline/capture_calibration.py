@@ -12,8 +12,7 @@ from ..calibration.results import Calibration, Identification
 from ..calibration.sampling import monte_carlo
 from ..core.arguments import checked_arguments, with_options
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..data.capture import Capture, draw_poses
-from ..data.joined_captures import join_sessions
+from ..data.capture import Capture, draw_poses, join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.contradictions import remove_contradicting

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..calibration.left_out import CrossValidation, LeftOut
-from ..calibration.prediction import unseen_errors
+from ..calibration.prediction import CrossValidation, LeftOut, unseen_errors
 from ..calibration.record import CalibrationRecord, uncertainty_of
-from ..calibration.results import Calibration
+from ..calibration.scale_anchor import fixes_scale
 from ..core.arguments import checked_arguments, items_of, with_options
 from ..core.errors import InputError
 from ..core.linear_algebra import inverse_cholesky
@@ -28,13 +27,16 @@ from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
 from .single import CalibrationOptions, calibrate, with_joint_model
 
-_REGIONS = 4  # a power of two
+_HALVINGS = 2  # of joint space into regions
 _POSES_A_REGION = 10
 _GROUPS = 3  # of placements or stations, fewer of which say nothing of the scatter between them
 _POSES = 5  # in a region, at least
 _MOVES = 0.02  # rad or mm: the least travel of a joint that has halves
 _RIDGE = 1e-12  # of a unit diagonal
 _NOTHING = 1e-12  # mm^2: what is fitted exactly has no error to compare
+
+
+_Part = tuple[Capture, Capture, tuple[str, ...]]  # what remains, what is left out, and its names
 
 
 def groups_of(capture: Capture) -> tuple[tuple[str, ...], ...]:
@@ -58,56 +60,53 @@ def can_cross_validate(capture: Capture, parameters: int) -> bool:
     """Whether without any one group the scale is determined, and enough poses are left for so many parameters."""
     groups = groups_of(capture)
     if capture.observations:
-        parts = _observed_parts(capture)
+        parts = _parts_of(capture)
         return len(parts) > 1 and all(_determines(rest, parameters) for rest, _, _ in parts)
-    with_lengths = {group for group in groups if any(length.start in group for length in capture.lengths)}
-    if len(with_lengths) < 2:
+    if sum(any(length.start in group for length in capture.lengths) for group in groups) < 2:
         return False
-    poses = {group: sum(capture.sizes[capture.names.index(name)] - 1 for name in group) for group in groups}
-    return 3 * (sum(poses.values()) - max(poses.values())) >= parameters
+    poses = [sum(capture.sizes[capture.names.index(name)] - 1 for name in group) for group in groups]
+    return 3 * (sum(poses) - max(poses)) >= parameters
 
 
-def _observed_parts(capture: Capture) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
-    """What remains, what is left out, and its names: group by group or, of one group only, region by region."""
+def _parts_of(capture: Capture) -> list[_Part]:
+    """Group by group or, of one group of observations only, by regions of joint space."""
     groups = groups_of(capture)
-    if len(groups) > 1:
+    if len(groups) > 1 or not capture.observations:
         return _parts(capture, groups)
-    if capture.sizes or any(len(o.q) < _REGIONS * _POSES_A_REGION for o in capture.observations):
+    if capture.sizes or any(len(o.q) < 2**_HALVINGS * _POSES_A_REGION for o in capture.observations):
         return []
     regions = [_regions(np.asarray(observation.q)) for observation in capture.observations]
 
     def only(number: int, inside: bool) -> Capture:
-        chosen = [
-            observation.select(np.flatnonzero((region == number) == inside))
-            for observation, region in zip(capture.observations, regions, strict=True)
-        ]
-        return Capture({}, [], chosen)
+        pairs = zip(capture.observations, regions, strict=True)
+        return Capture({}, [], [o.select(np.flatnonzero((region == number) == inside)) for o, region in pairs])
 
-    return [
-        (only(i, False), only(i, True), tuple(f"{o.name}, region {i + 1}" for o in capture.observations))
-        for i in range(_REGIONS)
-    ]
+    names = [tuple(f"{o.name}, region {i + 1}" for o in capture.observations) for i in range(2**_HALVINGS)]
+    return [(only(i, False), only(i, True), of_region) for i, of_region in enumerate(names)]
 
 
 def _regions(q: Float[np.ndarray, "m n"]) -> np.ndarray:
     """A number for the region of joint space of each pose: halved again and again across its widest joint."""
     numbers = np.zeros(len(q), dtype=int)
-    regions = 1
-    while regions < _REGIONS:
-        for number in range(regions):
+    for count in 2 ** np.arange(_HALVINGS):
+        for number in range(count):
             inside = np.flatnonzero(numbers == number)
             widest = int(np.argmax(np.ptp(q[inside], axis=0)))
             order = inside[np.argsort(q[inside, widest], kind="stable")]
-            numbers[order[len(order) // 2 :]] += regions
-        regions *= 2
+            numbers[order[len(order) // 2 :]] += count
     return numbers
+
+
+def _parts(capture: Capture, groups: Iterable[tuple[str, ...]]) -> list[_Part]:
+    every = names_in(capture)
+    rests = [tuple(name for name in every if name not in group) for group in groups]
+    return [(part_of(capture, rest), part_of(capture, group), group) for rest, group in zip(rests, groups, strict=True)]
 
 
 def _determines(capture: Capture, parameters: int) -> bool:
     """Whether the scale is determined, and enough rows are there for the parameters and the geometry."""
-    fixed = bool(capture.lengths) or any(observation.fixes_scale for observation in capture.observations)
     observed = Observed.of(capture, None)
-    return fixed and observed.equations >= parameters + len(observed.steps)
+    return fixes_scale(capture) and observed.equations >= parameters + len(observed.steps)
 
 
 @checked_arguments
@@ -148,10 +147,21 @@ def cross_validate(
     given = CalibrationOptions(**options)
     arm, bounds, prior = with_joint_model(arm, capture, bounds, given.model, given.prior)
     given = given._replace(model=None, prior=prior, undetermined="ignore")
+    count = len(bounds.space.names)
     if groups is not None:
-        parts = _chosen(capture, groups, len(bounds.space.names))
-    elif can_cross_validate(capture, len(bounds.space.names)):
-        parts = _observed_parts(capture) if capture.observations else _parts(capture, groups_of(capture))
+        patterns = items_of(groups, "groups")
+        chosen = [names_in(capture.select(pattern)) for pattern in patterns]
+        for pattern, group in zip(patterns, chosen, strict=True):
+            _check_some_left(pattern, len(group) < len(names_in(capture)))
+        parts = _parts(capture, chosen)
+        for pattern, (rest, _, _) in zip(patterns, parts, strict=True):
+            if not _determines(rest, count):
+                raise InputError(
+                    f"without '{pattern}' nothing fixes the scale, or too few poses are left for the parameters; leave "
+                    "out less."
+                )
+    elif can_cross_validate(capture, count):
+        parts = _parts_of(capture)
     else:
         raise InputError(
             "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that "
@@ -159,55 +169,20 @@ def cross_validate(
             "the parameters; place the reference length somewhere else too, or leave cross-validation out "
             "(--no-cross-validate)."
         )
-    return CrossValidation(
-        tuple(_left_out(calibrate(arm, rest, bounds, **given._asdict()), left, group) for rest, left, group in parts)
-    )
+    left_out = []
+    for rest, left, names in parts:
+        result = calibrate(arm, rest, bounds, **given._asdict())
+        errors = unseen_errors(uncertainty_of(to_numpy(result)), left)
+        poses, lengths = errors.of(errors.parts), errors.of_lengths()
+        of_lengths, of_noise = lengths.degrees_of_freedom, errors.noise_degrees_of_freedom
+        columns = poses.count, poses.rms, poses.predicted, errors.length_error, errors.length_u, bool(result.converged)
+        left_out.append(LeftOut(names, *columns, poses.degrees_of_freedom, of_lengths, of_noise))
+    return CrossValidation(tuple(left_out))
 
 
-def _parts(capture: Capture, groups: Iterable[tuple[str, ...]]) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
-    """What remains, what is left out, and its names, group by group."""
-    every = names_in(capture)
-    return [
-        (part_of(capture, tuple(name for name in every if name not in group)), part_of(capture, group), group)
-        for group in groups
-    ]
-
-
-def _chosen(
-    capture: Capture, patterns: Iterable[str], parameters: int
-) -> list[tuple[Capture, Capture, tuple[str, ...]]]:
-    """The same of groups by name, or `InputError` where one leaves too little."""
-    given = items_of(patterns, "groups")
-    groups = [names_in(capture.select(pattern)) for pattern in given]
-    for pattern, group in zip(given, groups, strict=True):
-        if len(group) == len(names_in(capture)):
-            raise InputError(f"nothing is left without '{pattern}', so nothing can be calibrated; leave out less.")
-    parts = _parts(capture, groups)
-    for pattern, (rest, _, _) in zip(given, parts, strict=True):
-        if not _determines(rest, parameters):
-            raise InputError(
-                f"without '{pattern}' nothing fixes the scale, or too few poses are left for the parameters; leave out "
-                "less."
-            )
-    return parts
-
-
-def _left_out(result: Calibration, left: Capture, names: tuple[str, ...]) -> LeftOut:
-    """How a calibration without a group agrees with it."""
-    found = unseen_errors(uncertainty_of(to_numpy(result)), left)
-    poses, lengths = found.of(found.parts), found.of_lengths()
-    return LeftOut(
-        sockets=names,
-        poses=poses.count,
-        rms=poses.rms,
-        rms_predicted=poses.predicted,
-        length_error=found.length_error,
-        length_u=found.length_u,
-        converged=bool(result.converged),
-        rms_degrees_of_freedom=poses.degrees_of_freedom,
-        length_degrees_of_freedom=lengths.degrees_of_freedom,
-        noise_degrees_of_freedom=found.noise_degrees_of_freedom,
-    )
+def _check_some_left(pattern: str, some: bool) -> None:
+    if not some:
+        raise InputError(f"nothing is left without '{pattern}', so nothing can be calibrated; leave out less.")
 
 
 class Region(NamedTuple):
@@ -235,34 +210,28 @@ def regions_of(
     Raises:
         InputError: A pattern names nothing or everything, or there are too few poses.
     """
-    names = names_in(capture)
     sizes = [*capture.sizes, *(observation.q.shape[0] for observation in capture.observations)]
-    owner = np.repeat(np.array(names), sizes)
+    owner, groups = np.repeat(np.array(names_in(capture)), sizes), groups_of(capture)
     if patterns is not None:
         members = {pattern: names_in(capture.select(pattern)) for pattern in items_of(patterns, "regions")}
         regions = [Region(pattern, np.isin(owner, group)) for pattern, group in members.items()]
-    elif len(groups := groups_of(capture)) >= _GROUPS:
+    elif len(groups) >= _GROUPS:
         labelled = zip(common_labels(groups), groups, strict=True)
         regions = [Region(label, np.isin(owner, group)) for label, group in labelled]
     else:
-        regions = _halves(np.asarray(capture.readings)[:, :joints])
-    whole = [region.label for region in regions if region.poses.all()]
-    if whole:
-        raise InputError(f"nothing is left without '{whole[0]}', so nothing can be calibrated; leave out less.")
+        q, regions = np.asarray(capture.readings)[:, :joints], []
+        for joint in np.flatnonzero(np.ptp(q, axis=0) > _MOVES):
+            upper = q[:, joint] >= np.median(q[:, joint])
+            halves = {"lower": ~upper, "upper": upper}
+            regions += [Region(f"joint {joint + 1}, {half} half", poses) for half, poses in halves.items()]
+    for region in regions:
+        _check_some_left(region.label, not region.poses.all())
     regions = [region for region in regions if _POSES <= region.poses.sum() <= len(owner) - _POSES]
     if len(regions) < 2:
         raise InputError(
             "models are compared by regions that they have not seen, and these poses make fewer than two; record more."
         )
     return tuple(regions)
-
-
-def _halves(q: Float[np.ndarray, "M n"]) -> list[Region]:
-    halves = []
-    for joint in np.flatnonzero(np.ptp(q, axis=0) > _MOVES):
-        upper = q[:, joint] >= np.median(q[:, joint])
-        halves += [Region(f"joint {joint + 1}, lower half", ~upper), Region(f"joint {joint + 1}, upper half", upper)]
-    return halves
 
 
 class _Dense(NamedTuple):
@@ -311,9 +280,8 @@ def unseen_regions(
     Of a calibration of everything, with observations or a prior. Reference lengths with an end that only the region
     shows are left out with it.
     """
-    dense = _dense(
-        equations_of(record) if equations is None else equations, len(record.names) - (record.hold is not None)
-    )
+    equations = equations_of(record) if equations is None else equations
+    dense = _dense(equations, len(record.names) - (record.hold is not None))
     whole = dense.white.T @ dense.white, dense.white.T @ dense.residual
     return tuple(_without(dense, *whole, region) for region in regions)
 

@@ -104,7 +104,7 @@ class ComparedModels(NamedTuple):
         """Of each model from the best: mean difference of the mean square errors, and its standard error, mm^2."""
         best = self.models[self.best].mean_squares
         paired = [model.mean_squares - best for model in self.models]
-        return [(float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(len(each)))) for each in paired]
+        return [(float(np.mean(part)), float(np.std(part, ddof=1) / np.sqrt(len(part)))) for part in paired]
 
     @property
     def as_good(self) -> tuple[ComparedModel, ...]:

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from ..calibration.results import Calibration, Identification
-from ..calibration.scale_anchor import Method, warn_of_known_scale
+from ..calibration.scale_anchor import Method, method_of, warn_of_known_scale
 from ..calibration.stages import Stages, identified, in_two_stages, jointly
-from ..calibration.task import Solving, Task, method_of, task_of, without_lengths
+from ..calibration.task import Solving, Task, task_of, without_lengths
 from ..core._compat import inside_trace
 from ..core.arguments import Count, check_finite, checked_arguments, shown, with_options
 from ..core.arrays import Numbers, is_concrete
@@ -189,7 +189,7 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     given = CalibrationOptions(**options)
     arm, bounds, prior = with_joint_model(arm, capture, bounds, given.model, given.prior)
     given = given._replace(model=None, prior=prior)
-    method, at_once = method_of(arm, capture, bounds.space, given.solving, given.method)
+    method, at_once = method_of(arm, capture, bounds.space, given.noise, given.method, given.solving.all_at_once)
     given = given._replace(method=method)
     if at_once:
         _check_single(arm, capture, bounds, "calibrate_many")
@@ -270,7 +270,7 @@ def _with_components_of(other: Calibration, result: Calibration) -> Calibration:
     if components is None or lacking is None:
         return result
     none = eqx.tree_at(lambda lacking: lacking.matrices, lacking, 0 * lacking.matrices)
-    return eqx.tree_at(lambda one: one.parameter_covariance.components, result, components.joined(none))
+    return eqx.tree_at(lambda r: r.parameter_covariance.components, result, components.joined(none))
 
 
 def with_joint_model(

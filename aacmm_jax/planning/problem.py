@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float, Int
 from ..core.arguments import Count, Range, checked_fields
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.arm_classes import CLASSES, ArmNoise, small_arm_noise
-from ..data.noise import Noise
+from ..data.noise import CLASSES, ArmNoise, Noise, small_arm_noise
 from ..kinematics.arm import Arm, is_single, jacobian_at, joint_limits
 from ..kinematics.chain import reading_units
 from ..kinematics.collisions import Cell, HalfSpace

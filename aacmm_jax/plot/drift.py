@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..drift.results import Drift, Trend, in_words
-from ..summaries.harmonics import listed_apart
+from ..summaries.result_tables import listed_apart
 from .charts import SERIES, Axis, Marks, Plot, histogram, linear, names
 from .figures import check_format, draw, new_figure, save_figure
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import InputError
-from ..core.extras import require
+from ..core.errors import InputError, require
 from ..files.outputs import write_atomically
 from .charts import Axis, Marks, Plot
 

@@ -9,7 +9,7 @@ from ..acceptance.results import AcceptanceTest
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import DEG
-from ..diagnostics.tried_poses import TriedPoses
+from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.tables import decimals_for, format_number
 from ..uncertainty.volume import VolumetricUncertainty
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, ordinates, runs, shades, thinned

@@ -13,7 +13,7 @@ from ..kinematics.arm import is_length, parameter_unit
 from ..kinematics.corrections import Term
 from ..pipeline.model_ladder import ComparedModels
 from ..summaries.compared_models import compared_models_summary
-from ..summaries.harmonics import listed_apart
+from ..summaries.result_tables import listed_apart
 from ..summaries.tables import decimals_for, format_number
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability

@@ -8,16 +8,22 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG, people_read
+from ..diagnostics.joint_travel import TriedPoses, tried_poses
 from ..diagnostics.pose_residuals import observation_residuals
-from ..diagnostics.tried_poses import TriedPoses, tried_poses
 from ..kinematics.arm import joint_limits, parameter_unit
-from ..model.metrics import pose_outliers
+from ..model.sockets import pose_outliers
 from ..plot.charts import Chart, Marks, Plot, linear, names, thinned
 from ..plot.lengths import tried_chart, volume_chart
 from ..plot.parameters import bounds_chart, change_chart, correlation_chart, functions_chart, singular_chart
 from ..plot.residuals import Groups, distances_in, kinds_chart, pattern_charts
-from ..summaries.harmonics import listed_apart
-from ..summaries.result_tables import geometry_table, harmonics_table, parameter_table, weights_table, with_u_digits
+from ..summaries.result_tables import (
+    geometry_table,
+    harmonics_table,
+    listed_apart,
+    parameter_table,
+    weights_table,
+    with_u_digits,
+)
 from ..summaries.tables import (
     Cell,
     by_columns,

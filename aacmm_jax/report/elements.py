@@ -14,7 +14,7 @@ from ..data.observations.observation import POINT, offset_of
 from ..diagnostics.pose_residuals import distances_of, observation_residuals
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import arm_reach, skeleton
-from ..model.metrics import pose_outliers
+from ..model.sockets import pose_outliers
 from ..plot.charts import Chart, thinned
 from ..plot.residuals import Groups, distances_in, pose_chart
 from ..summaries.observations import capture_observations

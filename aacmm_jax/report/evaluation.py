@@ -12,7 +12,7 @@ from ..acceptance.results import AcceptanceTest
 from ..calibration.evaluation import Evaluation, evaluate
 from ..core.text import pluralise
 from ..data.capture import ReferenceLength
-from ..data.sphere import ProbedSphere
+from ..data.recording import ProbedSphere
 from ..plot.lengths import metrics_chart, reading_errors_chart
 from ..plot.residuals import arms_chart, distances_in
 from ..summaries import result_tables

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..acceptance.record import SIMULATED
-from ..core.extras import require
+from ..core.errors import require
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
 from ..files.hdf5 import read_summary, read_tables
 from ..files.inputs import InputFile, fingerprint

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Bool, Float, PyTree
 
 from ..core.numpy_or_jax import AnyArray, cond, namespace, while_loop
 from .arrow import Arrow
@@ -53,15 +52,6 @@ class Box(NamedTuple):
     lower: Flat
     upper: Flat
     scale: Flat | None
-
-    @classmethod
-    def of(cls, y: PyTree[Array], lower: PyTree, upper: PyTree, scale: PyTree) -> "Box":
-        """Bounds and scale in any form that `expand` takes, but scale may be None as a whole."""
-
-        def flat(tree: PyTree, fill: float) -> Flat:
-            return ravel_pytree(expand(y, tree, fill))[0]
-
-        return cls(flat(lower, -jnp.inf), flat(upper, jnp.inf), None if scale is None else flat(scale, 1.0))
 
     def clip(self, y: Flat) -> Flat:
         """The nearest point of the box."""
@@ -153,12 +143,11 @@ def _solve_within(
 
 def choose(predicate: Bool[AnyArray, "*slots"], new: PyTree, old: PyTree) -> PyTree:
     """Slot by slot, the new tree or the old one."""
-
     if namespace(predicate) is np and predicate.ndim == 0:
         return new if predicate else old
 
-    def pick(one: Any, other: Any) -> Any:
-        return jnp.where(predicate.reshape(predicate.shape + (1,) * (one.ndim - predicate.ndim)), one, other)
+    def pick(first: Any, second: Any) -> Any:
+        return jnp.where(predicate.reshape(predicate.shape + (1,) * (first.ndim - predicate.ndim)), first, second)
 
     return jax.tree.map(pick, new, old)
 
@@ -167,15 +156,3 @@ def norm(vector: Flat) -> Number:
     """Euclidean lengths of a batch of vectors."""
     xp = namespace(vector)
     return xp.sqrt(xp.sum(vector**2, axis=-1))
-
-
-def expand(y: PyTree[Array], given: PyTree, absent: float) -> PyTree[Array]:
-    """A tree like ``y``, from one like it whose leaves broadcast, or from a number for all; None stands for
-    ``absent``."""
-
-    def leaf_of(leaf: Array, value: object) -> Array:
-        return jnp.broadcast_to(jnp.asarray(absent if value is None else value, dtype=jnp.float64), leaf.shape)
-
-    if given is None or (jax.tree_util.all_leaves([given]) and jnp.ndim(given) == 0):
-        return jax.tree.map(lambda leaf: leaf_of(leaf, given), y)
-    return jax.tree.map(leaf_of, y, given)

@@ -39,7 +39,8 @@ class Arrow(NamedTuple):
 
     def diagonal(self) -> Float[AnyArray, "*batch z"]:
         """The diagonal."""
-        return joined(*(_diagonal(part) for part in (self.head, *self.own)))
+        parts = (namespace(part).diagonal(part, axis1=-2, axis2=-1) for part in (self.head, *self.own))
+        return joined(*parts)
 
     def sum(self) -> Float[AnyArray, "*batch"]:
         """The sum of what is stored, which is finite where everything is."""
@@ -112,10 +113,6 @@ def joined(head: Float[AnyArray, "*batch h"], *parts: Float[AnyArray, "*batch _ 
         return head
     flat = [part.reshape(*part.shape[:-2], -1) for part in parts]
     return namespace(head, parts).concatenate([head, *flat], axis=-1)
-
-
-def _diagonal(matrix: Float[AnyArray, "*batch k k"]) -> Float[AnyArray, "*batch k"]:
-    return namespace(matrix).diagonal(matrix, axis1=-2, axis2=-1)
 
 
 def _damped(

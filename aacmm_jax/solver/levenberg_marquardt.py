@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ..core.numpy_or_jax import AnyArray, namespace, while_loop
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, norm, propose
@@ -61,51 +61,70 @@ def begin(y: Flat, box: Box, gram: Any = None) -> Progress:
 
 def advance(progress: Progress, evaluated: QuadraticModel, box: Box, rules: Rules) -> Progress:
     """Accept or refuse the trial from its evaluated model, test for convergence, and propose the next trial."""
-    xp, first = namespace(progress), progress.steps == 0
-    finite = evaluated.finite()
-    trial = progress.step.trial
-    trial_optimality = box.optimality(trial, evaluated)
-    accept = finite & (first | _improves(progress, evaluated, trial_optimality))
+    xp, first, before, tried = namespace(progress), progress.steps == 0, progress.model, progress.step
+    finite, decrease = evaluated.finite(), before.cost - evaluated.cost
+    trial_optimality = box.optimality(tried.trial, evaluated)
+    # Close to the solution the decrease drowns in the rounding of the cost; the gradient still points downhill. (Tips
+    # at 1 m that differ by 10 um lose five digits, hence the wide margin.)
+    margin = 1e6 * _EPSILON * before.cost
+    within_rounding = (tried.predicted < margin) & (xp.abs(decrease) < margin)
+    closer = trial_optimality < progress.optimality
+    improves = (tried.predicted > 0) & xp.where(within_rounding, closer, decrease > 1e-4 * tried.predicted)
+    accept = finite & (first | improves)
     y, model, optimality = choose(
-        accept, (trial, evaluated, trial_optimality), (progress.y, progress.model, progress.optimality)
+        accept, (tried.trial, evaluated, trial_optimality), (progress.y, before, progress.optimality)
     )
     curvature = xp.maximum(progress.curvature, Arrow.of(model.gram).diagonal())
-    scale = _scale(box, curvature)
-
-    ratio = _ratio(progress, evaluated, accept)
-    damping, growth = _next_damping(progress, ratio, accept)
+    scale = box.scale
+    if scale is None:
+        scale = xp.where(curvature > 0, 1.0 / xp.sqrt(xp.where(curvature > 0, curvature, 1.0)), 1.0)
+    # Actual to predicted decrease of an accepted step. Nielsen's rule: shrink smoothly with it, grow ever faster with
+    # refusals.
+    ratio = xp.where(accept, decrease / xp.where(tried.predicted > 0, tried.predicted, 1.0), 0.0)
+    ratio = xp.where(xp.isfinite(ratio), ratio, 0.0)
+    shrink = xp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
+    damping = progress.damping * xp.where(accept, shrink, progress.growth)
+    growth = xp.where(accept, 2.0, 2.0 * progress.growth)
     largest = xp.max(scale**2 * curvature, axis=-1)
     # With less, rounding in the Gram matrix can make it indefinite.
     least = 1e3 * _EPSILON * largest
     initial = 0.0 if rules.initial_damping is None else rules.initial_damping * largest
-    damping = xp.maximum(xp.where(first, initial, damping), least)
-    radius = None
+    damping, radius = xp.maximum(xp.where(first, initial, damping), least), None
     if rules.initial_damping is None:
-        trusted = xp.where(_within_rounding(progress, evaluated), 1.0, ratio)
-        radius = _next_radius(progress, y, model, scale, trusted, accept)
+        radius = _next_radius(progress, y, model, scale, xp.where(within_rounding, 1.0, ratio), accept)
         radius = xp.where(model.finite(), radius, np.inf)
-
     step, damping = propose(y, model, box, scale, damping, radius)
 
     # After an accepted trial the next step is tested: where it is too small to matter it is not taken, which saves the
     # last evaluation. After a refusal, the refused one. Both before clipping: a step that the box cuts to nothing says
     # only that the damping is still too small.
-    small_step = xp.where(accept, step.length, progress.step.length) <= rules.rtol * norm(y / scale) + rules.atol
-    below_rounding = xp.abs(progress.step.predicted) <= 4 * _EPSILON * progress.model.cost
-    unclipped = norm((trial - progress.y) / scale) >= 0.5 * progress.step.length
+    small_step = xp.where(accept, step.length, tried.length) <= rules.rtol * norm(y / scale) + rules.atol
+    below_rounding = xp.abs(tried.predicted) <= 4 * _EPSILON * before.cost
+    unclipped = norm((tried.trial - progress.y) / scale) >= 0.5 * tried.length
     tiny = small_step | (below_rounding & unclipped & ~accept & finite)
     # Refusals alone made this step tiny, far from any minimum: the model is wrong (a false derivative, a kink). A step
     # this small may be accepted all the same: the cost does not resolve it, and which of two equal gradients is the
     # smaller one is decided by rounding.
     forced = (progress.damping > 1e-3 * largest) & (optimality > 1e-6)
-    reason = xp.where(tiny, xp.where(small_step, STEP, ROUNDING), RUNNING)
-    reason = xp.where(tiny & forced, STALLED, reason)
+    reason = xp.where(tiny, xp.where(forced, STALLED, xp.where(small_step, STEP, ROUNDING)), RUNNING)
     # A gradient may also be zero because the residual, or its derivative, depends on no unknown at all.
     ended = xp.where((largest > 0) | (model.cost == 0), GRADIENT, STALLED)
     reason = xp.where(optimality <= rules.gtol, ended, reason)
     reason = xp.where(first & ~finite, NONFINITE, reason).astype(np.int32)
     steps, accepted = progress.steps + 1, progress.accepted + xp.where(accept, 1, 0)
     return Progress(y, model, optimality, step, damping, growth, curvature, steps, accepted, reason)
+
+
+def _next_radius(progress: Progress, y: Flat, model: QuadraticModel, scale: Flat, ratio: Number, accept: Any) -> Number:
+    """The trust radius, scaled, of which the damping is to make the next step."""
+    xp = namespace(progress)
+    # At first the distance of the start from 0: from a bad start a step of Gauss and Newton can leave the region in
+    # which the residual depends on the unknowns at all (NIST's BoxBOD), and a step that is damped a given amount may
+    # follow the steepest descent into the wrong valley (MGH10).
+    start = norm(y / scale)
+    start = xp.where(start > 0, start, xp.sqrt(2 * model.cost))
+    factor = xp.where(accept, xp.where(ratio > 0.75, 2.0, xp.where(ratio > 0.25, 1.0, 0.5)), 0.25)
+    return xp.where(progress.steps == 0, start, factor * progress.step.length)
 
 
 def minimise(
@@ -121,18 +140,9 @@ def minimise(
 ) -> Progress:
     """The steps of `solver.least_squares` in NumPy, with nothing to compile, or in JAX for a batch; not differentiable.
 
-    Args:
-        model: A function of (y, args): the `QuadraticModel`.
-        start: Where to start ``(p,)``; it is clipped to the box.
-        args: Passed to ``model``.
-        lower: Lower bounds ``(p,)``.
-        upper: Upper bounds ``(p,)``.
-        scale: The natural step of each unknown ``(p,)``; None takes it from the curvature.
-        rules: Tolerances and initial damping.
-        max_steps: The largest number of evaluations.
-
-    Returns:
-        The last state; its reason is the step limit where that was reached.
+    ``model`` is a function of (y, args); ``start`` is clipped to the box, and ``scale``, the natural step of each
+    unknown, taken from the curvature where it is None. The reason of the last state is the step limit where that was
+    reached.
     """
     box, form = Box(lower, upper, scale), None
     if namespace(start, args) is not np:
@@ -145,53 +155,3 @@ def minimise(
     )
     ended = namespace(progress).where(progress.reason == RUNNING, MAX_STEPS, progress.reason).astype(np.int32)
     return eqx.tree_at(lambda p: p.reason, progress, ended)
-
-
-def _improves(progress: Progress, evaluated: QuadraticModel, trial_optimality: Number) -> Bool[AnyArray, "*slots"]:
-    xp = namespace(progress)
-    predicted = progress.step.predicted
-    decreases = progress.model.cost - evaluated.cost > 1e-4 * predicted
-    closer = trial_optimality < progress.optimality
-    return (predicted > 0) & xp.where(_within_rounding(progress, evaluated), closer, decreases)
-
-
-def _within_rounding(progress: Progress, evaluated: QuadraticModel) -> Bool[AnyArray, "*slots"]:
-    xp = namespace(progress)
-    # Close to the solution the decrease drowns in the rounding of the cost; the gradient still points downhill. (Tips
-    # at 1 m that differ by 10 um lose five digits, hence the wide margin.)
-    margin = 1e6 * _EPSILON * progress.model.cost
-    return (progress.step.predicted < margin) & (xp.abs(progress.model.cost - evaluated.cost) < margin)
-
-
-def _ratio(progress: Progress, evaluated: QuadraticModel, accept: Bool[AnyArray, "*slots"]) -> Number:
-    """Actual to predicted decrease of an accepted step."""
-    xp = namespace(progress)
-    predicted = xp.where(progress.step.predicted > 0, progress.step.predicted, 1.0)
-    ratio = xp.where(accept, (progress.model.cost - evaluated.cost) / predicted, 0.0)
-    return xp.where(xp.isfinite(ratio), ratio, 0.0)
-
-
-def _next_damping(progress: Progress, ratio: Number, accept: Bool[AnyArray, "*slots"]) -> tuple[Number, Number]:
-    xp = namespace(progress)
-    # Nielsen's rule: shrink smoothly with the ratio, grow ever faster with refusals.
-    shrink = xp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
-    damping = progress.damping * xp.where(accept, shrink, progress.growth)
-    return damping, xp.where(accept, 2.0, 2.0 * progress.growth)
-
-
-def _next_radius(progress: Progress, y: Flat, model: QuadraticModel, scale: Flat, ratio: Number, accept: Any) -> Number:
-    xp = namespace(progress)
-    # As in trust-region methods. At first the distance of the start from 0: from a bad start a step of Gauss and Newton
-    # can leave the region in which the residual depends on the unknowns at all (NIST's BoxBOD), and a step that is
-    # damped a given amount may follow the steepest descent into the wrong valley (MGH10).
-    start = norm(y / scale)
-    start = xp.where(start > 0, start, xp.sqrt(2 * model.cost))
-    factor = xp.where(accept, xp.where(ratio > 0.75, 2.0, xp.where(ratio > 0.25, 1.0, 0.5)), 0.25)
-    return xp.where(progress.steps == 0, start, factor * progress.step.length)
-
-
-def _scale(box: Box, curvature: Flat) -> Flat:
-    xp = namespace(curvature)
-    if box.scale is not None:
-        return box.scale
-    return xp.where(curvature > 0, 1.0 / xp.sqrt(xp.where(curvature > 0, curvature, 1.0)), 1.0)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.extras import require
+from ..core.errors import require
 from ..files.hdf5 import undamaged
 from ..kinematics.arm import parameter_unit
 from ..solver.reason import Reason, numbers_of

@@ -18,9 +18,8 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from ..core._compat import reset_compilation_cache
-from ..core.compilation_cache import set_up
-from ..core.errors import InputError
-from ..core.extras import require
+from ..core.errors import InputError, require
+from ..core.jax_setup import set_up
 from ..files.outputs import OutputFile
 from .blocks import Block, check_same, computed_with
 from .configuration_pool import check_reach

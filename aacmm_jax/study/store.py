@@ -90,8 +90,8 @@ class Results:
         if not results.finished:
             results.finished_blocks()  # refuses those of somebody else
         else:
-            with opened(results.path, ("study",), verify=False) as content:
-                arrays = {name: content.dataset("trials", name) for name in VARIABLES}
+            with opened(results.path, ("study",), verify=False) as file:
+                arrays = {name: file["trials"][name] for name in VARIABLES}
                 shapes = any(array.shape != results.empty(name).shape for name, array in arrays.items())
                 check_sense(results.path, {"its results have other shapes than its study": shapes})
                 ran = (arrays["converged"][()] != VARIABLES["converged"].fill).all()
@@ -196,8 +196,8 @@ class Results:
                     arrays = self.of_block(block)
                     yield block.slices[1], {name: arrays[name][cell - block.first_cell] for name in names}
             return
-        with opened(self.path, ("study",), verify=False) as content:
-            arrays = {name: content.dataset("trials", name) for name in names}
+        with opened(self.path, ("study",), verify=False) as file:
+            arrays = {name: file["trials"][name] for name in names}
             for first in range(0, self.study.trials, _TRIALS_IN_MEMORY):
                 trials = slice(first, min(first + _TRIALS_IN_MEMORY, self.study.trials))
                 yield trials, {name: arrays[name][cell, trials] for name in names}

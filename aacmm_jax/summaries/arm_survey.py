@@ -1,7 +1,5 @@
 """An arm looked at before its first calibration: joints, reach, what data determine, what a first capture needs."""
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +8,7 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import pluralise, shorten
 from ..core.units import ARCSEC
-from ..data.arm_classes import ArmNoise
+from ..data.noise import ArmNoise
 from ..kinematics.arm import Arm, correction_names, joint_limits, without_corrections
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, tip_frame
 from ..kinematics.corrected_arm import function_values, loads_of
@@ -27,6 +25,7 @@ from ..planning.first_capture import (
     still_joints,
 )
 from .calibration import arm_summary
+from .tables import plain
 
 _SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
 _SHOWN = (15, 30, 60, 120)  # poses
@@ -35,11 +34,7 @@ _OTHERS = "Left out as constant, or as combinations of other functions of their 
 
 
 def arm_survey(
-    specification: ArmSpecification,
-    usual: ArmNoise,
-    *,
-    base: Transform | None = None,
-    model: str | None = None,
+    specification: ArmSpecification, usual: ArmNoise, *, base: Transform | None = None, model: str | None = None
 ) -> dict[str, Any]:
     """Plain values for JSON and display.
 
@@ -50,69 +45,54 @@ def arm_survey(
         model: The model that the arm's corrections are of, where one was named.
     """
     arm: Arm = to_numpy(specification.arm)
-    plain = without_corrections(arm)
-    reach = arm_reach(plain)
+    plain_arm, links = without_corrections(arm), total_link_length(arm)
+    reach = arm_reach(plain_arm)
     base = np.eye(4) if base is None else base
+    geometry = geometry_of(plain_arm)
+    # Where the axis of each joint is at readings of zero, and the tip.
+    frames = [*dh_frames(geometry, base)[:-1], tip_frame(geometry, base)]
     summary = arm_summary(specification) | {
-        "frames": _frames(plain, base),
+        "frames": [
+            {"joint": joint, "origin_mm": frame[:3, 3].tolist(), "axis": (np.round(frame[:3, 2], 12) + 0.0).tolist()}
+            for joint, frame in zip([*range(1, arm.joints + 1), None], frames, strict=True)
+        ],
         "reach_mm": {
             "shoulder": (base[:3, :3] @ reach.shoulder + base[:3, 3]).tolist(),
             "farthest": reach.radius,
-            "nearest": closest_approach(plain),
-            "links": total_link_length(arm),
+            "nearest": closest_approach(plain_arm),
+            "links": links,
         },
+        "corrections_left_out": _left_out(arm, model),
+        **{name: [] for name in ("redundant", "weak", "parallel", "free", "fixed", "determined", "still", "needed")},
+        "advice": "",
+        "warnings": [],
     }
-    summary["corrections_left_out"] = _left_out(arm, model)
-    empty: dict[str, Any] = {"redundant": [], "weak": [], "parallel": [], "free": [], "fixed": []}
-    empty |= {"determined": [], "still": [], "needed": [], "advice": ""}
-    summary |= empty | {"warnings": _warnings(arm)}
+    if not _SHORTEST <= links <= _LONGEST:
+        summary["warnings"].append(f"The links together measure {links:.4g} mm; is the unit of the lengths right?")
+    if arm.limits is None:
+        summary["warnings"].append(
+            "No joint limits are given, so joints are taken to go from -180 to 180 deg; add them."
+        )
     try:
         best, chosen, still = determined_by(arm), Parameters.independent(arm), still_joints(arm)
+        seen = best[1].seen
         summary |= {
             "parameters": len(best[0].seen.names),
-            "redundant": _redundant(best),
-            "weak": [trade_off.text for trade_off in best[1].seen.trade_offs],
-            "parallel": list(best[1].seen.parallel),
+            # What no data on the tip can separate, whatever is recorded.
+            "redundant": [text for text, always in zip(seen.undetermined, seen.structural, strict=True) if always],
+            "weak": [trade_off.text for trade_off in seen.trade_offs],
+            "parallel": list(seen.parallel),
             "free": list(chosen.names),
             "fixed": [name for name in chosen.held if not name.startswith("beta_")],
-            "determined": [_row(data) for data in best],
+            "determined": [_determined_row(data) for data in best],
             "still": [{"joint": row.joint, "lost": None if row.lost is None else list(row.lost)} for row in still],
         }
-        needed = [first_capture(arm, usual.noise, usual.arm_class)]
-        moving = [row.joint for row in still if row.lost is None or row.lost]
-        summary |= {
-            "needed": [_needed(capture, usual.source) for capture in needed],
-            "advice": _advice(needed, moving, arm.joints),
-        }
+        needed = first_capture(arm, usual.noise, usual.arm_class)
+        moving = [str(row.joint) for row in still if row.lost is None or row.lost]
+        summary |= {"needed": [_needed(needed, usual.source)], "advice": _advice(needed, moving, arm.joints)}
     except InputError as error:
         summary["warnings"].append(f"What a calibration needs cannot be computed for this arm: {error}")
     return summary
-
-
-def _frames(arm: Arm, base: Transform) -> list[dict[str, Any]]:
-    """Where the axis of each joint is at readings of zero, and the tip."""
-    geometry = geometry_of(arm)
-    rows = [
-        {"joint": number, "origin_mm": frame[:3, 3].tolist(), "axis": (np.round(frame[:3, 2], 12) + 0.0).tolist()}
-        for number, frame in enumerate(dh_frames(geometry, base)[:-1], start=1)
-    ]
-    tip = tip_frame(geometry, base)
-    return [*rows, {"joint": None, "origin_mm": tip[:3, 3].tolist(), "axis": (np.round(tip[:3, 2], 12) + 0.0).tolist()}]
-
-
-def _warnings(arm: Arm) -> list[str]:
-    warnings, links = [], total_link_length(arm)
-    if not _SHORTEST <= links <= _LONGEST:
-        warnings.append(f"The links together measure {links:.4g} mm; is the unit of the lengths right?")
-    if arm.limits is None:
-        warnings.append("No joint limits are given, so joints are taken to go from -180 to 180 deg; add them.")
-    return warnings
-
-
-def _redundant(best: Sequence[Determined]) -> list[str]:
-    """What no data on the tip can separate, whatever is recorded."""
-    seen = best[1].seen
-    return [text for text, always in zip(seen.undetermined, seen.structural, strict=True) if always]
 
 
 def _left_out(arm: Arm, model: str | None) -> list[str]:
@@ -133,10 +113,10 @@ def _left_out(arm: Arm, model: str | None) -> list[str]:
     return [reason.format(joint=joint, names=shorten(names)) for (joint, reason), names in why.items()]
 
 
-def _row(one: Determined) -> dict[str, Any]:
-    seen = one.seen
+def _determined_row(data: Determined) -> dict[str, Any]:
+    seen = data.seen
     return {
-        "data": one.data,
+        "data": data.data,
         "determined": seen.rank,
         "well_determined": seen.rank - len(seen.trade_offs),
         "scale": not any("the scale" in text for text in seen.undetermined),
@@ -146,46 +126,46 @@ def _row(one: Determined) -> dict[str, Any]:
     }
 
 
-def _needed(one: FirstCapture, source: str) -> dict[str, Any]:
+def _needed(capture: FirstCapture, source: str) -> dict[str, Any]:
     return {
-        "class": one.arm_class,
+        "class": capture.arm_class,
         "noise_source": source,
         "u_length_mm": U_LENGTH,
         "u_tracker_mm": U_TRACKER,
-        "encoder_arcsec": float(np.max(np.asarray(one.noise.encoder))) / ARCSEC,
-        "seating_mm": float(one.noise.seating),
-        "u_reading_mm": one.u_reading,
+        "encoder_arcsec": float(np.max(np.asarray(capture.noise.encoder))) / ARCSEC,
+        "seating_mm": float(capture.noise.seating),
+        "u_reading_mm": capture.u_reading,
         "rows": [
             {
                 "data": row.data,
                 "sockets": row.sockets,
                 "lengths": row.lengths,
                 "enough_poses": row.enough,
-                "u_mm": {str(count): row.u[count] if math.isfinite(row.u[count]) else None for count in _SHOWN},
+                "u_mm": {str(count): plain(row.u[count]) for count in _SHOWN},
             }
-            for row in one.expected
+            for row in capture.expected
         ],
     }
 
 
-def _advice(needed: Sequence[FirstCapture], moving: list[int], arm_joints: int) -> str:
+def _advice(needed: FirstCapture, moving: list[str], joints: int) -> str:
     """What to record, in a sentence or two: the fewest sockets of which some number of poses is enough."""
-    rows = [row for row in needed[0].expected if row.sockets and row.enough is not None]
+    rows = [(row.enough, row.sockets, row) for row in needed.expected if row.sockets and row.enough is not None]
     if not rows:
         return (
             "Random poses in sockets do not determine this arm well; use a tracker, or see what aacmm plan finds for "
             "chosen poses."
         )
-    best = min(rows, key=lambda row: (row.enough or 0, row.sockets))
-    poses = best.enough or 0
-    every = "Every joint must move." if len(moving) == arm_joints else ""
-    joints = every or f"These joints must move: {shorten([str(joint) for joint in moving], 20)}." * bool(moving)
-    trackers = (row.enough for row in needed[0].expected if not row.sockets and row.enough is not None)
+    poses, _, best = min(rows, key=lambda row: row[:2])
+    to_move = f"These joints must move: {shorten(moving, 20)}." if moving else ""
+    to_move = "Every joint must move." if len(moving) == joints else to_move
     tracked = "".join(
-        f" With a tracker: {pluralise(2 * enough, 'pose')} all over its workspace." for enough in trackers
+        f" With a tracker: {pluralise(2 * row.enough, 'pose')} all over its workspace."
+        for row in needed.expected
+        if not row.sockets and row.enough is not None
     )
     return (
         f"Record {2 * poses} poses, as different as possible, in {best.data}. From {pluralise(poses, 'pose')} on the "
         "calibration adds less to a measured length than the readings themselves; the others are its check."
-        f"{tracked} {joints}"
+        f"{tracked} {to_move}"
     )

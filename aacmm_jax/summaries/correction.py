@@ -3,22 +3,24 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..core.text import pluralise, shorten
 from ..core.units import DEG
 from ..kinematics.arm import Arm, by_joint
 from ..kinematics.inverse_kinematics import FULL_POSE, ReadingsAtPoses, least_motion
+from .tables import View, formatted, listed, plain, warnings_of, written_of
 
 _SINGULAR = 3.0  # mm a rad: 1 mm takes 20 deg of the joints; axes of a wrist are within half a degree of each other
 _LARGE_CHANGE = 5.0  # deg: ten times what link errors of 1 mm and 1 mrad take where no axes align
+_MOST_ROWS = 20  # that are printed
 
 
 def correction_summary(
     nominal: Arm,
     calibrated: Arm,
     q: Float[np.ndarray, "N n"],
-    found: ReadingsAtPoses,
+    corrected: ReadingsAtPoses,
     *,
     unit: str,
     of_readings: bool,
@@ -29,81 +31,101 @@ def correction_summary(
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
         q: Commanded readings, or those that the search for a pose began with, rad and mm; perhaps with temperatures.
-        found: The corrected readings.
+        corrected: The corrected readings.
         unit: Of readings in the tables, deg or rad.
         of_readings: Whether readings were commanded; of positions with orientations nothing is known of the arm
             without a correction.
     """
-    reached = np.asarray(found.reached)
+    reached, after = np.asarray(corrected.reached), np.asarray(corrected.q)
+    commanded, distance, angle = q[:, : nominal.joints], np.asarray(corrected.distance), np.asarray(corrected.angle)
+    largest = ("distance_before_mm", "distance_mm", "angle_deg", "change", "slide")
+    warnings: list[str] = []
     summary: dict[str, Any] = {
         "rows": len(reached),
         "unit": unit,
         "position_only": nominal.joints < FULL_POSE,
-        "largest_distance_before_mm": None,
-        "largest_distance_mm": None,
-        "largest_angle_deg": None,
-        "largest_change": None,
-        "largest_slide": None,
+        **dict.fromkeys((f"largest_{name}" for name in largest), None),
         "singular": [],
-        "not_reached": [_missed(nominal, found, row) for row in np.flatnonzero(~reached).tolist()],
-        "warnings": [],
+        "not_reached": [],
+        "warnings": warnings,
     }
+    at_limit = np.zeros(after.shape, dtype=bool)
+    if nominal.limits is not None:
+        low, high = np.asarray(nominal.limits).T
+        at_limit = (after <= low) | (after >= high)  # where the search ended
+    for row in np.flatnonzero(~reached).tolist():
+        missed = {"row": row + 1, "distance_mm": distance[row], "angle_deg": angle[row] / DEG}
+        summary["not_reached"].append(plain(missed | {"joints_at_limit": np.flatnonzero(at_limit[row]) + 1}))
     if summary["position_only"]:
-        summary["warnings"].append(
+        warnings.append(
             f"the arm has {pluralise(nominal.joints, 'joint')}, fewer than six, so positions alone are corrected, not "
             "orientations."
         )
     if not reached.any():
         return summary
-    summary["singular"] = _singular(nominal, q[:, : nominal.joints] if of_readings else np.asarray(found.q), reached)
+    near = least_motion(nominal, commanded if of_readings else after) < _SINGULAR
+    summary["singular"] = (np.flatnonzero(near & reached) + 1).tolist()
     if summary["singular"]:
         rows = shorten([str(row) for row in summary["singular"]])
-        summary["warnings"].append(
+        warnings.append(
             f"In {pluralise(len(summary['singular']), 'row')} (row {rows}) the nominal arm is singular, or nearly so: "
             "axes align, or it is stretched. Its controller's inverse has no unique answer there, and may take other "
             "readings for such a pose than these; command readings there, not poses, or keep away from it."
         )
-    summary["largest_distance_mm"] = float(np.asarray(found.distance)[reached].max())
-    summary["largest_angle_deg"] = float(np.asarray(found.angle)[reached].max() / DEG)
-    if of_readings:
-        before = np.asarray(calibrated.position(q[reached]))
-        q = q[:, : nominal.joints]
-        before = before - np.asarray(nominal.position(q[reached]))
-        summary["largest_distance_before_mm"] = float(np.linalg.norm(before, axis=1).max())
-        moved = np.where(reached[:, None], np.abs(np.asarray(found.q) - q), 0.0)
-        change, slide = (moved * np.array(by_joint(nominal, *of)) for of in ((1 / DEG, 0.0), (0.0, 1.0)))
-        if len(nominal.prismatic) < nominal.joints:
-            row, joint = divmod(int(np.argmax(change)), nominal.joints)
-            summary["largest_change"] = {"row": row + 1, "joint": joint + 1, "change_deg": float(change[row, joint])}
-        if nominal.prismatic:
-            row, joint = divmod(int(np.argmax(slide)), nominal.joints)
-            summary["largest_slide"] = {"row": row + 1, "joint": joint + 1, "change_mm": float(slide[row, joint])}
-        large = np.flatnonzero(change.max(axis=1) > _LARGE_CHANGE) + 1
-        if len(large):
-            summary["warnings"].append(
-                f"{pluralise(len(large), 'row')} (row {shorten([str(x) for x in large])}) changed a reading by more "
-                f"than {_LARGE_CHANGE:g} deg: near there axes of the arm align, and small corrections take large "
-                "motions; look at them before an arm is sent there."
-            )
+    summary["largest_distance_mm"] = float(distance[reached].max())
+    summary["largest_angle_deg"] = float(angle[reached].max() / DEG)
+    if not of_readings:
+        return summary
+    before = np.asarray(calibrated.position(q[reached])) - np.asarray(nominal.position(commanded[reached]))
+    summary["largest_distance_before_mm"] = float(np.linalg.norm(before, axis=1).max())
+    moved = np.where(reached[:, None], np.abs(after - commanded), 0.0)
+    change, slide = (moved * np.array(by_joint(nominal, *of)) for of in ((1 / DEG, 0.0), (0.0, 1.0)))
+    slides, turns = bool(nominal.prismatic), len(nominal.prismatic) < nominal.joints
+    for key, exists, values, in_unit in (("change", turns, change, "deg"), ("slide", slides, slide, "mm")):
+        if exists:
+            row, joint = divmod(int(np.argmax(values)), nominal.joints)
+            amount = {f"change_{in_unit}": float(values[row, joint])}
+            summary[f"largest_{key}"] = {"row": row + 1, "joint": joint + 1} | amount
+    large = np.flatnonzero(change.max(axis=1) > _LARGE_CHANGE) + 1
+    if len(large):
+        warnings.append(
+            f"{pluralise(len(large), 'row')} (row {shorten([str(x) for x in large])}) changed a reading by more "
+            f"than {_LARGE_CHANGE:g} deg: near there axes of the arm align, and small corrections take large "
+            "motions; look at them before an arm is sent there."
+        )
     return summary
 
 
-def _singular(nominal: Arm, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> list[int]:
-    """Rows, from 1, near a singular configuration."""
-    near = least_motion(nominal, q) < _SINGULAR
-    return (np.flatnonzero(near & reached) + 1).tolist()
-
-
-def _missed(nominal: Arm, found: ReadingsAtPoses, row: int) -> dict[str, Any]:
-    """How far a pose is missed, and which joints are at a limit where the search ended."""
-    q = np.asarray(found.q)[row]
-    at_limit = []
-    if nominal.limits is not None:
-        low, high = np.asarray(nominal.limits).T
-        at_limit = (np.flatnonzero((q <= low) | (q >= high)) + 1).tolist()
-    return {
-        "row": row + 1,
-        "distance_mm": float(np.asarray(found.distance)[row]),
-        "angle_deg": float(np.asarray(found.angle)[row] / DEG),
-        "joints_at_limit": at_limit,
-    }
+def corrections(summary: dict[str, Any]) -> View:
+    """How far poses are reached with corrected readings, and how much readings change."""
+    yield from warnings_of(summary)
+    meant, has = (", ".join(f"{x:.3f}" for x in probe) for probe in summary["probe_mm"])
+    if meant == has:
+        yield f"The tip is at ({has}) mm in the last frame."
+    else:
+        yield (
+            f"The controller means the tip at ({meant}) mm in the last frame, the calibrated arm's is at ({has}) mm: "
+            "right for the probe of the calibration. State another tool with --probe X,Y,Z."
+        )
+    rows, missed = summary["rows"], summary["not_reached"]
+    yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} reached with corrected readings."
+    if len(missed) < rows:
+        # Of the arithmetic, not of the arm: how far it is really off is what an evaluation with unseen data says.
+        distance = formatted(summary["largest_distance_mm"])
+        yield f"Largest distance from a pose with them, if the arm is as calibrated: {distance} mm."
+    if summary["largest_distance_before_mm"] is not None:
+        yield f"Without the correction: {formatted(summary['largest_distance_before_mm'])} mm."
+    for key, what, unit in (("largest_change", "reading", "deg"), ("largest_slide", "slide", "mm")):
+        row = summary[key]
+        if row is not None:
+            where = f"(joint {row['joint']}, row {row['row']})"
+            yield f"Largest change of a {what}: {row[f'change_{unit}']:.4f} {unit} {where}."
+    if missed:
+        first = f", the first {_MOST_ROWS}, all by --json" if len(missed) > _MOST_ROWS else ""
+        yield listed(f"Not reached{first}", missed[:_MOST_ROWS], {
+            "row": "row",
+            "distance left [mm]": "distance_mm",
+            "angle left [deg]": "angle_deg",
+            "joints at a limit": lambda row: ", ".join(map(str, row["joints_at_limit"])) or "-",
+        })  # fmt: skip
+    yield from written_of(summary)

@@ -1,17 +1,33 @@
-"""Comparisons of calibrations as plain dictionaries with the unit in every key, and as CSV."""
+"""Comparisons of calibrations: as plain dictionaries with the unit in every key, as CSV, and as people see them."""
 
 from typing import Any
 
 import numpy as np
 
 from ..core.text import csv_text
+from ..core.units import people_read, people_read_change
 from ..drift.results import Drift, Trend
-from ..drift.statistics import LengthChange, ProbeTest
+from ..drift.statistics import LengthChange
+from .result_tables import listed_apart
+from .tables import (
+    Cell,
+    Styled,
+    View,
+    decimals_for,
+    limits_of,
+    listed,
+    number,
+    plain,
+    rows_of,
+    warnings_of,
+    written_of,
+)
 
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
     """Two calibrations compared; None for what is unknown or infinite."""
     joint, units = drift.joint_test, dict(zip(drift.names, drift.units, strict=True))
+    probe = joint.probe
     return {
         "kind": "comparison",
         "level": drift.level,
@@ -22,36 +38,44 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
         "moved": int(drift.moved.sum()),
         "moved_by_chance": drift.by_chance,
         "joint": {
-            "statistic": _finite(joint.statistic),
+            "statistic": plain(joint.statistic),
             "rank": joint.rank,
-            "freedom": _finite(joint.degrees_of_freedom),
-            "p": _finite(joint.p),
+            "freedom": plain(joint.degrees_of_freedom),
+            "p": plain(joint.p),
             "parameters": list(joint.names),
             "causes": [{"parameter": name, "unit": units[name], "change": amount} for name, amount in joint.causes],
-            "probe": None if joint.probe is None else _probe_summary(joint.probe),
+            # Of the hypothesis that only the probe changed.
+            "probe": probe
+            and {
+                "remounted": bool(probe.remounted),
+                "statistic_left": probe.statistic,
+                "rank": probe.rank,
+                "p": plain(probe.p),
+                "ratio": probe.ratio,
+                "change_mm": dict(probe.change),
+            },
         },
-        "lengths": lengths_summary(drift.lengths),
-    }
-
-
-def _probe_summary(probe: ProbeTest) -> dict[str, Any]:
-    """Of the hypothesis that only the probe changed."""
-    return {
-        "remounted": bool(probe.remounted),
-        "statistic_left": probe.statistic,
-        "rank": probe.rank,
-        "p": _finite(probe.p),
-        "ratio": probe.ratio,
-        "change_mm": dict(probe.change),
+        "lengths": _lengths(drift.lengths),
     }
 
 
 def compared_summary(trend: Trend, labels: list[str], arm: str) -> dict[str, Any]:
     """The first calibration against the last in full, and the trend of all; ``labels`` in the order given."""
-    summary = {"kind": "comparison", "arm": arm, "old": labels[trend.order[0]], "new": labels[trend.order[-1]]}
-    summary |= {"old_created": trend.dates[0].isoformat(), "new_created": trend.dates[-1].isoformat()}
-    summary |= drift_summary(trend.drifts[-1])
-    return summary | {"warnings": trend.warnings, "trend": trend_summary(trend, labels)}
+    first, created = labels[trend.order[0]], trend.dates[0].isoformat()
+    summary = {"kind": "comparison", "arm": arm, "old": first, "new": labels[trend.order[-1]]}
+    summary |= {"old_created": created, "new_created": trend.dates[-1].isoformat()}
+    rows: list[dict[str, Any]] = [{"calibration": first, "created": created}]
+    for date, position, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
+        rows.append({
+            "calibration": labels[position],
+            "created": date.isoformat(),
+            "moved": int(drift.moved.sum()),
+            "moved_by_chance": drift.by_chance,
+            "p": plain(drift.joint_test.p),
+            "lengths": _lengths(drift.lengths),
+            "parameters": _rows(drift),
+        })  # fmt: skip
+    return summary | drift_summary(trend.drifts[-1]) | {"warnings": trend.warnings, "trend": rows}
 
 
 def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[str], list[str]]:
@@ -66,65 +90,92 @@ def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[st
     return ([verdict], []) if kept else ([], [verdict])
 
 
-def lengths_summary(lengths: LengthChange) -> dict[str, Any]:
+def _lengths(lengths: LengthChange) -> dict[str, Any]:
     """Changes of lengths over the working volume."""
     return {
         "length_mm": lengths.length,
         "places": len(lengths.change),
         "rms_mm": lengths.rms,
-        "rms_by_chance_mm": _finite(lengths.rms_by_chance),
+        "rms_by_chance_mm": plain(lengths.rms_by_chance),
         "percentile_95_mm": lengths.percentile_95,
         "largest_mm": lengths.largest,
         "mean_mm": float(np.mean(lengths.change)),
         "mean_um_per_m": 1e6 * lengths.scale_change,
-        "mean_expanded_um_per_m": _finite(1e6 * lengths.expanded_scale_change),
+        "mean_expanded_um_per_m": plain(1e6 * lengths.expanded_scale_change),
         "moved_share": float(np.mean(lengths.moved)),
     }
 
 
-def trend_summary(trend: Trend, labels: list[str]) -> list[dict[str, Any]]:
-    """Every calibration of a trend in the order of their dates; ``labels`` in the order given."""
-    rows: list[dict[str, Any]] = [{"calibration": labels[trend.order[0]], "created": trend.dates[0].isoformat()}]
-    for date, position, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
-        rows.append({
-            "calibration": labels[position],
-            "created": date.isoformat(),
-            "moved": int(drift.moved.sum()),
-            "moved_by_chance": drift.by_chance,
-            "p": _finite(drift.joint_test.p),
-            "lengths": lengths_summary(drift.lengths),
-            "parameters": _rows(drift),
-        })  # fmt: skip
-    return rows
+def _rows(drift: Drift) -> list[dict[str, Any]]:
+    return rows_of(
+        parameter=drift.names,
+        unit=drift.units,
+        old=drift.old,
+        new=drift.new,
+        change=drift.change,
+        u=drift.u,
+        expanded=drift.expanded,
+        moved=[None if reason else moved for moved, reason in zip(drift.moved.tolist(), drift.reasons, strict=True)],
+        without=[reason or None for reason in drift.reasons],
+    )
 
 
 def drift_csv(trend: Trend, labels: list[str]) -> str:
     """Every parameter of every calibration but the first, compared with the first, in its unit; empty if unknown."""
-    columns = ("parameter", "unit", "old", "new", "change", "u", "expanded", "moved", "without")
-    rows: list[list[Any]] = [["old_calibration", "new_calibration", "new_created", *columns]]
+    rows: list[list[Any]] = []
     for date, position, drift in zip(trend.dates[1:], trend.order[1:], trend.drifts, strict=True):
-        for row in _rows(drift):
-            cells = ["" if row[name] is None else row[name] for name in columns]
-            rows.append([labels[trend.order[0]], labels[position], date.isoformat(), *cells])
-    return csv_text(rows)
+        pair = [labels[trend.order[0]], labels[position], date.isoformat()]
+        rows += [[*pair, *("" if value is None else value for value in row.values())] for row in _rows(drift)]
+    return csv_text([["old_calibration", "new_calibration", "new_created", *_rows(trend.drifts[0])[0]], *rows])
 
 
-def _rows(drift: Drift) -> list[dict[str, Any]]:
-    return [
-        {
-            "parameter": name,
-            "unit": drift.units[i],
-            "old": float(drift.old[i]),
-            "new": float(drift.new[i]),
-            "change": float(drift.change[i]),
-            "u": _finite(drift.u[i]),
-            "expanded": _finite(drift.expanded[i]),
-            "moved": bool(drift.moved[i]) if not drift.reasons[i] else None,
-            "without": drift.reasons[i] or None,
-        }
-        for i, name in enumerate(drift.names)
-    ]
+def comparison(summary: dict[str, Any]) -> View:
+    """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
+    new, old = (f"{summary[which]} ({summary[f'{which}_created'][:10]})" for which in ("new", "old"))
+    yield [Styled(summary["arm"]), f": {new} against {old}"]
+    yield from warnings_of(summary)
+    yield from summary["findings"]
+    yield from _parameters(summary)
+    lengths = summary["lengths"]
+    keys = ("rms_mm", "rms_by_chance_mm", "percentile_95_mm", "largest_mm", "mean_mm")
+    yield listed(
+        f"Lengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
+        [["not determined" if lengths[key] is None else lengths[key] for key in keys]],
+        ("RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean"),
+    )
+    if len(summary["trend"]) > 2:
+        first, *others = summary["trend"]
+        rows: list[list[Any]] = [["1", first["calibration"], first["created"][:10], *[None] * 6]]
+        for i, row in enumerate(others, start=2):
+            lengths, p = row["lengths"], row["p"]
+            probability = "-" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.2g}"
+            numbers = [lengths[key] for key in ("rms_mm", "rms_by_chance_mm", "largest_mm")]
+            cells = [row["moved"], probability, *numbers, number(lengths["mean_um_per_m"], 1, signed=True)]
+            rows.append([str(i), row["calibration"], row["created"][:10], *cells])
+        headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
+        title = "Each calibration against the first (whose own error is in all of them)"
+        yield listed(title, rows, (*headings, "mean [um/m]"))
+        yield "The change of every parameter from the first calibration: --csv, --json, --figure."
+    yield from limits_of(summary)
+    yield from written_of(summary)
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _parameters(summary: dict[str, Any]) -> View:
+    """Values to the digits that the uncertainty of their change allows, changes in small units: um, arcsec."""
+    apart, _ = listed_apart(summary["parameters"])
+    # Of hundreds of harmonics, those that moved.
+    shown = [row for row in summary["parameters"] if row["moved"] or row in apart]
+    rows = []
+    for row in shown:
+        (factor, unit), (fine, small_unit) = people_read(row["unit"]), people_read_change(row["unit"])
+        coarse_u, fine_u = (row["expanded"] and scale * row["expanded"] for scale in (factor, fine))
+        decimals, small = decimals_for(coarse_u, 5), decimals_for(fine_u, 2)
+        old, new = (number(factor * row[which], decimals, rounded=True) for which in ("old", "new"))
+        change = number(fine * row["change"], small, signed=True, rounded=True)
+        mark = row["without"] or Cell("* beyond U" if row["moved"] else "", None, "outlier")
+        rows.append((row["parameter"], unit, old, new, small_unit, change, number(fine_u, small), mark))
+    title = f"Parameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)"
+    yield listed(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
+    left_out = len(summary["parameters"]) - len(shown)
+    if left_out:
+        yield f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv."

@@ -1,6 +1,7 @@
-"""Plans of poses and of acceptance tests as plain dictionaries with the unit in every key."""
+"""Plans of poses and of acceptance tests as plain dictionaries with the unit in every key, and as people see them."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,13 +9,22 @@ import numpy as np
 
 from ..acceptance.procedure import Procedure
 from ..acceptance.standards import PLANNED
+from ..core.text import pluralise
 from ..data.noise import linear_encoder_mm
-from ..kinematics.collisions import Cell
 from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from ..planning.motion import Motion
 from ..planning.problem import MORE, Prediction
 from .calibration import reference_length_rows
+from .tables import Styled, View, listed, number, warnings_of, written_of
+
+_PREDICTED = {
+    "predicted": "this plan",
+    "loose": "this plan, joints kept to about 5 deg only",
+    "random": "{poses} random poses in the same {where}",
+    "more": "this plan and {more_poses} more poses",
+    "unconstrained": "as many without cones, obstacles and approach points",
+}
 
 
 def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
@@ -30,8 +40,9 @@ def plan_summary(plan: Plan, arm: str) -> dict[str, Any]:
         }
         for i, (name, point) in enumerate(plan.sockets.items())
     ]
-    stated = _plan_rows(plan, arm, [plan.motion], list(plan.sockets), plan.owner)
-    return {"kind": "plan", **stated, "sockets": rows, "lengths": reference_length_rows(plan.lengths)}
+    lengths = reference_length_rows(plan.lengths, u_mm=[float(length.u) for length in plan.lengths])
+    stated = _stated(plan, arm, [plan.motion], list(plan.sockets), plan.owner)
+    return {"kind": "plan", **stated, "sockets": rows, "lengths": lengths}
 
 
 def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
@@ -46,17 +57,34 @@ def kit_plan_summary(plan: KitPlan, arm: str) -> dict[str, Any]:
         ]
         row = {"observation": observation.name, "kind": observation.kind, "part": part}
         rows.append(row | {"poses": observation.q.shape[0], "places": put})
-    names = [row["observation"] for row in rows]
     owner = np.repeat(np.arange(len(rows)), [row["poses"] for row in rows])
     without = {name: _prediction(u) if np.isfinite(u.largest) else None for name, u in plan.without.items()}
-    stated = _plan_rows(plan, arm, list(plan.motions), names, owner)
+    stated = _stated(plan, arm, plan.motions, [row["observation"] for row in rows], owner)
     return {"kind": "kit plan", **stated, "observations": rows, "without": without}
 
 
-def _plan_rows(
+def _stated(
     plan: Plan | KitPlan, arm: str, motions: Sequence[Motion], names: Sequence[str], owner: np.ndarray
 ) -> dict[str, Any]:
-    """What both kinds of plans state: the noise assumed, how the arm moves, and the predicted uncertainties."""
+    """What both kinds of plans state: the noise assumed, how the arm moves (largest tilt, smallest clearance, travel,
+    moves that hit something by pose number), and the predicted uncertainties."""
+    tilts = np.concatenate([np.zeros(0), *(motion.tilt[np.isfinite(motion.tilt)] for motion in motions)])
+    collisions, cell = None, plan.cell
+    if cell is not None:
+        starts = np.cumsum([0, *(len(motion.tilt) for motion in motions)]).tolist()
+        hits = [
+            (start + index, [one, other])
+            for start, motion in zip(starts, motions, strict=False)
+            for index, one, other in motion.blocked
+        ]
+        clearances = [motion.clearance.min() for motion in motions if motion.clearance is not None]
+        collisions = {
+            "smallest_clearance_mm": float(min(clearances)),
+            "allowed_clearance_mm": cell.clearance,
+            "obstacles": [obstacle.name for obstacle in cell.obstacles],
+            "unchecked": [list(pair) for pair in cell.unchecked],
+            "blocked_moves": [{"before_pose": i + 1, "at": names[int(owner[i])], "between": pair} for i, pair in hits],
+        }
     return {
         "arm": arm,
         "criterion": plan.criterion,
@@ -65,51 +93,23 @@ def _plan_rows(
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
-        "unconstrained": None if plan.unconstrained is None else _prediction(plan.unconstrained),
-        **_motion_summary(motions, plan.cell, plan.retract, names, owner),
-        **{name: _prediction(getattr(plan, name)) for name in ("predicted", "loose", "random", "more")},
+        "largest_tilt_deg": float(np.degrees(tilts.max())) if len(tilts) else None,
+        "retract_mm": plan.retract if any(motion.approach is not None for motion in motions) else 0.0,
+        "travel_deg": math.degrees(sum(motion.travel for motion in motions)),
+        "unordered_travel_deg": math.degrees(sum(motion.unordered for motion in motions)),
+        "collisions": collisions,
+        **{name: _prediction(getattr(plan, name)) for name in _PREDICTED},
         "more_poses": MORE,
     }
 
 
-def _motion_summary(
-    motions: Sequence[Motion], cell: Cell | None, retract: float, names: Sequence[str], owner: np.ndarray
-) -> dict[str, Any]:
-    """How the arm moves: largest tilt, smallest clearance, travel, and moves that hit something, by pose number."""
-    first = np.cumsum([0, *(len(motion.tilt) for motion in motions)])
-    blocked = [
-        {"before_pose": int(start) + index + 1, "at": names[owner[int(start) + index]], "between": [one, other]}
-        for start, motion in zip(first[:-1], motions, strict=True)
-        for index, one, other in motion.blocked
-    ]
-    tilts = np.concatenate([np.zeros(0), *(motion.tilt[np.isfinite(motion.tilt)] for motion in motions)])
-    clearances = [motion.clearance.min() for motion in motions if motion.clearance is not None]
-    return {
-        "largest_tilt_deg": float(np.degrees(tilts.max())) if len(tilts) else None,
-        "retract_mm": retract if any(motion.approach is not None for motion in motions) else 0.0,
-        "travel_deg": math.degrees(sum(motion.travel for motion in motions)),
-        "unordered_travel_deg": math.degrees(sum(motion.unordered for motion in motions)),
-        "collisions": None
-        if cell is None
-        else {
-            "smallest_clearance_mm": float(min(clearances)),
-            "allowed_clearance_mm": cell.clearance,
-            "obstacles": [obstacle.name for obstacle in cell.obstacles],
-            "unchecked": [list(pair) for pair in cell.unchecked],
-            "blocked_moves": blocked,
-        },
-    }
-
-
-def _prediction(prediction: Prediction) -> dict[str, float]:
-    return {"median_mm": prediction.median, "largest_mm": prediction.largest}
+def _prediction(prediction: Prediction | None) -> dict[str, float] | None:
+    return None if prediction is None else {"median_mm": prediction.median, "largest_mm": prediction.largest}
 
 
 def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
     """A planned acceptance test: what to set up, and how many poses to take."""
-    lengths: dict[float, int] = {}
-    for *_, value in procedure.lengths:
-        lengths[value] = lengths.get(value, 0) + 1
+    lengths = Counter(value for *_, value in procedure.lengths)
     return {
         "kind": "acceptance plan",
         "arm": arm,
@@ -141,3 +141,134 @@ def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
         ],
         "warnings": list(procedure.left_out),
     }
+
+
+def plan(summary: dict[str, Any]) -> View:
+    """Positions of the sockets, and the predicted uncertainty, compared with that of random poses."""
+    sockets = pluralise(len(summary["sockets"]), "socket")
+    yield [Styled(summary["arm"]), f": {summary['poses']} poses in {sockets}"]
+    yield listed("", summary["sockets"], {
+        "socket": "socket",
+        **{f"{axis} [mm]": lambda row, i=i: number(row["position_mm"][i], 0) for i, axis in enumerate("xyz")},
+        "poses": "poses",
+        "cone [deg]": lambda row: "any" if row["cone_deg"] >= 180 else number(row["cone_deg"], 0),
+        "largest tilt [deg]": lambda row: number(row["largest_tilt_deg"], 0),
+    })  # fmt: skip
+    for row in summary["lengths"]:
+        ends = f"{row['from']} - {row['to']}"
+        yield f"Reference length {ends}: {row['value_mm']:.1f} mm, u = {row['u_mm']:.3g} mm"
+    yield from _predictions(summary, "sockets")
+    yield from written_of(summary)
+
+
+def kit_plan(summary: dict[str, Any]) -> View:
+    """Where artefacts are put, how many poses each gets, and the predicted uncertainty, also without each part."""
+    yield [Styled(summary["arm"]), f": {pluralise(summary['poses'], 'pose')}"]
+    rows = []
+    for row in summary["observations"]:
+        for i, place in enumerate(row["places"]):
+            names = (row["observation"], row["kind"]) if i == 0 else ("", "")
+            rows.append((*names, *(number(value, 0) for value in place["position_mm"]), place["poses"]))
+    yield listed("", rows, ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"))
+    yield "Positions are those of the points of an artefact; elsewhere the middle of the tips."
+    without = {}
+    for name, prediction in summary["without"].items():
+        # The places of a thing of the kit are named after it.
+        others = [row for row in summary["observations"] if not f"{row['observation']}/".startswith(f"{name}/")]
+        poses = sum(place["poses"] for row in others for place in row["places"])
+        without[f"without {name}: {pluralise(poses, 'pose')}"] = prediction
+    yield from _predictions(summary, "places", without)
+    yield from written_of(summary)
+
+
+def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | None = None) -> View:
+    """U of a length by this plan, and by what it is compared with; the noise it assumes; how the arm moves."""
+    length = f"{summary['check_length_mm']:g} mm"
+    yield ["\n", Styled(f"U that the calibration adds to lengths of {length} over the volume [mm, k = 2]")]
+    titles = {key: text.format(**summary, where=where) for key, text in _PREDICTED.items()}
+    predictions = {title: summary[key] for key, title in titles.items() if summary[key] is not None} | (without or {})
+    yield listed("", predictions.items(), {
+        "": lambda row: row[0],
+        "median": lambda row: "not determined" if row[1] is None else 2 * row[1]["median_mm"],
+        "largest": lambda row: "" if row[1] is None else 2 * row[1]["largest_mm"],
+    })  # fmt: skip
+    encoders, seat, slide = summary["encoder_arcsec"], summary["seating_mm"], summary["linear_encoder_mm"]
+    by_joint = isinstance(encoders, list)
+    arcsec = ", ".join(f"{value:.3g}" for value in encoders) if by_joint else f"{encoders:.3g}"
+    linear, option = (
+        ("", "") if slide is None else (f", linear ones of {slide:.3g} mm", f"--linear-encoder-mm {slide:.3g} ")
+    )
+    model = "" if summary.get("model") is None else f"--model {summary['model']} "
+    options = f" (--method joint {model}--encoder-arcsec {arcsec} {option}--seating-mm {seat:g})"
+    yield (
+        f"For a joint calibration with encoders of {arcsec} arcsec{linear} and a seat of {seat:g} mm"
+        f"{'' if by_joint else options}; {summary['noise_source']}."
+    )
+    collisions, retract, tilt = summary["collisions"], summary["retract_mm"], summary["largest_tilt_deg"]
+    by_way = f" by way of approach points {retract:g} mm above the sockets" if retract else ""
+    yield (
+        ("" if tilt is None else f"Largest tilt from a normal {tilt:.0f} deg. ")
+        + f"Joint travel {summary['travel_deg']:,.0f} deg{by_way} ({summary['unordered_travel_deg']:,.0f} before "
+        "ordering; each joint counts by what it carries)."
+    )
+    if collisions is None:
+        yield (
+            "Checked: joint limits, reach, cones of approach, and that nothing comes below the table. Not checked: "
+            "obstacles and collisions of the arm with itself (--collisions, --cell, --link-radius-mm)."
+        )
+    else:
+        yield from _collisions(collisions)
+        yield from (f"Note: {note}" for note in summary["notes"])
+
+
+def _collisions(collisions: dict[str, Any]) -> View:
+    """Clearance, and what was checked."""
+    yield (
+        "Checked: joint limits, reach, cones of approach, the arm's body against itself and obstacles "
+        f"({', '.join(collisions['obstacles']) or 'none'}), in each pose and along the straight joint moves between "
+        f"them. Smallest clearance of a pose {collisions['smallest_clearance_mm']:.0f} mm."
+    )
+    if collisions["unchecked"]:
+        pairs = "; ".join(" and ".join(pair) for pair in collisions["unchecked"])
+        yield f"Not checked, since they touch wherever the arm is: {pairs}."
+    for row in collisions["blocked_moves"]:
+        yield Styled(
+            f"The straight joint move to pose {row['before_pose']} ({row['at']}) hits: {' and '.join(row['between'])}; "
+            "go there by another way.",
+            "yellow",
+        )
+
+
+def procedure(summary: dict[str, Any]) -> View:
+    """A planned acceptance test: positions of the artefacts, and number of poses."""
+
+    def at(point: list[float]) -> str:
+        return ", ".join(f"{value:.0f}" for value in point)
+
+    stated = "" if summary["measuring_range_stated"] else " (twice the reach; state the maker's)"
+    yield [
+        Styled(summary["arm"]),
+        f": {summary['standard']}, {summary['poses']} poses. Measuring range {summary['measuring_range_mm']:.0f} mm"
+        f"{stated}. Reach {summary['reach_mm']:.0f} mm from the shoulder at ({at(summary['shoulder_mm'])}) mm",
+    ]
+    yield from warnings_of(summary)
+    for bar in summary["bars"]:
+        yield f"A bar of about {bar['length_mm']:.0f} mm, in {bar['positions']} positions"
+    for sphere in summary["spheres"]:
+        yield f"A sphere of {sphere['diameter_mm']:g} mm for the test '{sphere['test']}'"
+    rows, by_name = [], {row["name"]: row for row in summary["items"]}
+    for row in summary["items"]:
+        bar, _, side = row["name"].rpartition("/")
+        other = by_name.get(f"{bar}/b") if side == "a" else None
+        if side == "b" and f"{bar}/a" in by_name:
+            continue  # in the row of the bar's other end
+        end, poses = ("", "") if other is None else (at(other["position_mm"]), f" + {other['poses']}")
+        name = row["name"] if other is None else bar
+        rows.append((row["test"], name, row["group"], at(row["position_mm"]), end, f"{row['poses']}{poses}"))
+    headings = ("test", "name", "group", "at (x, y, z) [mm]", "to (x, y, z) [mm]", "poses")
+    yield listed("", rows, headings)
+    yield (
+        "Checked: joint limits, reach, that nothing comes below the table, and that spheres are touched from outside. "
+        "Not checked: obstacles, collisions of the arm with itself, and how artefacts are mounted."
+    )
+    yield from written_of(summary)

@@ -1,21 +1,22 @@
 """Tables of results, made of the rows of a summary: terminal and report show the same ones."""
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.units import DEG, people_read
-from .harmonics import harmonics_by_joint
 from .tables import (
     METRICS,
     Cell,
     Columns,
     Table,
     decimals_for,
-    difference_from_best,
     expanded_words,
     listed,
     number,
     quantity_words,
+    rms_difference,
     volume_rows,
 )
 
@@ -24,20 +25,34 @@ Rows = Sequence[Row]
 STAGES = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
 BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
-_SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
-_TRUTH = {
-    "length_error_largest_mm": ("largest error of a length parameter [mm]", 1.0),
-    "angle_error_largest_rad": ("largest error of an angle parameter [deg]", 1 / DEG),
-}
-_POOLED = (
-    ("RMS distance of poses from their socket's centroid or geometry", "rms_mm", "rms_predicted_mm"),
-    ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
+MODELS_MEANING = (
+    "Determined: parameters that the data determine. Inside, outside: RMS distance from the geometry of all poses, and "
+    "of regions left out one by one. To the best: difference of the error outside to the best one, compared region by "
+    "region. u: standard errors by the scatter of the regions. Ratio: mean of (error / predicted standard deviation)² "
+    "outside. Evidence: its logarithm, less that of the most probable model."
 )
+_SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
+_HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
+_MOST_LISTED = 48  # coefficients of harmonics that a table lists one by one
 
 
 def with_u_digits(u: float | None, mark: str = "") -> Cell:
     """An uncertainty, to two digits."""
     return number(u, decimals_for(u), mark=mark)
+
+
+def _said(words: str, mark: str) -> Cell:
+    """What is to be noticed in a row, if anything."""
+    return Cell(words, None, mark if words else "")
+
+
+def _in_degrees(row: Row) -> Cell:
+    angle = row["rms_angle_rad"]
+    return number(None if angle is None else angle / DEG)
+
+
+def _two_decimals(key: str) -> Any:
+    return lambda row: number(row[key], 2)
 
 
 def metrics_table(
@@ -47,47 +62,52 @@ def metrics_table(
 
     ``fixed_scale``: a single length fixed the scale of the last arm, so its error is zero by construction.
     """
-    last = list(stages)[-1]
+    first, *_, last = stages
 
     def value(stage: str, key: str) -> Cell | str:
         by_construction = fixed_scale and stage == last and key.startswith("length")
         return BY_CONSTRUCTION if by_construction else number(summary[stage].get(key))
 
-    rows = [(key, title) for key, title in METRICS if key in summary[next(iter(stages))]]
+    rows = [(key, title) for key, title in METRICS if key in summary[first]]
     columns = {words: lambda row, stage=stage: value(stage, row[0]) for stage, words in stages.items()}
     return listed(caption, rows, {"": lambda row: row[1]} | columns)
 
 
 def truth_table(truth: Row, stages: Mapping[str, str] = STAGES) -> Table:
     """Errors of parameters against the true arm of a simulation."""
-    columns: Columns = {"": lambda key: _TRUTH[key][0]}
-    columns |= {words: lambda key, s=stage: _TRUTH[key][1] * truth[s][key] for stage, words in stages.items()}
-    return listed("Against the true arm of the simulation", _TRUTH, columns)
+    rows = [
+        ["largest error of a length parameter [mm]", *(truth[stage]["length_error_largest_mm"] for stage in stages)],
+        ["largest error of an angle parameter [deg]",
+         *(truth[stage]["angle_error_largest_rad"] / DEG for stage in stages)],
+    ]  # fmt: skip
+    return listed("Against the true arm of the simulation", rows, ("", *stages.values()))
 
 
 def validation_tables(summary: Row) -> list[Table]:
     """Cross-validation, pooled and group by group, the most improbable group first."""
-    pooled = [(title, summary[value], summary[u]) for title, value, u in _POOLED if summary[value] is not None]
+    pooled = [
+        ("RMS distance of poses from their socket's centroid or geometry", "rms_mm", "rms_predicted_mm"),
+        ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
+    ]
+    cells = [(title, summary[value], summary[u]) for title, value, u in pooled if summary[value] is not None]
     caption = f"Cross-validated: each of {summary['groups']} groups held out once [mm]"
+    tables = [listed(caption, cells, ("", "residual", "predicted by u"))]
     rows = summary.get("left_out") or []
-    lengths = any(row["lengths"] for row in rows)
-
-    def state(row: Row) -> Cell:
-        words = "disagrees" if row["disagrees"] else "" if row["converged"] else "did not converge"
-        return Cell(words, None, "bad" if words else "")
-
-    groups: Columns = {
-        "group held out": "group",
-        "poses": "poses",
-        "RMS distance": "rms_mm",
-        "predicted": "rms_predicted_mm",
-        "RMS length error": "length_error_rms_mm" if lengths else None,
-        "u": "length_u_mm" if lengths else None,
-        "by chance [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
-        "": state,
-    }
-    of_all = listed(caption, pooled, ("", "residual", "predicted by u"))
-    return [of_all, *([listed("Groups held out [mm]", rows, groups)] if rows else [])]
+    if rows:
+        lengths = any(row["lengths"] for row in rows)
+        tables.append(listed("Groups held out [mm]", rows, {
+            "group held out": "group",
+            "poses": "poses",
+            "RMS distance": "rms_mm",
+            "predicted": "rms_predicted_mm",
+            "RMS length error": "length_error_rms_mm" if lengths else None,
+            "u": "length_u_mm" if lengths else None,
+            "by chance [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
+            "": lambda row: _said(
+                "disagrees" if row["disagrees"] else "" if row["converged"] else "did not converge", "bad"
+            ),
+        }))  # fmt: skip
+    return tables
 
 
 def prior_table(rows: Rows) -> Table:
@@ -95,9 +115,8 @@ def prior_table(rows: Rows) -> Table:
 
     def deviation(row: Row) -> str:
         scale, unit = people_read(row["unit"])
-        if not row["supported"]:
-            return "0: not supported by the data, so exact"
-        return f"{row['sd'] * scale:.3g} {unit}".strip()
+        given = f"{row['sd'] * scale:.3g} {unit}".strip()
+        return given if row["supported"] else "0: not supported by the data, so exact"
 
     return listed("Priors of the parameters, and effective parameters", rows, {
         "group": "group",
@@ -108,30 +127,25 @@ def prior_table(rows: Rows) -> Table:
     })  # fmt: skip
 
 
-def _value(row: Row, value: float, u: float | None, *, signed: bool = False) -> Cell:
-    """A number of a parameter in the unit that people read, to two digits of an uncertainty."""
+def _value(row: Row, value: float, u: float | None, *, signed: bool = False, least: int = 0) -> Cell:
+    """A number of a parameter in the unit that people read, to two digits of an uncertainty, or ``least`` decimals."""
     scale, _ = people_read(row["unit"])
-    decimals = decimals_for(None if u is None else scale * u)
-    return number(scale * value, decimals, signed=signed, rounded=u is not None)
+    decimals = max(decimals_for(u and scale * u), least)
+    return number(scale * value, decimals, signed=signed, rounded=u is not None and not least)
 
 
 def _expanded(row: Row, u: float | None) -> Cell:
-    return with_u_digits(None if u is None else people_read(row["unit"])[0] * u)
+    return with_u_digits(u and people_read(row["unit"])[0] * u)
 
 
 def parameter_table(caption: str, rows: Rows) -> Table:
     """Parameters with their expanded uncertainty, each in the unit that people read."""
 
     def state(row: Row) -> Cell:
-        words = "" if row["expanded"] else "only with others"
         if row["bound"]:
-            words = f"on the {row['bound']} bound" + (" of stage 1; U is that of k" if row["expanded"] else "")
-        return Cell(words, None, "unsure" if words else "")
-
-    def nominal(row: Row) -> Cell:
-        scale, _ = people_read(row["unit"])
-        u = row["expanded"]
-        return number(scale * row["nominal"], max(decimals_for(None if u is None else scale * u), 4))
+            of_k = " of stage 1; U is that of k" if row["expanded"] else ""
+            return _said(f"on the {row['bound']} bound{of_k}", "unsure")
+        return _said("" if row["expanded"] else "only with others", "unsure")
 
     return listed(caption, rows, {
         "parameter": "parameter",
@@ -139,12 +153,44 @@ def parameter_table(caption: str, rows: Rows) -> Table:
         "calibrated": lambda row: _value(row, row["calibrated"], row["expanded"]),
         "U (95 %)": lambda row: _expanded(row, row["expanded"]),
         "change": lambda row: _value(row, row["calibrated"] - row["nominal"], row["expanded"], signed=True),
-        "nominal": nominal,
+        "nominal": lambda row: _value(row, row["nominal"], row["expanded"], least=4),
         "": state,
     })  # fmt: skip
 
 
-def harmonics_table(rows: Sequence[Any]) -> Table:
+def listed_apart(parameters: Rows) -> tuple[list[Row], list[Row]]:
+    """The parameters that a table lists one by one, and the coefficients of harmonics if there are too many; rows of a
+    summary, with their name as "parameter"."""
+    harmonics = [row for row in parameters if _HARMONIC.fullmatch(row["parameter"])]
+    if len(harmonics) <= _MOST_LISTED:
+        return list(parameters), []
+    return [row for row in parameters if not _HARMONIC.fullmatch(row["parameter"])], harmonics
+
+
+def harmonics_by_joint(coefficients: Rows) -> list[dict[str, Any]]:
+    """Coefficients of harmonics, joint by joint: rows with the orders in words, the RMS ("rms") that the harmonics have
+    over a whole revolution, in the unit "unit", and the "largest" coefficient, itself a row."""
+    joints: dict[int, list[tuple[int, Row]]] = {}
+    for row in coefficients:
+        match = _HARMONIC.fullmatch(row["parameter"])
+        if match is not None:
+            joints.setdefault(int(match[2]), []).append((int(match[1]), row))
+    rows = []
+    for joint, of_joint in sorted(joints.items()):
+        orders, values = sorted({order for order, _ in of_joint}), [row for _, row in of_joint]
+        whole = len(orders) > 1 and orders[-1] - orders[0] + 1 == len(orders)
+        rows.append({
+            "joint": joint,
+            "coefficients": len(values),
+            "orders": f"{orders[0]} to {orders[-1]}" if whole else ", ".join(map(str, orders)),
+            "unit": values[0]["unit"],
+            "rms": math.sqrt(sum(row["calibrated"] ** 2 for row in values) / 2),
+            "largest": max(values, key=lambda row: abs(row["calibrated"])),
+        })  # fmt: skip
+    return rows
+
+
+def harmonics_table(rows: Rows) -> Table:
     """Coefficients of harmonics, joint by joint: their RMS over a revolution, and the largest."""
     return listed("Harmonics of the joints", harmonics_by_joint(rows), {
         "joint": "joint",
@@ -160,21 +206,23 @@ def harmonics_table(rows: Sequence[Any]) -> Table:
 
 def volume_table(caption: str, volume: Row) -> Table:
     """Expanded uncertainty of tips and lengths over the working volume."""
-    columns: Columns = {"": lambda row: row[0]}
-    for i, words in enumerate(("median", "95th percentile", "largest")):
-        columns[words] = lambda row, i=i: "not determined" if row[1][i] is None else with_u_digits(row[1][i])
-    return listed(caption, volume_rows(volume), columns)
+    rows = [
+        [title, *("not determined" if u is None else with_u_digits(u) for u in values)]
+        for title, values in volume_rows(volume)
+    ]
+    return listed(caption, rows, ("", "median", "95th percentile", "largest"))
 
 
 def agreement_tables(summary: Row) -> list[Table]:
     """Root mean square residuals by kind and by observation, nominal and calibrated."""
-    angles = any(row["rms_angle_rad"] is not None for row in summary["observations"])
     columns: Columns = {
         "poses": "poses",
         "nominal [mm]": "rms_before_mm",
         "calibrated [mm]": "rms_after_mm",
-        "calibrated [deg]": _in_degrees if angles else None,
-        "calibrated, in standard deviations": lambda row: number(row["reduced_chi"], 2),
+        "calibrated [deg]": (
+            _in_degrees if any(row["rms_angle_rad"] is not None for row in summary["observations"]) else None
+        ),
+        "calibrated, in standard deviations": _two_decimals("reduced_chi"),
     }
     by_kind, by_observation = (
         listed(f"RMS residuals by {first}", summary[f"{first}s"], {first: first, second: second} | columns)
@@ -182,11 +230,6 @@ def agreement_tables(summary: Row) -> list[Table]:
     )
     # Where each kind was observed once, both say the same.
     return [by_observation] if len(by_kind.rows) == len(by_observation.rows) else [by_kind, by_observation]
-
-
-def _in_degrees(row: Row) -> Cell:
-    angle = row["rms_angle_rad"]
-    return number(None if angle is None else angle / DEG)
 
 
 def other_poses_table(others: Row) -> Table:
@@ -198,27 +241,25 @@ def other_poses_table(others: Row) -> Table:
 
 def weights_table(summary: Row, most: int | None = None) -> Table:
     """The poses that a robust loss took weight from; ``most``: the first ones only."""
-    columns: Columns = {
+    caption = f"Poses that the robust loss ({summary['robust']}) took half of their weight from or more, and why"
+    return listed(caption, summary["less_weight"][:most], {
         "observation": "observation",
         "pose": "pose",
         "weight": lambda row: number(row["weight"], 3),
         "residual [mm]": "residual_mm",
         "residual in standard deviations": lambda row: number(row["normalised"], 1),
-    }
-    caption = f"Poses that the robust loss ({summary['robust']}) took half of their weight from or more, and why"
-    return listed(caption, summary["less_weight"][:most], columns)
+    })  # fmt: skip
 
 
 def geometry_table(parts: Rows, coverage: float) -> Table:
     """Parts of the unknown geometry, beside what is certified of them; ``coverage``: the coverage factor of U."""
     rows = []
     for part in parts:
-        certified, quantities = part["certified"], part["quantities"]
         # What is certified has its numbers in the order of the quantities.
-        pairs = iter([] if certified is None else zip(part["values"], certified, strict=True))
-        for quantity in quantities:
+        pairs = iter([] if part["certified"] is None else zip(part["values"], part["certified"], strict=True))
+        for quantity in part["quantities"]:
             errors = [abs(value - stated) for _, (value, stated) in zip(quantity["values"], pairs, strict=False)]
-            rows.append(quantity | {"part": part["part"], "difference": max(errors) if errors else ""})
+            rows.append(quantity | {"part": part["part"], "difference": max(errors, default="")})
     certified = any(part["certified"] is not None for part in parts)
     return listed("Geometry found", rows, {
         "part": "part",
@@ -238,19 +279,13 @@ def observations_table(caption: str, rows: Rows) -> Table:
         "nominal": "nominal_rms_mm",
         "calibrated": "rms_mm",
         "predicted": "rms_predicted_mm" if any("rms_predicted_mm" in row for row in rows) else None,
-        "calibrated, in standard deviations": lambda row: number(row["reduced_chi"], 2),
+        "calibrated, in standard deviations": _two_decimals("reduced_chi"),
     })  # fmt: skip
 
 
 def stated_expanded(u: float) -> Cell:
     """U, or that nothing was stated to compute it from."""
     return with_u_digits(u) if u > 0 else Cell("not stated")
-
-
-def decided(decision: str | None, failing: int = 0, parts: int = 1) -> Cell:
-    """A decision of an acceptance test, and how many of its parts fail."""
-    count = f" ({failing} of {parts})" if failing and parts > 1 else ""
-    return Cell(_SIGNS[decision] + count, None, MARKS[decision])
 
 
 def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
@@ -262,31 +297,31 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
     limited = any(metric["limit_mm"] is not None for metric in metrics)
     nominal = any(metric["as_found_mm"] is not None for metric in metrics)
     value = "calibrated" if nominal else "value"
+
+    def decided(row: Row) -> Cell:
+        parts = len(row["parts"])
+        count = f" ({row['failing']} of {parts})" if row["failing"] and parts > 1 else ""
+        return Cell(_SIGNS[row["decision"]] + count, None, MARKS[row["decision"]])
+
+    def before(row: Row) -> Cell:
+        return Cell(_SIGNS[row["as_found_decision"]], None, MARKS[row["as_found_decision"]])
+
+    def read(key: str) -> Any:
+        return lambda row: number(row[key], decimals_for(row["expanded_mm"]))
+
     # Decisions first: on a telephone, what stands behind them is off the screen.
     columns: Columns = {
         "metric": "symbol",
-        f"decision, {value}" if nominal and not brief else "decision": (
-            (lambda row: decided(row["decision"], row["failing"], len(row["parts"]))) if limited else None
-        ),
-        "decision, nominal": (
-            (lambda row: decided(row["as_found_decision"])) if limited and nominal and not brief else None
-        ),
-        value: lambda row: number(row["value_mm"], decimals_for(row["expanded_mm"])),
+        f"decision, {value}" if nominal and not brief else "decision": decided if limited else None,
+        "decision, nominal": before if limited and nominal and not brief else None,
+        value: read("value_mm"),
         "U (k = 2)": lambda row: stated_expanded(row["expanded_mm"]),
         "MPE": "limit_mm" if limited else None,
-        "nominal": (lambda row: number(row["as_found_mm"], decimals_for(row["expanded_mm"]))) if nominal else None,
+        "nominal": read("as_found_mm") if nominal else None,
         "worst at": "where",
         "what it is": None if brief else "what",
     }
     return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
-
-
-MODELS_MEANING = (
-    "Determined: parameters that the data determine. Inside, outside: RMS distance from the geometry of all poses, and "
-    "of regions left out one by one. To the best: difference of the error outside to the best one, compared region by "
-    "region. u: standard errors by the scatter of the regions. Ratio: mean of (error / predicted standard deviation)² "
-    "outside. Evidence: its logarithm, less that of the most probable model."
-)
 
 
 def model_tables(summary: Row) -> tuple[Table, Table]:
@@ -295,23 +330,26 @@ def model_tables(summary: Row) -> tuple[Table, Table]:
     most_probable = max(row["log_evidence"] for row in models)
     least = min(row["rms_outside"] for row in models)
 
-    def name(row: Row) -> str | Cell:
-        return row["model"] if row["converged"] else Cell(f"{row['model']}: did not converge", None, "unsure")
+    def to_best(row: Row) -> tuple[float | None, float | None]:
+        """Nothing of the best model itself, and where the regions say nothing."""
+        compared = row["difference"] is not None and row["u_difference"] is not None
+        return rms_difference(row, least) if compared and row["rms_outside"] > least else (None, None)
 
-    columns = {
-        "model": name,
+    by_name = listed("Models", models, {
+        "model": lambda row: (
+            row["model"] if row["converged"] else Cell(f"{row['model']}: did not converge", None, "unsure")
+        ),
         "parameters": "parameters",
         "determined": lambda row: number(row["effective_parameters"], 1),
         "inside [mm]": "rms_inside",
         "outside [mm]": "rms_outside",
         "u of outside": "u_outside",
-        "to the best": lambda row: difference_from_best(row, least)[0],
-        "u of it": lambda row: difference_from_best(row, least)[1],
-        "ratio": lambda row: number(row["ratio"], 2),
+        "to the best": lambda row: to_best(row)[0],
+        "u of it": lambda row: to_best(row)[1],
+        "ratio": _two_decimals("ratio"),
         "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
         "CPU [s]": lambda row: number(row["cpu_seconds"], 1),
-    }
+    })  # fmt: skip
     of_region: Columns = {"region": lambda i: regions[i], "poses": lambda i: models[0]["regions"][i]["poses"]}
     of_region |= {row["model"]: lambda i, row=row: row["regions"][i]["rms"] for row in models}
-    by_region = listed("RMS error of each region [mm]", range(len(regions)), of_region)
-    return listed("Models", models, columns), by_region
+    return by_name, listed("RMS error of each region [mm]", range(len(regions)), of_region)

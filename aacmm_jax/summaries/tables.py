@@ -11,7 +11,7 @@ Example:
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from numbers import Integral
 from typing import Any, NamedTuple
 
@@ -69,13 +69,11 @@ class Table(NamedTuple):
         return [[_cell(cell) for cell in row] for row in self.rows]
 
 
+View = Iterator[Line | Table]  # what people see of a summary
+
+
 def listed(
-    title: str,
-    rows: Iterable[Any],
-    columns: Columns | Sequence[str],
-    *,
-    folded: bool = False,
-    keys: int = 1,
+    title: str, rows: Iterable[Any], columns: Columns | Sequence[str], *, folded: bool = False, keys: int = 1
 ) -> Table:
     """A table of rows: each column is a key of the row, or a function of the row; None: there is no such column.
 
@@ -83,17 +81,32 @@ def listed(
     """
     if not isinstance(columns, Mapping):
         return Table(title, columns, list(rows), keys, folded)
-    read = {
-        heading: getter if callable(getter) else lambda row, key=getter: row.get(key)
-        for heading, getter in columns.items()
-        if getter is not None
-    }
-    return Table(title, list(read), [[cell(row) for cell in read.values()] for row in rows], keys, folded)
+    getters = {heading: getter for heading, getter in columns.items() if getter is not None}
+    cells = [
+        [getter(row) if callable(getter) else row.get(getter) for getter in getters.values()]
+        for row in rows
+    ]  # fmt: skip
+    return Table(title, list(getters), cells, keys, folded)
 
 
 def by_columns(title: str, columns: Mapping[str, Iterable[Any]]) -> Table:
     """A table of columns that are known as a whole: heading -> the cells from above."""
     return Table(title, list(columns), list(zip(*columns.values(), strict=True)))
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON can hold it: arrays and sequences as lists, and None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
+    value = value.tolist() if hasattr(value, "tolist") else value  # of NumPy and JAX
+    if isinstance(value, list | tuple | range):
+        return [plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def rows_of(**columns: Any) -> list[dict[str, Any]]:
+    """A dictionary for each row of columns that are known as a whole, with values as JSON can hold them."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*map(plain, columns.values()), strict=True)]
 
 
 def _cell(cell: Any) -> Cell:
@@ -135,9 +148,22 @@ def formatted(value: float | None, decimals: int = 4) -> str:
     return "-" if value is None else format_number(value, decimals).replace("−", "-")
 
 
-def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:") -> list[Line]:
+def two_digits(u: float) -> str:
+    """An uncertainty to two digits: 0.0123 is "0.012"."""
+    return f"{u:.{decimals_for(u)}f}"
+
+
+def decimals_for(u: float | None, default: int = 4) -> int:
+    """Decimals that show two digits of an uncertainty, and that its value is rounded to."""
+    if u is None or not math.isfinite(u) or u <= 0:
+        return default
+    # 0.0996 is 0.10 and not 0.100.
+    return min(max(1 - math.floor(math.log10(float(f"{u:.1e}"))), 0), 9)
+
+
+def warnings_of(summary: Mapping[str, Any], lead: str = "Warning:", key: str = "warnings") -> list[Line]:
     """What a user should know before the numbers."""
-    return [[Styled(lead, "yellow"), f" {warning}"] for warning in summary["warnings"]]
+    return [[Styled(lead, "yellow"), f" {warning}"] for warning in summary.get(key, ())]
 
 
 def verdict_of(summary: Mapping[str, Any]) -> list[Line]:
@@ -170,42 +196,33 @@ def observed_words(sockets: int, others: int, lengths: int | None = None) -> str
 
 def quantity_words(row: Mapping[str, Any], u: bool = True, coverage: float | None = None) -> str:
     """A quantity of an observation as a person reads it, angles in deg; with its standard uncertainty where one is
-    known and ``u`` is true. With a coverage factor, what was found is rounded to its expanded uncertainty."""
-    factor, unit = (180 / math.pi, "deg") if row["unit"] == "rad" else (1.0, row["unit"])
-    default = 6 if unit == "1" else 4
+    stated and ``u`` is true. With a coverage factor, what was found is rounded to its expanded uncertainty."""
+    factor, unit = _quantity_unit(row)
     uncertainties = [None] * len(row["values"]) if coverage is None else row["u_found"]
     expanded = [None if value is None else (coverage or 0.0) * factor * value for value in uncertainties]
-    decimals = [min(decimals_for(u, default), _MOST_DECIMALS) for u in expanded]
+    decimals = [min(decimals_for(u, 4 if unit else 6), _MOST_DECIMALS) for u in expanded]
     pairs = zip(row["values"], decimals, strict=True)
-    values = ", ".join(f"{factor * value:z.{digits}f}" for value, digits in pairs)
-    words = f"({values})" if len(row["values"]) > 1 else values
-    words += "" if unit == "1" else f" {unit}"
+    words = _in_brackets([f"{factor * value:z.{digits}f}" for value, digits in pairs]) + unit
     if not u or row["u"] is None:
         return words
-    return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g} {unit})"
+    return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g}{unit or ' 1'})"
 
 
-def expanded_words(row: Mapping[str, Any], factor: float) -> str:
+def expanded_words(row: Mapping[str, Any], coverage: float) -> str:
     """The expanded uncertainties of a quantity that was found, two digits each, angles in deg."""
-    scale, unit = (180 / math.pi, " deg") if row["unit"] == "rad" else (1.0, "" if row["unit"] == "1" else " mm")
+    factor, unit = _quantity_unit(row)
     if any(u is None for u in row["u_found"]):
         return "not determined"
-    expanded = [factor * scale * u for u in row["u_found"]]
-    words = ", ".join(two_digits(value) if value > 0 else "0" for value in expanded)
-    return (f"({words})" if len(row["u_found"]) > 1 else words) + unit
+    return _in_brackets([two_digits(coverage * factor * u) if u > 0 else "0" for u in row["u_found"]]) + unit
 
 
-def two_digits(u: float) -> str:
-    """An uncertainty to two digits: 0.0123 is "0.012"."""
-    return f"{u:.{decimals_for(u)}f}"
+def _quantity_unit(row: Mapping[str, Any]) -> tuple[float, str]:
+    units = {"rad": (1 / DEG, " deg"), "1": (1.0, "")}
+    return units.get(row["unit"], (1.0, f" {row['unit']}"))
 
 
-def decimals_for(u: float | None, default: int = 4) -> int:
-    """Decimals that show two digits of an uncertainty, and that its value is rounded to."""
-    if u is None or not math.isfinite(u) or u <= 0:
-        return default
-    # 0.0996 is 0.10 and not 0.100.
-    return min(max(1 - math.floor(math.log10(float(f"{u:.1e}"))), 0), 9)
+def _in_brackets(words: Sequence[str]) -> str:
+    return f"({', '.join(words)})" if len(words) > 1 else words[0]
 
 
 def factor_words(volume: Mapping[str, Any]) -> str:
@@ -228,14 +245,14 @@ def volume_rows(volume: Mapping[str, Any]) -> list[tuple[str, list[float | None]
     return [(title, [volume[f"{key}_{statistic}_mm"] for statistic in which]) for key, title in titles.items()]
 
 
-def encoders_in_words(found: Mapping[str, Any]) -> str:
+def encoders_in_words(noise: Mapping[str, Any]) -> str:
     """The noise of the encoders of a summary: "encoders 2 arcsec, linear encoders 5 um"."""
 
-    def listed(values: float | list[float], factor: float) -> str:
+    def joined(values: float | list[float], factor: float) -> str:
         return ", ".join(f"{factor * x:.3g}" for x in (values if isinstance(values, list) else [values]))
 
-    words, linear = f"encoders {listed(found['encoder_arcsec'], 1.0)} arcsec", found["linear_encoder_mm"]
-    return words if linear is None else f"{words}, linear encoders {listed(linear, 1e3)} um"
+    words, linear = f"encoders {joined(noise['encoder_arcsec'], 1.0)} arcsec", noise["linear_encoder_mm"]
+    return words if linear is None else f"{words}, linear encoders {joined(linear, 1e3)} um"
 
 
 def seat_in_words(summary: Mapping[str, Any]) -> str:
@@ -248,12 +265,6 @@ def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, floa
     between regions, mm: a difference of squares is that of the roots times their sum."""
     total = max(row["rms_outside"] + best_rms, 1e-300)
     return row["difference"] / total, row["u_difference"] / total
-
-
-def difference_from_best(row: Mapping[str, Any], best_rms: float) -> tuple[float | None, float | None]:
-    """`rms_difference`, mm; nothing of the best model itself, and where the regions say nothing."""
-    compared = row["difference"] is not None and row["u_difference"] is not None
-    return rms_difference(row, best_rms) if compared and row["rms_outside"] > best_rms else (None, None)
 
 
 def lengths_sentence(found: Mapping[str, Any]) -> str:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..calibration.left_out import LEVEL
+from ..calibration.prediction import LEVEL
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from .tables import two_digits
@@ -26,14 +26,8 @@ class Verdict(NamedTuple):
 def calibration_verdict(
     findings: Sequence[Finding], volume: Mapping[str, Any], held_out: Mapping[str, Any] | None, simulated: bool
 ) -> Verdict:
-    """Of a calibration.
-
-    Args:
-        findings: What diagnostics say of it, the most serious first.
-        volume: The uncertainty over the working volume, of its summary.
-        held_out: The summary of its cross-validation.
-        simulated: Whether its readings are simulated.
-    """
+    """Of a calibration: by its findings, the most serious first, and by the uncertainty over the working volume and the
+    cross-validation of its summary."""
     unusable = [finding for finding in findings if finding.severity == "unusable"]
     if unusable:
         says = unusable[0].doubt
@@ -48,9 +42,8 @@ def calibration_verdict(
         f"(at worst {two_digits(largest)} mm)"
     )
     if doubts:
-        return Verdict(
-            "unsure", f"To be used with care: {'; '.join(doubts)}, so errors may exceed the stated {stated}."
-        )
+        says = f"To be used with care: {'; '.join(doubts)}, so errors may exceed the stated {stated}."
+        return Verdict("unsure", says)
     agrees = held_out is not None and held_out["rms_mm"] is not None
     checked = "held-out data agree with it" if agrees else "no held-out data confirm it"
     prefix = "Calibrated, in simulation" if simulated else "Calibrated"
@@ -62,34 +55,22 @@ def checked_lengths(
 ) -> dict[str, Any] | None:
     """What a calibration says of the lengths that it was tried on, mm; None without reference lengths.
 
-    Args:
-        lengths: Rows of a summary, with errors of the calibrated arm.
-        held_out: The summary of a cross-validation.
-        fixed_by_one: Whether a single length fixed the scale, so that its error is 0 by construction.
+    Of the rows of its summary, with the summary of a cross-validation; the error of the only length is 0 by
+    construction where that fixed the scale.
     """
     if not lengths:
         return None
-    values = [row["value_mm"] for row in lengths]
-    checked = {"lengths": len(lengths), "held_out": 0, "shortest_mm": min(values), "longest_mm": max(values)}
-    checked |= {"rms_mm": None, "predicted_mm": None}
-    held = sum(group["lengths"] for group in held_out.get("left_out", [])) if held_out else 0
-    if held_out and held and held_out["length_error_rms_mm"] is not None:
-        return checked | {
-            "held_out": min(held, len(lengths)),
-            "rms_mm": held_out["length_error_rms_mm"],
-            "predicted_mm": held_out["length_u_mm"],
-        }
-    if fixed_by_one:
-        return checked
-    u = [row["error_u_mm"] for row in lengths]
-    return checked | {
-        "rms_mm": _root_mean_square([row["error_mm"] for row in lengths]),
-        "predicted_mm": None if None in u else _root_mean_square(u),
-    }
-
-
-def _root_mean_square(values: Sequence[float]) -> float:
-    return math.sqrt(sum(value**2 for value in values) / len(values))
+    values, held, u = [row["value_mm"] for row in lengths], 0, [row["error_u_mm"] for row in lengths]
+    rms = predicted = None
+    if held_out and held_out["length_error_rms_mm"] is not None:
+        held = min(sum(group["lengths"] for group in held_out.get("left_out", [])), len(lengths))
+    if held_out and held:
+        rms, predicted = held_out["length_error_rms_mm"], held_out["length_u_mm"]
+    elif not fixed_by_one:
+        rms = math.sqrt(sum(row["error_mm"] ** 2 for row in lengths) / len(lengths))
+        predicted = None if None in u else math.sqrt(sum(value**2 for value in u) / len(u))
+    ends = {"shortest_mm": min(values), "longest_mm": max(values)}
+    return {"lengths": len(lengths), "held_out": held, **ends, "rms_mm": rms, "predicted_mm": predicted}
 
 
 def overall_decision(summary: Mapping[str, Any]) -> str | None:
@@ -105,15 +86,14 @@ def overall_decision(summary: Mapping[str, Any]) -> str | None:
 def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Verdict:
     """Of the summary of an evaluation, or of acceptance tests of points.
 
-    Args:
-        summary: What `evaluation_summary` or `points_summary` returned.
-        own_warnings: How many warnings concern this evaluation, so that "conforms" is not said without reserve.
+    ``own_warnings``: how many warnings concern this evaluation, so that "conforms" is not said without reserve.
     """
     decision = overall_decision(summary)
     metrics = [metric for test in summary["acceptance"] for metric in test["figures"]]
     names = [metric["name"] for metric in metrics if metric["decision"] == decision]
     if decision == "fails":
-        reasons = [*(f"{name} is over its limit" for name in names), *(one.rstrip(".") for one in summary["failed"])]
+        failed = (sentence.rstrip(".") for sentence in summary["failed"])
+        reasons = [*(f"{name} is over its limit" for name in names), *failed]
         return Verdict("bad", f"Fails: {shorten(reasons, 3)}.")
     if decision == "undecided":
         return Verdict("unsure", f"Undecided: the measurement is too uncertain for {shorten(names)}.")
@@ -128,19 +108,18 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
         says += "; a procedure was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)
-    return _without_limits(summary)
-
-
-def _without_limits(summary: Mapping[str, Any]) -> Verdict:
-    held_out = summary.get("held_out")
-    if held_out is None:
+    if summary.get("held_out") is None:
         return Verdict("neutral", "Measured; no limit was given.")
-    predicted = held_out.get("predicted") or {"poses": {}, "lengths": {}}
+    return _as_predicted(summary["held_out"].get("predicted") or {"poses": {}, "lengths": {}})
+
+
+def _as_predicted(predicted: Mapping[str, Any]) -> Verdict:
+    """Of errors on held-out data, which no limit was given for."""
     poses = predicted["poses"]
     if poses.get("rms_mm") is None or poses.get("rms_predicted_mm") is None:
         return Verdict("neutral", "Measured on held-out data; no limit was given.")
     measured, expected = poses["rms_mm"], poses["rms_predicted_mm"]
-    chances = [one["probability"] for one in (poses, predicted["lengths"]) if one["probability"] is not None]
+    chances = [row["probability"] for row in (poses, predicted["lengths"]) if row["probability"] is not None]
     rms = f"held-out poses are {measured:.3g} mm RMS from their geometry, predicted {expected:.3g} mm"
     ratio = predicted["lengths"]["normalised_error_rms"]
     if ratio is not None:

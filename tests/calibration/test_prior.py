@@ -7,7 +7,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration import record_of, sampling
-from aacmm_jax.calibration.prior_fit import _History
+from aacmm_jax.calibration.prior_fit import Rounds
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.summaries.calibration import calibration_summary, prior_sentence
 
@@ -318,11 +318,9 @@ def test_coverage_where_the_truth_is_drawn_from_the_prior(paper_arm, space):
 def test_rounds_that_follow_each_other_are_extrapolated():
     """A fixed point that is reached by turns, eleven times closer each second round, takes a dozen rounds."""
     turn = 0.3 * np.array([[0.0, 1.0, 0.1], [-1.0, 0.0, 0.0], [0.0, 0.2, 0.5]])
-    point, scales, rounds = np.array([1.0, -2.0, 0.5]), np.zeros(3), 0
-    history, change = _History.empty(scales), np.inf
-    while change > 1e-12:
-        led_to = point + turn @ (scales - point) + 0.01 * (scales - point) ** 2
-        history, change, rounds = history.continued(scales, led_to), np.abs(led_to - scales).max(), rounds + 1
-        scales = history.extrapolated() if change < 0.5 else led_to
-    np.testing.assert_allclose(scales, point, atol=1e-12)
-    assert rounds <= 12
+    point, rounds = np.array([1.0, -2.0, 0.5]), Rounds.begun(np.zeros(3))
+    while rounds.change > 1e-12:
+        away = rounds.scales - point
+        rounds = rounds.after(point + turn @ away + 0.01 * away**2)
+    np.testing.assert_allclose(rounds.scales, point, atol=1e-12)
+    assert rounds.count <= 12

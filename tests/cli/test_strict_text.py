@@ -46,7 +46,7 @@ def test_what_is_printed(text, shown):
         (("--seating-mm", "nan"), "--seating-mm 'nan' is not a finite number"),
         (("--encoder-arcsec", "inf"), "--encoder-arcsec 'inf' is not a finite number"),
         (("--seed", "12345678901234567890"), "should be less than or equal to"),
-        (("--poses", "99999999"), "socket 'A' is given 99,999,999 poses, more than 100,000; give fewer."),
+        (("--poses", "99999999"), "number of poses of socket 'A' is 1e+08; it must be at least 1 and at most 100000."),
         (("--poses", "9" * 5001), "is not of the form N"),
         (("--poses", "\u0663"), "--poses '\u0663' is not of the form N"),
         (("--socket", "B=1_0,2,3"), "is not of the form NAME=X,Y,Z"),

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from aacmm_jax.core import backend
+from aacmm_jax.core import jax_setup as backend
 from aacmm_jax.files.hdf5 import undamaged
 from tests.refusals import assert_refused
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from aacmm_jax.core.compilation_cache import _remove_damaged, _unsafe
+from aacmm_jax.core.jax_setup import _remove_damaged, _unsafe
 
 JAX = "print(jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64)"
 IMPORTS = {

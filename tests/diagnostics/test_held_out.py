@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from aacmm_jax.calibration.left_out import CrossValidation, LeftOut
-from aacmm_jax.calibration.prediction import NOTHING, Agreement
+from aacmm_jax.calibration.prediction import NOTHING, Agreement, CrossValidation, LeftOut
 from aacmm_jax.diagnostics.findings import sentences
 from aacmm_jax.diagnostics.held_out import contradicted_prediction, no_better, surprise
-from aacmm_jax.summaries.validation import cross_validation_summary
+from aacmm_jax.summaries.calibration import cross_validation_summary
 
 
 def group(place, rms=0.1, error=0.01, poses=30):

@@ -13,7 +13,7 @@ from aacmm_jax.calibration.redrawn import draw_shared, truth_of
 from aacmm_jax.calibration.sampling import Repeated
 from aacmm_jax.core.distributions import student_quantile
 from aacmm_jax.core.numpy_or_jax import to_numpy
-from aacmm_jax.data.arm_classes import ArmNoise
+from aacmm_jax.data.noise import ArmNoise
 from aacmm_jax.diagnostics.findings import amendable
 from aacmm_jax.diagnostics.group_test import Block
 from aacmm_jax.diagnostics.random_effects import Effects, one_variance

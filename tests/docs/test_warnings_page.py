@@ -15,7 +15,7 @@ PAGE = (ROOT / "docs" / "warnings.md").read_text(encoding="utf-8")
 # Where warnings are worded: of a module all functions, or those that are named.
 SOURCES: dict[str, tuple[str, ...]] = {
     "diagnostics/likely_cause.py": ("likely_cause",),
-    "summaries/arm_survey.py": ("arm_survey", "_warnings"),
+    "summaries/arm_survey.py": ("arm_survey",),
     "summaries/compared_models.py": ("_warnings",),
     "summaries/correction.py": ("correction_summary",),
     "cli/compare_commands.py": ("_compared",),
@@ -27,7 +27,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "acceptance/procedure_items.py": ("socket_in_zone",),
     "report/study.py": ("_warnings",),
     "solver/reason.py": ("Reason",),
-    "core/compilation_cache.py": ("set_up",),
+    "core/jax_setup.py": ("set_up",),
 }
 # Parts of sentences, by their beginning, and what is no warning.
 PARTS = (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.data.arm_classes import CLASSES, class_noise, noise_of_repeatability
+from aacmm_jax.data.noise import CLASSES, class_noise, noise_of_repeatability
 from aacmm_jax.files import load_noise, usual_noise
 
 TABLE = """\

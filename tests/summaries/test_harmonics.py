@@ -11,7 +11,7 @@ from aacmm_jax.cli import calibration_views
 from aacmm_jax.cli.display import display
 from aacmm_jax.report.calibration import calibration_report
 from aacmm_jax.summaries.calibration import calibration_summary
-from aacmm_jax.summaries.harmonics import harmonics_by_joint, listed_apart
+from aacmm_jax.summaries.result_tables import harmonics_by_joint, listed_apart
 
 
 def rows(*names):

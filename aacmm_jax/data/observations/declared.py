@@ -21,7 +21,8 @@ from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 MOST_POSES = 100_000  # to simulate, as in a study
 REQUIRED = inspect.Parameter.empty
 NAME = object()  # as a default: the name of the observation
-_CONTENTS = {str: "text", bool: "truth", int: "count", dict: "points"}
+Content = Literal["number", "count", "text", "truth", "points"]
+_CONTENTS: dict[Any, Content] = {str: "text", bool: "truth", int: "count", dict: "points"}
 _ARGUMENTS = {"number": "Numbers", "count": "int", "text": "str", "truth": "bool", "points": "dict"}
 
 
@@ -42,10 +43,11 @@ class Entry(NamedTuple):
     annotation: Any = None
 
     @property
-    def content(self) -> str:
+    def content(self) -> Content:
         """By its type: number, count, text, truth or points (a dictionary of points by name)."""
         alternatives = (get_origin(self.annotation), self.annotation, *get_args(self.annotation))
-        return next((_CONTENTS[one] for one in alternatives if one in _CONTENTS), "number")
+        contents: list[Content] = [_CONTENTS[kind] for kind in alternatives if kind in _CONTENTS]
+        return contents[0] if contents else "number"
 
     @property
     def described(self) -> str:
@@ -200,9 +202,9 @@ def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
     if content == "points":
         return {name: tuple(map(float, point)) for name, point in value.items()}
     if content == "count":
-        Range(least=1, most=MOST_POSES)(value, what, sizes)
+        Range(least=1, most=MOST_POSES)(value, what)
     elif content == "number" and value is not None and not np.ndim(value) and not entry.dimensions:
-        (Range(above=0) if entry.positive else Range(least=0))(value, what, sizes)
+        (Range(above=0) if entry.positive else Range(least=0))(value, what)
     return value
 
 
