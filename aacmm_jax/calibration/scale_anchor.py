@@ -31,7 +31,7 @@ from ..kinematics.arm import (
     parameter_names,
     value_of,
 )
-from ..kinematics.independence import PosesInSockets, equations, generic_poses
+from ..kinematics.independence import equations, generic_poses, poses_in_sockets
 from ..kinematics.inverse_kinematics import SocketPoses, project_to_centroids
 from ..kinematics.parameters import Parameters, based_on
 from ..kinematics.workspace import total_link_length
@@ -226,7 +226,7 @@ def _of_slides(
     all over the workspace."""
     if capture is not None and capture.sizes and is_concrete(capture.q):
         q = np.asarray(capture.q)
-        poses = PosesInSockets(q.reshape(-1, *q.shape[-2:])[0], tuple(capture.sizes))
+        poses = poses_in_sockets(q.reshape(-1, *q.shape[-2:])[0], tuple(capture.sizes))
     else:
         prismatic = np.isin(np.arange(1, arm.joints + 1), arm.prismatic)
         limits = np.where(prismatic[:, None], [-500.0, 500.0], [-np.pi, np.pi]).tolist()
