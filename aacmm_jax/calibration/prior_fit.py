@@ -27,7 +27,6 @@ from ..uncertainty.evidence import (
     effective_parameters,
     eliminated,
     learned_log_variances,
-    slope_of_expectation,
 )
 from .results import PriorMetrics
 from .task import NEAR, Begun, Fit, State, Task, fit, state_at, whitening_at
@@ -162,7 +161,7 @@ class PriorProblem(NamedTuple):
         xp, model, sd, variances = namespace(scales, z), self.model(scales, z), self.sd(scales), scales[1:]
         effective, groups = effective_parameters(model, sd), self.groups
         slope = xp.asarray(groups.members) @ ((model.deviation / sd) ** 2 - effective)
-        slope = slope + slope_of_expectation(groups, variances)
+        slope = slope + groups.slope(variances)
         smallest = stop_gradient(variances) <= _LEAST_LOG + 1e-9
         of_groups = xp.where(smallest, variances - _LEAST_LOG, slope)
         of_groups = xp.where(xp.asarray(self.learned), of_groups, variances - groups.first)

@@ -27,7 +27,7 @@ from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replac
 from ..uncertainty.active_bounds import of_active_bounds
 from ..uncertainty.covariance import DISAGREEMENT, STATED
 from ..uncertainty.degrees_of_freedom import Components
-from ..uncertainty.linear_propagation import covariance_with, rows_of_functions
+from ..uncertainty.linear_propagation import by_covariances, rows_of_functions
 from ..uncertainty.linearisation import Linearisation
 from .results import Calibration, Identification, ObservedMetrics
 from .scale_anchor import ScaleAnchor, fixed_lengths, fixes_scale
@@ -149,13 +149,13 @@ def positions_at_ends(capture: Capture) -> list[str]:
 
 
 def ends_between(
-    observed: Observed, geometry: Float[AnyArray, " g"], own: Sequence[Float[AnyArray, "_ _ _"]], capture: Capture
+    observed: Observed, geometry: Float[AnyArray, " g"], by_class: Sequence[Float[AnyArray, "_ _ _"]], capture: Capture
 ) -> MeasuredEnds:
-    """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
+    """The ends of a capture's lengths; ``by_class`` are the covariances of components by a given arm."""
     xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
     for name in used:
         number, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        covariances.append(own[number][component, first : first + 3, first : first + 3])
+        covariances.append(by_class[number][component, first : first + 3, first : first + 3])
     return MeasuredEnds(
         positions=xp.stack([geometry[observed.positions[name]] for name in used]),
         covariances=xp.stack(covariances),
@@ -276,7 +276,8 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
     can_scale = solution.identification.anchor.can_scale
     foot = xp.stack([xp.zeros(()), xp.zeros(()), linear.space.base.d[0]]) if can_scale else None
     variance = solution.covariance_of(measured.rows)[0, 0] + measured.added
-    _, with_k = covariance_with(solution.influence, measured.rows, solution.covariances)
+    answer = solution.influence.response(by_covariances(measured.rows, solution.covariances))
+    with_k = [part[..., 0] for part in answer[1]]  # covariance of private geometry with k, natural steps
     covariances = {}
     for name in observed.names:
         matrix = metrics.geometry_covariance[name]

@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..core.units import DEG
 from ..data.capture import Capture, names_in, part_of
 from ..data.observations.held import Socket
-from .equations import PROBE, Equations, Rows
+from .equations import EXACT, PROBE, Equations, Rows
 from .findings import Case, Finding, case_of, chance_text
 from .group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of
 
@@ -26,7 +26,6 @@ _LEAST_RATIO = 9.0
 _LEAST_DIFFERENCE, _LEAST_REMOUNTED = 16.0, 50.0
 _LEVEL = 0.01
 _EXPLAINS = 0.67  # share of a contradiction that a single cause must explain to be named
-_EXACT = 1e-6  # mm: smaller contradictions are rounding errors of a simulation without noise
 _LARGE = ("session", "station")  # kinds of groups with more poses than parameters
 _NAMED_ALIKE = ("socket", "observation")  # kinds whose groups are chosen by their own names
 
@@ -81,16 +80,31 @@ def removal(removed: Removed) -> Finding:
 
 def _finding(contradiction: Contradiction) -> Finding:
     kind, suspects = contradiction
-    cause = suspects[-1].cause
+    cause, seems = suspects[-1].cause, ""
     remounted = kind == "session" and cause is not None and cause.names == PROBE
+    if cause is not None and cause.names == PROBE:
+        offset = ", ".join(f"{value:+.3g}" for value in cause.values)
+        seems = f" In {suspects[-1].group}, the probe seems displaced by {offset} mm (x, y, z of the last frame)."
+    elif cause is not None:
+        sort, joint = cause.names[0].split("_")
+        more = f"{-cause.values[0]:+.3g} mm" if sort == "d" else f"{-cause.values[0] / DEG:+.3g} deg"
+        seems = f" In {suspects[-1].group}, joint {joint} seems to read {more} more."
     # Whichever session is the wrong one, the probe of each other one is displaced from it.
     suspects = suspects[-1:] if remounted else suspects
-    options = " or ".join(f"--without '{_pattern(kind, suspect)}'" for suspect in suspects)
     changes = "; ".join(
         f"without {suspect.group}, the others scatter by {suspect.rms_others[1]:.2g} mm RMS instead of "
         f"{suspect.rms_others[0]:.2g} mm, and it by {suspect.rms[1]:.2g} mm instead of {suspect.rms[0]:.2g} mm"
         for suspect in suspects
     )
+    patterns = []  # of a shell, which select the groups
+    for suspect in suspects:
+        inside, members = f"{suspect.group}/", suspect.members
+        if kind in _NAMED_ALIKE or len(members) == 1:
+            patterns.append(members[0])
+        else:
+            alike = all(name.startswith(inside) for name in members)
+            patterns.append(f"{inside}*" if alike else "' '".join(members))
+    options = " or ".join(f"--without '{pattern}'" for pattern in patterns)
     plural = "indices" if kind == "index" else f"{kind}s"
     says = (
         f"{kind.capitalize()} {suspects[0].group} contradicts the other {plural}"
@@ -99,32 +113,13 @@ def _finding(contradiction: Contradiction) -> Finding:
     )
     return Finding(
         "contradiction",
-        f"{says}: {changes}. {_as_if(cause, suspects[-1].group)}".rstrip(),
+        f"{says}: {changes}.{seems}",
         advice="Calibrate with a probe for each session (without --same-probe)."
         if remounted
         else f"Check the readings, and calibrate without what is wrong ({options}).",
         probability=max(suspect.test.probability for suspect in suspects),
         concerns=tuple(name for suspect in suspects for name in suspect.members),
     )
-
-
-def _pattern(kind: str, suspect: Suspect) -> str:
-    """A shell pattern that selects the group."""
-    if kind in _NAMED_ALIKE or len(suspect.members) == 1:
-        return suspect.members[0]
-    inside = f"{suspect.group}/"
-    return f"{inside}*" if all(name.startswith(inside) for name in suspect.members) else "' '".join(suspect.members)
-
-
-def _as_if(cause: Cause | None, group: str) -> str:
-    if cause is None:
-        return ""
-    if cause.names == PROBE:
-        offset = ", ".join(f"{value:+.3g}" for value in cause.values)
-        return f"In {group}, the probe seems displaced by {offset} mm (x, y, z of the last frame)."
-    kind, joint = cause.names[0].split("_")
-    more = f"{-cause.values[0]:+.3g} mm" if kind == "d" else f"{-cause.values[0] / DEG:+.3g} deg"
-    return f"In {group}, joint {joint} seems to read {more} more."
 
 
 def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
@@ -174,25 +169,20 @@ def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
 
 def _contradictions(case: Case) -> list[Contradiction]:
     equations, kinds = case.equations, groupings(case.record.recording.capture)
-    best: tuple[float, str, list[list[GroupTest]]] = (0.0, "", [])
-    for kind, labels in kinds.items():
-        blocks = equations.grouped(labels)
-        tests = contradicting_groups(blocks, level=_LEVEL, least_ratio=_LEAST_RATIO)
+    best: list[list[GroupTest]] = []
+    kind, labels = "", {}
+    for candidate, groups in kinds.items():
+        blocks = equations.grouped(groups)
+        choices = [contradicting_groups(blocks, level=_LEVEL, least_ratio=_LEAST_RATIO)]
         # An unlikely error of a few poses does not hide one that all poses of a session share.
-        if kind in _LARGE:
-            tests = max(tests, _different(equations, blocks, labels), key=_first_ratio)
-        if tests and _first_ratio(tests) > best[0]:
-            best = _first_ratio(tests), kind, tests
-    _, kind, tests = best
-    if not tests:
-        return []
-    labels = kinds[kind]
-    result = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in tests]
-    return [] if result[0].suspects[0].rms_others[0] < _EXACT else result
-
-
-def _first_ratio(tests: Sequence[Sequence[GroupTest]]) -> float:
-    return tests[0][0].ratio if tests else 0.0
+        if candidate in _LARGE:
+            choices.append(_different(equations, blocks, groups))
+        for tests in choices:
+            # Kinds with the same group differ by rounding.
+            if tests and (not best or tests[0][0].ratio > (1 + 1e-9) * best[0][0].ratio):
+                best, kind, labels = tests, candidate, groups
+    found = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in best]
+    return [] if not found or found[0].suspects[0].rms_others[0] < EXACT else found
 
 
 def _different(
@@ -215,21 +205,13 @@ def _suspect(equations: Equations, labels: Mapping[str, str | None], test: Group
     others = [rows for rows in equations.rows if rows.name not in members]
     # Geometry that only this group has is open in the least squares of the others, and follows its poses.
     loose = ~np.any([np.any(rows.shared, axis=(0, 1)) for rows in others], axis=0)
-    step = np.where(loose, 0.0, test.step)
-    following = [
-        block._replace(residual=block.residual + block.shared @ step, shared=block.shared[:, loose])
-        for block in (rows.block("") for rows in own)
-    ]
+    step, following = np.where(loose, 0.0, test.step), []
+    for block in (rows.block("") for rows in own):
+        residual = block.residual + block.shared @ step
+        following.append(block._replace(residual=residual, shared=block.shared[:, loose]))
     step[loose] = fit_of(following).step
-    still = np.zeros_like(step)
-    return Suspect(
-        group=str(test.group),
-        members=members,
-        test=test,
-        rms=(rms_of(own, still), rms_of(own, step)),
-        rms_others=(rms_of(others, still), rms_of(others, step)),
-        cause=_cause(equations, members),
-    )
+    rms, rms_others = ((rms_of(rows, 0 * step), rms_of(rows, step)) for rows in (own, others))
+    return Suspect(str(test.group), members, test, rms, rms_others, _cause(equations, members))
 
 
 def rms_of(rows: Sequence[Rows], step: Float[np.ndarray, " s"]) -> float:

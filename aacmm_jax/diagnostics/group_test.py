@@ -9,8 +9,7 @@ What an error of its own may be (a joint's zero, a remounted probe) is tested li
 has, which must explain what it contradicts.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
-from functools import reduce
+from collections.abc import Hashable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +42,7 @@ class GroupTest(NamedTuple):
 class Block(NamedTuple):
     """Equations of one fixture and one group: residuals in standard deviations, and their derivatives.
 
-    Blocks of one fixture have the same unknowns of their own. Those whose group is None are never taken out.
+    Those whose group is None are never taken out.
     """
 
     fixture: Hashable
@@ -53,33 +52,6 @@ class Block(NamedTuple):
     own: Float[np.ndarray, "r k"]  # by what only this fixture has, such as the position of a socket
 
 
-class _Gram(NamedTuple):
-    """Gram matrix of the derivatives by the parameters, the residual and the derivatives by the fixture's unknowns."""
-
-    matrix: Float[np.ndarray, "m m"]
-    rows: int
-
-    @classmethod
-    def of(cls, block: Block) -> "_Gram":
-        columns = np.concatenate([block.shared, block.residual[:, None], block.own], axis=1)
-        return cls(columns.T @ columns, len(columns))
-
-    def plus(self, other: "_Gram") -> "_Gram":
-        return _Gram(self.matrix + other.matrix, self.rows + other.rows)
-
-    def less(self, other: "_Gram") -> "_Gram":
-        return _Gram(self.matrix - other.matrix, self.rows - other.rows)
-
-    def without_own(self, unknowns: int) -> "_Gram":
-        """Less what the fixture's own unknowns account for."""
-        size = len(self.matrix) - unknowns
-        if not unknowns:
-            return self
-        inverse, rank = _inverse(self.matrix[size:, size:], np.diag(self.matrix)[size:])
-        crossed = self.matrix[size:, :size]
-        return _Gram(self.matrix[:size, :size] - crossed.T @ inverse @ crossed, self.rows - rank)
-
-
 class Fit(NamedTuple):
     """A least squares from its Gram matrix."""
 
@@ -87,14 +59,34 @@ class Fit(NamedTuple):
     degrees_of_freedom: int
     step: np.ndarray
 
+
+class _Gram(NamedTuple):
+    """Gram matrix of the derivatives by the parameters and the residual, less what the fixtures' own unknowns account
+    for, and how many rows are left."""
+
+    matrix: Float[np.ndarray, "m m"]
+    rows: int
+
     @classmethod
-    def of(cls, gram: _Gram, diagonal: Float[np.ndarray, " p"]) -> "Fit":
+    def of(cls, blocks: Iterable[Block]) -> "_Gram":
+        matrix, rows = np.zeros((0, 0)), 0
+        for block in blocks:
+            columns = np.concatenate([block.shared, block.residual[:, None], block.own], axis=1)
+            whole, size, rank = columns.T @ columns, block.shared.shape[1] + 1, 0
+            part = whole[:size, :size]
+            if block.own.shape[1]:
+                inverse, rank = _inverse(whole[size:, size:], np.diag(whole)[size:])
+                part = part - whole[:size, size:] @ inverse @ whole[size:, :size]
+            matrix, rows = (part + matrix if rows else part), rows + len(columns) - rank
+        return cls(matrix, rows)
+
+    def fit(self, diagonal: Float[np.ndarray, " p"] | None = None) -> Fit:
         """``diagonal``: that of the whole normal matrix, against which what is left of a column may be rounding."""
-        information, gradient = gram.matrix[:-1, :-1], gram.matrix[:-1, -1]
-        inverse, rank = _inverse(information, diagonal)
+        information, gradient = self.matrix[:-1, :-1], self.matrix[:-1, -1]
+        inverse, rank = _inverse(information, np.diag(information) if diagonal is None else diagonal)
         step = -inverse @ gradient
-        cost = float(gram.matrix[-1, -1] + step @ gradient)
-        return cls(max(cost, 0.0), gram.rows - rank, step)
+        cost = float(self.matrix[-1, -1] + step @ gradient)
+        return Fit(max(cost, 0.0), self.rows - rank, step)
 
 
 def _inverse(matrix: Float[np.ndarray, "p p"], diagonal: Float[np.ndarray, " p"]) -> tuple[np.ndarray, int]:
@@ -104,6 +96,15 @@ def _inverse(matrix: Float[np.ndarray, "p p"], diagonal: Float[np.ndarray, " p"]
     present = values > _NULL * values.max(initial=0.0)
     rows = (scale[:, None] * vectors)[:, present]
     return (rows / values[present]) @ rows.T, int(present.sum())
+
+
+def fit_of(blocks: Iterable[Block]) -> Fit:
+    """The least squares of some of the equations."""
+    return _Gram.of(blocks).fit()
+
+
+def _groups(blocks: Sequence[Block]) -> list[Hashable]:
+    return list(dict.fromkeys(block.group for block in blocks if block.group is not None))
 
 
 def contradicting_groups(
@@ -119,29 +120,33 @@ def contradicting_groups(
     of each group that was found, without those before it; and after it, as its alternatives, the tests of groups
     without which the others agree as well (of two groups that contradict each other, either).
     """
-    parts = _Parts.of(blocks)
-    removed: list[Hashable] = []
+    grams = {group: _Gram.of(block for block in blocks if block.group == group) for group in (*_groups(blocks), None)}
     contradicting: list[list[GroupTest]] = []
     number = 0
-    for _ in range(len(parts.groups) // 2):
-        tests = parts.tests(removed)
+    for _ in range((len(grams) - 1) // 2):
+        # Every group that is left against the others; not those that add no equation, or leave none to compare.
+        left = [gram for gram in grams.values() if gram.rows]
+        whole = _Gram(np.sum([gram.matrix for gram in left], axis=0), sum(gram.rows for gram in left))
+        diagonal, tests = np.diag(whole.matrix)[:-1], []
+        everything = whole.fit(diagonal)
+        for group, gram in grams.items():
+            if group is None:
+                continue
+            others = _Gram(whole.matrix - gram.matrix, whole.rows - gram.rows).fit(diagonal)
+            added, freedom = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom
+            if added > 0 and freedom > 0:
+                gain = everything.cost - others.cost
+                tests.append(GroupTest.of(group, added, gain, others.cost, freedom, others.step))
         significant = [test for test in tests if test.probability * len(tests) < level]
         if not significant:
             break
         worst = max(significant, key=lambda test: test.ratio)
         alternatives = [test for test in significant if test is not worst and test.ratio >= least_ratio]
         contradicting.append([worst, *(test for test in alternatives if test.variance < _AS_WELL * worst.variance)])
-        removed.append(worst.group)
+        del grams[worst.group]
         if worst.ratio >= least_ratio:
             number = len(contradicting)
     return contradicting[:number]
-
-
-def fit_of(blocks: Sequence[Block]) -> Fit:
-    """The least squares of some of the equations."""
-    parts = _Parts.of(blocks)
-    whole = reduce(_Gram.plus, parts.eliminated([]).values())
-    return Fit.of(whole, np.diag(whole.matrix)[:-1])
 
 
 def different_groups(blocks: Sequence[Block]) -> list[GroupTest]:
@@ -152,7 +157,7 @@ def different_groups(blocks: Sequence[Block]) -> list[GroupTest]:
     group counts with both sides: it relates unknowns that only one of them has.
     """
     whole, tests = fit_of(blocks), []
-    for group in _Parts.of(blocks).groups:
+    for group in _groups(blocks):
         own = fit_of([block for block in blocks if block.group in (group, None)])
         others = fit_of([block for block in blocks if block.group != group])
         freedom = own.degrees_of_freedom + others.degrees_of_freedom
@@ -162,55 +167,3 @@ def different_groups(blocks: Sequence[Block]) -> list[GroupTest]:
             apart = own.cost + others.cost
             tests.append(GroupTest.of(group, added, whole.cost - apart, apart, freedom, others.step))
     return sorted(tests, key=lambda test: -test.ratio)
-
-
-class _Parts(NamedTuple):
-    """Gram matrices by fixture and group."""
-
-    grams: Mapping[Hashable, Mapping[Hashable | None, _Gram]]
-    unknowns: Mapping[Hashable, int]  # own ones of each fixture
-
-    @classmethod
-    def of(cls, blocks: Sequence[Block]) -> "_Parts":
-        grams: dict[Hashable, dict[Hashable | None, _Gram]] = {}
-        for block in blocks:
-            of_fixture, gram = grams.setdefault(block.fixture, {}), _Gram.of(block)
-            of_fixture[block.group] = of_fixture[block.group].plus(gram) if block.group in of_fixture else gram
-        return cls(grams, {block.fixture: block.own.shape[1] for block in blocks})
-
-    @property
-    def groups(self) -> list[Hashable]:
-        return [g for g in dict.fromkeys(g for of in self.grams.values() for g in of) if g is not None]
-
-    def eliminated(self, without: Sequence[Hashable]) -> dict[Hashable, _Gram]:
-        """The sum over each fixture's groups, less what its unknowns account for."""
-        sums = {}
-        for fixture, grams in self.grams.items():
-            kept = [gram for group, gram in grams.items() if group is None or group not in without]
-            if kept:
-                sums[fixture] = reduce(_Gram.plus, kept).without_own(self.unknowns[fixture])
-        return sums
-
-    def tests(self, removed: Sequence[Hashable]) -> list[GroupTest]:
-        """Every group that is left against the others; not those that add no equation, or leave none to compare."""
-        whole = self.eliminated(removed)
-        if not whole:
-            return []
-        total = reduce(_Gram.plus, whole.values())
-        diagonal = np.diag(total.matrix)[:-1]
-        everything, tests = Fit.of(total, diagonal), []
-        touched: dict[Hashable, list[Hashable]] = {}
-        for fixture in whole:
-            for group in self.grams[fixture]:
-                if group is not None and group not in removed:
-                    touched.setdefault(group, []).append(fixture)
-        for group, fixtures in touched.items():
-            part = _Parts({fixture: self.grams[fixture] for fixture in fixtures}, self.unknowns)
-            rest = reduce(_Gram.less, (whole[fixture] for fixture in fixtures), total)
-            rest = reduce(_Gram.plus, part.eliminated([*removed, group]).values(), rest)
-            others = Fit.of(rest, diagonal)
-            added, freedom = everything.degrees_of_freedom - others.degrees_of_freedom, others.degrees_of_freedom
-            if added > 0 and freedom > 0:
-                gain = everything.cost - others.cost
-                tests.append(GroupTest.of(group, added, gain, others.cost, freedom, others.step))
-        return tests

@@ -1,12 +1,16 @@
-"""Joints that stand still, or nearly, over the poses of a capture: what that leaves open, and what to fix then."""
+"""How far joints travel over the poses of a capture: what joints that stand still leave open, and which other poses are
+near to those of a calibration."""
 
 import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from ..core.arguments import checked_arguments
+from ..core.arrays import Numbers
+from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import listed, pluralise
 from ..core.units import DEG
@@ -20,6 +24,7 @@ from ..kinematics.arm import (
     with_arrays,
     without_corrections,
 )
+from ..kinematics.chain import reading_units
 from ..kinematics.independence import determined_at, nearly_parallel
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..uncertainty.identifiability import observability
@@ -29,6 +34,9 @@ from ..uncertainty.identifiability import observability
 _TURN, _SLIDE = 1.0 * DEG, 20.0
 _SIGMA = 0.05  # mm, of tips: what these determine no better than usual bounds counts as open
 _TARGET = np.array([100.0, 70.0, 50.0])  # mm
+_QUERIES = 500  # poses of a capture, evenly chosen, whose distance from their nearest neighbour is computed
+_AT_ONCE = 64
+_NEAR = 0.95  # of the capture's poses are as near to another one as what counts as tried
 
 
 class StandingJoint(NamedTuple):
@@ -75,18 +83,18 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
     """
     still = standing_joints(arm, np.asarray(capture.readings))
     joints = [standing.joint for standing in still]
-    open_by = lost_by_standing(arm, capture, joints)
     remedy = "move it" if len(still) == 1 else "move them"
     if nominal is not None and still:
-        added = _open_parameters(nominal.space(), capture, joints)
-        held = {name for name in nominal.space().held if not name.startswith(("beta_", "gravity_"))} | added
+        space = nominal.space()
+        added = _open_parameters(space, capture, joints)
+        held = {name for name in space.held if not name.startswith(("beta_", "gravity_"))} | added
         remedy += ", or calibrate "
         if added:
-            remedy += f"with --held {','.join(name for name in parameter_names(nominal.space().base) if name in held)}"
+            remedy += f"with --held {','.join(name for name in parameter_names(space.base) if name in held)}"
         else:
             remedy += "as it is: the parameters that are free by default leave nothing open"
     rows = []
-    for (joint, travel, poses), names in zip(still, open_by, strict=True):
+    for (joint, travel, poses), names in zip(still, lost_by_standing(arm, capture, joints), strict=True):
         unit, size = ("mm", travel) if joint in arm.prismatic else ("deg", travel / DEG)
         says = f"Joint {joint} stands still ({size:.2g} {unit} over {pluralise(poses, 'pose')})"
         if names:
@@ -101,7 +109,7 @@ def _open_parameters(space: Parameters, capture: Capture, joints: Sequence[int])
     """Free parameters to fix: those lost by standing, and one of each combination that is (nearly) undetermined."""
     # First as if they stood exactly still, since it is little, and mostly noise, that a small movement says.
     fixed = {name for names in lost_by_standing(space.base, capture, joints, space.names) for name in names}
-    while capture.lengths or any(one.fixes_scale for one in capture.observations):
+    while capture.lengths or any(observation.fixes_scale for observation in capture.observations):
         left = Parameters(space.base, tuple(name for name in space.names if name not in fixed))
         seen = observability(left.base, capture, left, sigma=_SIGMA)
         if seen.null.shape[1]:
@@ -132,22 +140,75 @@ def lost_by_standing(
         without = {f"d_{i}" if i in parallel else f"beta_{i}" for i in range(1, base.joints + 1)}
         others = [name for name in parameter_names(without_corrections(base)) if name not in without]
         names = list(dict.fromkeys([*space.names, *others]))
-    own = {f"{kind}_{joint}" for kind in ("alpha", "a", "d", "theta", "beta") for joint in joints}
-    order = sorted(names, key=own.__contains__)  # the last are lost first
+    of_joints = {f"{kind}_{joint}" for kind in ("alpha", "a", "d", "theta", "beta") for joint in joints}
+    order = sorted(names, key=of_joints.__contains__)  # the last are lost first
     neighbour = neighbouring_arm(base, tuple(order))  # without the exact alignments of the nominal arm
-    if any(one.target for one in capture.observations):  # whose place is unknown, and hardly on the last axis
+    # A target's place is unknown, and hardly on the last axis.
+    if any(observation.target for observation in capture.observations):
         neighbour = with_arrays(neighbour, probe=np.asarray(neighbour.probe) + _TARGET)
     low, high = np.asarray(joint_limits(arm, None)).T
-    standing = np.asarray(capture.readings)[0]
-    random = np.random.default_rng(0)
+    standing, random, left = np.asarray(capture.readings)[0], np.random.default_rng(0), []
+    for count in range(len(joints) + 1):
 
-    def determined(still: Sequence[int]) -> tuple[str, ...]:
-        def changed(q: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+        def changed(q: Float[np.ndarray, "m n"], still: Sequence[int] = joints[:count]) -> Float[np.ndarray, "m n"]:
             for i in (joint - 1 for joint in joints):
                 q[:, i] = standing[i] if i + 1 in still else random.uniform(low[i], high[i], len(q))
             return q
 
-        return determined_at(neighbour, capture, order, changed)
+        left.append(determined_at(neighbour, capture, order, changed))
+    return [tuple(name for name in before if name not in after) for before, after in itertools.pairwise(left)]
 
-    left = [determined(joints[:count]) for count in range(len(joints) + 1)]
-    return [tuple(x for x in before if x not in after) for before, after in itertools.pairwise(left)]
+
+class TriedPoses(NamedTuple):
+    """Distances in joint space: root mean square over the joints, each the shorter way round, rad (slides: m)."""
+
+    spacing: float  # within which 95 % of the calibration's poses have another one
+    distance: Float[np.ndarray, " v"]  # of each other pose from the nearest one of the calibration
+
+    @property
+    def tried(self) -> Bool[np.ndarray, " v"]:
+        """Which poses are as near to one of the calibration as these are to one another."""
+        return self.distance <= self.spacing
+
+
+@checked_arguments
+def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
+    """How far poses are from those of a calibration, and these from one another.
+
+    What a model lacks depends on the readings, so a calibration has seen such errors only near its own poses. Elsewhere
+    an uncertainty that follows from the model alone says nothing of them.
+
+    Args:
+        arm: The arm.
+        calibrated: Readings that it was calibrated with, ``(N, n)``, rad (slides: mm). A temperature after
+            them is left out.
+        q: Readings of other poses, ``(v, n)``.
+
+    Returns:
+        The distances.
+
+    Raises:
+        InputError: Fewer than two poses were calibrated with.
+    """
+    units = np.asarray(reading_units(arm.geometry))
+    poses, others = (np.asarray(values, dtype=float)[:, : arm.joints] / units for values in (calibrated, q))
+    if len(poses) < 2:
+        raise InputError(
+            f"{len(poses)} pose has no distance from another; give at least two that were calibrated with."
+        )
+    turns = np.array(by_joint(arm, True, False))
+
+    def nearest(q: Float[np.ndarray, "v n"], same: np.ndarray | None = None) -> Float[np.ndarray, " v"]:
+        """Distance of each pose from the nearest of the calibration; ``same``: which of these each of them is."""
+        distances = np.empty(len(q))
+        for start in range(0, len(q), _AT_ONCE):
+            rows = slice(start, start + _AT_ONCE)
+            apart = q[rows, None] - poses[None]
+            squares = np.mean(np.where(turns, (apart + np.pi) % (2 * np.pi) - np.pi, apart) ** 2, axis=2)
+            if same is not None:
+                squares[np.arange(len(squares)), same[rows]] = np.inf
+            distances[rows] = np.sqrt(squares.min(axis=1))
+        return distances
+
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _QUERIES)).round().astype(int))
+    return TriedPoses(float(np.quantile(nearest(poses[chosen], chosen), _NEAR)), nearest(others))

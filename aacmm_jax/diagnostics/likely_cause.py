@@ -6,7 +6,7 @@ is identified. A nominal arm is a few millimetres off, a mistake some hundred.
 
 import itertools
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -39,31 +39,30 @@ _UNITS = {
     "measured values in um are taken for mm, or those in mm for m": UM,
     "measured values in mm are taken for inches": 1 / INCH,
 }
-_MIRRORED = "left-handed: two columns are exchanged, or one has the wrong sign"
-
-
-class _Tried(NamedTuple):
-    cause: str
-    q: Float[np.ndarray, "M n"]
-    observations: tuple[AbstractObservation, ...] | None = None  # None: as given
-    write: str = ""  # what corrects it in the manifest, as a sentence
+# A cause, readings, observations (None: as given), and a sentence on what corrects it in the manifest.
+_Correction = tuple[str, np.ndarray, tuple[AbstractObservation, ...] | None, str]
 
 
 def likely_cause(arm: Arm, capture: Capture) -> str:
     """The mistake whose correction makes the residuals by the nominal arm far smaller, as a sentence; or nothing."""
     arm, capture = to_numpy((arm, capture))
+    sockets = [Socket(name, q) for name, q in capture.sockets.items() if len(q) > 1]
+    scattering = [*sockets, *capture.observations]
+    if not scattering:  # no two poses can disagree
+        return ""
+    chosen = [scattering[i] for i in _evenly(len(scattering), _OBSERVATIONS)]
+    part = [observation.select(_evenly(observation.q.shape[0], _POSES)) for observation in chosen]
+    # Without the arm: its readings may be in any unit.
+    observed, size = Observed.of(Capture({}, (), part), None), total_link_length(arm)
     with np.errstate(all="ignore"):
-        misfit = _Misfit.by(arm, capture)
-        if misfit is None:
-            return ""
-        given, size = misfit.rms(_Tried("", np.asarray(misfit.observed.q))), total_link_length(arm)
+        given = _rms(arm, observed.moved(arm, np.asarray(observed.q)))
         if given < _NOMINAL * size:
             return ""
         rms, cause, write = np.inf, "", ""
-        for tried in misfit.corrections():
-            corrected = misfit.rms(tried)
+        for text, q, observations, line in _corrections(arm, observed):
+            corrected = _rms(arm, observed.moved(arm, q, observations))
             if corrected < 0.98 * rms:  # of equally good corrections, the first
-                rms, cause, write = corrected, tried.cause, tried.write
+                rms, cause, write = corrected, text, line
     if not rms < min(given / _BETTER, _SMALL * size):
         return ""
     return (
@@ -72,109 +71,87 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
     )
 
 
-class _Misfit(NamedTuple):
-    """How far an arm is from what was observed: sockets and other observations, a part of them where there are many."""
-
-    arm: Arm
-    observed: Observed
-
-    @classmethod
-    def by(cls, arm: Arm, capture: Capture) -> "_Misfit | None":
-        """None where no two poses can disagree."""
-        sockets = [Socket(name, q) for name, q in capture.sockets.items() if len(q) > 1]
-        scattering = [*sockets, *capture.observations]
-        if not scattering:
-            return None
-        chosen = [scattering[i] for i in _evenly(len(scattering), _OBSERVATIONS)]
-        part = [observation.select(_evenly(observation.q.shape[0], _POSES)) for observation in chosen]
-        # Without the arm: its readings may be in any unit.
-        observed = Observed.of(Capture({}, (), part), None)
-        return cls(arm, observed.moved(arm, np.asarray(observed.q)))
-
-    def corrections(self) -> Iterator[_Tried]:
-        q, observations = np.asarray(self.observed.q), self.observed.observations
-        for tried in _of_joints(q[:, : self.arm.joints], self.arm):  # the column of a thermometer stays
-            yield tried._replace(q=np.concatenate([tried.q, q[:, self.arm.joints :]], axis=1))
-        concerned = [i for i, one in enumerate(observations) if _measured_field(one) is not None]
-        alike: dict[tuple[str, str], list[int]] = {}
-        for i in concerned:
-            for label in ("kind", "station", "artefact"):
-                alike.setdefault((label, str(getattr(observations[i], label, i))), []).append(i)
-        for several in dict.fromkeys([tuple(concerned), *map(tuple, alike.values()), *((i,) for i in concerned)]):
-            if not several:
-                continue
-            corrected = [list(_measured(observations[i])) for i in several]
-            for cause in dict.fromkeys(text for of in corrected for text, _ in of):
-                changed = list(observations)
-                for i, of in zip(several, corrected, strict=True):
-                    changed[i] = dict(of).get(cause, observations[i])
-                names = shorten([observations[i].name for i in several], 3)
-                field = _measured_field(observations[several[0]])
-                unit = length_unit(_UNITS.get(cause, 0.0))
-                write = f' In its table of the manifest write units = {{ {field} = "{unit}" }}.'
-                write = write if unit in ("m", "inch") else ""
-                yield _Tried(f"{cause} ({names})", q, tuple(changed), write)
-
-    def rms(self, tried: _Tried) -> float:
-        """RMS distance of the tips from the geometry that fits them, mm; an angle counts as the arm's lever makes it.
-
-        What is certified stays as it is stated.
-        """
-        observed = self.observed.moved(self.arm, tried.q, tried.observations)
-        space, lever = Parameters(self.arm, ("d_1",)), total_link_length(self.arm) / 4
-        certified: dict[str, AnyArray] = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
-        fixed = [np.full(len(units), name in certified) for name, units in observed.blocks.items()]
-        vector, best = np.asarray(space.vector()), np.inf
-        try:
-            start = observed.split(np.asarray(observed.start(space, vector))) | certified
-            z = np.concatenate([vector, *(start[name] for name in observed.blocks)])
-            for _ in range(_ROUNDS):
-                point = rows_at(space, observed, z)
-                sizes = [rows.values.shape for rows in point.rows]
-                roots = [np.diag([1.0] * min(size, 3) + [lever] * (size - 3)) for size, _ in sizes]
-                roots = tuple(
-                    np.broadcast_to(root, (m, *root.shape)) for root, (_, m) in zip(roots, sizes, strict=True)
-                )
-                whitening = Whitening(roots, np.zeros(0), {name: 0 * value for name, value in certified.items()})
-                linear = Linearisation.of(observed, space, z, point, [], whitening, None)
-                squares = sum(float(np.sum(white**2)) for white in linear.white())
-                rms = float(np.sqrt(squares / len(observed.q)))
-                if not rms < 0.95 * best:
-                    break
-                best, z = rms, linear.fitted(np.concatenate([[True], *fixed]))
-        except np.linalg.LinAlgError:
-            return np.inf
-        return best if np.isfinite(best) else np.inf
-
-
 def _evenly(number: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, number - 1, min(number, most)).astype(int))
 
 
-def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[_Tried]:
+def _rms(arm: Arm, observed: Observed) -> float:
+    """RMS distance of the tips from the geometry that fits them, mm; an angle counts as the arm's lever makes it.
+
+    What is certified stays as it is stated.
+    """
+    space, lever = Parameters(arm, ("d_1",)), total_link_length(arm) / 4
+    certified: dict[str, AnyArray] = {name: np.asarray(value) for name, (value, _) in observed.certified().items()}
+    fixed = [np.full(len(units), name in certified) for name, units in observed.blocks.items()]
+    vector, best = np.asarray(space.vector()), np.inf
+    try:
+        start = observed.split(np.asarray(observed.start(space, vector))) | certified
+        z = np.concatenate([vector, *(start[name] for name in observed.blocks)])
+        for _ in range(_ROUNDS):
+            point, roots = rows_at(space, observed, z), []
+            for rows in point.rows:
+                size, poses = rows.values.shape
+                root = np.diag([1.0] * min(size, 3) + [lever] * (size - 3))
+                roots.append(np.broadcast_to(root, (poses, size, size)))
+            whitening = Whitening(tuple(roots), np.zeros(0), {name: 0 * value for name, value in certified.items()})
+            linear = Linearisation.of(observed, space, z, point, [], whitening, None)
+            squares = sum(float(np.sum(white**2)) for white in linear.white())
+            rms = float(np.sqrt(squares / len(observed.q)))
+            if not rms < 0.95 * best:
+                break
+            best, z = rms, linear.fitted(np.concatenate([[True], *fixed]))
+    except np.linalg.LinAlgError:
+        return np.inf
+    return best if np.isfinite(best) else np.inf
+
+
+def _corrections(arm: Arm, observed: Observed) -> Iterator[_Correction]:
+    q, observations = np.asarray(observed.q), observed.observations
+    for cause, corrected in _of_joints(q[:, : arm.joints], arm):  # the column of a thermometer stays
+        yield cause, np.concatenate([corrected, q[:, arm.joints :]], axis=1), None, ""
+    concerned = [i for i, observation in enumerate(observations) if _measured_field(observation) is not None]
+    alike: dict[tuple[str, str], list[int]] = {}
+    for i in concerned:
+        for label in ("kind", "station", "artefact"):
+            alike.setdefault((label, str(getattr(observations[i], label, i))), []).append(i)
+    for several in dict.fromkeys([tuple(concerned), *map(tuple, alike.values()), *((i,) for i in concerned)]):
+        if not several:
+            continue
+        corrected = [dict(_of_measured(observations[i])) for i in several]
+        names, field = shorten([observations[i].name for i in several], 3), _measured_field(observations[several[0]])
+        for cause in dict.fromkeys(text for changes in corrected for text in changes):
+            changed = list(observations)
+            for i, changes in zip(several, corrected, strict=True):
+                changed[i] = changes.get(cause, observations[i])
+            unit = length_unit(_UNITS.get(cause, 0.0))
+            write = f' In its table of the manifest write units = {{ {field} = "{unit}" }}.'
+            yield f"{cause} ({names})", q, tuple(changed), write if unit in ("m", "inch") else ""
+
+
+def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[tuple[str, Float[np.ndarray, "M n"]]]:
     joints = range(q.shape[1])
-    for several in (1, 2):
-        for chosen in itertools.combinations(joints, several):
-            signs = np.where(np.isin(joints, chosen), -1.0, 1.0)
-            named = " and ".join(str(joint + 1) for joint in chosen)
-            yield _Tried(f"joint{'s' if several > 1 else ''} {named} read with the wrong sign", q * signs)
-    yield _Tried("all joints read with the wrong sign", -q)
-    for one, other in itertools.combinations(joints, 2):
+    for i in joints:
+        yield f"joint {i + 1} read with the wrong sign", np.where(np.isin(joints, [i]), -q, q)
+    pairs = list(itertools.combinations(joints, 2))
+    for i, j in pairs:
+        yield f"joints {i + 1} and {j + 1} read with the wrong sign", np.where(np.isin(joints, [i, j]), -q, q)
+    yield "all joints read with the wrong sign", -q
+    for i, j in pairs:
         order = list(joints)
-        order[one], order[other] = other, one
-        yield _Tried(f"the columns of joints {one + 1} and {other + 1} are exchanged", q[:, order])
-    yield _Tried("the columns are in reverse order", q[:, ::-1])
-    yield _Tried("the columns begin with that of the last joint", np.roll(q, -1, axis=1))
-    yield _Tried("the columns end with that of the first joint", np.roll(q, 1, axis=1))
+        order[i], order[j] = j, i
+        yield f"the columns of joints {i + 1} and {j + 1} are exchanged", q[:, order]
+    yield "the columns are in reverse order", q[:, ::-1]
+    yield "the columns begin with that of the last joint", np.roll(q, -1, axis=1)
+    yield "the columns end with that of the first joint", np.roll(q, 1, axis=1)
     slides = np.array(by_joint(arm, False, True))
-    yield _Tried("readings in gon are taken for degrees", np.where(slides, q, 0.9 * q))
+    yield "readings in gon are taken for degrees", np.where(slides, q, 0.9 * q)
     largest = float(np.abs(q[:, ~slides]).max(initial=0.0))
     if 0 < largest < _TURN * DEG:
-        yield _Tried("readings in radians are taken for degrees", np.where(slides, q, q / DEG))
+        yield "readings in radians are taken for degrees", np.where(slides, q, q / DEG)
     if largest > _TURN:  # otherwise every tip would come near every other
-        yield _Tried("readings in degrees are taken for radians", np.where(slides, q, q * DEG))
+        yield "readings in degrees are taken for radians", np.where(slides, q, q * DEG)
     if slides.any():
-        yield _Tried("readings of prismatic joints in m are taken for mm", np.where(slides, 1000.0 * q, q))
+        yield "readings of prismatic joints in m are taken for mm", np.where(slides, 1000.0 * q, q)
 
 
 def _measured_field(observation: AbstractObservation) -> str | None:
@@ -186,11 +163,12 @@ def _measured_field(observation: AbstractObservation) -> str | None:
     return None
 
 
-def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractObservation]]:
+def _of_measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractObservation]]:
     """Corrections of what one observation measured."""
+    from scipy.spatial.transform import Rotation
+
     name = _measured_field(observation)
-    if name is None:
-        return
+    assert name is not None
     values = np.asarray(getattr(observation, name))
 
     def changed(new: AnyArray, field: str = name) -> Any:
@@ -200,26 +178,21 @@ def _measured(observation: AbstractObservation) -> Iterator[tuple[str, AbstractO
         yield cause, changed(values * factor)
     if values.shape[1:] != (3,):
         return
-    yield f"measured coordinates are {_MIRRORED}", changed(values * [1, 1, -1])
-    if isinstance(observation, MeasuredTransforms):
-        rotations = np.asarray(observation.rotations)
-        for order in itertools.permutations(range(3)):
-            for signs in itertools.product((1, -1), repeat=3) if order == (0, 1, 2) else ((1, 1, 1),):
-                read = " ".join(("-" if signs[i] < 0 else "") + "xyz"[i] for i in np.argsort(order))
-                if read != "x y z":
-                    yield f"the columns of positions are {read}", changed(values[:, order] * signs)
-        for cause, corrected in _rotations(rotations):
-            yield cause, changed(corrected, "rotations")
-
-
-def _rotations(rotations: Float[np.ndarray, "m 3 3"]) -> Iterator[tuple[str, Float[np.ndarray, "m 3 3"]]]:
-    from scipy.spatial.transform import Rotation
-
-    read = Rotation.from_matrix(rotations)
-    first, last = read.as_quat(scalar_first=True), read.as_quat()
-    yield "quaternions in the order x y z w are taken for w x y z", Rotation.from_quat(first).as_matrix()
-    yield (
-        "quaternions in the order w x y z are taken for x y z w",
-        Rotation.from_quat(last, scalar_first=True).as_matrix(),
-    )
-    yield "orientations are those of the instrument in the target's frame", rotations.swapaxes(-1, -2)
+    mirrored = "measured coordinates are left-handed: two columns are exchanged, or one has the wrong sign"
+    yield mirrored, changed(values * [1, 1, -1])
+    if not isinstance(observation, MeasuredTransforms):
+        return
+    rotations = np.asarray(observation.rotations)
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3) if order == (0, 1, 2) else ((1, 1, 1),):
+            read = " ".join(("-" if signs[i] < 0 else "") + "xyz"[i] for i in np.argsort(order))
+            if read != "x y z":
+                yield f"the columns of positions are {read}", changed(values[:, order] * signs)
+    first, last = (Rotation.from_matrix(rotations).as_quat(scalar_first=scalar_first) for scalar_first in (True, False))
+    for cause, corrected in (
+        ("quaternions in the order x y z w are taken for w x y z", Rotation.from_quat(first)),
+        ("quaternions in the order w x y z are taken for x y z w", Rotation.from_quat(last, scalar_first=True)),
+    ):
+        yield cause, changed(corrected.as_matrix(), "rotations")
+    inverse = changed(rotations.swapaxes(-1, -2), "rotations")
+    yield "orientations are those of the instrument in the target's frame", inverse

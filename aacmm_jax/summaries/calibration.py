@@ -17,10 +17,10 @@ from ..data.noise import linear_encoder_mm
 from ..data.recording import Recording
 from ..diagnostics.determined import determined
 from ..diagnostics.findings import case_of, finding_rows, findings_of, sentences
+from ..diagnostics.joint_travel import tried_poses
 from ..diagnostics.model_errors import model_tests, rows_of_tests
 from ..diagnostics.pose_residuals import rms
 from ..diagnostics.recorded import findings_of_capture
-from ..diagnostics.tried_poses import tried_poses
 from ..diagnostics.usability import on_bounds
 from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
 from ..kinematics.corrections import coefficient_of

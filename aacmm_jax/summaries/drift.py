@@ -80,9 +80,10 @@ def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[st
 
 def _lengths(lengths: LengthChange) -> dict[str, Any]:
     """Changes of lengths over the working volume."""
-    names = ("rms", "rms_by_chance", "percentile_95", "largest", "length")
+    names = ("rms", "rms_by_chance", "largest", "length")
     return attributes(lengths, **{f"{name}_mm": name for name in names}) | {
         "places": len(lengths.change),
+        "percentile_95_mm": float(np.quantile(np.abs(lengths.change), 0.95)),
         "mean_mm": float(np.mean(lengths.change)),
         "mean_um_per_m": 1e6 * lengths.scale_change,
         "mean_expanded_um_per_m": plain(1e6 * lengths.expanded_scale_change),

@@ -246,10 +246,11 @@ def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
         return attributes(value, "where", value_mm="value", expanded_mm="expanded", limit_mm="limit")
 
     return {
-        **attributes(metric, "name", "decision", "failing"),
+        **attributes(metric, "name", "decision"),
         "what": METRICS[metric.name],
         **part(metric.worst),
         "as_found_mm": None if earlier is None else earlier.value,
         "as_found_decision": None if earlier is None else earlier.decision,
+        "failing": sum(value.decision == "fails" for value in metric.values),
         "parts": [part(value) | {"decision": value.decision} for value in metric.values],
     }

@@ -138,10 +138,19 @@ class Uncertainty(eqx.Module):
         others = self.components.variances(derivatives)
         return xp.concatenate([whole - xp.sum(others, axis=-1, keepdims=True), others], axis=-1)
 
+    def _of_parameters(self) -> tuple[Float[np.ndarray, "p c"], Law]:
+        whole = to_numpy(self).complete
+        return np.asarray(whole.parts(np.eye(len(whole.names))[: len(self.names)])), whole.law
+
     def factor(self, level: float = LEVEL) -> Float[np.ndarray, " p"]:
         """Coverage factor of the U of each parameter: Student's t, for as many degrees of freedom as what its
         uncertainty rests on gives it (`uncertainty.degrees_of_freedom`)."""
         return coverage_factor(level, *self._of_parameters())
+
+    @property
+    def degrees_of_freedom(self) -> Float[np.ndarray, " p"]:
+        """Effective degrees of freedom of the uncertainty of each parameter."""
+        return degrees_of_freedom(*self._of_parameters())
 
     def expanded(self, level: float = LEVEL) -> Float[np.ndarray, " p"]:
         """Expanded uncertainty of each parameter, mm and rad; infinite where only a combination is determined."""
@@ -153,19 +162,11 @@ class Uncertainty(eqx.Module):
         wider = np.pad(derivatives, [*((0, 0),) * (derivatives.ndim - 1), (0, len(whole.names) - len(self.names))])
         return whole.expanded_by_parts(np.asarray(whole.parts(wider)), level)
 
-    @property
-    def degrees_of_freedom(self) -> Float[np.ndarray, " p"]:
-        """Effective degrees of freedom of the uncertainty of each parameter."""
-        return degrees_of_freedom(*self._of_parameters())
-
-    def expanded_by_parts(self, parts: Float[np.ndarray, "... c"], level: float = LEVEL) -> Float[np.ndarray, "..."]:
+    def expanded_by_parts(self, parts: Float[AnyArray, "... c"], level: float = LEVEL) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of quantities of the `complete` uncertainty with these variances of their parts."""
+        parts = np.asarray(parts)
         u = np.sqrt(np.maximum(np.sum(parts, axis=-1), 0.0))
         return np.asarray(coverage_factor(level, parts, to_numpy(self).complete.law) * u)
-
-    def _of_parameters(self) -> tuple[Float[np.ndarray, "p c"], Law]:
-        whole = to_numpy(self).complete
-        return np.asarray(whole.parts(np.eye(len(whole.names))[: len(self.names)])), whole.law
 
     def expanded_by_scatter(
         self, u: Float[np.ndarray, "..."], stated: Float[np.ndarray, "..."], level: float = LEVEL
@@ -190,38 +191,22 @@ class Uncertainty(eqx.Module):
         whole = self.complete
         covariance = whole.covariance_of_functions(whole.derivatives(q))
         if reading:
-            xp = namespace(self, q)
-            covariance = covariance + self._noise(q) + self.in_one_place**2 * xp.asarray(np.eye(3))
+            covariance = covariance + self._noise(q) + self.in_one_place**2 * namespace(self, q).asarray(np.eye(3))
         return covariance
 
     def expanded_tip(self, q: Numbers, *, level: float = LEVEL, reading: bool = False) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the tip at joint angles ``(..., n)``, along its most uncertain direction, mm."""
-        return self.expanded_by_parts(np.asarray(self.tip_parts(q, reading=reading)), level)
+        return self.expanded_by_parts(self.tip_parts(q, reading=reading), level)
 
     @numpy_if_known
     def tip_parts(self, q: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
         """Variances of the tip along the direction in which it is most uncertain, part by part, mm^2."""
-        xp, q, whole = namespace(self, q, reading), self._checked(q), self.complete
+        xp, q = namespace(self, q, reading), self._checked(q)
         covariance = self.tip(q, reading=reading)
-        finite = xp.where(xp.isfinite(covariance), covariance, 0.0)
-        direction = semidefinite_eigen(finite)[1][..., 0]
-        along = xp.einsum("...c,...cp->...p", direction, whole.derivatives(q))
-        parts = whole.parts(along)
-        if reading:
-            of_noise = xp.einsum("...c,...cd,...d->...", direction, self._noise(q), direction)
-            parts = whole.with_reading(parts, of_noise, 1)
-        return xp.where(xp.all(xp.isfinite(covariance), axis=(-1, -2))[..., None], parts, np.inf)
-
-    def with_reading(
-        self, parts: Float[AnyArray, "... c"], of_noise: Float[AnyArray, "..."], ends: int
-    ) -> Float[AnyArray, "... c"]:
-        """Variances of `parts` with the noise of readings, and with what poses in each of so many places share."""
-        xp = namespace(self, parts, of_noise)
-        names = () if self.components is None else self.components.names
-        in_places = [0.0 if self.shared is None else ends * self.shared.sd_of(name) ** 2 for name in names]
-        return xp.stack(
-            [part + more for part, more in zip(xp.moveaxis(parts, -1, 0), [of_noise, *in_places], strict=True)], axis=-1
-        )
+        finite = xp.all(xp.isfinite(covariance), axis=(-1, -2))
+        direction = semidefinite_eigen(xp.where(finite[..., None, None], covariance, 0.0))[1][..., 0]
+        parts = self._parts_along(direction, self.complete.derivatives(q), (q,) if reading else ())
+        return xp.where(finite[..., None], parts, np.inf)
 
     @numpy_if_known
     def length(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "..."]:
@@ -232,7 +217,7 @@ class Uncertainty(eqx.Module):
         self, start: Numbers, end: Numbers, *, level: float = LEVEL, reading: bool = False
     ) -> Float[np.ndarray, "..."]:
         """Expanded uncertainty of the distance between the tips at two poses, ``(..., n)`` each, mm."""
-        return self.expanded_by_parts(np.asarray(self.length_parts(start, end, reading=reading)), level)
+        return self.expanded_by_parts(self.length_parts(start, end, reading=reading), level)
 
     @numpy_if_known
     def length_parts(self, start: Numbers, end: Numbers, *, reading: bool = False) -> Float[AnyArray, "... c"]:
@@ -251,13 +236,24 @@ class Uncertainty(eqx.Module):
                 "both poses put the tip in the same place, so there is no length between them; give others."
             )
         direction, whole = between / xp.linalg.norm(between, axis=-1, keepdims=True), self.complete
-        along = xp.einsum("...c,...cp->...p", direction, whole.derivatives(end) - whole.derivatives(start))
-        parts = whole.parts_of_functions(along)
-        if reading:
-            both = self._noise(start) + self._noise(end)
-            of_noise = xp.einsum("...c,...cd,...d->...", direction, both, direction)
-            parts = whole.with_reading(parts, of_noise, 2)
-        return parts
+        derivatives = whole.derivatives(end) - whole.derivatives(start)
+        return self._parts_along(direction, derivatives, (start, end) if reading else ())
+
+    def _parts_along(
+        self, direction: Float[AnyArray, "... 3"], derivatives: Float[AnyArray, "... 3 k"], read: tuple[AnyArray, ...]
+    ) -> Float[AnyArray, "... c"]:
+        """Variances along a direction of what has these derivatives by the `complete` parameters, with the noise of
+        each pose that is ``read``, and what the poses of its place share; infinite where it follows what is open."""
+        xp, whole = namespace(self, direction), self.complete
+        parts = whole.parts_of_functions(xp.einsum("...c,...cp->...p", direction, derivatives))
+        if not read:
+            return parts
+        noise: AnyArray = sum((self._noise(q) for q in read[1:]), self._noise(read[0]))
+        added = [xp.einsum("...c,...cd,...d->...", direction, noise, direction)]
+        for name in () if whole.components is None else whole.components.names:
+            in_place = 0.0 if whole.shared is None else whole.shared.sd_of(name)
+            added.append(xp.zeros_like(added[0]) + len(read) * in_place**2)
+        return parts + xp.stack(added, axis=-1)
 
     def derivatives(self, q: Float[AnyArray, "... n"]) -> Float[AnyArray, "... 3 p"]:
         """Derivatives of the tip by the free parameters."""

@@ -60,13 +60,11 @@ class Law(NamedTuple):
     def joined(self, *others: "Law") -> "Law":
         """With further parts."""
         every = [self, *others]
-        most = max(law.ratios.shape[1] for law in every)
-        xp = namespace(every)
-        ratios = [xp.pad(law.ratios, ((0, 0), (0, most - law.ratios.shape[1])), constant_values=1.0) for law in every]
-        weights = [xp.pad(law.weights, ((0, 0), (0, most - law.weights.shape[1]))) for law in every]
-        return Law(
-            xp.concatenate([law.degrees_of_freedom for law in every]), xp.concatenate(ratios), xp.concatenate(weights)
-        )
+        xp, most, padded = namespace(every), max(law.ratios.shape[1] for law in every), []
+        for freedom, ratios, weights in every:
+            further = ((0, 0), (0, most - ratios.shape[1]))
+            padded.append((freedom, xp.pad(ratios, further, constant_values=1.0), xp.pad(weights, further)))
+        return Law(*(xp.concatenate(parts) for parts in zip(*padded, strict=True)))
 
 
 class Components(eqx.Module):
@@ -134,11 +132,9 @@ def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law)
     if not 0 < level < 1:
         raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
     law, variances = law.in_numpy, np.asarray(variances, dtype=float)
-    finite = np.all(np.isfinite(variances), axis=-1)
-    variances = np.where(finite[..., None], variances, 0.0)
+    variances = np.where(np.all(np.isfinite(variances), axis=-1)[..., None], variances, 0.0)
     freedom = effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
-    factors = np.array(student_quantile(0.5 + level / 2, freedom))
-    total = np.sum(variances, axis=-1)
+    factors, total = np.array(student_quantile(0.5 + level / 2, freedom)), np.sum(variances, axis=-1)
     spread = np.flatnonzero(np.sum(np.asarray(law.weights) > 0, axis=1) > 1)
     mixed = np.any(variances[..., spread] > 1e-9 * total[..., None], axis=-1) & (total > 0)
     if mixed.any():
@@ -150,10 +146,8 @@ def degrees_of_freedom(variances: Float[AnyArray, "... c"], law: Law) -> Float[n
     """Those of Student's t with the same coverage factor at 95 %."""
     from scipy import special
 
-    variances = np.asarray(variances, dtype=float)
-    plain = effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
-    factor = coverage_factor(LEVEL, variances, law)
-    normal = special.ndtri(0.5 + LEVEL / 2)
+    plain = effective_degrees_of_freedom(np.asarray(variances, dtype=float), np.asarray(law.degrees_of_freedom))
+    factor, normal = coverage_factor(LEVEL, variances, law), special.ndtri(0.5 + LEVEL / 2)
     # Very many are infinitely many: the inverse has no more digits there.
     mixed = special.stdtridf(0.5 + LEVEL / 2, np.maximum(factor, normal * (1 + 1e-6)))
     same = np.abs(student_quantile(0.5 + LEVEL / 2, plain) - factor) < 1e-9 * factor
@@ -163,8 +157,23 @@ def degrees_of_freedom(variances: Float[AnyArray, "... c"], law: Law) -> Float[n
 def _of_mixtures(
     level: float, variances: Float[np.ndarray, "m c"], law: Law, spread: np.ndarray
 ) -> Float[np.ndarray, " m"]:
-    """Coverage factors of quantities of whose variance some parts have distributions."""
-    ratios, weights = _combinations(np.asarray(law.ratios), np.asarray(law.weights), spread)
+    """Coverage factors of quantities of whose variance some parts have distributions.
+
+    Possible variances of all parts over the stated ones: all of one part that has a distribution, and of several a
+    lattice (Kronecker's sequence), which has as many of each.
+    """
+    first, *further = spread
+    chances = np.asarray(law.weights)[first]
+    ratios, weights = np.ones((int(np.sum(chances > 0)), variances.shape[1])), chances[chances > 0]
+    ratios[:, first] = np.asarray(law.ratios)[first, chances > 0]
+    if further:
+        number, weights = np.arange(_DRAWS), np.full(_DRAWS, 1 / _DRAWS)
+        ratios = np.ones((_DRAWS, variances.shape[1]))
+        for i, part in enumerate(spread):
+            order = np.argsort(law.ratios[part])
+            possible, chances = np.asarray(law.ratios)[part, order], np.asarray(law.weights)[part, order]
+            at = (number + 0.5) / _DRAWS if i == 0 else (0.5 + number * _STEPS[(i - 1) % len(_STEPS)]) % 1.0
+            ratios[:, part] = np.interp(at, np.cumsum(chances) - 0.5 * chances, possible)
     total = np.sum(variances, axis=1)
     parts = variances[:, None, :] * ratios  # (m, draws, c)
     possible = np.maximum(np.sum(parts, axis=2), 1e-12 * total[:, None])
@@ -183,22 +192,3 @@ def _of_mixtures(
         if np.all(np.abs(factors - last) <= 1e-9 * factors):
             break
     return factors
-
-
-def _combinations(
-    ratios: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"], spread: np.ndarray
-) -> tuple[Float[np.ndarray, "d c"], Float[np.ndarray, " d"]]:
-    """Variances of all parts over the stated ones, and their probabilities: all of one part that has a distribution,
-    and of several a lattice (Kronecker's sequence), which has as many of each."""
-    if len(spread) == 1:
-        kept = weights[spread[0]] > 0
-        possible = np.ones((int(kept.sum()), len(ratios)))
-        possible[:, spread[0]] = ratios[spread[0], kept]
-        return possible, weights[spread[0], kept]
-    possible, number = np.ones((_DRAWS, len(ratios))), np.arange(_DRAWS)
-    for i, part in enumerate(spread):
-        at = (number + 0.5) / _DRAWS if i == 0 else (0.5 + number * _STEPS[(i - 1) % len(_STEPS)]) % 1.0
-        order = np.argsort(ratios[part])
-        of_order = weights[part, order]
-        possible[:, part] = np.interp(at, np.cumsum(of_order) - 0.5 * of_order, ratios[part, order])
-    return possible, np.full(_DRAWS, 1 / _DRAWS)

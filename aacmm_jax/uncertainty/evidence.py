@@ -60,25 +60,22 @@ def eliminated(
     return PriorModel(information, xp.where(pinned_here, 0.0, information @ free - slope), deviation, pinned_here)
 
 
-class _Posterior(NamedTuple):
-    covariance: Float[AnyArray, "k k"]  # V
-    effective: Float[AnyArray, " k"]  # gamma
-    log_determinant: Float[AnyArray, ""]  # of I + K
-
-
-def _posterior(model: PriorModel, sd: Float[AnyArray, " k"]) -> _Posterior:
+def _posterior(
+    model: PriorModel, sd: Float[AnyArray, " k"]
+) -> tuple[Float[AnyArray, "k k"], Float[AnyArray, " k"], Float[AnyArray, ""]]:
+    """V, gamma, and the log determinant of I + K."""
     xp = namespace(model, sd)
     relative = sd[:, None] * model.information * sd[None, :]
     whitening = inverse_cholesky(xp.asarray(np.eye(sd.shape[0])) + relative)
     covariance = whitening.T @ whitening
     # Not 1 - V_ii, which loses what little the data say of a parameter with a small standard deviation.
     effective = xp.sum(covariance * relative, axis=1)
-    return _Posterior(covariance, effective, -2 * xp.sum(xp.log(xp.diagonal(whitening))))
+    return covariance, effective, -2 * xp.sum(xp.log(xp.diagonal(whitening)))
 
 
 def effective_parameters(model: PriorModel, sd: Float[AnyArray, " k"]) -> Float[AnyArray, " k"]:
     """How much of each parameter the data determine, 0 to 1, with a prior of these standard deviations."""
-    return _posterior(model, sd).effective
+    return _posterior(model, sd)[1]
 
 
 def _given_pinned(covariance: Float[AnyArray, "k k"], pinned: Bool[AnyArray, " k"]) -> Float[AnyArray, "k k"]:
@@ -98,6 +95,10 @@ class Groups(NamedTuple):
     expected: np.ndarray  # and expected to be about that
     least: float  # smallest log variance of a learned group
 
+    def slope(self, at: Float[AnyArray, " g"]) -> Float[AnyArray, " g"]:
+        """What expectations add to the derivative of twice the log evidence by log variances."""
+        return (at - self.first) * (self.expected * -2 / _EXPECTED_VARIANCE)
+
 
 class _Evidence(NamedTuple):
     """Twice the log evidence but for a constant, and its derivatives by log variances."""
@@ -108,39 +109,30 @@ class _Evidence(NamedTuple):
     fisher: Float[AnyArray, "g g"]  # expectation of -second over data
     spent: Float[AnyArray, " g"]  # sum of gamma
 
-
-def _evidence(model: PriorModel, groups: Groups, now: Float[AnyArray, " g"]) -> _Evidence:
-    xp = namespace(model, now)
-    members, unit = xp.asarray(groups.members), np.eye(groups.members.shape[1])
-
-    sd = xp.exp(0.5 * (now @ members))
-    covariance, effective, log_determinant = _posterior(model, sd)
-    pinned = model.pinned
-    of_free = cond(xp.any(pinned), _given_pinned, lambda covariance, _: covariance, covariance, pinned)
-    scaled = sd * model.right
-    mean = xp.where(pinned, model.deviation / sd, of_free @ scaled)
-    by_group = mean[:, None] * members.T
-    follow = 2 * of_free @ by_group - by_group
-    second = members @ (mean[:, None] * follow) + members @ covariance**2 @ members.T
-    second = second - xp.asarray(np.eye(len(members))) * (members @ xp.diagonal(covariance))[:, None]
-    informed = (xp.asarray(unit) - covariance) ** 2 + xp.asarray(unit) * xp.where(pinned, 1.0, 0.0)[:, None]
-    spent, away = members @ effective, (now - groups.first) * groups.expected.astype(float)
-    certain = xp.asarray(np.diag(groups.expected * 2 / _EXPECTED_VARIANCE))
-    return _Evidence(
-        value=scaled @ mean
-        - log_determinant
-        - xp.sum(xp.where(pinned, mean**2, 0.0))
-        - xp.sum(away**2) / _EXPECTED_VARIANCE,
-        slope=members @ mean**2 - spent + slope_of_expectation(groups, now),
-        second=second - certain,
-        fisher=members @ informed @ members.T + certain,
-        spent=spent,
-    )
-
-
-def slope_of_expectation(groups: Groups, at: Float[AnyArray, " g"]) -> Float[AnyArray, " g"]:
-    """What expectations add to the derivative of twice the log evidence by log variances."""
-    return (at - groups.first) * (groups.expected * -2 / _EXPECTED_VARIANCE)
+    @classmethod
+    def at(cls, model: PriorModel, groups: Groups, now: Float[AnyArray, " g"]) -> "_Evidence":
+        xp, pinned = namespace(model, now), model.pinned
+        members, unit = xp.asarray(groups.members), xp.asarray(np.eye(groups.members.shape[1]))
+        sd = xp.exp(0.5 * (now @ members))
+        covariance, effective, log_determinant = _posterior(model, sd)
+        of_free = cond(xp.any(pinned), _given_pinned, lambda covariance, _: covariance, covariance, pinned)
+        scaled = sd * model.right
+        mean = xp.where(pinned, model.deviation / sd, of_free @ scaled)
+        by_group = mean[:, None] * members.T
+        follow = 2 * of_free @ by_group - by_group
+        second = members @ (mean[:, None] * follow) + members @ covariance**2 @ members.T
+        second = second - xp.asarray(np.eye(len(members))) * (members @ xp.diagonal(covariance))[:, None]
+        informed = (unit - covariance) ** 2 + unit * xp.where(pinned, 1.0, 0.0)[:, None]
+        spent, away = members @ effective, (now - groups.first) * groups.expected.astype(float)
+        certain = xp.asarray(np.diag(groups.expected * 2 / _EXPECTED_VARIANCE))
+        of_pinned = xp.sum(xp.where(pinned, mean**2, 0.0))
+        return cls(
+            value=scaled @ mean - log_determinant - of_pinned - xp.sum(away**2) / _EXPECTED_VARIANCE,
+            slope=members @ mean**2 - spent + groups.slope(now),
+            second=second - certain,
+            fisher=members @ informed @ members.T + certain,
+            spent=spent,
+        )
 
 
 def covariance_of_log_variances(
@@ -154,7 +146,7 @@ def covariance_of_log_variances(
     xp = namespace(model, at)
     beforehand = xp.asarray(np.diag(np.where(groups.expected, 0.0, 0.25)))
     unit, both = xp.asarray(np.eye(len(groups.members))), moving[:, None] & moving[None, :]
-    curvature = xp.where(both, beforehand - 0.5 * _evidence(model, groups, at).second, unit)
+    curvature = xp.where(both, beforehand - 0.5 * _Evidence.at(model, groups, at).second, unit)
     return xp.where(both, inverse_positive_definite(curvature), 0.0)
 
 
@@ -169,15 +161,11 @@ class _Search(NamedTuple):
 def learned_log_variances(
     model: PriorModel, groups: Groups, start: Float[AnyArray, " g"] | None = None
 ) -> Float[AnyArray, " g"]:
-    """Log variances of groups at which the evidence is largest; those that are not learned stay as they are given.
+    """Log variances of groups at which the evidence is largest, from ``start`` or ``groups.first``; those that are not
+    learned stay as they are given.
 
     Fisher scoring, damped where the evidence would fall, until Newton's steps are short (the second derivatives follow
     from dV = -V dK V).
-
-    Args:
-        model: of the parameters, in natural steps.
-        groups: of the parameters.
-        start: log variance of each group ``(g,)`` to begin with; by default ``groups.first``.
     """
     start = groups.first if start is None else start
     xp = namespace(model, start)
@@ -196,7 +184,7 @@ def learned_log_variances(
         near = xp.all(xp.isfinite(newton)) & (xp.max(xp.abs(newton)) <= 1.0) & (damping <= 0)
         step = xp.where(moving, xp.where(near, newton, scoring), 0.0)
         after = xp.where(learn, xp.maximum(now + step, groups.least), now)
-        new = _evidence(model, groups, after)
+        new = _Evidence.at(model, groups, after)
         better = new.value >= evidence.value - _ROUNDING * (1 + xp.abs(evidence.value))
         size = xp.max(xp.abs(after - now))
         size = xp.where(near, size**2, size)
@@ -204,12 +192,8 @@ def learned_log_variances(
         change = xp.where(better | (size <= _TOLERANCE), size, np.inf)
         eased = xp.where(damping <= _DAMPING, 0.0, 0.1 * damping)
         damping = xp.where(better, eased, xp.maximum(10 * damping, _DAMPING))
-        now = xp.where(better, after, now)
         evidence = _Evidence(*(xp.where(better, *pair) for pair in zip(new, evidence, strict=True)))
-        return _Search(count + 1, now, evidence, damping, change)
+        return _Search(count + 1, xp.where(better, after, now), evidence, damping, change)
 
-    def unfinished(state: _Search) -> AnyArray:
-        return (state.count < _ROUNDS) & (state.change > _TOLERANCE)
-
-    first = _Search(xp.asarray(0), start, _evidence(model, groups, start), xp.asarray(0.0), xp.asarray(np.inf))
-    return while_loop(unfinished, again, first).now
+    first = _Search(xp.asarray(0), start, _Evidence.at(model, groups, start), xp.asarray(0.0), xp.asarray(np.inf))
+    return while_loop(lambda state: (state.count < _ROUNDS) & (state.change > _TOLERANCE), again, first).now

@@ -97,16 +97,16 @@ class Observability(NamedTuple):
 
     def sentences(self) -> list[str]:
         """What a user should know, one sentence each: directions that are not or hardly determined, and what to do."""
-        always = [text for text, never in zip(self.undetermined, self.structural, strict=True) if never]
-        now = [text for text, never in zip(self.undetermined, self.structural, strict=True) if not never]
         sentences = []
+        pairs = list(zip(self.undetermined, self.structural, strict=True))
+        always, now = ([text for text, never in pairs if never == wanted] for wanted in (True, False))
         if always:
             sentences.append(
                 f"No measurement of this kind can separate: {'; '.join(always)}. Fix one of each (--held)."
             )
         if now:
-            remedy = f" {self.remedy}" if self.remedy else " Fix one of each (--held)."
-            sentences.append(f"Not determined by these data: {_first(now)}.{remedy}")
+            remedy = self.remedy or "Fix one of each (--held)."
+            sentences.append(f"Not determined by these data: {_first(now)}. {remedy}")
         if self.by_prior:
             sentences.append(f"Determined by the prior and not, or hardly, by these data: {_first(self.by_prior)}.")
         if self.trade_offs:
@@ -170,58 +170,57 @@ def observability(
     check_finite(arm=arm, capture=capture, noise=noise)
     check_columns(space.base, capture.columns)
     arm, capture, space, noise, bounds = to_numpy((arm, capture, space, noise, bounds))
-    q = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
     if noise is not None:
         noise.check(arm.joints)
-        sigma = rms_of_noise(arm.geometry, q, noise)
+        readings = np.concatenate([capture.q, *(observation.q for observation in capture.observations)])
+        sigma = rms_of_noise(arm.geometry, readings, noise)
     # Fixed values are those of the arm, not of the space's base.
     base = with_arrays(arm, beta=np.zeros_like(arm.alpha)) if arm.beta is None and space.base.beta is not None else arm
-    space = Parameters(base, space.names)
-    spectrum = _Spectrum.of(base, capture, space, noise)
+    spectrum = _Spectrum.of(base, capture, space.names, noise)
     if spectrum.null.shape[1]:
         # A nominal arm may have an exact alignment (a probe on the last axis) that the real one does not share.
-        neighbour = neighbouring_arm(base, space.names)
-        other = _Spectrum.of(neighbour, capture, space, noise, targets_of=base)
-        if other.null.shape[1] < spectrum.null.shape[1]:
-            base, spectrum = neighbour, other
-    names, known = space.names, set(items_of(known, "known"))
+        other = _Spectrum.of(neighbouring_arm(base, space.names), capture, space.names, noise, targets_of=base)
+        spectrum = other if other.null.shape[1] < spectrum.null.shape[1] else spectrum
+    return _of_spectrum(spectrum, spectrum.trade_offs(sigma, bounds), set(items_of(known, "known")), arm)
+
+
+def _of_spectrum(spectrum: "_Spectrum", weak: tuple[TradeOff, ...], known: set[str], arm: Arm) -> Observability:
+    """Which directions are open, why, and what would determine them; told apart what a prior determines."""
+    base, names, null = spectrum.arm, spectrum.names, spectrum.null
     functions = set(correction_names(base))
     # Undetermined directions that concern no known parameter, and the others.
-    null = spectrum.null
     _, sizes, turned = np.linalg.svd(null[[name in known for name in names]])
     split = int(np.sum(sizes > 1e-6))
     null, of_prior = null @ turned[split:].T, null @ turned[:split].T
     of_prior = of_prior[:, ~np.any(np.abs(of_prior[[name in functions & known for name in names]]) > _FOLLOWS, axis=0)]
-    null, undetermined = spectrum.named(null, base, space)
-    structural = _structural(null, base, space)
-    weak = _trade_offs(spectrum, space, sigma, bounds)
+    null, undetermined = spectrum.named(null)
+    structural = spectrum.structural(null)
     weak_by_prior = [trade_off for trade_off in weak if known.intersection(trade_off.names)]
     weak = tuple(trade_off for trade_off in weak if not known.intersection(trade_off.names))
-    chief = [
-        [tuple(np.array(names)[direction > share * direction.max()].tolist()) for share in (0.5, _FOLLOWS)]
-        for direction in np.abs(null.T)
-    ]
+    groups = []
+    for direction in np.abs(null.T):
+        chief, every = (np.array(names)[direction > share * direction.max()] for share in (0.5, _FOLLOWS))
+        groups.append((tuple(chief.tolist()), tuple(every.tolist())))
     # Of a trade-off, the parameter to fix, or its strongest partner where that is no coefficient.
-    groups = [(main, every) for main, every in chief]
     groups += [(trade_off.names[: 1 + (trade_off.names[0] not in functions)], trade_off.names) for trade_off in weak]
-    reasons, unexplained = why_undetermined(base, q, groups)
+    reasons, unexplained = why_undetermined(base, np.asarray(spectrum.agreeing.observed.q), groups)
     return Observability(
         names=names,
-        poses=len(q),
+        poses=len(spectrum.agreeing.observed.q),
         singular=spectrum.singular,
         condition=spectrum.condition,
         null=null,
         undetermined=undetermined,
         structural=tuple(structural.tolist()),
-        remedy="" if structural.all() else _remedy(base, capture, space, int(structural.sum())),
+        remedy="" if structural.all() else spectrum.remedy(int(structural.sum())),
         # Whether the angle between nearly parallel axes is identified without Hayati's beta.
         parallel=tuple(i for i in nearly_parallel(arm) if f"beta_{i}" not in names and f"alpha_{i}" in names),
         trade_offs=weak,
         by_prior=(
-            *spectrum.named(of_prior, base, space)[1],
+            *spectrum.named(of_prior)[1],
             *(trade_off.text for trade_off in weak_by_prior if not known & functions & set(trade_off.names)),
         ),
-        corrections=reasons + _by_more_sockets(base, capture, space, unexplained),
+        corrections=reasons + spectrum.by_more_sockets(unexplained),
     )
 
 
@@ -236,9 +235,16 @@ def _first(texts: Sequence[str]) -> str:
     return "; ".join([*texts[:_NAMED], *more])
 
 
+def _some(items: list[str], most: int, more: str) -> list[str]:
+    return items if len(items) <= most else [*items[: most - 1], f"{len(items) - most + 1} {more}"]
+
+
 class _Spectrum(NamedTuple):
     """Singular values of the derivatives of all that was observed, by the parameters in natural steps."""
 
+    arm: Arm
+    capture: Capture
+    space: Parameters
     agreeing: Agreeing
     movements: Float[np.ndarray, "m p"]  # rows whose sum of squares is the mean square movement of the tips, mm
     geometry: Float[np.ndarray, "g p"]  # how the unknown geometry follows
@@ -248,15 +254,21 @@ class _Spectrum(NamedTuple):
 
     @classmethod
     def of(
-        cls, arm: Arm, capture: Capture, space: Parameters, noise: Noise | None = None, targets_of: Arm | None = None
+        cls,
+        arm: Arm,
+        capture: Capture,
+        names: tuple[str, ...],
+        noise: Noise | None = None,
+        targets_of: Arm | None = None,
     ) -> "_Spectrum":
-        agreeing = Agreeing.of(capture, Parameters(arm, space.names), targets_of)
+        space = Parameters(arm, names)
+        agreeing = Agreeing.of(capture, space, targets_of)
         plain = agreeing.eliminated()
         whitened = plain if noise is None else agreeing.eliminated(noise)
         # Each pose has as many rows on average: only their number of poses counts.
         poses = plain.poses * np.sqrt(len(plain.poses) / len(agreeing.observed.q))
         # With as many rows of zeros as there are parameters all singular values and vectors are there.
-        p = len(space.names)
+        p = len(names)
         rows = np.concatenate([whitened.poses, whitened.relations, np.zeros((p, p))])
         _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
         rank = int(np.sum(singular > _RANK * max(singular[0], 1e-300)))
@@ -265,18 +277,20 @@ class _Spectrum(NamedTuple):
         equal = np.linalg.svd(rows / scale, compute_uv=False)[:rank]
         condition = float(equal[0] / equal[-1]) if rank else np.inf
         movements = tip_movements(poses[:, None], plain.relations)
-        return cls(agreeing, movements, plain.geometry, singular, vectors[rank:].T, condition)
+        return cls(arm, capture, space, agreeing, movements, plain.geometry, singular, vectors[rank:].T, condition)
 
-    def named(
-        self, null: Float[np.ndarray, "p k"], arm: Arm, space: Parameters
-    ) -> tuple[Float[np.ndarray, "p k"], tuple[str, ...]]:
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.space.names
+
+    def named(self, null: Float[np.ndarray, "p k"]) -> tuple[Float[np.ndarray, "p k"], tuple[str, ...]]:
         """Part of the null space by directions of few parameters, and their names, with the parts of the geometry that
         follow them; the scale is a direction of its own."""
         if not null.shape[1]:
             return null, ()
         rest, texts, directions = null, [], []
-        values = np.asarray(space.vector(arm)) * space.lengths
-        scale = np.where([name == "d_1" for name in space.names], 0.0, values)
+        scale = np.asarray(self.space.vector(self.arm)) * self.space.lengths
+        scale = np.where([name == "d_1" for name in self.names], 0.0, scale)
         size = np.linalg.norm(scale)
         if size > 0 and np.linalg.norm(scale - null @ (null.T @ scale)) < 1e-6 * size:
             texts.append("all lengths together: the scale")
@@ -287,7 +301,7 @@ class _Spectrum(NamedTuple):
             rest = np.linalg.svd(rest, full_matrices=False)[0][:, : null.shape[1] - 1]
         for direction in reduced_echelon(rest)[0].T:
             size, followers = np.abs(direction).max(), self.geometry @ direction
-            names = [name for name, x in zip(space.names, np.abs(direction), strict=True) if x > _PRESENT * size]
+            names = [name for name, x in zip(self.names, np.abs(direction), strict=True) if x > _PRESENT * size]
             parts = [name for name, at in self.agreeing.parts if np.abs(followers[at]).max() > _MOVED * size]
             items = _some(names, _PARAMETERS_NAMED, "more")
             items += _some(parts, _PARTS_NAMED, "more parts of the geometry")
@@ -296,94 +310,83 @@ class _Spectrum(NamedTuple):
             directions.append(direction / np.linalg.norm(direction))
         return np.stack(directions, axis=1), tuple(texts)
 
+    def structural(self, null: Float[np.ndarray, "p k"]) -> Bool[np.ndarray, " k"]:
+        """Which directions move the tip, in any pose, only as a rigid motion of the whole arm, which no capture
+        shows."""
+        random = np.random.default_rng(0)
+        q = random.uniform(-np.pi, np.pi, (_CONFIGURATIONS, self.arm.joints))
+        if self.arm.thermometer:
+            q = np.concatenate([q, random.uniform(10.0, 30.0, (_CONFIGURATIONS, 1))], axis=1)
+        rows = 3 * _CONFIGURATIONS
+        movements = (jacobian_at(self.arm, q, self.names) * np.asarray(self.space.scale) @ null).reshape(rows, -1)
+        rigid = rigid_motions(np.asarray(self.arm.position(q))).reshape(rows, 6)
+        remaining = movements - rigid @ np.linalg.lstsq(rigid, movements, rcond=None)[0]
+        return np.linalg.norm(remaining, axis=0) < 1e-6 * np.sqrt(rows)
 
-def _some(items: list[str], most: int, more: str) -> list[str]:
-    return items if len(items) <= most else [*items[: most - 1], f"{len(items) - most + 1} {more}"]
+    def trade_offs(self, sigma: float | None = None, bounds: Bounds | None = None) -> tuple[TradeOff, ...]:
+        """Near-degenerate directions; by a standard deviation of tips also those that data determine hardly better
+        than bounds do."""
+        if sigma is None or not sigma > 0:
+            return trade_offs(self.movements, self.names)
+        rows = self.agreeing.eliminated(sigma)
+        half = default = np.where(self.space.lengths, 10.0, 17.5)
+        if bounds is not None:
+            half = np.asarray(bounds.upper - bounds.lower) / 2 / np.asarray(self.space.scale)
+            half = np.where(np.isfinite(half), half, default)
+        whitened = np.concatenate([rows.poses, rows.relations])
+        return trade_offs(self.movements, self.names, whitened=whitened, half_widths=half)
 
+    def with_more(
+        self, sockets: dict[str, Float[np.ndarray, "_ _"]], lengths: Sequence[ReferenceLength] = ()
+    ) -> "_Spectrum":
+        """With invented sockets, which have the first pose's temperature where they have none."""
+        capture, joints = self.capture, self.arm.joints
+        temperature, more = np.asarray(capture.readings)[:1, joints:], dict(capture.sockets)
+        for name, q in sockets.items():
+            more[name] = np.concatenate([q, np.repeat(temperature, len(q), axis=0)], axis=1)[:, : capture.columns]
+        capture = Capture(more, [*capture.lengths, *lengths], capture.observations)
+        return _Spectrum.of(self.arm, capture, self.names)
 
-def _structural(null: Float[np.ndarray, "p k"], arm: Arm, space: Parameters) -> Bool[np.ndarray, " k"]:
-    """Which directions move the tip, in any pose, only as a rigid motion of the whole arm, which no capture shows."""
-    random = np.random.default_rng(0)
-    q = random.uniform(-np.pi, np.pi, (_CONFIGURATIONS, arm.joints))
-    if arm.thermometer:
-        q = np.concatenate([q, random.uniform(10.0, 30.0, (_CONFIGURATIONS, 1))], axis=1)
-    rows = 3 * _CONFIGURATIONS
-    movements = (jacobian_at(arm, q, space.names) * np.asarray(space.scale) @ null).reshape(rows, -1)
-    rigid = rigid_motions(np.asarray(arm.position(q))).reshape(rows, 6)
-    remaining = movements - rigid @ np.linalg.lstsq(rigid, movements, rcond=None)[0]
-    return np.linalg.norm(remaining, axis=0) < 1e-6 * np.sqrt(rows)
+    def by_more_sockets(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """A sentence on which of these coefficients poses in more sockets would determine, where some do."""
+        if not names or self.capture.observations:
+            return ()
+        generic = generic_poses(self.arm)
+        parts = np.split(np.asarray(generic.q), np.cumsum(generic.sizes)[:-1])
+        spectrum = self.with_more({f"\0{i}": q for i, q in enumerate(parts)})
+        left = {name for name, row in zip(self.names, np.abs(spectrum.null), strict=True) if np.any(row > _FOLLOWS)}
+        left |= {trade_off.names[0] for trade_off in spectrum.trade_offs()}
+        determined = [name for name in names if name not in left]
+        if not determined:
+            return ()
+        return (f"Poses in more sockets, over all of the workspace, would determine {listed(determined)}.",)
 
-
-def _trade_offs(
-    spectrum: _Spectrum, space: Parameters, sigma: float | None, bounds: Bounds | None
-) -> tuple[TradeOff, ...]:
-    if sigma is None or not sigma > 0:
-        return trade_offs(spectrum.movements, space.names)
-    rows = spectrum.agreeing.eliminated(sigma)
-    half = default = np.where(space.lengths, 10.0, 17.5)
-    if bounds is not None:
-        half = np.asarray(bounds.upper - bounds.lower) / 2 / np.asarray(space.scale)
-        half = np.where(np.isfinite(half), half, default)
-    whitened = np.concatenate([rows.poses, rows.relations])
-    return trade_offs(spectrum.movements, space.names, whitened=whitened, half_widths=half)
-
-
-def _with_more(
-    arm: Arm,
-    capture: Capture,
-    space: Parameters,
-    sockets: dict[str, Float[np.ndarray, "_ _"]],
-    lengths: Sequence[ReferenceLength] = (),
-) -> _Spectrum:
-    """With invented sockets, which have the first pose's temperature where they have none."""
-    temperature = np.asarray(capture.readings)[:1, arm.joints :]
-    more = dict(capture.sockets)
-    for name, q in sockets.items():
-        more[name] = np.concatenate([q, np.repeat(temperature, len(q), axis=0)], axis=1)[:, : capture.columns]
-    return _Spectrum.of(arm, Capture(more, [*capture.lengths, *lengths], capture.observations), space)
-
-
-def _by_more_sockets(arm: Arm, capture: Capture, space: Parameters, names: tuple[str, ...]) -> tuple[str, ...]:
-    """A sentence on which of these coefficients poses in more sockets would determine, where some do."""
-    if not names or capture.observations:
-        return ()
-    generic = generic_poses(arm)
-    parts = np.split(np.asarray(generic.q), np.cumsum(generic.sizes)[:-1])
-    spectrum = _with_more(arm, capture, space, {f"\0{i}": q for i, q in enumerate(parts)})
-    left = {name for name, row in zip(space.names, np.abs(spectrum.null), strict=True) if np.any(row > _FOLLOWS)}
-    left |= {trade_off.names[0] for trade_off in _trade_offs(spectrum, space, None, None)}
-    determined = [name for name in names if name not in left]
-    if not determined:
-        return ()
-    return (f"Poses in more sockets, over all of the workspace, would determine {listed(determined)}.",)
-
-
-def _remedy(arm: Arm, capture: Capture, space: Parameters, left: int) -> str:
-    """Which further data would leave so many directions open: tried one after the other, the least effort first."""
-    random = np.random.default_rng(0)
-    low, high = np.asarray(joint_limits(arm, None)).T
-    # The zero byte keeps the invented sockets apart from those of the capture.
-    more_sockets = {f"\0{i}": row[None] for i, row in enumerate(random.uniform(low, high, (4, arm.joints)))}
-    lengths = [ReferenceLength("\0000", "\0001", 1.0), ReferenceLength("\0002", "\0003", 1.0)]
-    more_poses, warmer = {}, {}
-    for name, q in capture.sockets.items():
-        first = np.tile(np.asarray(q)[:1], (60, 1))
-        if not more_poses:  # other configurations with the tip in the same place
-            starts = first.copy()
-            starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
-            moved, reached = project_to_targets(arm, starts, np.asarray(arm.position(first)))
-            more_poses[f"\0 {name}"] = moved[reached] if reached.any() else first[:1]
-        if capture.columns > arm.joints:
-            shift = 10.0 * (np.arange(capture.columns) == capture.columns - 1)  # K
-            warmer[f"\0 {name}"] = np.concatenate([q, q + shift])
-    length = "a second position of the reference length" if capture.lengths else "a reference length"
-    for text, sockets, added in (
-        ("Poses in the same sockets at other temperatures", warmer, []),
-        (f"{length[0].upper()}{length[1:]}", more_sockets, lengths[:1]),
-        ("Reference lengths at two more positions", more_sockets, lengths),
-        ("More poses in a socket, as different as possible,", more_poses, []),
-        (f"More poses in a socket, and {length},", more_poses | more_sockets, lengths[:1]),
-    ):
-        if sockets and _with_more(arm, capture, space, sockets, added).null.shape[1] <= left:
-            return f"{text} would determine them."
-    return ""
+    def remedy(self, left: int) -> str:
+        """Which further data would leave so many directions open: one after the other, the least effort first."""
+        arm, capture, random = self.arm, self.capture, np.random.default_rng(0)
+        low, high = np.asarray(joint_limits(arm, None)).T
+        # The zero byte keeps the invented sockets apart from those of the capture.
+        more_sockets = {f"\0{i}": row[None] for i, row in enumerate(random.uniform(low, high, (4, arm.joints)))}
+        lengths = [ReferenceLength("\0000", "\0001", 1.0), ReferenceLength("\0002", "\0003", 1.0)]
+        more_poses, warmer = {}, {}
+        for name, q in capture.sockets.items():
+            first = np.tile(np.asarray(q)[:1], (60, 1))
+            if not more_poses:  # other configurations with the tip in the same place
+                starts = first.copy()
+                starts[:, : arm.joints] += random.uniform(-1.5, 1.5, (60, arm.joints))
+                moved, reached = project_to_targets(arm, starts, np.asarray(arm.position(first)))
+                more_poses[f"\0 {name}"] = moved[reached] if reached.any() else first[:1]
+            if capture.columns > arm.joints:
+                shift = 10.0 * (np.arange(capture.columns) == capture.columns - 1)  # K
+                warmer[f"\0 {name}"] = np.concatenate([q, q + shift])
+        length = "a second position of the reference length" if capture.lengths else "a reference length"
+        for text, sockets, added in (
+            ("Poses in the same sockets at other temperatures", warmer, []),
+            (f"{length[0].upper()}{length[1:]}", more_sockets, lengths[:1]),
+            ("Reference lengths at two more positions", more_sockets, lengths),
+            ("More poses in a socket, as different as possible,", more_poses, []),
+            (f"More poses in a socket, and {length},", more_poses | more_sockets, lengths[:1]),
+        ):
+            if sockets and self.with_more(sockets, added).null.shape[1] <= left:
+                return f"{text} would determine them."
+        return ""

@@ -96,13 +96,6 @@ class Influence(NamedTuple):
             blocks, weights, fixed, rows, parts, of_prior, information, inverse, lost, determined, own, follow, left
         )
 
-    def covariance(self) -> UnknownsCovariance:
-        """Of the unknowns, where every row has the variance 1 that its weight says."""
-        pairs = zip(self.own, self.follow, strict=True)
-        return UnknownsCovariance(
-            self.inverse, [d_inverse + _conjugated(self.inverse, follow) for d_inverse, follow in pairs]
-        )
-
     def weighted(self, number: int, rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k r m"]:
         """Rows of a block as a robust loss counts them: the influence of its poses."""
         weight = self.weights[number]
@@ -209,44 +202,26 @@ def covariance_of_rows(
     )
 
 
-def covariance_with(
-    influence: Influence, rows: list[Float[AnyArray, "1 _ _"]], covariances: list[Float[AnyArray, "_ _ _"]]
-) -> tuple[Float[AnyArray, " h"], list[Float[AnyArray, "_ _"]]]:
-    """Covariance of the unknowns with a function that follows the rows so; natural steps."""
-    head, components = influence.response(by_covariances(rows, covariances))
-    return head[:, 0], [part[..., 0] for part in components]
-
-
 def _flat(rows: Float[AnyArray, "h r m"]) -> Float[AnyArray, "h _"]:
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2])
 
 
-def _conjugated(matrix: Float[AnyArray, "h h"], by: Float[AnyArray, "*K k h"]) -> Float[AnyArray, "*K k k"]:
-    """B M B^T."""
-    return by @ matrix @ namespace(by).swapaxes(by, -1, -2)
-
-
-class RowErrors(NamedTuple):
-    """How what errs reaches the whitened rows of a group."""
-
-    readings: Float[AnyArray, "r n m"]  # by the readings, each over its stated standard deviation
-    seat: Float[AnyArray, "r c m"]  # by the seat, mm
-    measured: Float[AnyArray, "r r m"]  # covariance of what was measured
+def _of_measured(rows: Rows, whitening: Float[AnyArray, "r r m"]) -> Float[AnyArray, "r r m"]:
+    """The part of the whitened rows' covariance that what was measured has."""
+    return products(products(whitening, namespace(whitening).moveaxis(rows.measured, 0, -1)), whitening)
 
 
 def row_errors(
     rows: Rows, errors: ArmErrors, root: Float[AnyArray, "m r r"] | None, spread: Float[AnyArray, "*n"]
-) -> RowErrors:
-    """Of a group whose rows ``root`` whitens; ``spread`` is the standard deviation of the readings."""
+) -> tuple[Float[AnyArray, "r n m"], Float[AnyArray, "r c m"], Float[AnyArray, "r r m"]]:
+    """How what errs reaches the whitened rows of a group: the readings, each over its standard deviation ``spread``;
+    the seat, mm; and the covariance of what was measured."""
     assert root is not None  # only rows of a stage without covariances have none
     xp = namespace(root, errors.by_seat, spread)
     whitening = xp.moveaxis(root, 0, -1)
     readings = errors.by_readings * xp.broadcast_to(spread, (errors.by_readings.shape[1],))[None, :, None]
-    return RowErrors(
-        readings=matrix_products(whitening, readings),
-        seat=matrix_products(whitening, errors.by_seat),
-        measured=products(products(whitening, xp.moveaxis(rows.measured, 0, -1)), whitening),
-    )
+    of_readings, of_seat = (matrix_products(whitening, matrices) for matrices in (readings, errors.by_seat))
+    return of_readings, of_seat, _of_measured(rows, whitening)
 
 
 def row_covariances(
@@ -314,20 +289,17 @@ def propagated(
     # Of dy = -D^-1 (B W w + C dx): both parts, and twice what they have in common.
     components = []
     for d_inverse, follow, square, both in zip(influence.own, influence.follow, middle, crossed, strict=True):
-        mixed = d_inverse @ both @ inverse @ xp.swapaxes(follow, -1, -2)
-        components.append(
-            _conjugated(head, follow) + d_inverse @ square @ d_inverse - mixed - xp.swapaxes(mixed, -1, -2)
-        )
+        turned = xp.swapaxes(follow, -1, -2)
+        mixed = d_inverse @ both @ inverse @ turned
+        separate = follow @ head @ turned + d_inverse @ square @ d_inverse
+        components.append(separate - mixed - xp.swapaxes(mixed, -1, -2))
     return UnknownsCovariance(head, components)
 
 
 def of_stated(influence: Influence, rows: list[Rows], whitening: Whitening) -> Float[AnyArray, "h h"]:
     """The part of the head's covariance that rests on what is stated: of relations, a prior, and measured values."""
-    measured = []
-    for part, root in zip(rows, whitening.roots, strict=True):
-        xp = namespace(root, part.measured)
-        turned = xp.moveaxis(root, 0, -1)
-        measured.append(products(products(turned, xp.moveaxis(part.measured, 0, -1)), turned))
+    pairs = zip(rows, whitening.roots, strict=True)
+    measured = [_of_measured(part, namespace(root).moveaxis(root, 0, -1)) for part, root in pairs]
     weighted_rows = [influence.weighted_rows(number) for number in range(len(influence.blocks))]
     total = covariance_of_rows(weighted_rows, measured) + influence.prior
     return influence.inverse @ total @ influence.inverse

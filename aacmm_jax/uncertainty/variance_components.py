@@ -36,14 +36,6 @@ class Moments(NamedTuple):
     seat: Float[AnyArray, ""]
 
 
-class _Covariances(NamedTuple):
-    """Of a group's whitened rows."""
-
-    readings: Float[AnyArray, "r r m"]  # D: for 1 arcsec
-    seat: Float[AnyArray, "r r m"]  # T: for 1 mm
-    measured: Float[AnyArray, "r r m"]  # S: of what was measured
-
-
 def moments(
     influence: Influence,
     rows: list[Rows],
@@ -69,71 +61,52 @@ def moments(
     parts = []
     for part, error, root in zip(rows, errors, whitening.roots, strict=True):
         readings, seat, measured = row_errors(part, error, root, xp.asarray(one_arcsec(error.kinds)))
-        parts.append(_Covariances(products(readings, readings), products(seat, seat), measured))
+        parts.append((products(readings, readings), products(seat, seat), measured))
+    plain = [list(matrices) for matrices in zip(*parts, strict=True)]  # D, T and S of each group
     white = [block.white for block in influence.blocks[: len(rows)]]
-    columns = [
-        _Sums.of(influence, [getattr(part, name) for part in parts], weighted=True) for name in _Covariances._fields
-    ]
+    columns = [_Sums.of(influence, matrices, weighted=True) for matrices in plain]
 
     def solved(forms: list[list[Any]], counts: list[Any]) -> Moments:
-        """The variances that explain both sums of quadratic forms of the residuals."""
-        seen = []
+        """The variances that explain both sums of quadratic forms of the residuals; the expectations of a form are
+        those for 1 arcsec, for 1 mm and of what was measured."""
+        table, seen = [], []
         for of_form in forms:
             poses = zip(white, of_form, counts, strict=True)
             seen.append(sum(xp.einsum("am,abm,bm,m->", values, form, values, count) for values, form, count in poses))
-        sums = [_Sums.of(influence, form, weighted=False) for form in forms]
-        table = [[_expectation(influence, form, column) for column in columns] for form in sums]
-        if of_prior is not None:
-            for row, form in zip(table, sums, strict=True):
-                row[-1] = row[-1] + xp.sum(of_prior * form.head)
-        return _two_variances(table, seen, sigma)
+            sums = _Sums.of(influence, of_form, weighted=False)
+            row = [_expectation(influence, sums, column) for column in columns]
+            table.append([*row[:2], row[2] if of_prior is None else row[2] + xp.sum(of_prior * sums.head)])
+        (dd, dt, ds), (td, tt, ts) = table
+        right_d, right_t = seen[0] - ds, seen[1] - ts
+        determinant = dd * tt - dt * td
+        apart = determinant > 1e-9 * dd * tt
+        safe = xp.where(apart, determinant, 1.0)
+        encoder, seat = (tt * right_d - dt * right_t) / safe, (dd * right_t - td * right_d) / safe
+        without_seat = xp.maximum(right_d / xp.where(dd > 0, dd, 1.0), 0.0)
+        positive = apart & (encoder > 0)
+        return Moments(
+            xp.where(positive, xp.where(seat > 0, encoder, without_seat), 0.0),
+            xp.where(positive, xp.maximum(seat, 0.0), sigma**2),
+        )
 
     if not robust:
-        plain = [[part.readings for part in parts], [part.seat for part in parts]]
-        return solved(plain, [xp.ones(values.shape[1]) for values in white])
+        return solved(plain[:2], [xp.ones(values.shape[1]) for values in white])
 
     def again(last: Moments, _: Any) -> tuple[Moments, Any]:
-        forms: list[list[Any]] = [[], []]
-        counts = []
-        for values, part in zip(white, parts, strict=True):
-            by_covariance, count = _bounded(values, part, stop_gradient(last))
-            counts.append(count)
-            for form, covariance in zip(forms, part[:2], strict=True):
-                form.append(matrix_products(matrix_products(by_covariance, covariance), by_covariance))
-        return solved(forms, counts), xp.zeros(())
+        forms, counts = ([], []), []
+        encoder, seat = stop_gradient(last)
+        for values, (of_readings, of_seat, measured) in zip(white, parts, strict=True):
+            # A little of the first weights besides, since C has no inverse where two joints are all that errs.
+            r = values.shape[0]
+            covariance = encoder * of_readings + seat * of_seat + measured + 0.01 * xp.asarray(np.eye(r))[:, :, None]
+            inverse = xp.moveaxis(inverse_positive_definite(xp.moveaxis(covariance, -1, 0)), 0, -1)
+            square, (most, expected) = xp.einsum("am,abm,bm->m", values, inverse, values), bounded_square(r)
+            counts.append(xp.minimum(1.0, most / xp.maximum(square, 1e-300)) / expected)
+            for form, matrix in zip(forms, (of_readings, of_seat), strict=True):
+                form.append(matrix_products(matrix_products(inverse, matrix), inverse))
+        return solved(list(forms), counts), xp.zeros(())
 
     return scan(again, Moments(xp.zeros(()), sigma**2), length=_ROUNDS)[0]
-
-
-def _bounded(
-    white: Float[AnyArray, "r m"], part: _Covariances, variances: Moments
-) -> tuple[Float[AnyArray, "r r m"], Float[AnyArray, " m"]]:
-    """C^-1 of every pose, and how much its square counts."""
-    xp, r = namespace(white, variances), white.shape[0]
-    # A little of the first weights besides, since C has no inverse where two joints are all that errs.
-    covariance = variances.encoder * part.readings + variances.seat * part.seat + part.measured
-    covariance = covariance + 0.01 * xp.asarray(np.eye(r))[:, :, None]
-    inverse = xp.moveaxis(inverse_positive_definite(xp.moveaxis(covariance, -1, 0)), 0, -1)
-    square = xp.einsum("am,abm,bm->m", white, inverse, white)
-    most, expected = bounded_square(r)
-    return inverse, xp.minimum(1.0, most / xp.maximum(square, 1e-300)) / expected
-
-
-def _two_variances(table: list[list[Any]], seen: list[Any], sigma: Float[AnyArray, ""]) -> Moments:
-    """Solution of the two equations: expectations for 1 arcsec, for 1 mm and of what was measured, by form."""
-    xp = namespace(table, sigma)
-    (dd, dt, ds), (td, tt, ts) = table
-    right_d, right_t = seen[0] - ds, seen[1] - ts
-    determinant = dd * tt - dt * td
-    apart = determinant > 1e-9 * dd * tt
-    safe = xp.where(apart, determinant, 1.0)
-    encoder, seat = (tt * right_d - dt * right_t) / safe, (dd * right_t - td * right_d) / safe
-    without_seat = xp.maximum(right_d / xp.where(dd > 0, dd, 1.0), 0.0)
-    positive = apart & (encoder > 0)
-    return Moments(
-        xp.where(positive, xp.where(seat > 0, encoder, without_seat), 0.0),
-        xp.where(positive, xp.maximum(seat, 0.0), sigma**2),
-    )
 
 
 class _Sums(NamedTuple):

@@ -88,18 +88,14 @@ def volumetric_uncertainty(
     length = default_length(uncertainty.arm) if length is None else length
     start, end = sample_lengths(uncertainty.arm, points, length=length, limits=limits, seed=seed)
     tips, *parts = _volume(to_numpy(uncertainty), start, end)
-    parts = [np.asarray(part) for part in parts]
-    u = [np.sqrt(np.sum(part, axis=-1)) for part in parts]
+    u = [np.sqrt(np.sum(np.asarray(part), axis=-1)) for part in parts]
     expanded = [uncertainty.expanded_by_parts(part) for part in parts]
     return VolumetricUncertainty(length, start, end, tips[0], tips[1], *u, *expanded)
 
 
 @compiled(jit=eqx.filter_jit)
-def _volume(
-    uncertainty: Uncertainty, start: Float[AnyArray, "v n"], end: Float[AnyArray, "v n"]
-) -> tuple[Any, Any, Any, Any]:
-    xp = namespace(uncertainty, start, end)
-    tips = xp.stack([uncertainty.arm.position(q) for q in (start, end)])
+def _volume(uncertainty: Uncertainty, start: Float[AnyArray, "v n"], end: Float[AnyArray, "v n"]) -> tuple[Any, ...]:
+    tips = namespace(uncertainty, start, end).stack([uncertainty.arm.position(q) for q in (start, end)])
     plain, read = (uncertainty.length_parts(start, end, reading=reading) for reading in (False, True))
     return tips, uncertainty.tip_parts(start), plain, read
 

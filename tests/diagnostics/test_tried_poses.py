@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aacmm_jax.diagnostics.tried_poses import tried_poses
+from aacmm_jax.diagnostics.joint_travel import tried_poses
 from tests.prismatic_arms import SCARA
 from tests.refusals import assert_refused
 
