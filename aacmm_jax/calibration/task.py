@@ -383,8 +383,8 @@ def args_of(task: Task, whitening: Whitening, loss: Loss | None, z: Float[AnyArr
 
 
 def fit(task: Task, args: Args, z: Float[AnyArray, " n"], begun: Begun, rules: Rules, differentiable: bool) -> Fit:
-    """A least squares within bounds: differentiable for arrays of JAX, unless no derivative is needed. The steps of what
-    is begun scale the unknowns."""
+    """A least squares within bounds: differentiable for arrays of JAX, unless no derivative is needed. The steps of
+    what is begun scale the unknowns."""
     xp, count = namespace(z, args, begun.sides), z.shape[0]
     if not task.fitted[:count].any():
         return Fit(z, xp.zeros((), dtype=int), reasons(xp.asarray(GRADIENT)), xp.zeros(()))
