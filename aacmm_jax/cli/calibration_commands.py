@@ -16,17 +16,15 @@ from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
 from . import options, views
-from .app import app, examples, show_summary, with_spinner
+from .app import command, show_summary, with_spinner
 from .options import argument, bad_option, flag, names_option, option, output, seed
 
 
-@app.command(
-    epilog=examples(
-        "aacmm calibrate capture.h5 -o calibration.h5",
-        "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
-        "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
-        "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
-    )
+@command(
+    "aacmm calibrate capture.h5 -o calibration.h5",
+    "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
+    "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
+    "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
 )
 def calibrate(
     capture: list[Path] = argument("CAPTURE.h5 ...", "Capture, or captures of one arm in several sessions."),
@@ -202,13 +200,11 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
     return data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
 
 
-@app.command(
-    "compare-models",
-    epilog=examples(
-        "aacmm compare-models capture.h5",
-        'aacmm compare-models capture.h5 --models "dh;gravity;gravity,harmonics=1" --leave-out "monday/*" '
-        '--leave-out "tuesday/*"',
-    ),
+@command(
+    "aacmm compare-models capture.h5",
+    'aacmm compare-models capture.h5 --models "dh;gravity;gravity,harmonics=1" --leave-out "monday/*" '
+    '--leave-out "tuesday/*"',
+    name="compare-models",
 )
 def compare_models(
     capture: Path = argument("CAPTURE.h5", "Capture, written by import or simulate."),
@@ -266,11 +262,9 @@ def compare_models(
         raise typer.Exit(1)
 
 
-@app.command(
-    epilog=examples(
-        "aacmm compare march.h5 september.h5",
-        "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05",
-    )
+@command(
+    "aacmm compare march.h5 september.h5",
+    "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05",
 )
 def compare(
     paths: list[Path] = argument(
