@@ -17,7 +17,7 @@ from jaxtyping import Float
 from ..core.arrays import Numbers
 from ..core.errors import InputError, naming
 from ..core.rotations import roll_pitch_yaw, roll_pitch_yaw_matrix
-from ..core.text import number, quoted
+from ..core.text import is_number, number, quoted
 from ..kinematics.arm import Arm, arm_of
 from ..kinematics.axes_to_dh import (
     Axes,
@@ -119,10 +119,7 @@ def _numbers_of(entries: dict[str, str], name: str, count: int) -> Float[np.ndar
         of_joints = "; a kinematics.yaml has it for each of six joints." if count == 1 else "; add it."
         raise InputError(f"'{name}' is missing{of_joints}")
     parts = entries[name].strip("[] ").replace(",", " ").split()
-    try:
-        numbers = np.array([number(part) for part in parts])
-    except ValueError:
-        numbers = np.array([math.nan])
+    numbers = np.array([number(part) if is_number(part) else math.nan for part in parts])
     if len(parts) != count or not np.all(np.abs(numbers) < _LARGEST):
         asked = "a finite number" if count == 1 else "six finite numbers"
         raise InputError(f"'{name}' is {quoted(entries[name])}; give {asked} below {_LARGEST:g}, m or rad.")
