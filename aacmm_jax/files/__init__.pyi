@@ -16,6 +16,7 @@ from .compared_models import load_compared_models as load_compared_models
 from .compared_models import save_compared_models as save_compared_models
 from .controllers import dh_table as dh_table
 from .controllers import python_program as python_program
+from .controllers import ur_kinematics_yaml as ur_kinematics_yaml
 from .controllers import zero_offsets as zero_offsets
 from .controllers import zero_offsets_csv as zero_offsets_csv
 from .evaluations import load_evaluation as load_evaluation
@@ -24,7 +25,6 @@ from .kits import read_kit as read_kit
 from .manifest import read_manifest as read_manifest
 from .manifest import read_points as read_points
 from .plans import save_plan as save_plan
-from .ur_kinematics import ur_kinematics_yaml as ur_kinematics_yaml
 from .urdf import link_masses as link_masses
 from .urdf import save_urdf as save_urdf
 from .urdf import urdf_chain as urdf_chain

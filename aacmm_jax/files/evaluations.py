@@ -20,7 +20,7 @@ from ..uncertainty.shared_errors import SharedErrors
 from . import captures, schema
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Within, records_within, rows_table, table_of, tables_within, values_in
-from .sense import read_checked
+from .schema import read_checked
 
 _RECORDS = {
     "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
