@@ -98,12 +98,8 @@ def load_cell(
 
     Example:
         >>> from pathlib import Path
-        >>> _ = Path("cell.toml").write_text('''clearance = 20.0
-        ... [[half_space]]
-        ... name = "table"
-        ... normal = [0, 0, 1]
-        ... point = [0, 0, 0]
-        ... ''')
+        >>> table = '{ name = "table", normal = [0, 0, 1], point = [0, 0, 0] }'
+        >>> _ = Path("cell.toml").write_text(f"clearance = 20.0\\nhalf_space = [{table}]")
         >>> cell = aj.files.load_cell("robot.urdf", "cell.toml").cell
         >>> print(cell.body.names, [obstacle.name for obstacle in cell.obstacles], cell.clearance)
         ('shoulder', 'upper_arm', 'forearm') ['table'] 20.0

@@ -62,12 +62,8 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
 
     Example:
         >>> from pathlib import Path
-        >>> _ = Path("kit.toml").write_text('''[[socket]]
-        ... name = "cone"
-        ... point = [400, 200, 300]
-        ... poses = 5
-        ... places = 3
-        ... ''')
+        >>> cone = '{ name = "cone", point = [400, 200, 300], poses = 5, places = 3 }'
+        >>> _ = Path("kit.toml").write_text(f"socket = [{cone}]")
         >>> print([(item.simulated.name, item.places) for item in aj.files.read_kit("kit.toml")])
         [('cone', 3)]
     """
