@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.all_tests import checked_limits
 from ..acceptance.judgement import Expansion, Influences, Limit, Rule, checked_influences
-from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
+from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord, checked_limits
 from ..acceptance.results import Measured
 from ..core.arguments import checked
 from ..kinematics.arm import parameter_names
