@@ -146,7 +146,7 @@ def _minimum(
     """The minimum with its derivatives, and the last state of the solve."""
     start, unravel = ravel_pytree(y0)
 
-    def residual(point: Flat, args: PyTree) -> Float[Array, " r"]:
+    def residual(point: Array, args: PyTree) -> Float[Array, " r"]:
         value = ravel_pytree(fn(unravel(point), args))[0]
         if not value.size or jnp.iscomplexobj(value):
             raise InputError("the residual must be real numbers, at least one; look at what the function returns.")
@@ -156,40 +156,37 @@ def _minimum(
     inputs = (eqx.filter_closure_convert(residual, start, args), args, box)
     constant_residual, constant_args, still_box = stop_gradient(inputs)
 
-    def model(point: Flat, _: None) -> QuadraticModel:
+    def model(point: Array, _: None) -> QuadraticModel:
         if normal is not None:
             return normal(unravel(point), constant_args)
         value = constant_residual(point, constant_args)
         jacobian = jax.jacfwd(constant_residual)(point, constant_args)
         return QuadraticModel(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian)
 
-    lower, upper, scale = still_box
-    last = minimise(
-        model, stop_gradient(start), None, lower=lower, upper=upper, scale=scale, rules=rules, max_steps=max_steps
-    )
+    last = minimise(model, stop_gradient(start), None, still_box, rules, max_steps)
     return unravel(_with_derivatives(last.y, inputs)), last
 
 
 @eqx.filter_custom_jvp
-def _with_derivatives(y: Flat, inputs: PyTree) -> Flat:
+def _with_derivatives(y: Array, inputs: PyTree) -> Array:
     """The minimum, whose derivatives by its inputs are those that keep it stationary."""
     del inputs
     return y
 
 
 @_with_derivatives.def_jvp
-def _(primals: Any, tangents: Any) -> tuple[Flat, Flat]:
+def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
     (y, inputs), (_, change) = primals, tangents
     y = _with_derivatives(y, inputs)  # so that derivatives of any order pass
     _, slope = eqx.filter_jvp(lambda inputs: _stationarity(y, inputs), (inputs,), (change,))
     return y, -_solved(jax.jacfwd(lambda y: _stationarity(y, inputs))(y), slope)
 
 
-def _stationarity(y: Flat, inputs: PyTree) -> Flat:
+def _stationarity(y: Array, inputs: PyTree) -> Array:
     """Zero at a bounded minimum: the gradient where an unknown is free, its distance from the bound where pinned."""
     residual, args, box = inputs
 
-    def cost(point: Flat) -> Array:
+    def cost(point: Array) -> Array:
         value = residual(point, args)
         return 0.5 * jnp.dot(value, value)
 
