@@ -32,8 +32,7 @@ from ..kinematics.independence import (
 )
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.parameters import Bounds, Parameters
-from .correction_limits import why_undetermined
-from .observed_identifiability import Agreeing
+from .observed_identifiability import Agreeing, why_undetermined
 
 _RANK = 1e-8  # singular values below this, of the largest, are zero
 _NAMED, _PARAMETERS_NAMED, _PARTS_NAMED = 4, 6, 3  # directions in a sentence, and parts of one
