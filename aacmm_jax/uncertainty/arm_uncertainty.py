@@ -91,7 +91,7 @@ class Uncertainty(eqx.Module):
     def u(self) -> Float[AnyArray, " p"]:
         """Standard uncertainty of each free parameter; infinite where only a combination is determined.
 
-        0 on a bound, unless the data hardly determine the direction that it ends (`active_bounds`).
+        0 on a bound, unless the data hardly determine the direction that it ends (`linearisation.of_active_bounds`).
         """
         xp = namespace(self)
         return xp.where(xp.diagonal(self.open) > 1e-6, np.inf, xp.sqrt(xp.diagonal(self.covariance)))
