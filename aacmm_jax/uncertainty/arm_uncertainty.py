@@ -15,8 +15,8 @@ from ..kinematics.arm import Arm, checked_readings
 from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
+from .covariance import SharedErrors
 from .degrees_of_freedom import LEVEL, Components, Law, coverage_factor, degrees_of_freedom
-from .shared_errors import SharedErrors
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 
