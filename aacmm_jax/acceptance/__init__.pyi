@@ -1,5 +1,3 @@
-from .all_tests import measured_by as measured_by
-from .all_tests import run as run
 from .geometry import enclosing_sphere as enclosing_sphere
 from .geometry import fit_sphere as fit_sphere
 from .judgement import RULES as RULES
@@ -19,6 +17,8 @@ from .procedure import simulate_procedure as simulate_procedure
 from .record import EvaluationRecord as EvaluationRecord
 from .record import PointsRecord as PointsRecord
 from .record import evaluation_of as evaluation_of
+from .record import measured_by as measured_by
+from .record import run as run
 from .requirements import requirements_table as requirements_table
 from .results import METRICS as METRICS
 from .results import AcceptanceTest as AcceptanceTest

@@ -5,7 +5,6 @@ The texts of the standards were not available: formulas follow secondary sources
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -126,32 +125,20 @@ def two_rms(deviations: Numbers) -> float:
     return 2 * math.sqrt(float(np.mean(given**2)))
 
 
-class _Reading(NamedTuple):
-    """One reading of a length: deviation, and standard uncertainties of artefact and test, mm."""
-
-    where: str
-    deviation: float
-    u: float
-    u_test: float
-    length: float
-
-    @property
-    def value(self) -> MetricValue:
-        return metric_value(self.where, self.deviation, self.u, self.u_test)._replace(length=self.length)
-
-
-def _readings(measured: Measured, influences: Influences) -> list[_Reading]:
+def _readings(measured: Measured, influences: Influences) -> tuple[list[MetricValue], np.ndarray]:
     """Every length as single readings: the i-th point at one end with the i-th at the other; thermal expansion of
-    artefact and arm, where it is stated, is corrected."""
-    readings = []
+    artefact and arm, where it is stated, is corrected. And the u of each: of the artefact, and of the test, mm."""
+    values, u = [], []
     for length in measured.lengths:
         start, end = (measured.sockets[name] for name in (length.start, length.end))
         pairs, value = min(len(start), len(end)), float(length.value)
         deviations = np.linalg.norm(end[:pairs] - start[:pairs], axis=1) - value + influences.correction(value)
+        of_length = float(length.u), influences.u_of(value)
         for number, deviation in enumerate(deviations.tolist(), start=1):
             where = f"{length.start} - {length.end}" + (f", reading {number}" if pairs > 1 else "")
-            readings.append(_Reading(where, deviation, float(length.u), influences.u_of(value), value))
-    return readings
+            values.append(metric_value(where, deviation, *of_length)._replace(length=value))
+            u.append(of_length)
+    return values, np.array(u).reshape(-1, 2)
 
 
 def _deviations(name: str, measured: Measured, influences: Influences) -> list[Metric]:
@@ -161,15 +148,15 @@ def _deviations(name: str, measured: Measured, influences: Influences) -> list[M
     which lengths share one. So U of the range takes the errors as independent, and U of the RMS as fully correlated (by
     the Cauchy-Schwarz inequality it cannot be larger).
     """
-    readings = _readings(measured, influences)
-    largest = Metric(name, tuple(reading.value for reading in readings))
-    if len(readings) < 2:
+    values, u = _readings(measured, influences)
+    largest = Metric(name, tuple(values))
+    if len(values) < 2:
         return [largest]
-    low, high = (choose(readings, key=lambda reading: reading.deviation) for choose in (min, max))
-    where, span = f"{low.where} to {high.where}", high.deviation - low.deviation
-    of_span = metric_value(where, span, low.u, high.u, low.u_test, high.u_test)
-    deviations, *u = np.array([(reading.deviation, reading.u, reading.u_test) for reading in readings]).T
-    of_rms = metric_value(f"{len(readings)} readings", two_rms(deviations), *map(two_rms, u))
+    deviations = np.array([value.value for value in values])
+    low, high = int(deviations.argmin()), int(deviations.argmax())
+    where, span = f"{values[low].where} to {values[high].where}", float(deviations[high] - deviations[low])
+    of_span = metric_value(where, span, *u[[low, high]].T.ravel().tolist())
+    of_rms = metric_value(f"{len(values)} readings", two_rms(deviations), *map(two_rms, u.T))
     return [largest, Metric(f"{name}_Range", (of_span,)), Metric(f"{name}_2RMS", (of_rms,))]
 
 
@@ -258,4 +245,4 @@ def location(measured: Measured, influences: Influences) -> list[Metric]:
 
 def length_error(measured: Measured, influences: Influences) -> list[Metric]:
     """Length error of single readings. The repeated readings that the standard permits are not taken into account."""
-    return [Metric("E_Uni", tuple(reading.value for reading in _readings(measured, influences)))]
+    return [Metric("E_Uni", tuple(_readings(measured, influences)[0]))]

@@ -1,8 +1,15 @@
-"""The records of an evaluation: a calibrated arm on a capture, or points, with the limits they are judged by."""
+"""Acceptance tests of arms by JJF 1408-2013 (as Cheng et al. 2018 use it), ASME B89.4.22-2004 and ISO 10360-12:2016.
 
+The texts of the standards were not available: formulas and procedures follow secondary sources of the editions named.
+Every metric is of single readings, never of means, because a test states by how much one measurement can be wrong.
+Uncertainties are the tester's (artefacts, seat, fixture, temperature): the arm's own scatter is what is tested (ISO
+14253-5, ISO/TS 23165). An evaluation of a calibrated arm, or of points, is a record that the tests follow from.
+"""
+
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
@@ -10,23 +17,153 @@ import numpy as np
 from ..calibration.evaluation import evaluate
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.task import check_observed
-from ..core.errors import InputError
+from ..core.arguments import Range, checked, checked_arguments
+from ..core.errors import InputError, nearest
 from ..core.numpy_or_jax import to_numpy
 from ..data.capture import Capture, names_in
-from ..data.recording import Recording
+from ..data.recording import Recording, checked_sphere
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry
 from ..kinematics.parameters import ArmSpecification, Parameters
+from ..kinematics.workspace import arm_reach
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .all_tests import NO_INFLUENCES, checked_limits, measured_by, run
-from .judgement import Influences, Limit, Rule
-from .results import AcceptanceTest, Measured
-from .standards import OF_SPHERES, STANDARDS, Standard, checked_standards
+from .geometry import points_of, postures_of
+from .judgement import MOST, Influences, Limit, Rule, checked_influences, checked_limit, decide, without_test
+from .requirements import TESTS
+from .results import METRICS, AcceptanceTest, Measured, Metric
+from .standards import DEFAULT_RULES, OF_SPHERES, STANDARDS, checked_standards
 
+NO_INFLUENCES = Influences()
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
-_ROUNDING = 1e-7  # relative error up to which a length has the error zero by construction
 SIMULATED = "The readings are simulated: no real arm was measured."
+_Millimetres = Annotated[float, Range(least=0, most=MOST, unit="mm")]
+_FARTHEST = 1e6  # mm: no arm reaches a kilometre
+_ROUNDING = 1e-7  # relative error up to which a length has the error zero by construction
+
+
+def measured_by(arm: Arm, recording: Recording) -> Measured:
+    """Compute what an arm measures where the poses of a recording were taken, mm.
+
+    Args:
+        arm: The arm, for example a calibrated one.
+        recording: Joint readings in sockets and on spheres, with the reference lengths.
+
+    Example:
+        >>> measured = aj.acceptance.measured_by(result.arm, recording)
+        >>> print(measured.sockets["A"].shape, f"{measured.reach.radius:.0f} mm")
+        (40, 3) 1360 mm
+    """
+    capture, touched = recording.capture, [group for sphere in recording.spheres for group in sphere.groups]
+    readings = [np.asarray(q) for q in (*capture.sockets.values(), *touched)]
+    ends = np.cumsum([len(q) for q in readings])
+    none = np.zeros((0, capture.columns))
+    points = iter(np.split(np.asarray(arm.position(np.concatenate([*readings, none]))), ends[:-1]))
+    sockets = {name: next(points) for name in capture.sockets}
+    # Sockets that held another target than the arm's own probe are not part of any procedure.
+    lengths = tuple(length for length in capture.lengths if length.start in sockets and length.end in sockets)
+    spheres = tuple(sphere._replace(groups=tuple(next(points) for _ in sphere.groups)) for sphere in recording.spheres)
+    reach = arm_reach(arm)
+    postures = postures_of(arm, recording, reach)
+    return Measured(sockets, lengths, spheres, reach, measuring_range=recording.measuring_range, postures=postures)
+
+
+@checked_arguments
+def run(
+    measured: Measured,
+    limits: Mapping[str, Limit | float] | None = None,
+    u_test: _Millimetres = 0.0,
+    *,
+    influences: Influences = NO_INFLUENCES,
+    rule: Rule | None = None,
+) -> list[AcceptanceTest]:
+    """Run every test that the measured points allow and that has at least one metric.
+
+    Source: JJF 1408-2013 as used by Cheng et al. 2018, ASME B89.4.22-2004, ISO 10360-12:2016; formulas stated from
+    secondary sources (`requirements_table` says which, and how certain they are). Decisions: see `decide`. A test says
+    what its full procedure would also need, and bears the standard's name (`AcceptanceTest.called`) only where nothing
+    that can be checked is missing. `InputError` for points that are not in mm, and for a limit of a metric that these
+    points do not give, or that grows with a length although the metric is not of one.
+
+    Args:
+        measured: Points of sockets and spheres, and reference lengths, mm.
+        limits: MPE by the name of a metric (a key of `METRICS`): a `Limit`, or a number of mm.
+        u_test: Standard uncertainty that seat and fixture add to every test value, mm.
+        influences: What else adds to it: in proportion to a length, and thermal expansion of artefact and arm.
+        rule: Decision rule (a key of `RULES`); by default ISO 14253-1:2017, and simple acceptance for ASME.
+
+    Example:
+        >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
+        >>> for test in aj.acceptance.run(measured, limits={"SPAT": 0.1}):
+        ...     print(test.called, [(metric.name, metric.decision) for metric in test.metrics])
+        based on JJF 1408-2013 [('Deltam', None), ('Length', None), ('Length_Range', None), ('Length_2RMS', None)]
+        based on ASME B89.4.22-2004 [('SPAT', 'conforms'), ('SPAT_2s', None)]
+        based on ASME B89.4.22-2004 [('Volumetric', None), ('Volumetric_Range', None), ('Volumetric_2RMS', None)]
+        based on ISO 10360-12:2016 [('E_Uni', None)]
+    """
+    measured, influences, given = _checked(measured), checked_influences(influences), checked_limits(limits or {})
+    influences = influences._replace(u=math.hypot(influences.u, u_test))
+    tests = [result for test in TESTS if (result := test.run(measured, influences)) is not None]
+    tests = [test._replace(rule=rule or DEFAULT_RULES[test.standard]) for test in tests]
+    if measured.none_held_out:
+        held_out = "Everything was used to identify the arm; measure sockets and lengths that were not."
+        tests = [test._replace(missing=(held_out, *test.missing)) for test in tests]
+    present = {metric.name for test in tests for metric in test.metrics}
+    for name in given:
+        if name not in present:
+            held_out = " that the calibration was not identified from" if measured.identified_from else ""
+            raise InputError(
+                f"a limit is given for {name} ({METRICS[name]}), but the capture has nothing{held_out} to measure it on"
+                "; leave the limit out."
+            )
+    return [
+        test._replace(metrics=tuple(_decided(metric, given.get(metric.name), test.rule) for metric in test.metrics))
+        for test in tests
+    ]
+
+
+def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:
+    """Limits by the name of a metric, numbers made into `Limit`; `InputError` for an unknown metric or a bad limit."""
+    by_name = {}
+    for name, limit in limits.items():
+        if name not in METRICS:
+            raise InputError(f"there is no metric '{name}'{without_test(name, list(METRICS))}")
+        fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
+        what = f"the limit of {name}"
+        by_name[name] = checked_limit(Limit(float(checked(fixed, _Millimetres, what)), divisor), what)
+    return by_name
+
+
+def _checked(measured: Measured) -> Measured:
+    sockets = {name: points_of(points, f"the points of socket '{name}'") for name, points in measured.sockets.items()}
+    for length in measured.lengths:
+        for end in (length.start, length.end):
+            if end not in sockets:
+                raise InputError(
+                    f"length '{length.start}' to '{length.end}' names the unknown socket '{end}'{nearest(end, sockets)}"
+                )
+    spheres = tuple(checked_sphere(sphere, 3) for sphere in measured.spheres)
+    for name, points in (*sockets.items(), *((sphere.name, group) for sphere in spheres for group in sphere.groups)):
+        if np.abs(points).max() > _FARTHEST:
+            raise InputError(f"'{name}' has a coordinate beyond {_FARTHEST:g} mm; give points in mm.")
+    size = measured.measuring_range
+    if size is not None and not 0 < size <= 2 * _FARTHEST:
+        raise InputError(f"measuring_range is {size:g} mm; give the diameter of the maker's measuring volume in mm.")
+    return measured._replace(sockets=sockets, spheres=spheres)
+
+
+def _decided(metric: Metric, limit: Limit | None, rule: Rule) -> Metric:
+    if limit is None:
+        return metric
+    values = []
+    for value in metric.values:
+        if value.length is None and math.isfinite(limit.divisor):
+            raise InputError(
+                f"the limit of {metric.name} grows with a length, but the metric is not of one; give only a number."
+            )
+        most = limit.at(value.length or 0.0)
+        values.append(value._replace(limit=most, decision=decide(value.value, most, value.expanded, rule)))
+    return metric._replace(values=tuple(values))
 
 
 class EvaluationRecord(NamedTuple):
@@ -184,6 +321,7 @@ def evaluation_of(
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
             f"'{record.recording.nominal.name}'; check that it is the same arm."
         )
+    made_for = (*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres))
     evaluation = EvaluationRecord(
         recording._replace(nominal=record.recording.nominal),
         record.calibrated,
@@ -191,7 +329,7 @@ def evaluation_of(
         limits=checked_limits(limits or {}),
         u_test=u_test,
         maxima=dict(maxima or {}),
-        standards=made_for(recording) if standards is None else checked_standards(standards),
+        standards=checked_standards(made_for if standards is None else standards),
         uncertainty=uncertainty_of(record),
         influences=influences,
         rule=rule,
@@ -226,11 +364,6 @@ def check_geometry(arm: Arm, capture: Capture) -> None:
     """Raise `InputError` where observations do not determine their own unknowns."""
     space = to_numpy(Parameters(arm, ("d_1",)))
     check_observed(Observed.of(capture, arm), space, np.asarray(space.vector()), 0)
-
-
-def made_for(recording: Recording) -> tuple[Standard, ...]:
-    """Standards whose acceptance procedure a recording was made for: as it says, or as the spheres say it has."""
-    return checked_standards((*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres)))
 
 
 def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:

@@ -85,11 +85,6 @@ class Metric(NamedTuple):
         """The worst decision of all values; None without limits."""
         return worst([value.decision for value in self.values if value.decision is not None])
 
-    @property
-    def failing(self) -> int:
-        """How many values fail."""
-        return sum(value.decision == "fails" for value in self.values)
-
 
 class AcceptanceTest(NamedTuple):
     """What one test found, and what its full procedure would also have needed (nothing if it is complete).

@@ -104,7 +104,19 @@ def evaluate(
         raise InputError("the capture is a batch; evaluate its captures one by one, or map over them with jax.vmap.")
     check_finite(noise=noise)
     observed = Observed.of(capture, arm, lengths=False)
-    kept = _checked_geometry(observed, geometry)
+    if not isinstance(geometry, Mapping | None):
+        raise InputError("geometry must be a dictionary; give that of a calibration: result.observed.geometry.")
+    kept, given = {}, geometry or {}
+    for name, units in observed.blocks.items():
+        if name in given:
+            kept[name] = as_array(given[name], name, like=np.zeros(0))
+            if kept[name].shape != (len(units),):
+                raise InputError(f"{name} has shape {kept[name].shape}; give ({len(units)},).")
+    if given and not kept:
+        first = next(iter(given))
+        raise InputError(
+            f"the capture has no '{first}' or other part of this geometry{nearest(first, observed.blocks)}"
+        )
     whole = bool(capture.observations) or bool(kept) or noise is not None
     subject = observed, *to_numpy((capture.lengths, kept, noise))
     shape = np.broadcast_shapes(*(leaf.shape[:-1] for leaf in jax.tree.leaves(arm)))
@@ -200,23 +212,3 @@ def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noi
     z, state, _, _ = minimised(task, begin(task))
     linear = Linearisation.of(observed, space, z, state.point, state.errors, whitening_at(task, state), None)
     return GeometryFit(linear, task.fitted[1:], state.sigma, observed.equations > task.fitted.sum())
-
-
-def _checked_geometry(observed: Observed, geometry: Mapping[str, Numbers] | None) -> dict[str, AnyArray]:
-    """The parts of a given geometry that these observations have, or `InputError` where there is none."""
-    if geometry is None:
-        return {}
-    if not isinstance(geometry, Mapping):
-        raise InputError("geometry must be a dictionary; give that of a calibration: result.observed.geometry.")
-    parts = {}
-    for name, units in observed.blocks.items():
-        if name in geometry:
-            parts[name] = as_array(geometry[name], name, like=np.zeros(0))
-            if parts[name].shape != (len(units),):
-                raise InputError(f"{name} has shape {parts[name].shape}; give ({len(units)},).")
-    if geometry and not parts:
-        first = next(iter(geometry))
-        raise InputError(
-            f"the capture has no '{first}' or other part of this geometry{nearest(first, observed.blocks)}"
-        )
-    return parts

@@ -35,6 +35,7 @@ from .results import (
 from .stages import against_division
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
+_POINTS = 400  # of a joint's corrections as a function of its reading
 _BEYOND = 0.15  # of a joint's travel, on either side of it, where its corrections are given
 _CORRELATED = 0.1  # smallest eigenvalue of correlations, below which parameters slide along each other
 _MOST_NAMED, _LEAST_SHARE = 4, 0.3  # of the parameters that do, and of the largest share
@@ -344,42 +345,33 @@ class JointFunction(NamedTuple):
 
 
 def function_of_joint(
-    record: CalibrationRecord, joint: int, q: Float[np.ndarray, "poses joints"], points: int = 400
+    record: CalibrationRecord, joint: int, q: Float[np.ndarray, "poses joints"]
 ) -> JointFunction | None:
-    """The functions of its own reading that correct a joint (harmonics, gear ratio), with their uncertainty.
+    """The functions of its own reading that correct a joint (harmonics, gear ratio), numbered from 1, over the travel
+    of these poses, with their uncertainty; None where it has none.
 
     The mean over the poses is taken away: a zero offset takes it up.
-
-    Args:
-        record: A calibration.
-        joint: Number of the joint, from 1.
-        q: Readings of the poses, rad and mm.
-        points: Number of readings, evenly spaced, at which the function is given.
-
-    Returns:
-        The function; None if the joint has no such corrections.
     """
     arm: Arm = to_numpy(record.calibrated.arm)
-    if arm.corrections is None:
+    terms = [] if arm.corrections is None else [(i, t) for i, t in enumerate(arm.corrections.functions.terms)]
+    chosen = {i: t for i, t in terms if isinstance(t, Term) and t.joint == joint and t.kind.of_own_reading}
+    if arm.corrections is None or not chosen:
         return None
-    every = [(i, term) for i, term in enumerate(arm.corrections.functions.terms) if isinstance(term, Term)]
-    chosen = [(i, term) for i, term in every if term.joint == joint and term.kind.of_own_reading]
-    if not chosen:
-        return None
-    terms, coefficients = [term for _, term in chosen], np.asarray(arm.coefficients)[[i for i, _ in chosen]]
+    coefficients = np.asarray(arm.coefficients)[list(chosen)]
     travel = q[:, joint - 1]
     low, high = joint_limits(arm, None)[joint - 1] if arm.limits is not None or not arm.prismatic else (-np.inf, np.inf)
     beyond = _BEYOND * np.ptp(travel)
-    at = np.linspace(max(travel.min() - beyond, low), min(travel.max() + beyond, high), points)
-    rows = np.zeros((points, q.shape[1]))
-    rows[:, joint - 1] = at
-    gravity = np.asarray(arm.gravity)
-    at_poses = function_values(arm.corrections.nominal, terms, q, gravity)
-    mean = at_poses.mean(axis=1, keepdims=True)
-    functions = function_values(arm.corrections.nominal, terms, rows, gravity) - mean
-    names = [term.name for term in terms]
-    free = [i for i, name in enumerate(names) if name in record.names]
-    slopes = np.zeros((points, len(record.names)))
-    slopes[:, [record.names.index(names[i]) for i in free]] = functions[free].T
+    reading = np.linspace(max(travel.min() - beyond, low), min(travel.max() + beyond, high), _POINTS)
+    rows = np.zeros((_POINTS, q.shape[1]))
+    rows[:, joint - 1] = reading
+    values = [
+        function_values(arm.corrections.nominal, list(chosen.values()), poses, np.asarray(arm.gravity))
+        for poses in (q, rows)
+    ]
+    at_poses, functions = (value - values[0].mean(axis=1, keepdims=True) for value in values)
+    slopes = np.zeros((_POINTS, len(record.names)))
+    for term, function in zip(chosen.values(), functions, strict=True):
+        if term.name in record.names:
+            slopes[:, record.names.index(term.name)] = function
     expanded = uncertainty_of(record).expanded_of(slopes)
-    return JointFunction(at, coefficients @ functions, expanded, coefficients @ (at_poses - mean))
+    return JointFunction(reading, coefficients @ functions, expanded, coefficients @ at_poses)

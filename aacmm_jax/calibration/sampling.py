@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..core.arguments import OneOf, Range, checked_arguments
-from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.random_keys import random_generator
@@ -156,7 +155,7 @@ def monte_carlo(
             # Student's t (JCGM 101, 6.4.9).
             scale = 1.0 if math.isinf(freedom) else np.sqrt(freedom / random.chisquare(freedom, size=(count, 1, 1)))
             captures, errors = truth.drawn(count, noise, random, scale, shared)
-            means = repeated.prior_means(count, random, np.asarray(result.parameters))
+            means = repeated.prior_means(count, random)
             solved, lost = repeated.solved(captures, means, errors and errors.coefficients)
             parts.append(solved)
             failed += lost
@@ -210,9 +209,7 @@ def bootstrap(
     """
     random, repeated = random_generator(seed), Repeated.of(result, capture, None, robust)
     captures = truth_of(result, capture).resampled(trials, random)
-    prior = result.prior
-    means = None if prior is None else repeated.in_order(np.asarray(prior.mean), result.parameters)
-    values, failed = repeated.solved(captures, repeated.prior_means(trials, random, means))
+    values, failed = repeated.solved(captures, repeated.prior_means(trials, random, about_means=True))
     _check_some(values, trials, "bootstrap", "there are too few poses a socket for this, so record more")
     return repeated.sampled(values, failed, level, 1)
 
@@ -263,21 +260,19 @@ class Repeated(NamedTuple):
             )
         return cls(result, (np.asarray(lengths[0]), np.asarray(lengths[1])), robust)
 
-    def in_order(self, values: Float[np.ndarray, " q"], others: Numbers) -> Float[np.ndarray, " p"]:
-        """Numbers of the parameters of a prior in the order of all, with others for those that it leaves out."""
-        prior, names = self.result.prior, self.result.space.names
-        ordered = np.array(np.broadcast_to(np.asarray(others), (len(names),)))
-        ordered[[names.index(name) for name in prior.names] if prior else []] = values
-        return ordered
-
     def prior_means(
-        self, count: int, random: np.random.Generator, centre: Float[np.ndarray, " p"] | None
+        self, count: int, random: np.random.Generator, about_means: bool = False
     ) -> Float[np.ndarray, "t p"] | None:
-        """Parameters of so many arms in which those with a prior have its means, drawn anew about a centre."""
-        if self.result.prior is None or centre is None:
+        """Parameters of so many arms in which those with a prior have its means, drawn anew: about the calibration's
+        parameters, or about the means themselves."""
+        prior, names = self.result.prior, self.result.space.names
+        if prior is None:
             return None
-        weight = self.in_order(np.asarray(self.result.prior.weight), 0.0)
-        sd = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
+        index = [names.index(name) for name in prior.names]
+        centre, sd, weight = np.array(self.result.parameters), np.zeros(len(names)), np.asarray(prior.weight)
+        sd[index] = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)
+        if about_means:
+            centre[index] = prior.mean
         return centre + sd * random.normal(size=(count, len(sd)))
 
     def solved(

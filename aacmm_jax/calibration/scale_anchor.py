@@ -8,7 +8,6 @@ still says nothing, and neither does the quill of a SCARA, which has one height 
 """
 
 import math
-import warnings
 from typing import Literal, NamedTuple
 
 import jax
@@ -17,7 +16,7 @@ from jaxtyping import Float
 
 from ..core.arguments import shown
 from ..core.arrays import is_concrete
-from ..core.errors import IdentifiabilityWarning, InputError
+from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.capture import Capture
@@ -32,7 +31,7 @@ from ..kinematics.arm import (
     parameter_names,
     value_of,
 )
-from ..kinematics.independence import PosesInSockets, equations, generic_poses
+from ..kinematics.independence import equations, generic_poses, poses_in_sockets
 from ..kinematics.inverse_kinematics import SocketPoses, project_to_centroids
 from ..kinematics.parameters import Parameters, based_on
 from ..kinematics.workspace import total_link_length
@@ -98,7 +97,12 @@ def scale_anchor(
     hold = _checked_hold(hold, space, lengths, concrete)
     fixed, slides = fixed_lengths(arm, space), tuple(f"q_{i}" for i in arm.prismatic)
     partners = None if fixed or slides else ((), ())
-    longest = _longest_link(lengths, arm) if concrete else None
+    longest = None
+    if concrete and lengths:
+        # A link; but the links of a gantry are slides, and all that scales with the wrist may be the probe.
+        sizes = {name: float(np.abs(value_of(arm, name)).max()) for name in lengths}
+        links = [name for name in lengths if not name.startswith("probe") and name != "d_1" and sizes[name]]
+        longest = max(links or lengths, key=sizes.__getitem__)
     set_by, without_anchor = (), False
     if concrete and (fixed or slides):
         with jax.ensure_compile_time_eval():
@@ -185,16 +189,6 @@ def method_of(
     return method, at_once
 
 
-def warn_of_known_scale(set_by: tuple[str, ...], prismatic: bool) -> None:
-    """Warn where a division by k changes nothing: ``set_by`` names the fixed parameters that set the scale."""
-    if set_by:
-        sentence = (
-            f"{scale_set_by_clause(set_by)}, so the reference lengths change nothing; "
-            f"{'' if prismatic else 'free one of these lengths, or '}use both with method='joint'."
-        )
-        warnings.warn(sentence, IdentifiabilityWarning, stacklevel=4)
-
-
 def scale_set_by_clause(names: tuple[str, ...]) -> str:
     """The beginning of a warning about fixed lengths, or slides, that set the scale."""
     slides = [name.removeprefix("q_") for name in names if name.startswith("q_")]
@@ -211,15 +205,6 @@ def fixed_lengths(arm: Arm, space: Parameters) -> tuple[str, ...]:
     if not is_concrete(*jax.tree.leaves(arm)):
         return tuple(names)
     return tuple(name for name in names if np.any(value_of(arm, name) != 0))
-
-
-def _longest_link(lengths: list[str], arm: Arm) -> str | None:
-    links = [name for name in lengths if not name.startswith("probe") and name != "d_1"] or lengths
-    if not links:
-        return None
-    sizes = {name: float(np.abs(value_of(arm, name)).max()) for name in lengths}
-    # The links of a gantry are slides, and all that scales with the wrist may be the probe.
-    return max(links if any(sizes[name] for name in links) else lengths, key=sizes.__getitem__)
 
 
 def _columns_of_both(arm: Arm, space: Parameters, fixed: tuple[str, ...]) -> list[Float[np.ndarray, "rows k"]]:
@@ -241,7 +226,7 @@ def _of_slides(
     all over the workspace."""
     if capture is not None and capture.sizes and is_concrete(capture.q):
         q = np.asarray(capture.q)
-        poses = PosesInSockets(q.reshape(-1, *q.shape[-2:])[0], tuple(capture.sizes))
+        poses = poses_in_sockets(q.reshape(-1, *q.shape[-2:])[0], tuple(capture.sizes))
     else:
         prismatic = np.isin(np.arange(1, arm.joints + 1), arm.prismatic)
         limits = np.where(prismatic[:, None], [-500.0, 500.0], [-np.pi, np.pi]).tolist()

@@ -148,13 +148,13 @@ def positions_at_ends(capture: Capture) -> list[str]:
 
 
 def ends_between(
-    observed: Observed, geometry: Float[AnyArray, " g"], own: Sequence[Float[AnyArray, "_ _ _"]], capture: Capture
+    observed: Observed, geometry: Float[AnyArray, " g"], by_class: Sequence[Float[AnyArray, "_ _ _"]], capture: Capture
 ) -> MeasuredEnds:
-    """The ends of a capture's lengths; ``own`` are the covariances of components by a given arm, class by class."""
+    """The ends of a capture's lengths; ``by_class`` are the covariances of components by a given arm."""
     xp, used, covariances = namespace(geometry), positions_at_ends(capture), []
     for name in used:
         number, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        covariances.append(own[number][component, first : first + 3, first : first + 3])
+        covariances.append(by_class[number][component, first : first + 3, first : first + 3])
     return MeasuredEnds(
         positions=xp.stack([geometry[observed.positions[name]] for name in used]),
         covariances=xp.stack(covariances),

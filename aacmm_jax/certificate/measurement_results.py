@@ -14,7 +14,7 @@ from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, obs
 from ..files.administrative_data import NOT_STATED, AdministrativeData, Reference
 from ..kinematics.arm import parameter_names, parameter_unit
 from ..kinematics.parameters import Parameters
-from ..summaries.calibration import prior_rows, prior_sentence
+from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import LEVEL
@@ -226,14 +226,12 @@ def _length_name(number: int, length: ReferenceLength) -> str:
 def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool, uncertainty: Uncertainty) -> Element:
     """Value, measured value and error of each length; of one that fixed the scale the value alone."""
     lengths, fixed_scale = record.recording.capture.lengths, calibrated and record.fixed_by_one_length
-    columns = [np.asarray(column) for column in (evaluation.measured, evaluation.error, evaluation.u)]
-    stated = np.array([float(length.u) for length in lengths])
-    columns.append(uncertainty.expanded_by_scatter(columns[2], stated, LEVEL))
+    of_lengths = metrics_by_socket_and_length(record.recording.capture, evaluation, uncertainty)["lengths"]
     rows = []
-    for number, (length, *values) in enumerate(zip(lengths, *columns, strict=True), start=1):
-        measured, error, u, expanded = map(float, values)
-        factor = expanded / u if _is_known(u) else None
-        decimals = _DECIMALS[MILLIMETRE] if factor is None else xml.decimals_of(expanded)
+    for number, (length, row) in enumerate(zip(lengths, of_lengths, strict=True), start=1):
+        u, factor, decimals = row["error_u_mm"] or None, None, _DECIMALS[MILLIMETRE]
+        if u is not None:
+            factor, decimals = row["expanded_mm"] / u, xml.decimals_of(row["expanded_mm"])
         # The reference has the uncertainty of its own certificate, not that of this calibration's coverage factor.
         exact, construction = "" if length.u else "Taken as exact", None
         reference = real(float(length.value), MILLIMETRE, float(length.u) or None)
@@ -241,8 +239,8 @@ def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool
         if fixed_scale:
             construction = english("description", _FIXED_SCALE)
         else:
-            by_arm = real(measured, MILLIMETRE, decimals=decimals)
-            of_error = real(error, MILLIMETRE, u if _is_known(u) else None, factor, decimals)
+            by_arm = real(row["measured_mm"], MILLIMETRE, decimals=decimals)
+            of_error = real(row["error_mm"], MILLIMETRE, u, factor, decimals)
             quantities += [
                 named("quantity", "measured value", by_arm, ref_type="basic_measuredValue"),
                 named("quantity", "error", of_error, ref_type="basic_measurementError"),
@@ -313,7 +311,9 @@ def _covariance(record: CalibrationRecord) -> Element | None:
     rows = []
     for i, values, unit in zip(index, covariance.tolist(), units, strict=True):
         products = [f"{unit}{_SQUARED}" if unit == other and unit in _SIMPLE else unit + other for other in units]
-        rows.append(xml.table_row(record.names[i], values, products))
+        numbers = xml.si("valueXMLList", " ".join(f"{value:.8g}" for value in values))
+        row = xml.si("realListXMLList", numbers, xml.si("unitXMLList", " ".join(products)))
+        rows.append(element("quantity", text("name", record.names[i]), row))
     return _result(
         "Covariance matrix",
         "Of the parameters with an uncertainty of their own, a row each, columns in the same order. The diagonal has "

@@ -6,7 +6,7 @@ Elements and their order are those of the published schemas, https://ptb.de/dcc/
 https://ptb.de/si/v2.2.1/SI_Format.xsd.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib import metadata
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -48,16 +48,17 @@ def optional(tag: str, words: str | None) -> Element | None:
     return None if words is None else element(tag, words)
 
 
-def english(tag: str, words: str) -> Element:
-    """A term or sentence of this package, in English."""
+def text(tag: str, words: str, lang: str | None = None) -> Element:
+    """A name or text given by people, in whatever language where none is stated."""
     content = element("content", words)
-    content.set("lang", "en")
+    if lang is not None:
+        content.set("lang", lang)
     return element(tag, content)
 
 
-def text(tag: str, words: str) -> Element:
-    """A name or text given by people, in whatever language."""
-    return element(tag, element("content", words))
+def english(tag: str, words: str) -> Element:
+    """A term or sentence of this package, in English."""
+    return text(tag, words, "en")
 
 
 def named(tag: str, name: str, *children: Child, says: str = "", ref_type: str | None = None) -> Element:
@@ -98,31 +99,25 @@ def real(
     uncertainty = None
     if u is not None and factor is not None:
         decimals = decimals_of(factor * u)
-        uncertainty = _si(
+        uncertainty = si(
             "expandedMU",
-            _si("valueExpandedMU", rounded(factor * u, decimals)),
-            _si("coverageFactor", f"{factor:.4g}"),
-            _si("coverageProbability", repr(LEVEL)),
+            si("valueExpandedMU", rounded(factor * u, decimals)),
+            si("coverageFactor", f"{factor:.4g}"),
+            si("coverageProbability", repr(LEVEL)),
         )
     elif u is not None:
-        uncertainty = _si("standardMU", _si("valueStandardMU", repr(float(u))))
-    return _si(
+        uncertainty = si("standardMU", si("valueStandardMU", repr(float(u))))
+    return si(
         "real",
         # repr is the shortest text that is read back as the same number.
-        _si("value", repr(float(value)) if decimals is None else rounded(value, decimals)),
-        _si("unit", unit),
-        None if uncertainty is None else _si("measurementUncertaintyUnivariate", uncertainty),
+        si("value", repr(float(value)) if decimals is None else rounded(value, decimals)),
+        si("unit", unit),
+        None if uncertainty is None else si("measurementUncertaintyUnivariate", uncertainty),
     )
 
 
-def table_row(name: str, values: Sequence[float], units: Sequence[str]) -> Element:
-    """A row of a table: numbers with eight significant digits, and the unit of each."""
-    numbers = _si("valueXMLList", " ".join(f"{value:.8g}" for value in values))
-    row = _si("realListXMLList", numbers, _si("unitXMLList", " ".join(units)))
-    return element("quantity", text("name", name), row)
-
-
-def _si(tag: str, *children: Child) -> Element:
+def si(tag: str, *children: Child) -> Element:
+    """An element of the schema of values with units."""
     return element(tag, *children, prefix="si")
 
 

@@ -139,21 +139,22 @@ def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]
 
 
 def _checked_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
-    from ..files.commanded_poses import read_known_poses
+    from ..files.pose_tables import read_poses
 
-    table = read_known_poses(InputFile(path), specification.arm.joints, unit=unit)
-    positions, rotations, frame = table.positions, table.rotations, first_frame(specification)
+    table, frame = read_poses(InputFile(path), specification.arm, unit=unit, recorded=True), first_frame(specification)
+    positions = None if table.poses is None else table.poses[:, :3, 3]
+    rotations = table.poses[:, :3, :3] if table.poses is not None and table.oriented else None
     if positions is not None and frame is not None:
         frame = np.linalg.inv(frame)
         positions = positions @ frame[:3, :3].T + frame[:3, 3]
         rotations = None if rotations is None else frame[:3, :3] @ rotations
-    tips = {"sockets": table.sockets, "positions": positions, "rotations": rotations}
+    tips = {"sockets": table.sockets if positions is None else None, "positions": positions, "rotations": rotations}
     check = with_spinner("Comparing", lambda: diagnostics.check_readings(specification.arm, table.q, **tips))
     if positions is not None:
         seen = data.observations.MeasuredPoints("table", table.q, positions, station="table")
         capture = data.Capture({}, observations=[seen])
     else:
-        owner = np.array(table.sockets or ())
+        owner = np.array(table.sockets)
         capture = data.Capture({name: table.q[owner == name] for name in dict.fromkeys(owner.tolist())})
     return _check_summary(specification, check, capture, table.unit, table.length_unit)
 

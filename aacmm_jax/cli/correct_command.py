@@ -71,7 +71,7 @@ def correct(
     reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
     """
     from ..core.numpy_or_jax import to_numpy
-    from ..files.commanded_poses import corrected_csv, read_commanded_poses
+    from ..files.pose_tables import corrected_csv, read_poses
 
     begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with a reading for each joint")
     picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]
@@ -81,7 +81,7 @@ def correct(
         if probe is not None:
             tool = numbers_option("--probe", probe, "X,Y,Z in mm", 3)
             nominal, calibrated = nominal.replace(probe=tool), calibrated.replace(probe=tool)
-        commanded = read_commanded_poses(
+        commanded = read_poses(
             InputFile(poses), nominal, unit=unit, near=begin, columns=picked, length_unit=length_unit
         )
         q = _at_temperature(commanded, calibrated, temperature)

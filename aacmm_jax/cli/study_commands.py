@@ -44,9 +44,6 @@ def study(
     shards: bool = flag(
         "--shards", "Dask workers write their trials themselves, to the output's folder, which they share."
     ),
-    keep_parts: bool = flag(
-        "--keep-parts", "Leave the workers' files in their folder at the end: for results too large to copy."
-    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Run a Monte Carlo study of simulated calibrations.
@@ -86,7 +83,7 @@ def study(
         here = nullcontext((None, workers))
         with _progress_display() as show, here if dask is None else dask_executor(dask) as (executor, count):
             settings = {"executor": executor, "workers": count, "watch": show}
-            outcome = run_study(asked, output, chunk=chunk, shards=shards, keep_parts=keep_parts, **settings)
+            outcome = run_study(asked, output, chunk=chunk, shards=shards, **settings)
         summary = {
             "kind": "study",
             "written": str(output),

@@ -3,20 +3,16 @@
 A new version of one of them is tried against this module; ruff forbids those names everywhere else (pyproject.toml).
 """
 
-from collections.abc import Callable
 from os import _exit as end_process  # noqa: F401 - at once, whatever threads still do
 from typing import Any
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.core
 import numpy as np
 from jax.custom_derivatives import SymbolicZero as SymbolicZero
 from jax.experimental.compilation_cache.compilation_cache import reset_cache as reset_compilation_cache  # noqa: F401
 from jaxtyping import Array, Int
-
-Static = eqxi.Static  # a leaf that jit takes as a constant
 
 
 def is_traced(value: object) -> bool:
@@ -33,18 +29,6 @@ def jax_setting(name: str, usual: Any) -> Any:
     """A setting of JAX as it is now, or ``usual`` where this version of JAX has none of this name."""
     config: Any = jax.config
     return getattr(config, name, config.values.get(name, usual))  # some have no attribute
-
-
-def while_loop(cond_fun: Callable, body_fun: Callable, init_val: Any, *, max_steps: int | None) -> Any:
-    """XLA's own loop, with Equinox's limit on steps: the form that Optimistix asks of an adjoint."""
-    return eqxi.while_loop(cond_fun, body_fun, init_val, max_steps=max_steps, kind="lax")
-
-
-def implicit_jvp(*arguments: Any) -> Any:
-    """Optimistix's implicit differentiation of a root. (Imported late: it takes 0.2 s.)"""
-    from optimistix.internal import implicit_jvp
-
-    return implicit_jvp(*arguments)
 
 
 def member_numbers(member: Any) -> Int[Array | np.ndarray, "*batch"]:

@@ -11,15 +11,11 @@ rest: it converts lists to arrays, compares shapes across arguments, and raises 
         u: Annotated[Float[AnyArray, ""] | Float[AnyArray, "poses"], Range(least=0)] = 0.0,
         *,
         diameter: Annotated[float, Range(above=0, unit="mm")],
-        method: Literal["joint", "two-stage"] = "joint",
-        lengths: Sequence[ReferenceLength] = (),
-        trials: Count = 100,
     ): ...
 
     sphere("S", [[0.1, 0.2]], diameter=-1)  # diameter of sphere 'S' is -1 mm; it must be positive.
     sphere("S", [[0.1, 0.2]], [1, 2], diameter=9)
     # u of sphere 'S' has shape (2,); give one number, or (poses,) with 1 pose.
-    sphere("S", [[0.1, 0.2]], diameter=9, method="jiont")  # method of sphere 'S' is 'jiont'; did you mean 'joint'?
 
 | annotation | what passes, and what the function gets |
 |---|---|

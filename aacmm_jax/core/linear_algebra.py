@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 
 from .numpy_or_jax import AnyArray, namespace
 
+Square = Float[AnyArray, "*batch p p"]
+Rows = Float[AnyArray, "*batch p"]
 _EPSILON = float(np.finfo(np.float64).eps)
 # Rows of matrices whose factors are written out entry by entry. With six, XLA fuses pivots into more than one place and
 # rounds them differently there, which costs four digits.
@@ -23,9 +25,7 @@ _LARGE = 60  # rows from which the inverse of a triangle is worth the import of 
 _MAX_SWEEPS = 30  # of Jacobi rotations; matrices of 40 rows need about 10
 
 
-def length_and_direction(
-    vectors: Float[AnyArray, "k m"],
-) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "k m"]]:
+def length_and_direction(vectors: Float[AnyArray, "k m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "k m"]]:
     """Lengths of vectors that are columns, and unit vectors along them, with finite derivatives; of 0, both are 0."""
     xp = namespace(vectors)
     square = xp.sum(vectors**2, axis=0)
@@ -49,9 +49,7 @@ def products_by_column(
     return sum(products[1:], products[0])
 
 
-def solve_positive_definite(
-    matrix: Float[AnyArray, "*batch p p"], right: Float[AnyArray, "*batch p"]
-) -> Float[AnyArray, "*batch p"]:
+def solve_positive_definite(matrix: Square, right: Rows) -> Rows:
     """Solution x of matrix x = right by Cholesky; NaN where the matrix is not positive definite to working
     precision."""
     if namespace(matrix, right) is jnp:
@@ -86,7 +84,7 @@ def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple
     return solution, (inverse_positive_definite(matrix) @ change[..., None])[..., 0]
 
 
-def inverse_cholesky(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "*batch p p"]:
+def inverse_cholesky(matrix: Square) -> Square:
     """W, lower triangular with W matrix W^T = I: the inverse of the Cholesky factor. It whitens what has this
     covariance."""
     if namespace(matrix) is jnp:
@@ -119,7 +117,7 @@ def _inverse_cholesky(matrix: Float[Array, "*batch p p"]) -> Float[Array, "*batc
     return jnp.tril(_triangular(jnp.concatenate([matrix, identity], axis=-1))[..., p:])
 
 
-def _inverse_cholesky_by_entries(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "*batch p p"]:
+def _inverse_cholesky_by_entries(matrix: Square) -> Square:
     """The same, entry by entry: for many very small matrices several times as fast as loops over their rows."""
     p, xp = matrix.shape[-1], namespace(matrix)
     factor: list[list[Any]] = []  # rows of the Cholesky factor, left of the diagonal
@@ -147,7 +145,7 @@ def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Any]) -> tuple[
     return whitening, -half @ whitening
 
 
-def inverse_positive_definite(matrix: Float[AnyArray, "*batch p p"]) -> Float[AnyArray, "*batch p p"]:
+def inverse_positive_definite(matrix: Square) -> Square:
     """Inverse of a symmetric positive definite matrix; NaN where it is not."""
     whitening, p = inverse_cholesky(matrix), matrix.shape[-1]
     if namespace(matrix) is jnp and p <= _UNROLLED:
@@ -223,9 +221,7 @@ def singular_values(
     return left, values, stacked[..., height:, :]
 
 
-def semidefinite_eigen(
-    matrix: Float[AnyArray, "*batch p p"],
-) -> tuple[Float[AnyArray, "*batch p"], Float[AnyArray, "*batch p p"]]:
+def semidefinite_eigen(matrix: Square) -> tuple[Rows, Square]:
     """Eigenvalues in descending order and eigenvectors (columns) of a symmetric positive semidefinite matrix.
 
     Its singular values are its eigenvalues. No derivative passes: that of an eigenvector is infinite where values

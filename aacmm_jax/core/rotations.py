@@ -10,6 +10,8 @@ from jaxtyping import Float
 from .linear_algebra import semidefinite_eigen
 from .numpy_or_jax import AnyArray, namespace
 
+Vectors = Float[AnyArray, "3 ..."]
+Matrices = Float[AnyArray, "3 3 ..."]
 _SMALL = 1e-6  # rad^2: below it the series are exact to rounding
 # The matrix W of a cross product, W v = w x v, by the components of w: its nine entries as rows.
 _CROSS = np.zeros((9, 3))
@@ -22,12 +24,12 @@ def cross(u: Float[AnyArray, "... 3 m"], v: Float[AnyArray, "... 3 m"]) -> Float
     return namespace(u, v).stack([u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0], axis=-2)
 
 
-def cross_matrix(w: Float[AnyArray, "3 ..."]) -> Float[AnyArray, "3 3 ..."]:
+def cross_matrix(w: Vectors) -> Matrices:
     """The matrices that take vectors v to the cross products w x v."""
     return (namespace(w).asarray(_CROSS) @ w.reshape(3, -1)).reshape(3, 3, *w.shape[1:])
 
 
-def _coefficients(w: Float[AnyArray, "3 ..."]) -> tuple[AnyArray, AnyArray, AnyArray]:
+def _coefficients(w: Vectors) -> tuple[AnyArray, AnyArray, AnyArray]:
     """sin t / t, (1 - cos t) / t^2 and (t - sin t) / t^3 of the angle t; by series near 0."""
     xp = namespace(w)
     square = xp.sum(w**2, axis=0)
@@ -41,29 +43,25 @@ def _coefficients(w: Float[AnyArray, "3 ..."]) -> tuple[AnyArray, AnyArray, AnyA
     )
 
 
-def rotation_matrix(w: Float[AnyArray, "3 ..."]) -> Float[AnyArray, "3 3 ..."]:
+def rotation_matrix(w: Vectors) -> Matrices:
     """The rotation by the angle ``|w|`` about the axis ``w`` (Rodrigues 1840)."""
     sine, cosine, _ = _coefficients(w)
     return _polynomial(w, sine, cosine)
 
 
-def rotation_derivative(w: Float[AnyArray, "3 ..."]) -> Float[AnyArray, "3 3 ..."]:
+def rotation_derivative(w: Vectors) -> Matrices:
     """J with exp(w + dw) = exp(J dw) exp(w) to first order: the left Jacobian of the rotation group."""
     _, cosine, cubic = _coefficients(w)
     return _polynomial(w, cosine, cubic)
 
 
-def rotation_and_derivative(
-    w: Float[AnyArray, "3 ..."],
-) -> tuple[Float[AnyArray, "3 3 ..."], Float[AnyArray, "3 3 ..."]]:
+def rotation_and_derivative(w: Vectors) -> tuple[Matrices, Matrices]:
     """`rotation_matrix` and `rotation_derivative`, from the same sines and cosines."""
     sine, cosine, cubic = _coefficients(w)
     return _polynomial(w, sine, cosine), _polynomial(w, cosine, cubic)
 
 
-def _polynomial(
-    w: Float[AnyArray, "3 ..."], first: Float[AnyArray, "..."], second: Float[AnyArray, "..."]
-) -> Float[AnyArray, "3 3 ..."]:
+def _polynomial(w: Vectors, first: Float[AnyArray, "..."], second: Float[AnyArray, "..."]) -> Matrices:
     """I + first W + second W^2, with W the matrix of the cross product by w, and W^2 = w w^T - |w|^2 I."""
     xp = namespace(w, first, second)
     identity = xp.asarray(np.eye(3).reshape(3, 3, *(1,) * (w.ndim - 1)))

@@ -22,7 +22,6 @@ from .capture_data import (
     UNKNOWN,
     ReferenceLength,
     Repeated,
-    check_different,
     check_revolutions,
     check_temperatures,
     checked_parts,
@@ -90,9 +89,8 @@ class Capture(eqx.Module):
     ):
         # Sockets are observations like any other; they alone are kept as one array, since there may be thousands.
         given = checked_parts(sockets, observations)
-        rows = [different_poses(part) for part in given]
+        rows = different_poses(given)
         parts = [part if kept is None else part.select(kept) for part, kept in zip(given, rows, strict=True)]
-        check_different(parts)
         seats, self.observations = parts[: len(sockets)], tuple(parts[len(sockets) :])
         self.q = joined([part.q for part in seats]) if seats else jnp.zeros((0, given[0].q.shape[-1]))
         self.names = tuple(part.name for part in seats)

@@ -168,32 +168,33 @@ def checked_parts(sockets: Mapping[str, Numbers], observations: Any) -> tuple[Ab
     return parts
 
 
-def different_poses(part: AbstractObservation) -> list[int] | None:
-    """The first of each pose; None where all differ. The same reading may have been measured several times, and only
-    known values are compared."""
-    values = [getattr(part, field) for field in part.by_pose]
-    if not is_concrete(*values):
-        return None
-    first: dict[tuple[bytes, ...], int] = {}
-    arrays = [np.asarray(value) for value in values]
-    arrays = [array + 0.0 if array.dtype.kind == "f" else array for array in arrays]  # which has no negative zero
-    for i, rows in enumerate(zip(*arrays, strict=True)):
-        first.setdefault(tuple(row.tobytes() for row in rows), i)
-    return None if len(first) == part.q.shape[0] else list(first.values())
+def different_poses(parts: Iterable[AbstractObservation]) -> list[list[int] | None]:
+    """The first of each pose of every part; None where all differ. The same reading may have been measured several
+    times, and only known values are compared.
 
-
-def check_different(parts: Iterable[AbstractObservation]) -> None:
-    """Refuse two sockets, or two observations of one kind, with exactly the same poses: one file given twice."""
-    seen: dict[tuple[str, bytes], AbstractObservation] = {}
+    Raises `InputError` for two sockets, or two observations of one kind, with exactly the same poses: one file given
+    twice.
+    """
+    kept: list[list[int] | None] = []
+    seen: dict[Any, AbstractObservation] = {}
     for part in parts:
-        arrays = [getattr(part, field) for field in part.by_pose]
-        if is_concrete(*arrays) and part.q.shape[0] > 1:
-            twin = seen.setdefault((part.kind, b"".join(np.asarray(array).tobytes() for array in arrays)), part)
-            if twin is not part:
-                what = "sockets" if part.kind == Socket.kind else "observations"
-                raise InputError(
-                    f"{what} '{twin.name}' and '{part.name}' have exactly the same poses; is one file given twice?"
-                )
+        values = [getattr(part, field) for field in part.by_pose]
+        if not is_concrete(*values):
+            kept.append(None)
+            continue
+        first: dict[tuple[bytes, ...], int] = {}
+        arrays = [np.asarray(value) for value in values]
+        arrays = [array + 0.0 if array.dtype.kind == "f" else array for array in arrays]  # which has no negative zero
+        for i, rows in enumerate(zip(*arrays, strict=True)):
+            first.setdefault(tuple(row.tobytes() for row in rows), i)
+        twin = seen.setdefault((part.kind, *first), part) if len(first) > 1 else part
+        if twin is not part:
+            what = "sockets" if part.kind == Socket.kind else "observations"
+            raise InputError(
+                f"{what} '{twin.name}' and '{part.name}' have exactly the same poses; is one file given twice?"
+            )
+        kept.append(None if len(first) == part.q.shape[0] else list(first.values()))
+    return kept
 
 
 def different_lengths(

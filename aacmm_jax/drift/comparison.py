@@ -207,15 +207,17 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
             yield f"Failed: {label}. {record.reason} Its changes mean nothing."
         elif not record.plausible_scale:
             yield f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm."
-    both = f"Not independent: {labels[0]} and {labels[1]}"
     poses = [{row.tobytes() for row in np.asarray(record.recording.capture.readings)} for record in (old, new)]
     if poses[0] == poses[1]:
         values = [_values(record.calibrated.arm, old.names) for record in (old, new)]
         same = old.names == new.names and np.array_equal(values[0], values[1])
         what = "are one and the same calibration" if same else "are of the same capture"
-        yield f"{both} {what}, so drift cannot be seen."
+        yield f"Not independent: {labels[0]} and {labels[1]} {what}, so drift cannot be seen."
     elif common := len(poses[0] & poses[1]):
-        yield f"{both} share {common} of {len(poses[1])} poses, so the uncertainties of the changes are wrong."
+        yield (
+            f"Not independent: {labels[0]} and {labels[1]} share {common} of {len(poses[1])} poses, so the "
+            "uncertainties of the changes are wrong."
+        )
     nominal = [record.recording.nominal for record in (old, new)]
     names = tuple(dict.fromkeys(name for specification in nominal for name in parameter_names(specification.arm)))
     values = zip(names, *(_values(specification.arm, names) for specification in nominal), strict=True)
@@ -227,8 +229,10 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
             "fixed parameters count as drift."
         )
     if old.final_method != new.final_method:
-        methods = f"{labels[0]} is {old.final_method}, {labels[1]} {new.final_method}"
-        yield f"Different methods: {methods}; this is part of the change."
+        yield (
+            f"Different methods: {labels[0]} is {old.final_method}, {labels[1]} {new.final_method}; "
+            "this is part of the change."
+        )
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         if alone := [name for name in record.names if name not in other.names]:
             yield (

@@ -67,8 +67,14 @@ class Drift(NamedTuple):
         probe = self.joint_test.probe
         together = _of_all(self), "" if probe is None else _of_probe(self, probe)
         together = together[::-1] if probe is not None and probe.remounted else together
-        sentences = (*together, _of_each(self), *_of_lengths(self.lengths, self.level), _of_undetermined(self))
-        return [sentence for sentence in sentences if sentence]
+        sentences = [*together, _of_each(self), *_of_lengths(self.lengths, self.level)]
+        open_names: dict[str, list[str]] = {}
+        for name, reason in zip(self.names, self.reasons, strict=True):
+            if reason:
+                open_names.setdefault(reason, []).append(name)
+        groups = [f"{shorten(names)} ({reason})" for reason, names in open_names.items()]
+        sentences += [f"Without an uncertainty of change: {'; '.join(groups)}."] if groups else []
+        return list(filter(None, sentences))
 
 
 class Trend(NamedTuple):
@@ -155,16 +161,12 @@ def _of_each(drift: Drift) -> str:
     chance = f"{drift.by_chance:.0f}" if drift.by_chance >= 0.95 else f"{drift.by_chance:.1g}"
     whose = "its" if len(moved) == 1 else "their"
     count = f"{len(moved) or 'None'} of {drift.compared} parameters moved beyond {whose} uncertainty"
+    changes = []
+    for i in sorted(map(int, moved), key=lambda i: -abs(drift.change[i]) / drift.expanded[i]):
+        name, unit, u = drift.names[i], drift.units[i], float(drift.expanded[i])
+        changes.append(f"{name} by {in_words(unit, float(drift.change[i]))} (U = {in_words(unit, u, '')})")
     start = f"{count} ({100 * drift.level:g} %; {chance} would by chance)"
-    if not len(moved):
-        return f"{start}."
-    worst = sorted(moved, key=lambda i: -abs(drift.change[i]) / drift.expanded[i])
-    changes = [
-        f"{drift.names[i]} by {in_words(drift.units[i], drift.change[i])} "
-        f"(U = {in_words(drift.units[i], drift.expanded[i], '')})"
-        for i in map(int, worst)
-    ]
-    return f"{start}: {shorten(changes)}."
+    return f"{start}: {shorten(changes)}." if changes else f"{start}."
 
 
 def _of_lengths(lengths: LengthChange, level: float) -> Iterator[str]:
@@ -191,15 +193,6 @@ def _of_lengths(lengths: LengthChange, level: float) -> Iterator[str]:
             f"On average the same lengths measure {1e6 * abs(lengths.scale_change):.{decimals}f} um/m {word} than "
             f"before (U = {expanded:.{decimals}f} um/m), which is {relation} the uncertainty."
         )
-
-
-def _of_undetermined(drift: Drift) -> str:
-    names: dict[str, list[str]] = {}
-    for name, reason in zip(drift.names, drift.reasons, strict=True):
-        if reason:
-            names.setdefault(reason, []).append(name)
-    groups = [f"{shorten(group)} ({reason})" for reason, group in names.items()]
-    return f"Without an uncertainty of change: {'; '.join(groups)}." if groups else ""
 
 
 def in_words(unit: str, value: float, sign: str = "+") -> str:

@@ -82,11 +82,6 @@ class LengthChange(NamedTuple):
         """The change of largest magnitude, with its sign, mm."""
         return float(self.change[np.argmax(np.abs(self.change))])
 
-    @property
-    def percentile_95(self) -> float:
-        """95th percentile of the magnitude, mm."""
-        return float(np.quantile(np.abs(self.change), 0.95))
-
 
 def joint_test(
     old: CalibrationRecord,

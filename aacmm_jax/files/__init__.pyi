@@ -12,7 +12,6 @@ from .calibrations import save_calibration as save_calibration
 from .captures import load_capture as load_capture
 from .captures import save_capture as save_capture
 from .cells import load_cell as load_cell
-from .cells import urdf_body as urdf_body
 from .compared_models import load_compared_models as load_compared_models
 from .compared_models import save_compared_models as save_compared_models
 from .controllers import dh_table as dh_table

@@ -36,18 +36,14 @@ def _text(text: str) -> str:
     return text
 
 
-Text = Annotated[str, AfterValidator(_text)]
-
-
 def _country(code: str) -> str:
     if not re.fullmatch("[A-Z]{2}", code):
         raise ValueError(f"{code!r} is not a country code of ISO 3166-1; give two capital letters, for example DE.")
     return code
 
 
+Text = Annotated[str, AfterValidator(_text)]
 Country = Annotated[str, AfterValidator(_country)]
-
-
 Date = Annotated[datetime.date, Field(strict=False)]  # also in quotes
 
 
@@ -161,12 +157,6 @@ def read_administrative_data(path: str | os.PathLike) -> AdministrativeData:
         path: a TOML file with the tables ``[laboratory]``, ``[customer]``, ``[item]``, ``[[person]]``,
             ``[certificate]``, ``[[reference]]`` and ``[conformity]``, each of them optional.
 
-    Returns:
-        The data, checked.
-
-    Raises:
-        InputError: names the file, the key in it and what to do.
-
     Example:
         >>> from pathlib import Path
         >>> _ = Path("laboratory.toml").write_text('laboratory = { name = "Metrology", city = "Braunschweig" }')
@@ -185,13 +175,9 @@ def check_conformity(
     verdict = about.conformity.verdict
     if simulated:
         raise InputError("conformity is stated of a simulated arm, which cannot conform; leave [conformity] out.")
-    passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict, ("conforms", "undecided", "fails"))
+    results = {"conforms": "every limit is kept", "fails": "a limit is not kept", "undecided": "a limit is undecided"}
+    passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict, tuple(results))
     if tested and decision not in passes:
-        results = {
-            "conforms": "every limit is kept",
-            "fails": "a limit is not kept",
-            "undecided": "a limit is undecided",
-        }
         raise InputError(
             f"conformity.verdict is '{verdict}', but of this evaluation "
             f"{results.get(decision or '', 'no limit was given')}; correct the statement."

@@ -61,9 +61,6 @@ def load_arm(
         probe: A tool's tip ``(3,)`` in the frame of the last link, mm; by default that frame's origin. Not of an arm
             file that states one.
 
-    Raises:
-        InputError: There is neither, or the file is not an arm's.
-
     Example:
         >>> panda = aj.load_arm("panda")
         >>> print(panda.joints, panda.a)

@@ -36,9 +36,6 @@ def save_capture(path: str | os.PathLike, recording: Recording, summary: Mapping
         recording: the capture, with its nominal arm.
         summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
-    Raises:
-        InputError: the file cannot be written, or a name holds a character that no file can hold.
-
     Example:
         >>> aj.files.save_capture("capture.h5", recording)
         >>> print(np.array_equal(aj.files.load_capture("capture.h5").capture.q, capture.q))
@@ -52,9 +49,6 @@ def load_capture(path: str | os.PathLike) -> Recording:
 
     Args:
         path: the file to read.
-
-    Raises:
-        InputError: the file does not exist, is damaged, is not of this kind, or was written by another version.
 
     Example:
         >>> aj.files.save_capture("capture.h5", recording)

@@ -9,20 +9,20 @@ import os
 import re
 from itertools import combinations, product
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from pydantic import Field, FiniteFloat, NonNegativeFloat, PositiveFloat
 
 from ..core.errors import InputError, naming
 from ..kinematics.axes_to_dh import Transform, dh_frames, geometry_of, inverse
 from ..kinematics.collisions import Body, Box, Cell, HalfSpace, Post, body_along_links, check_obstacle, segment_distance
-from ..kinematics.parameters import ArmSpecification
+from ..kinematics.parameters import ArmSpecification, UrdfSource
 from ..kinematics.workspace import total_link_length
 from .arms import load_specification, urdf_folder
 from .inputs import InputFile
-from .toml import Strict, read_toml
+from .toml import Point, Strict, read_toml
 from .urdf import urdf_chain
 from .urdf_text import UrdfShape, collision_shapes
 
@@ -30,26 +30,24 @@ _CENTRING = 60  # steps to the middle of the smallest circle
 _HEADER, _TRIANGLE = 84, 50  # bytes of a binary STL: before the triangles, and of each
 _SLENDER = 0.05  # radius of a link where none is stated, of all links' length
 
-_Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-
 
 class _HalfSpace(Strict):
     name: str
-    normal: _Point
-    point: _Point
+    normal: Point
+    point: Point
 
 
 class _Box(Strict):
     name: str
-    centre: _Point
-    size: _Point
-    rotation: _Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
+    centre: Point
+    size: Point
+    rotation: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
 
 
 class _Capsule(Strict):
     name: str
-    start: _Point
-    end: _Point
+    start: Point
+    end: Point
     radius: PositiveFloat
 
 
@@ -98,9 +96,6 @@ def load_cell(
         tip: As of `load_arm`.
         radius: Radius of the links, mm, in place of the file's.
 
-    Raises:
-        InputError: Naming the file and the place in it.
-
     Example:
         >>> from pathlib import Path
         >>> _ = Path("cell.toml").write_text('''clearance = 20.0
@@ -114,39 +109,25 @@ def load_cell(
         ('shoulder', 'upper_arm', 'forearm') ['table'] 20.0
     """
     content: Any = _CellFile() if file is None else read_toml(file, _CellFile)
-    obstacles: tuple[Any, ...] = (
-        *(HalfSpace(row.name, tuple(row.normal), tuple(row.point)) for row in content.half_space),
-        *(Box(row.name, tuple(row.centre), tuple(row.size), tuple(row.rotation)) for row in content.box),
-        *(Post(row.name, tuple(row.start), tuple(row.end), row.radius) for row in content.capsule),
-    )
+    rows: Any = ((HalfSpace, content.half_space), (Box, content.box), (Post, content.capsule))
+    obstacles: list[Any] = []
+    for kind, tables in rows:
+        for row in tables:
+            obstacles.append(kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in row}))
+    radius = content.body.radius if radius is None else radius
     with contextlib.nullcontext() if file is None else naming(file):
         for obstacle in obstacles:
             check_obstacle(obstacle)
-        stated = content.body.radius if radius is None else radius
-        body, notes = _body(arm, base, tip, stated, content.body.tool_radius)
-    return LoadedCell(Cell(body, obstacles, content.clearance), notes)
-
-
-def _body(
-    source: str | os.PathLike, base: str | None, tip: str | None, radius: Any, tool_radius: float | None
-) -> tuple[Body, tuple[str, ...]]:
-    specification = load_specification(source, base=base, tip=tip)
-    slender = _SLENDER * total_link_length(specification.arm)
-    if radius is None and specification.urdf is not None:
-        body = urdf_body(specification, urdf_folder(source), slender)
-        if body is not None:
-            return body
-    notes = ()
-    if radius is None:
-        notes = (f"links are taken as {slender:.0f} mm in radius, 5 % of their length; state their radius.",)
-    return body_along_links(specification.arm, slender if radius is None else radius, tool_radius), notes
-
-
-class UrdfBody(NamedTuple):
-    """An arm's body, and what of it is not from the file's shapes, in sentences."""
-
-    body: Body
-    notes: tuple[str, ...]
+        specification, notes = load_specification(arm, base=base, tip=tip), ()
+        slender, body = _SLENDER * total_link_length(specification.arm), None
+        if radius is None and specification.urdf is not None:
+            body, notes = _urdf_body(specification, specification.urdf, urdf_folder(arm), slender)
+        if body is None:
+            if radius is None:
+                notes = (f"links are taken as {slender:.0f} mm in radius, 5 % of their length; state their radius.",)
+            stated = slender if radius is None else radius
+            body = body_along_links(specification.arm, stated, content.body.tool_radius)
+    return LoadedCell(Cell(body, tuple(obstacles), content.clearance), notes)
 
 
 class _Row(NamedTuple):
@@ -160,37 +141,19 @@ class _Row(NamedTuple):
     radius: float
 
 
-def urdf_body(specification: ArmSpecification, folder: Path, radius: float) -> UrdfBody | None:
-    """Capsules about the collision shapes of the links between base and tip; side branches at reading 0.
+def _urdf_body(
+    specification: ArmSpecification, urdf: UrdfSource, folder: Path, radius: float
+) -> tuple[Body | None, tuple[str, ...]]:
+    """Capsules about the collision shapes of the links between base and tip, side branches at reading 0; and notes.
 
-    Boxes, cylinders, spheres and the vertices of meshes (STL, OBJ) are each within one capsule. Links whose meshes are
-    not at hand have capsules about the lengths of their D-H row instead, and so has a probe beyond the tip.
-
-    Args:
-        specification: The arm as `read_urdf` gave it.
-        folder: The folder of the URDF, for its meshes.
-        radius: Radius where shapes are missing, mm.
-
-    Returns:
-        The body; None where the URDF has no collision shapes on these links.
-
-    Raises:
-        InputError: The arm is not from a URDF, or a shape cannot be read.
-
-    Example:
-        >>> from pathlib import Path
-        >>> robot = aj.files.load_specification("robot.urdf")
-        >>> body = aj.files.urdf_body(robot, Path("."), 40.0).body
-        >>> print(body.names, body.radius.round(1), "mm")
-        ('shoulder', 'upper_arm', 'forearm') [60.  56.6 42.4] mm
+    Links whose meshes are not at hand have capsules of this ``radius``, mm, about the lengths of their D-H row instead,
+    and so has a probe beyond the tip. No body where the URDF has no collision shapes on these links.
     """
-    if specification.urdf is None:
-        raise InputError("this arm was not read from a URDF, so it has no collision shapes; give radii of its links.")
-    chain, shapes = urdf_chain(specification.urdf), collision_shapes(specification.urdf.text)
+    chain, shapes = urdf_chain(urdf), collision_shapes(urdf.text)
     frames = dh_frames(geometry_of(chain.arm), chain.base)
     rows: list[_Row] = []
     missing: dict[int, str] = {}
-    for number, link, link_frame in chain.carried_links(specification.urdf.base):
+    for number, link, link_frame in chain.carried_links(urdf.base):
         for count, shape in enumerate(shapes.get(link, ()), start=1):
             capsule = _capsule(shape, inverse(frames[number]) @ link_frame @ shape.origin, folder)
             if capsule is None:
@@ -200,7 +163,7 @@ def urdf_body(specification: ArmSpecification, folder: Path, radius: float) -> U
             name = f"{link}/{count}" if len(shapes[link]) > 1 else link
             rows.append(_Row(name, number, start, number, end, width))
     if not rows and not missing:
-        return None
+        return None, ()
     simple, with_shape = body_along_links(specification.arm, radius), {row.end_frame for row in rows}
     tool = np.linalg.norm(np.asarray(specification.arm.probe) - np.asarray(chain.arm.probe)) > 0
     rows = [row for row in rows if not any(_holds(other, row) for other in rows)]
@@ -215,12 +178,7 @@ def urdf_body(specification: ArmSpecification, folder: Path, radius: float) -> U
     ):
         if links := [link for frame, link in missing.items() if (frame in with_shape) == partly]:
             notes.append(f"meshes of {', '.join(links)} are not at hand as STL or OBJ; {instead}.")
-    names, *columns = zip(*rows, strict=True)
-    return UrdfBody(Body(names, *map(np.array, columns), pairs=_pairs(rows, simple)), tuple(notes))
-
-
-def _pairs(rows: list[_Row], simple: Body) -> Int[np.ndarray, "m 2"]:
-    """The capsules that may not touch: not of one or successive links, of which those without a shape do not count."""
+    # Not of one or successive links may they touch, of which those without a shape do not count.
     rank = np.unique([row.end_frame for row in rows], return_inverse=True)[1]
     checked = {frozenset((simple.names[i], simple.names[j])) for i, j in simple.pairs}
     pairs = []
@@ -228,7 +186,8 @@ def _pairs(rows: list[_Row], simple: Body) -> Int[np.ndarray, "m 2"]:
         names = {rows[i].name, rows[j].name}
         if rank[j] - rank[i] > 1 and (not names <= set(simple.names) or names in checked):
             pairs.append((i, j))
-    return np.array(pairs, dtype=int).reshape(-1, 2)
+    names, *columns = zip(*rows, strict=True)
+    return Body(names, *map(np.array, columns), pairs=np.array(pairs, dtype=int).reshape(-1, 2)), tuple(notes)
 
 
 def _holds(outer: _Row, inner: _Row) -> bool:
@@ -265,34 +224,28 @@ def bounding_capsule(points: Float[np.ndarray, "m 3"]) -> tuple[np.ndarray, np.n
     the radius, and the caps are put as far in as the points allow; the axis with the smallest volume is taken.
     """
     centred = points - points.mean(axis=0)
-    axes = np.concatenate([np.linalg.eigh(centred.T @ centred)[1].T, np.eye(3)])
-    capsules = (_capsule_along(points, axis) for axis in axes)
-
-    def volume(capsule: tuple) -> float:
-        start, end, radius = capsule
-        return radius**2 * (np.linalg.norm(end - start) + 4 / 3 * radius)
-
-    return min(capsules, key=volume)
-
-
-def _capsule_along(points: Float[np.ndarray, "m 3"], axis: Float[np.ndarray, " 3"]) -> tuple:
-    along = points @ axis
-    flat = points - along[:, None] * axis
-    middle = (flat.min(axis=0) + flat.max(axis=0)) / 2
-    middle = middle - (middle @ axis) * axis
-    best, radius = middle, np.linalg.norm(flat - middle, axis=1).max()
-    for step in range(_CENTRING):  # Badoiu and Clarkson 2003: towards the farthest point by 1 / (i + 2) of the way
-        farthest = flat[np.argmax(np.sum((flat - middle) ** 2, axis=1))]
-        middle = middle + (farthest - middle) / (step + 2)
-        reach = np.linalg.norm(flat - middle, axis=1).max()
-        if reach < radius:
-            best, radius = middle, reach
-    inside = np.sqrt(np.maximum(radius**2 - np.sum((flat - best) ** 2, axis=1), 0.0))
-    low, high = np.min(along + inside), np.max(along - inside)
-    if low > high:  # a ball holds them all
-        low = high = (low + high) / 2
-        radius = np.linalg.norm(points - (best + low * axis), axis=1).max()
-    return best + low * axis, best + high * axis, float(radius)
+    capsules = []
+    for axis in np.concatenate([np.linalg.eigh(centred.T @ centred)[1].T, np.eye(3)]):
+        along = points @ axis
+        flat = points - along[:, None] * axis
+        middle = (flat.min(axis=0) + flat.max(axis=0)) / 2
+        middle = middle - (middle @ axis) * axis
+        best, radius = middle, np.linalg.norm(flat - middle, axis=1).max()
+        for step in range(_CENTRING):  # Badoiu and Clarkson 2003: towards the farthest point by 1 / (i + 2) of the way
+            farthest = flat[np.argmax(np.sum((flat - middle) ** 2, axis=1))]
+            middle = middle + (farthest - middle) / (step + 2)
+            reach = np.linalg.norm(flat - middle, axis=1).max()
+            if reach < radius:
+                best, radius = middle, reach
+        inside = np.sqrt(np.maximum(radius**2 - np.sum((flat - best) ** 2, axis=1), 0.0))
+        low, high = np.min(along + inside), np.max(along - inside)
+        if low > high:  # a ball holds them all
+            low = high = (low + high) / 2
+            radius = np.linalg.norm(points - (best + low * axis), axis=1).max()
+        start, end = best + low * axis, best + high * axis
+        volume = radius**2 * (np.linalg.norm(end - start) + 4 / 3 * radius)
+        capsules.append((volume, start, end, float(radius)))
+    return min(capsules, key=lambda capsule: capsule[0])[1:]
 
 
 def mesh_path(file: str, folder: Path) -> Path | None:

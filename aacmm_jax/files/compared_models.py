@@ -44,9 +44,6 @@ def save_compared_models(
         sources: Names and digests of the files that were read.
         seed: Seed of a random choice of poses.
 
-    Raises:
-        InputError: The file cannot be written, or a name holds a character that no file can hold.
-
     Example:
         >>> from aacmm_jax.summaries.compared_models import compared_models_summary
         >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
@@ -71,9 +68,6 @@ def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
     Args:
         path: The file to read.
 
-    Raises:
-        InputError: The file does not exist, is damaged, is not of this kind, or was written by another version.
-
     Example:
         >>> from aacmm_jax.summaries.compared_models import compared_models_summary
         >>> compared = aj.compare_models(arm, two_bars, bounds, models=["dh", "harmonics=1"])
@@ -82,8 +76,8 @@ def load_compared_models(path: str | os.PathLike) -> dict[str, Any]:
         >>> print(aj.files.load_compared_models("models.h5")["recommended"])
         dh
     """
-    with undamaged(path), opened(path, (KIND,)) as content:
-        summary = json.loads(str(content.values(content.file.id, "summary")))
+    with undamaged(path), opened(path, (KIND,)) as file:
+        summary = json.loads(file["summary"].asstr()[()])
         _check(path, summary)
         return summary
 

@@ -22,6 +22,7 @@ from ..kinematics.arm import (
     without_corrections,
 )
 from ..kinematics.axes_to_dh import Transform, canonical_origins, geometry_of
+from ..kinematics.chain import Geometry
 from ..kinematics.parameters import Parameters, single
 
 _UNITS = {"mm-deg": ("mm", "deg", 1.0, 1 / DEG), "m-rad": ("m", "rad", 1e-3, 1.0)}
@@ -58,9 +59,6 @@ def dh_table(
         units: ``"mm-deg"`` or ``"m-rad"``.
         base: The first frame in a robot's base link, mm, where it is another one.
 
-    Raises:
-        InputError: The convention or the units are unknown, or the arm is a batch.
-
     Example:
         >>> for line in aj.files.dh_table(arm).splitlines()[-3:]:
         ...     print(line)
@@ -69,27 +67,27 @@ def dh_table(
         6,0.0,11.5,0.0,-90.0,0.0
     """
     length_unit, angle_unit, length, angle = _UNITS[units]
+
+    def placed(transform: Transform) -> str:
+        xyz, rpy = length * transform[:3, 3], angle * roll_pitch_yaw(transform[:3, :3])
+        return f"x y z = {_row(xyz, ' ')} {length_unit}, roll pitch yaw = {_row(rpy, ' ')} {angle_unit}"
+
     geometry = geometry_of(without_corrections(single(arm)))
-    beta = np.zeros(arm.joints) if geometry.beta is None else geometry.beta
-    after = np.stack([length * geometry.a, angle * geometry.alpha, angle * beta], axis=1)
-    links, tip = after, length * geometry.probe
+    links = np.stack([length * geometry.a, angle * geometry.alpha, angle * _beta(geometry)], axis=1)
     lines = [f"# {_CRAIG if convention == 'craig' else _STANDARD}"]
     if arm.prismatic:
         lines.append(f"# {_SLIDES.format(', '.join(map(str, arm.prismatic)))}")
     if base is not None and not np.array_equal(base, np.eye(4)):
-        lines.append(f"# first frame in the base link: {_placed(base, length, angle, length_unit, angle_unit)}")
+        lines.append(f"# first frame in the base link: {placed(base)}")
     if convention == "craig":
-        links = np.concatenate([np.zeros((1, 3)), after[:-1]])
-        last = canonical_origins(geometry)[-1]
-        lines.append(f"# tip in the last frame: {_placed(last, length, angle, length_unit, angle_unit)}")
+        links = np.concatenate([np.zeros((1, 3)), links[:-1]])
+        lines.append(f"# tip in the last frame: {placed(canonical_origins(geometry)[-1])}")
     else:
-        lines.append(f"# tip in the last frame: x y z = {_row(tip, ' ')} {length_unit}")
-    heads = [f"a_{length_unit}", f"alpha_{angle_unit}", f"beta_{angle_unit}"]
-    lines.append(",".join(["joint", f"theta_{angle_unit}", f"d_{length_unit}", *heads]))
+        lines.append(f"# tip in the last frame: x y z = {_row(length * geometry.probe, ' ')} {length_unit}")
+    heads = [f"theta_{angle_unit}", f"d_{length_unit}", f"a_{length_unit}", f"alpha_{angle_unit}", f"beta_{angle_unit}"]
+    lines.append(",".join(["joint", *heads]))
     joints = np.stack([angle * geometry.theta, length * geometry.d], axis=1)
-    lines += [
-        f"{i},{_row((*joint, *link))}" for i, (joint, link) in enumerate(zip(joints, links, strict=True), start=1)
-    ]
+    lines += [f"{i},{_row(row)}" for i, row in enumerate(np.concatenate([joints, links], axis=1), start=1)]
     if arm.corrections is not None:
         lines.append("# coefficients of joint corrections, which are not Denavit-Hartenberg parameters:")
         coefficients = ((name, float(value_of(arm, name))) for name in correction_names(arm))
@@ -108,9 +106,6 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
         q: Readings, rad, or mm of prismatic joints: of the capture, or of the poses that matter.
-
-    Raises:
-        InputError: The arms or the readings have other numbers of joints.
 
     Example:
         >>> zeros = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))
@@ -136,15 +131,10 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
             if np.all(np.abs(change) < 1e-10):
                 break
         distances.append(np.linalg.norm(errors, axis=1))
-    rms_before, rms = (float(np.sqrt(np.mean(values**2))) for values in distances)
-    return ZeroOffsets(
-        vector[:-3] - np.asarray(Parameters(begin, tuple(offsets)).vector()),
-        tuple(by_joint(nominal, "rad", "mm")),
-        vector[-3:],
-        rms_before,
-        rms,
-        float(distances[1].max()),
-    )
+    rms_nominal, rms = (float(np.sqrt(np.mean(values**2))) for values in distances)
+    change = vector[:-3] - np.asarray(Parameters(begin, tuple(offsets)).vector())
+    units = tuple(by_joint(nominal, "rad", "mm"))
+    return ZeroOffsets(change, units, vector[-3:], rms_nominal, rms, float(distances[1].max()))
 
 
 def zero_offsets_csv(zeros: ZeroOffsets) -> str:
@@ -187,24 +177,19 @@ def python_program(arm: Arm, *, title: str, base: Transform | None = None) -> st
         True
     """
     geometry = geometry_of(single(arm))
-    beta = np.zeros(arm.joints) if geometry.beta is None else geometry.beta
-    base = np.eye(4) if base is None else base
-    values = {
-        "THETA": geometry.theta, "D": geometry.d, "A": geometry.a, "ALPHA": geometry.alpha, "BETA": beta,
-        "PROBE": geometry.probe,
-    }  # fmt: skip
+    values = {"THETA": geometry.theta, "D": geometry.d, "A": geometry.a, "ALPHA": geometry.alpha}
+    values |= {"BETA": _beta(geometry), "PROBE": geometry.probe}
     constants = [f"{name} = [{_row(row, ', ')}]" for name, row in values.items()]
     constants.append(f"PRISMATIC = {by_joint(arm, False, True)}")
-    rows = ",\n".join(f"    [{_row(row, ', ')}]" for row in base)
+    rows = ",\n".join(f"    [{_row(row, ', ')}]" for row in (np.eye(4) if base is None else base))
     template = Path(__file__).with_name("templates") / "program.txt"
     return template.read_text("utf-8").format(title=repr(title), base=rows, constants="\n".join(constants))
+
+
+def _beta(geometry: Geometry) -> Float[np.ndarray, " n"]:
+    return np.zeros(len(geometry.theta)) if geometry.beta is None else np.asarray(geometry.beta)
 
 
 def _row(values: Iterable[float], separator: str = ",") -> str:
     # Below 1e-12 of any unit is rounding.
     return separator.join(repr(float(value) if abs(value) > 1e-12 else 0.0) for value in values)
-
-
-def _placed(transform: Transform, length: float, angle: float, length_unit: str, angle_unit: str) -> str:
-    xyz, rpy = length * transform[:3, 3], angle * roll_pitch_yaw(transform[:3, :3])
-    return f"x y z = {_row(xyz, ' ')} {length_unit}, roll pitch yaw = {_row(rpy, ' ')} {angle_unit}"

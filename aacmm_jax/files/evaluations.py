@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.all_tests import checked_limits
 from ..acceptance.judgement import Expansion, Influences, Limit, Rule, checked_influences
-from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord
+from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord, checked_limits
 from ..acceptance.results import Measured
 from ..core.arguments import checked
 from ..kinematics.arm import parameter_names
@@ -37,9 +36,6 @@ def save_evaluation(
         path: the file to write.
         record: the evaluation, from `acceptance.evaluation_of`; or points with their limits.
         summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
-
-    Raises:
-        InputError: the file cannot be written, or a name holds a character that no file can hold.
 
     Example:
         >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal))
@@ -105,9 +101,6 @@ def load_evaluation(path: str | os.PathLike) -> Any:
 
     Returns:
         The record, from which the results are computed again.
-
-    Raises:
-        InputError: the file does not exist, is damaged, is not of this kind, or was written by another version.
 
     Example:
         >>> points = {"cone": true.position(capture.sockets["A"])}

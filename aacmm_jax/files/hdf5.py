@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from ..core.jax_setup import check_backend, is_from_jax
 from .inputs import STREAMED, largest_file, open_input, storable_name
 from .outputs import ELSEWHERE, storable, write_atomically
 from .reader_process import damaged, read_through, start, vouch_for
-
-if TYPE_CHECKING:
-    from .hdf5_content import Content
 
 FORMAT = "aacmm_jax"
 FORMAT_VERSION = 6  # fields are declared since 6, and earlier files are refused
@@ -234,15 +231,19 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
 
     Raises `InputError` where the file is missing, damaged, of another program or kind, or of another version.
     """
-    from .hdf5_content import attributes_of
+    from .hdf5_content import attributes_of, values_of
 
-    with opened(path, kinds) as content:
-        tables = {}
-        for name, group in content.groups():
-            if name not in without:
-                arrays = {key: content.values(group, key) for key in content.names(group)}
-                tables[name] = StoredTable(path, arrays, attributes_of(content.file[name]))
-    return Stored(Entries(path, "attribute", content.attributes), Entries(path, "table", tables))
+    with opened(path, kinds) as file:
+        groups = {name: group for name, group in file.items() if hasattr(group, "keys") and name not in without}
+        size = sum(data.size * data.dtype.itemsize for group in groups.values() for data in group.values())
+        if size > largest_file():
+            raise InputError(f"{path} holds arrays of {size / 2**20:,.0f} MiB, more than are read; name another file.")
+        tables = {
+            name: StoredTable(path, {key: values_of(data) for key, data in group.items()}, attributes_of(group))
+            for name, group in groups.items()
+        }
+        attributes = Entries(path, "attribute", attributes_of(file))
+    return Stored(attributes, Entries(path, "table", tables))
 
 
 def read_summary(path: str | os.PathLike, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any] | None]:
@@ -252,16 +253,17 @@ def read_summary(path: str | os.PathLike, kinds: Sequence[str]) -> tuple[dict[st
     """
     from importlib import metadata
 
-    with opened(path, kinds) as content:
-        current = content.attributes["package_version"] == metadata.version("aacmm_jax")
-        root = content.file.id
-        text = content.values(root, "summary") if current and "summary" in content.names(root) else None
-        return content.attributes, None if text is None else json.loads(str(text))
+    from .hdf5_content import attributes_of, values_of
+
+    with opened(path, kinds) as file:
+        attributes = attributes_of(file)
+        current = attributes["package_version"] == metadata.version("aacmm_jax") and "summary" in file
+        return attributes, json.loads(str(values_of(file["summary"]))) if current else None
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True) -> Iterator["Content"]:
-    """The content of a file of aacmm, of a kind that is asked for.
+def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True) -> Iterator[Any]:
+    """A file of aacmm (`h5py.File`), of a kind that is asked for.
 
     A file without the right SHA-256 at its end is never given to the HDF5 library. ``verify=False``: this process has
     verified it before. Raises `InputError` where it is damaged.
@@ -275,7 +277,7 @@ def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True
         source = stream.read() if size <= _IN_MEMORY else stream
         if verify and "h5py" not in sys.modules:
             start()  # which takes as long as the import here
-        from .hdf5_content import content_of, seal_of
+        from .hdf5_content import attributes_of, file_of, seal_of
 
         wanted = _with_article(" or ".join(kinds))
         if verify:
@@ -291,9 +293,9 @@ def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True
                     f"{path} is damaged or was edited: its content does not match its SHA-256; make it again."
                 )
             read_through(path, source, size, largest, seal)
-        with content_of(path, source, size, largest) as content:
-            _check_kind(Entries(path, "attribute", content.attributes), kinds, wanted)
-            yield content
+        with file_of(source) as file:
+            _check_kind(Entries(path, "attribute", attributes_of(file)), kinds, wanted)
+            yield file
 
 
 @contextlib.contextmanager

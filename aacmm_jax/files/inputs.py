@@ -39,8 +39,7 @@ class InputFile(os.PathLike):
     def __fspath__(self) -> str:
         return str(self._path)
 
-    def __str__(self) -> str:
-        return str(self._path)
+    __str__ = __fspath__
 
     @property
     def text(self) -> str:
@@ -60,10 +59,16 @@ def open_input(path: str | os.PathLike, times: float = 1) -> Iterator[Any]:
         return
     reading(as_path(path))
     limit = times * largest_file()
+
+    def check_ordinary(status: os.stat_result) -> None:
+        if not stat.S_ISREG(status.st_mode):
+            folder = stat.S_ISDIR(status.st_mode)
+            kind = "a folder; name a file" if folder else "a pipe or a device; name an ordinary file"
+            raise InputError(f"{path} is {kind}.")
+
     try:
         # Before it is opened, as opening a device may have effects; and again, as it may have been replaced.
-        if not _is_ordinary(os.stat(path)):
-            raise _not_ordinary(path)
+        check_ordinary(os.stat(path))
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; check the path.") from error
@@ -74,23 +79,13 @@ def open_input(path: str | os.PathLike, times: float = 1) -> Iterator[Any]:
         raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
     with open(descriptor, "rb") as stream:
         status = os.fstat(descriptor)
-        if not _is_ordinary(status):
-            raise _not_ordinary(path)
+        check_ordinary(status)
         if status.st_size > limit:
             raise InputError(
                 f"{path} has {status.st_size / 2**20:,.0f} MiB, more than the {limit / 2**20:,.0f} MiB that are read; "
                 f"name another file, or raise the limit with the environment variable {LARGEST_FILE}."
             )
         yield stream
-
-
-def _is_ordinary(status: os.stat_result) -> bool:
-    return stat.S_ISREG(status.st_mode)
-
-
-def _not_ordinary(path: str | os.PathLike) -> InputError:
-    kind = "a folder; name a file" if Path(path).is_dir() else "a pipe or a device; name an ordinary file"
-    return InputError(f"{path} is {kind}.")
 
 
 def fingerprint(path: str | os.PathLike, folder: str | os.PathLike | None = None) -> str:

@@ -10,25 +10,15 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import Field, FiniteFloat, NonNegativeInt, PositiveInt, create_model
 
-from ..core.errors import InputError
-from ..data.observations.declared import Entry
+from ..core.errors import InputError, naming
 from ..data.observations.observation import AbstractSimulated, simulated_kinds
 from ..planning.kit_placement import KitItem
-from .toml import Strict, read_toml
+from .toml import Point, Strict, read_toml
 
 _POSES = 20  # where none is stated
 _Numbers = list[FiniteFloat] | list[list[FiniteFloat]]
-_Point = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
-
-
-def _stated(entry: Entry) -> Any:
-    """The type of an entry in TOML, or None for one that is not stated."""
-    if entry.name == "errors":  # unknown to whoever has the artefact
-        return None
-    if entry.content == "number" and float not in (entry.annotation, *get_args(entry.annotation)):
-        return _Numbers
-    points = Annotated[dict[str, _Point], Field(min_length=1)]
-    return {"number": FiniteFloat, "count": PositiveInt, "text": str, "truth": bool, "points": points}[entry.content]
+_CONTENT = {"count": PositiveInt, "text": str, "truth": bool, "number": FiniteFloat}
+_CONTENT["points"] = Annotated[dict[str, Point], Field(min_length=1)]
 
 
 def _model(kind: type[AbstractSimulated]) -> type[Strict]:
@@ -37,12 +27,14 @@ def _model(kind: type[AbstractSimulated]) -> type[Strict]:
         "places": (NonNegativeInt, 0),
         "turned": (Literal["any", "vertical", "not"], "any"),
         "half_angle_deg": (Annotated[float, Field(gt=0, le=180)], 180.0),
-        "normal": (_Point, [0.0, 0.0, 1.0]),
+        "normal": (Point, [0.0, 0.0, 1.0]),
     }
     for entry in kind.entries:
-        stated = _stated(entry)
-        if stated is not None:
-            fields[entry.name] = (stated, ...) if entry.required else (stated | None, None)
+        if entry.name == "errors":  # unknown to whoever has the artefact
+            continue
+        array = entry.content == "number" and float not in (entry.annotation, *get_args(entry.annotation))
+        stated = _Numbers if array else _CONTENT[entry.content]
+        fields[entry.name] = (stated, ...) if entry.required else (stated | None, None)
     fields["poses"] = (PositiveInt, _POSES)
     return create_model(f"{kind.__name__}Table", __base__=Strict, **fields)
 
@@ -56,7 +48,7 @@ _Kit = create_model("_Kit", __base__=Strict, **_FIELDS)
 
 
 def read_kit(path: str | os.PathLike) -> list[KitItem]:
-    """Read a kit: what is at hand for a calibration, with its uncertainties.
+    """Read a kit: what is at hand for a calibration, with its uncertainties, for `planning.plan_kit`.
 
     Tables are ``[[artefact]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[planes]]`` (one, or two at a
     ``distance``), ``[[points]]``, ``[[transforms]]``, ``[[distances]]`` and ``[[socket]]``; their keys are the
@@ -67,12 +59,6 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
 
     Args:
         path: The TOML file.
-
-    Returns:
-        The things, for `planning.plan_kit`; their ``simulated`` for `simulate`.
-
-    Raises:
-        InputError: Naming the file and the place in it.
 
     Example:
         >>> from pathlib import Path
@@ -92,28 +78,19 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
             stated = {name: value for name, value in entry if value is not None}
             places, turned = stated.pop("places"), stated.pop("turned")
             half_angle, normal = math.radians(stated.pop("half_angle_deg")), stated.pop("normal")
-            if not any(normal):
-                raise InputError(f"{path}: [[{table}]] '{stated['name']}' has the normal (0, 0, 0); give a direction.")
-            items.append(KitItem(_checked(path, table, kind, stated), places, turned, half_angle, tuple(normal)))
+            with naming(f"{path}: [[{table}]] '{stated['name']}'"):
+                if not any(normal):
+                    raise InputError("it has the normal (0, 0, 0); give a direction.")
+                # Tried once, so that what cannot be recorded is refused here.
+                simulated = kind(**stated)
+                tips = simulated.tips(np.random.default_rng(0))
+                if not np.all(np.isfinite(tips)):
+                    raise InputError("numbers that do not fit together, such as two ends in one point; correct them.")
+                transforms = np.tile(np.eye(4), (len(tips), 1, 1))
+                transforms[:, :3, 3] = tips
+                simulated.recorded(np.zeros((len(tips), 1)), transforms, np.random.default_rng(0))
+            items.append(KitItem(simulated, places, turned, half_angle, tuple(normal)))
     if not items:
         tables = ", ".join(f"[[{table}]]" for table in _KINDS)
         raise InputError(f"{path} names nothing; give tables {tables}.")
     return items
-
-
-def _checked(
-    path: str | os.PathLike, table: str, kind: type[AbstractSimulated], stated: dict[str, Any]
-) -> AbstractSimulated:
-    """The simulated observation, tried once, so that what cannot be recorded is refused here."""
-    where = f"{path}: [[{table}]] '{stated['name']}'"
-    try:
-        simulated = kind(**stated)
-        tips = simulated.tips(np.random.default_rng(0))
-        if not np.all(np.isfinite(tips)):
-            raise InputError("numbers that do not fit together, such as two ends in one point; correct them.")
-        transforms = np.tile(np.eye(4), (len(tips), 1, 1))
-        transforms[:, :3, 3] = tips
-        simulated.recorded(np.zeros((len(tips), 1)), transforms, np.random.default_rng(0))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-    return simulated

@@ -15,62 +15,32 @@ from ..core.errors import InputError, naming, nearest
 from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
-from ..data.observations.observation import AbstractObservation
 from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile
 from .manifest_rows import Readings, Source, name_of, parts, points_of
-from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded, Sessions
+from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
 from .toml import read_toml
 
 
 def read_manifest(path: str | os.PathLike) -> Recording:
-    """Read a manifest and every file it names; paths are relative to the manifest.
+    """Read a manifest and every file it names, in mm and rad; paths are relative to the manifest.
 
     A field in braces matches part of a path and makes one socket for each value found: with
     ``file = "run_1/{place}/hole_{hole}.csv"`` and ``name = "{place}/{hole}"``, the length ``from = "{place}/0"``,
-    ``to = "{place}/1"`` is measured at every place. A field that makes up a whole folder or file name, such as
-    ``{place}``, matches anything but "/"; next to other text in a name, as ``{hole}``, it matches letters, digits and
-    "-" only, so that ``hole_0_pose.csv`` is left alone. ``exclude = ["*_old.csv"]`` in ``[[socket]]`` leaves out the
-    files that match such a shell pattern. ``visits = "files"`` says that the tip was lifted between the ``files`` of a
-    socket. Angles: reading -> sign * (reading - offset), in the stated unit. Readings of
-    prismatic joints are in ``linear_unit`` of ``[angles]``, by default mm; sign and offset hold for them too.
-    A column temperature_C, by that name in the header of every table, is the temperature of the arm, C;
-    ``temperature_C = 22.5`` in a table of the manifest states it for all of its poses. In ``[[length]]`` it is that of
-    the artefact, with its ``expansion`` (1/K), where ``value`` holds at 20 C.
+    ``to = "{place}/1"`` is measured at every place. Angles: reading -> sign * (reading - offset), in the stated unit.
+    ``columns`` picks by header name, shell pattern or number; where nothing is stated, readings are the columns with
+    names of joints in the header, or all. Units in the header must agree with those stated. All keys are listed in the
+    reference of file formats, and explained in the guide to manifests.
 
-    ``[[points]]``, ``[[transforms]]``, ``[[touched_sphere]]``, ``[[touched_cylinder]]``, ``[[plane]]``,
-    ``[[parallel_planes]]``, ``[[artefact]]`` and ``[[distances]]`` are observations of these kinds. Their ``file``
-    holds readings and measured values (or ``readings`` is a file of readings with as many rows).
-
-    In all tables ``columns`` picks by header name, shell pattern or number, ``columns = { q = "q*_rad", points =
-    ["x", "y", "z"] }``, or those of the readings alone, ``columns = ["J1", "J2", "J3"]``. Where nothing is stated, they
-    are those with names of joints in the header, or all. ``units``, ``rotation``, ``coverage_factor``, ``delimiter``,
-    ``decimal`` and ``skip`` say how they are written, ``group`` names a column that divides the table into several
-    sockets or observations, and ``preset`` (csv, leica, xyzijk, ipa) fills in what is not stated. Units in the header
-    must agree with those stated.
-
-    ``session = "monday"`` in such tables, with fields in braces if needed, or ``columns = { session = "day" }`` for
-    each row, makes sessions of one arm (`data.capture.join_sessions`); names are then ``monday/name``, in lengths too.
-    ``[sessions] probe = "same"`` says that the probe was not remounted between them.
-    ``acceptance`` (jjf, asme, iso, or a list) says for which standards' acceptance procedure the poses were taken, and
-    ``measuring_range`` the diameter of the measuring volume that the arm's maker states, mm.
-
-    ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Of a URDF, ``base`` and ``tip``
-    name the links at the ends of the chain; ``probe`` is a tool's tip in the last frame, mm, of an arm that states
-    none. Where the arm's file names no free parameters, they are those that such observations determine.
+    ``arm`` is a shipped name, an arm file (TOML), a URDF, or a ``kinematics.yaml``. Where the arm's file names no free
+    parameters, they are those that such observations determine.
 
     Args:
         path: the manifest (TOML).
-
-    Returns:
-        Capture and nominal arm, in mm and rad, with the SHA-256 of each file.
-
-    Raises:
-        InputError: names the file, the place in it and what to do.
 
     Example:
         >>> from pathlib import Path
@@ -100,13 +70,10 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
         readings = Readings(nominal.arm, model.angles)
         source = Source(manifest, "q", readings)
         sockets, lengths, spheres = _read_recorded(model, source)
+        observed: list[tuple[str, Any]] = [(seat.session, seat) for seat in sockets.values() if not seat.target]
         # Where another tip than the arm's own probe was held, it is an observation.
-        seats = [seated for seated in sockets.values() if not seated.target]
-        observed: list[tuple[str, AbstractObservation]] = [
-            (seated.session, Socket(seated.name, seated.poses, target=seated.target))
-            for seated in sockets.values()
-            if seated.target
-        ]
+        others = [seat for seat in sockets.values() if seat.target]
+        observed += [(seat.session, Socket(seat.name, seat.poses, target=seat.target)) for seat in others]
         for kind in TABLES:
             for entry in () if kind is Socket else getattr(model, kind.table):
                 for values in _fields(path.parent, entry, kind.table):
@@ -114,15 +81,12 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
                     for part in parts(source, kind, entry, values, f"[[{kind.table}]] '{name}'"):
                         named = f"{name}/{part.group}" if entry.group is not None else name
                         observed.append((part.session, kind.rebuilt(named, part.rows)))
-        if not seats and not observed:
+        if not observed:
             raise InputError("there is neither a [[socket]] nor another observation; add one.")
-        if any(seated.session for seated in seats) or any(session for session, _ in observed):
-            remounted = (model.sessions or Sessions()).probe == "remounted"
-            capture = _in_sessions(seats, lengths, observed, remounted)
-        elif model.sessions is not None:
+        probe = "remounted" if model.sessions is None else model.sessions.probe
+        if model.sessions is not None and not any(session for session, _ in observed):
             raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
-        else:
-            capture = _capture(seats, lengths, [observation for _, observation in observed])
+        capture = _capture(lengths, observed, probe == "remounted")
         if capture.columns == nominal.arm.joints + 1:
             nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
         check_readings(capture, nominal.arm)
@@ -140,21 +104,14 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
 
 
 def read_points(path: str | os.PathLike) -> Measured:
-    """Read a manifest of points and every file that it names; paths are relative to the manifest.
+    """Read a manifest of points and every file that it names, in mm; paths are relative to the manifest.
 
-    ``[points]`` has ``unit`` (mm, m, um, inch; by default that of the header), optionally ``columns`` of x, y and z,
-    the ``measuring_range`` that the maker states (a diameter, mm), and, for the zones of ASME B89.4.22, the arm's
-    ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
+    ``[points]`` has ``unit`` (mm, m, um, inch; by default that of the header), and for the zones of ASME B89.4.22 the
+    arm's ``reach`` and ``shoulder`` (x, y, z) in mm. ``[[socket]]``, ``[[length]]`` and ``[[sphere]]`` are those of
     `read_manifest`, with files of x, y, z: columns of these names, or the only three.
 
     Args:
         path: the manifest (TOML).
-
-    Returns:
-        The measured points, mm.
-
-    Raises:
-        InputError: names the file, the place in it and what to do.
 
     Example:
         >>> from pathlib import Path
@@ -238,40 +195,38 @@ def _read_recorded(
     return sockets, _lengths(model.length, fields, sockets), tuple(spheres)
 
 
-def _capture(
-    seats: Sequence[_Seated], lengths: Sequence[ReferenceLength], observed: Sequence[AbstractObservation]
-) -> Capture:
-    visits = {seated.name: seated.visits for seated in seats if seated.visits is not None}
-    return Capture({seated.name: seated.poses for seated in seats}, lengths, observed, visits=visits or None)
-
-
-def _in_sessions(
-    seats: Sequence[_Seated],
-    lengths: Sequence[ReferenceLength],
-    observed: Sequence[tuple[str, AbstractObservation]],
-    remounted: bool,
-) -> Capture:
+def _capture(lengths: Sequence[ReferenceLength], observed: Sequence[tuple[str, Any]], remounted: bool) -> Capture:
     """One capture of all sessions, each but the first with a probe of its own where that was ``remounted``."""
-    items = [*((seated.session, seated.name) for seated in seats), *((key, item.name) for key, item in observed)]
-    without = [name for session, name in items if not session]
-    if without:
+    by_session: dict[str, list[Any]] = {session: [] for session, _ in observed}
+    for session, item in observed:
+        by_session[session].append(item)
+    if len(by_session) > 1 and "" in by_session:
+        without = [item.name for item in by_session[""]]
         raise InputError(f"{shorten(without)} has no session, but other tables have; state it for every table.")
-    lengths_of: dict[str, list[ReferenceLength]] = {session: [] for session, _ in items}
+    lengths_of: dict[str, list[ReferenceLength]] = {session: [] for session in by_session}
     for length in lengths:  # named session/name
         ends = (length.start, length.end)
-        session = next((name for name in lengths_of if all(end.startswith(f"{name}/") for end in ends)), "")
-        if not session:
+        session = next((name for name in by_session if all(end.startswith(f"{name}/") for end in ends)), None)
+        if "" in by_session:
+            lengths_of[""].append(length)
+        elif session is None:
             raise InputError(
                 f"length from '{length.start}' to '{length.end}' is not between two sockets of one session; name them "
                 "session/name."
             )
-        start, end = (end.removeprefix(f"{session}/") for end in ends)
-        lengths_of[session].append(ReferenceLength(start, end, length.value, length.u))
+        else:
+            start, end = (end.removeprefix(f"{session}/") for end in ends)
+            lengths_of[session].append(ReferenceLength(start, end, length.value, length.u))
     captures = {}
-    for session, between in lengths_of.items():
-        observed_then = [observation for key, observation in observed if key == session]
-        captures[session] = _capture([seated for seated in seats if seated.session == session], between, observed_then)
-    return join_sessions(captures, own_probe=remounted)
+    for session, items in by_session.items():
+        seats = [item for item in items if isinstance(item, _Seated)]
+        captures[session] = Capture(
+            {seated.name: seated.poses for seated in seats},
+            lengths_of[session],
+            [item for item in items if not isinstance(item, _Seated)],
+            visits={seated.name: seated.visits for seated in seats if seated.visits is not None} or None,
+        )
+    return captures[""] if "" in captures else join_sessions(captures, own_probe=remounted)
 
 
 def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:

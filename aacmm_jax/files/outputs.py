@@ -82,8 +82,12 @@ def write_atomically(
             file.check_replaced()
             if group is None:
                 _put_in_place([file])
-            else:
-                group.take(file)
+            else:  # it waits for the others
+                for read in group.read:
+                    _check_different(file, read)
+                if file.target in group.made:
+                    group.made[file.target].discard()
+                group.made[file.target] = file
                 waits = True
     finally:
         if not waits:
@@ -104,12 +108,9 @@ class OutputFile:
             if "\0" in str(path):
                 raise OSError(None, "its name holds a NUL")
             self.target = Path(os.path.realpath(self.named))
-        self.temporary = self._sibling()
+        self.temporary = _beside(self.target)
         self._lock: int | None = None
         self._backup: Path | None = None
-
-    def _sibling(self) -> Path:
-        return self.target.parent / f".{self.target.name}.{secrets.token_hex(4)}.part"
 
     @contextlib.contextmanager
     def refusing(self) -> Iterator[None]:
@@ -123,21 +124,23 @@ class OutputFile:
     def check(self) -> None:
         """Raise `OSError` where the file cannot be written."""
         named, target, folder = self.named, self.target, self.target.parent
-        if is_planted_link(named):
-            raise OSError(None, "it is another user's link")
+        exists = target.exists()
         # A link in /proc (/dev/stdout) leads to what has no path, and one that leads to itself remains a link.
-        if (named.exists() or target.exists() or target.is_symlink()) and not target.is_file():
-            raise OSError(None, "it is a folder" if target.is_dir() else "it is not an ordinary file")
-        # The superuser may write to a file without write permission, which is protected all the same.
-        if target.exists() and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)):
-            raise OSError(None, "it is read-only")
-        folder.stat()  # which there must be
-        if not folder.is_dir():
-            raise OSError(None, "not a directory")
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise OSError(None, "its folder is read-only")
-        if target.exists() and not may_replace(target):
-            raise OSError(None, "it belongs to another user, and only they can replace it in its folder")
+        no_file = (named.exists() or exists or target.is_symlink()) and not target.is_file()
+        problems = {
+            "it is another user's link": is_planted_link(named),
+            "it is a folder": no_file and target.is_dir(),
+            "it is not an ordinary file": no_file,
+            # The superuser may write to a file without write permission, which is protected all the same.
+            "it is read-only": exists and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)),
+            "not a directory": folder.stat() and not folder.is_dir(),  # there must be one
+            "its folder is read-only": not os.access(folder, os.W_OK | os.X_OK),
+            "it belongs to another user, and only they can replace it in its folder": exists
+            and not may_replace(target),
+        }
+        for problem, present in problems.items():
+            if present:
+                raise OSError(None, problem)
 
     def create(self) -> None:
         """Make the temporary file and lock it; whoever removes leftovers may have seen it before it was locked."""
@@ -173,7 +176,13 @@ class OutputFile:
         if not self.temporary.exists():
             ours = self.target.suffix.lower() not in _MARKED or _is_marked(self.target)
         else:
-            ours = _is_own(self.target, self.temporary)
+            # Where the new file says who wrote it, the old one must, too. Tables, TOML, JSON and URDF have no place for
+            # that: they must have the same first line, or element, with the names of columns, of the arm or the robot.
+            first, first_new = _ends(self.target)[0], _ends(self.temporary)[0]
+            if _is_marked(self.temporary):
+                ours = _is_marked(self.target) and first[:4] in (b"", first_new[:4])
+            else:
+                ours = not first or _beginning(first) == _beginning(first_new)
             if ours and self._same_kind is not None and os.path.getsize(self.target):
                 token = _current.set(None)  # it may be read, though it is an output
                 try:
@@ -189,7 +198,7 @@ class OutputFile:
     def replace(self, keep: bool) -> None:
         """Put the new file in place; with ``keep``, the old one can be put back by `undo`."""
         if keep and self.target.exists():
-            self._backup = self._sibling()
+            self._backup = _beside(self.target)
             try:
                 os.link(self.target, self._backup)
             except OSError:  # a file system without hard links
@@ -219,6 +228,10 @@ class OutputFile:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+
+
+def _beside(target: Path) -> Path:
+    return target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
 
 
 def _put_in_place(files: list[OutputFile]) -> None:
@@ -271,18 +284,6 @@ def check_kept(path: str | os.PathLike, original: str) -> None:
         )
 
 
-def _is_own(old: Path, new: Path) -> bool:
-    """Whether a file is of the kind of the new one, as far as their beginnings and ends say; or is empty.
-
-    Where the new file says who wrote it, the old one must, too. Tables, TOML, JSON and URDF have no place for that:
-    they must have the same first line, or first element, which has the names of columns, of the arm or of the robot.
-    """
-    first, first_new = _ends(old)[0], _ends(new)[0]
-    if _is_marked(new):
-        return _is_marked(old) and first[:4] in (b"", first_new[:4])
-    return not first or _beginning(first) == _beginning(first_new)
-
-
 def _is_marked(path: Path) -> bool:
     """Whether a file says that this package wrote it; or is empty."""
     both = b"".join(_ends(path))
@@ -307,14 +308,6 @@ class _Outputs(NamedTuple):
     announced: list[OutputFile]
     made: dict[Path, OutputFile]
     read: list[Path]
-
-    def take(self, file: OutputFile) -> None:
-        """Have a finished file wait for the others."""
-        for path in self.read:
-            _check_different(file, path)
-        if file.target in self.made:
-            self.made[file.target].discard()
-        self.made[file.target] = file
 
 
 _current: ContextVar[_Outputs | None] = ContextVar("outputs", default=None)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..core.errors import InputError
-from ..core.text import is_control, quoted
+from ..core.text import is_control, quoted, shorten
 
 _FIELD = re.compile(r"\{(\w+)\}")
 # A folder's or file's name that is one field, perhaps with an extension.
@@ -18,7 +18,7 @@ _ANYTHING = "[^/]+"
 _WORD = r"(?:[^\W_]|-)+"
 _MOST_FIELDS = 8  # each more multiplies the ways in which a name can match
 _LONGEST_NAME = 200  # characters
-_NAMED = 3  # near misses that a message names
+_SHOWN = 3  # near misses that a message names
 
 
 def fields_of(text: str) -> set[str]:
@@ -64,31 +64,39 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     Raises `InputError` where no file matches, naming those that nearly do.
     """
     before = "" if Path(pattern).is_absolute() else f"{folder.as_posix()}/"
-    # Separators only: to resolve "./" or "//" would keep the pattern from matching.
-    paths = _glob(glob.escape(before) + "*".join(map(glob.escape, _FIELD.sub("\0", pattern).split("\0"))))
-    paths = [path.removeprefix(before) for path in paths]
-    kept = [path for path in paths if not _excluded(path, exclude)]
+
+    def below(pattern: str) -> list[str]:
+        # Separators only: to resolve "./" or "//" would keep the pattern from matching.
+        return sorted(
+            path.replace(os.sep, "/").removeprefix(before) for path in glob.glob(glob.escape(before) + pattern)
+        )
+
+    paths = below("*".join(map(glob.escape, _FIELD.sub("\0", pattern).split("\0"))))
+    left_out = [
+        path for path in paths if any(fnmatch.fnmatchcase(name, x) for x in exclude for name in (path, Path(path).name))
+    ]
+    kept = [path for path in paths if path not in set(left_out)]
     names = list(dict.fromkeys(_FIELD.findall(pattern)))
     strict, loose = (re.compile(_expression(pattern, partial)) for partial in (_WORD, _ANYTHING))
     values = [dict(zip(names, match.groups(), strict=True)) for path in kept if (match := strict.fullmatch(path))]
     if values:
         return values
     where = f"no file matches '{pattern}' in {folder}"
-    near = [path for path in kept if loose.fullmatch(path)]
+    near = [f"'{path}'" for path in kept if loose.fullmatch(path)]
     if near:
         raise InputError(
-            f"{where}, but nearly {_some(near)}: next to other text in a name, a field is letters, digits and '-' "
-            "only; write more of the name out."
+            f"{where}, but nearly {shorten(near, _SHOWN)}: next to other text in a name, a field is letters, digits "
+            "and '-' only; write more of the name out."
         )
-    if len(kept) < len(paths):
-        left_out = [path for path in paths if path not in kept]
-        raise InputError(f"{where} but {_some(left_out)}, which exclude leaves out; change exclude.")
-    alike = _alike(before, pattern)
-    raise InputError(f"{where}" + (f"; there is {_some(alike)}" if alike else "") + "; check the path.")
-
-
-def _glob(pattern: str) -> list[str]:
-    return sorted(path.replace(os.sep, "/") for path in glob.glob(pattern))
+    if left_out:
+        shown = shorten([f"'{path}'" for path in left_out], _SHOWN)
+        raise InputError(f"{where} but {shown}, which exclude leaves out; change exclude.")
+    # Files as deep in the folders as the pattern, with names like it.
+    fixed = _FIELD.split(pattern)[0].rpartition("/")[0]
+    deeper = "/".join("*" for _ in pattern.removeprefix(fixed).strip("/").split("/"))
+    files = [path for path in below(glob.escape(fixed) + "/" * bool(fixed) + deeper) if os.path.isfile(before + path)]
+    alike = [f"'{path}'" for path in difflib.get_close_matches(pattern, files, n=_SHOWN, cutoff=0.3)]
+    raise InputError(f"{where}" + (f"; there is {', '.join(alike)}" if alike else "") + "; check the path.")
 
 
 def _expression(pattern: str, partial: str) -> str:
@@ -99,33 +107,12 @@ def _expression(pattern: str, partial: str) -> str:
     """
     components = [text for text in pattern.split("/") if _FIELD.search(text)]
     shared = {name for text in components if not _WHOLE.fullmatch(text) for name in _FIELD.findall(text)}
-    expression, last, seen = "", 0, []
-    for field in _FIELD.finditer(pattern):
-        name = field.group(1)
-        expression += re.escape(pattern[last : field.start()])
+    expression, seen = "", []
+    for literal, name in re.findall(r"(.*?)(?:\{(\w+)\}|$)", pattern, flags=re.DOTALL):
+        expression += re.escape(literal)
         if name in seen:
             expression += f"(?:\\{seen.index(name) + 1})"
-        else:
+        elif name:
             expression += f"({partial if name in shared else _ANYTHING})"
             seen.append(name)
-        last = field.end()
-    return expression + re.escape(pattern[last:])
-
-
-def _excluded(path: str, exclude: Sequence[str]) -> bool:
-    names = (path, path.rpartition("/")[2])
-    return any(fnmatch.fnmatchcase(name, pattern) for pattern in exclude for name in names)
-
-
-def _alike(before: str, pattern: str) -> list[str]:
-    """Files as deep in the folders as the pattern, with names like it."""
-    fixed = _FIELD.split(pattern)[0].rpartition("/")[0]
-    below = glob.escape(before + fixed) + ("/" if fixed else "")
-    deeper = "/".join("*" for _ in pattern.removeprefix(fixed).strip("/").split("/"))
-    paths = [path.removeprefix(before) for path in _glob(below + deeper) if os.path.isfile(path)]
-    return difflib.get_close_matches(pattern, paths, n=_NAMED, cutoff=0.3)
-
-
-def _some(paths: Sequence[str]) -> str:
-    more = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
-    return ", ".join(f"'{path}'" for path in paths[:_NAMED]) + more
+    return expression

@@ -38,9 +38,6 @@ def save_plan(path: str | os.PathLike, plan: Planned, *, angles: Angles = "deg")
         plan: what `planning.plan`, `planning.plan_kit` or `acceptance.plan_procedure` returned.
         angles: the unit of the joint readings.
 
-    Raises:
-        InputError: the file cannot be written.
-
     Example:
         >>> from pathlib import Path
         >>> planned = aj.planning.plan(arm, sockets=four, poses=12, lengths=bars, candidates=60)

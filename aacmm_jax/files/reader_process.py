@@ -49,8 +49,13 @@ def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, 
     ``source`` is its bytes, or the open file where they are too many for the memory: the child opens it by its name.
     ``largest`` is the most bytes that may be read into memory.
     """
-    # A program that contains Python may have none beside it; files are then read without a child.
-    if seal in _vouched_for or not sys.executable or getattr(sys, "frozen", False):
+    if seal in _vouched_for:
+        return
+    if not sys.executable or getattr(sys, "frozen", False):  # a program that contains Python may have none beside it
+        from .hdf5_content import check
+
+        check(str(path), source, size, largest)
+        vouch_for(seal)
         return
     content = source.getbuffer() if hasattr(source, "getbuffer") else source  # of a file that is in memory already
     sent = isinstance(content, bytes | memoryview)
@@ -176,7 +181,7 @@ def serve() -> None:
     """What the child does: read one file after the other, until one cannot be read or nobody can ask any more."""
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what a library prints is no answer
-    from .hdf5_content import content_of
+    from .hdf5_content import check
 
     used = _memory_used()
     if hasattr(signal, "SIGPROF"):
@@ -190,7 +195,7 @@ def serve() -> None:
         try:
             with _limited(used, *request["limits"]), contextlib.ExitStack() as stack:
                 source = content or stack.enter_context(open(request["opened"], "rb"))
-                stack.enter_context(content_of(request["path"], source, request["size"], request["largest"])).check()
+                check(request["path"], source, request["size"], request["largest"])
         except InputError as error:
             answer = str(error)
         except Exception:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy

@@ -4,11 +4,13 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from ..core.errors import InputError
-from ..core.text import quoted
+from ..core.text import is_number, quoted
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..kinematics.arm import Arm
-from .text_lines import Column, bare_name, stem_and_number
+from .text_lines import Column, are_numbered, bare_name, stem_and_number
 from .text_table import TextTable
 
 # Words beside the number in the names of readings: q_1, joint 1, A1, axis_1, actual_q_0, /panda_joint1/position, ...
@@ -90,11 +92,15 @@ def reading_columns(
                 "pick one a joint."
             )
         return picked
+
+    def stated_by(columns: Sequence[int]) -> str:
+        return line.format(", ".join(str(i + 1) for i in columns))
+
     families = _families(table, joints)
     named = [family for family in families if family.of_joints and not set(family.columns) <= set(taken)]
     whole = [family.columns for family in named if family.whole]
     if len(whole) > 1:
-        choices = [f"{_line(line, columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
+        choices = [f"{stated_by(columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
         raise InputError(f"{table.path} has several columns of each joint; add {' or '.join(choices[:4])}.")
     # Where none is whole, one of as many columns is there twice.
     for columns in whole or [family.columns for family in named if len(family.columns) == joints]:
@@ -106,16 +112,17 @@ def reading_columns(
     free = [i for i in range(table.width) if i not in taken and i not in temperature]
     names = [bare_name(table.header[i]) for i in free if table.header]
     foreign = any(_NO_JOINT.fullmatch(word) for name in names for word in _words(name)[:1])
-    if len(free) == joints and not foreign and not named and not table.misnumbered:
+    if len(free) == joints and not foreign and not named and not (table.misnamed and are_numbered(table.title)):
         table.check_ascending(free, line)
         if _Family(free, False, True) in families or joints == 1 or not any(names):
             return free
-    guess = [family.columns for family in families if family.whole and all(map(table.is_numeric, family.columns))]
+    guess = [family.columns for family in families if family.whole]
+    guess = [columns for columns in guess if all(_is_numeric(table, i) for i in columns)]
     of_ur = [[i for i, name in enumerate(table.header) if joint in name.casefold()] for joint in _OF_UR]
     if joints == len(_OF_UR) and all(len(columns) == 1 for columns in of_ur):
         guess = [[columns[0] for columns in of_ur]]
     proposed = guess[0] if guess else proposed_columns(table, joints, taken)
-    add = f"add {_line(line, proposed)} if these are the joints in their order"
+    add = f"add {stated_by(proposed)} if these are the joints in their order"
     if not proposed:
         add = (
             "correct the header, or the delimiter where decimal commas are taken for it, or pick one column a joint "
@@ -129,14 +136,20 @@ def reading_columns(
 
 def proposed_columns(table: TextTable, count: int, taken: Sequence[int] = ()) -> list[int]:
     """So many columns of numbers, from 0, without times or indices before them; none where others may be meant."""
-    numeric = [i for i in range(table.width) if i not in taken and table.is_numeric(i)]
-    while len(numeric) > count and table.ascends(numeric[0]):
+    numeric = [i for i in range(table.width) if i not in taken and _is_numeric(table, i)]
+    while len(numeric) > count:
+        cells = table.cells(numeric[0])
+        # Each number is larger than the one before it in a column of times or indices.
+        if len(cells) < 2 or not all(map(is_number, cells)) or np.any(np.diff(np.array(cells, dtype=float)) <= 0):
+            break
         numeric.pop(0)
     return numeric if len(numeric) == count and not table.misnamed else []
 
 
-def _line(line: str, columns: Sequence[int]) -> str:
-    return line.format(", ".join(str(i + 1) for i in columns))
+def _is_numeric(table: TextTable, index: int) -> bool:
+    """Whether a column begins and ends with a number."""
+    cells = table.cells(index)
+    return is_number(cells[0]) and is_number(cells[-1])
 
 
 def find_named(
@@ -160,9 +173,6 @@ def position_columns(table: TextTable) -> tuple[list[int], str | None] | None:
 def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str | None) -> tuple[str | None, str | None]:
     """The units that the header states for readings of revolute and of prismatic joints, or None; ``stated``: that of
     the former in the manifest.
-
-    Raises:
-        InputError: It states units of something else.
     """
     slides = [picked[i - 1] for i in arm.prismatic]
     turns = [i for i in picked if i not in slides]

@@ -1,6 +1,7 @@
 """Lines and cells of a text table, and what the lines above its rows say: names of columns, units, and numbers."""
 
 import codecs
+import contextlib
 import csv
 import difflib
 import fnmatch
@@ -63,18 +64,20 @@ def delimiter_of(lines: Sequence[str], decimal: str) -> str:
     return "," if 2 * between_quotes > len(sample) else " "
 
 
-def cells_of(line: str, delimiter: str) -> list[str]:
-    """The cells of a line, not stripped; one in double quotes may hold the delimiter."""
+def cells_of(line: str, delimiter: str, header: bool = False) -> list[str]:
+    """The cells of a line; one in double quotes may hold the delimiter."""
     if delimiter == " ":
+        # In a line of names, a unit belongs to the name before it.
+        line = re.sub(r"[ \t]+(?=[\[(])", "", line) if header else line
         if '"' in line:
-            return [cell.strip('"') for cell in _BLANKS_OR_QUOTES.findall(line)]
+            return [cell.strip('"').strip(" \t") for cell in _BLANKS_OR_QUOTES.findall(line)]
         return _BLANKS.split(line.strip(" \t"))
+    cells = line.split(delimiter)
     if '"' in line:
-        try:
-            return next(csv.reader([line], delimiter=delimiter, strict=True, skipinitialspace=True))
-        except csv.Error:
-            pass  # a quote that does not end: its cells are refused where they are picked
-    return line.split(delimiter)
+        # A quote that does not end: its cells are refused where they are picked.
+        with contextlib.suppress(csv.Error):
+            cells = next(csv.reader([line], delimiter=delimiter, strict=True, skipinitialspace=True))
+    return [cell.strip(" \t") for cell in cells]
 
 
 AMBIGUOUS = "grad"  # deg in German, gon elsewhere
@@ -190,11 +193,6 @@ def is_row(cells: list[str]) -> bool:
     return all(cell.casefold() in _NO_VALUE for cell in cells) or has_number(cells) or any(map(is_number, cells))
 
 
-def header_cells(line: str, delimiter: str) -> list[str]:
-    """The cells of a line of names; between blanks, a unit belongs to the name before it."""
-    return stripped(cells_of(re.sub(r"[ \t]+(?=[\[(])", "", line) if delimiter == " " else line, delimiter))
-
-
 def names_of_columns(
     path: str | os.PathLike, width: int, words: Sequence[Line], comments: Sequence[Line], wanted: Sequence[Column]
 ) -> list[str]:
@@ -247,11 +245,6 @@ def matching(header: list[str], column: str) -> list[int]:
             if indices:
                 return indices
     return []
-
-
-def stripped(cells: list[str]) -> list[str]:
-    """Cells without blanks around them."""
-    return [cell.strip(" \t") for cell in cells]
 
 
 def trimmed(cells: list[str], least: int) -> list[str]:

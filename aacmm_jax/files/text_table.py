@@ -15,17 +15,14 @@ from .text_lines import (
     Column,
     Line,
     along_axes,
-    are_numbered,
     cells_of,
     delimiter_of,
     has_number,
-    header_cells,
     is_row,
     matching,
     names_of_columns,
     plain_name,
     stem_and_number,
-    stripped,
     table_lines,
     trimmed,
     unit_in,
@@ -67,14 +64,14 @@ class TextTable:
         rows: list[Line] = []
         for line_number, line in enumerate(lines[skip:], start=skip + 1):
             cells = cells_of(line, delimiter)
-            if not any(cell.strip(' \t"') for cell in cells):
+            if not any(cell.strip('"') for cell in cells):
                 continue
             text, above = line.strip(' \t"'), (rows or words)[-1:]
             # A line that begins with "#" is a row only where it is as wide as what is above it, and has numbers.
-            if text[:1] == "#" and not (above and len(cells) >= len(above[0][1]) and has_number(stripped(cells[1:]))):
-                comments += [] if rows else [(line_number, header_cells(text[1:].strip(" \t"), delimiter))]
-            elif not rows and not is_row(stripped(cells)):
-                words.append((line_number, header_cells(line, delimiter)))
+            if text[:1] == "#" and not (above and len(cells) >= len(above[0][1]) and has_number(cells[1:])):
+                comments += [] if rows else [(line_number, cells_of(text[1:].strip(" \t"), delimiter, header=True))]
+            elif not rows and not is_row(cells):
+                words.append((line_number, cells_of(line, delimiter, header=True)))
             else:
                 rows.append((line_number, cells))
         if not rows:
@@ -90,29 +87,24 @@ class TextTable:
         self._lines, self._rows = [number for number, _ in rows], [cells for _, cells in rows]
         # Columns at the end that are empty in all rows and without a name: lines that end with delimiters.
         named = max((len(trimmed(cells, 1)) for _, cells in words), default=0)
-        while len(self._rows[0]) > max(1, named) and not any(row[-1].strip() for row in self._rows):
+        while len(self._rows[0]) > max(1, named) and not any(row[-1] for row in self._rows):
             for row in self._rows:
                 row.pop()
         self.width, self.length = len(self._rows[0]), len(self._rows)
         words = [(number, trimmed(cells, self.width)) for number, cells in words]
-        self._title = words[-1][1] if words else []  # a line of words that does not name the columns
+        self.title = words[-1][1] if words else []  # a line of words that may not name the columns
         # Names of the columns; empty where the table has none.
         self.header = [name.strip("\"'") for name in names_of_columns(path, self.width, words, comments, wanted)]
 
     @property
     def misnamed(self) -> bool:
         """Whether a line of several names is above the rows, but not one name for each column."""
-        return not self.header and len(self._title) > 1
-
-    @property
-    def misnumbered(self) -> bool:
-        """Whether these are numbered, so that the order of the columns is not known."""
-        return self.misnamed and are_numbered(self._title)
+        return not self.header and len(self.title) > 1
 
     def shown(self) -> str:
         """Its columns as a message shows them: names with their numbers."""
         if not self.header:
-            others = f", but its header {len(self._title)} names" if self.misnamed else " without names"
+            others = f", but its header {len(self.title)} names" if self.misnamed else " without names"
             return f"{self.width} columns{others}"
         most = max(_LONG, 150 // self.width)
         names = [f"{i} {quoted(name[:most])}" for i, name in enumerate(self.header, start=1)]
@@ -194,20 +186,40 @@ class TextTable:
     def numbers(self, picked: Sequence[int], *, measured: bool = False, stated: bool = False) -> np.ndarray:
         """The numbers of columns, counted from 0, ``(rows, columns)``; ``measured``: they are not numbers of columns,
         and no two of them are the same unless somebody ``stated`` the columns."""
-        hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip(' \t"').startswith("#")), None)
+        hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip('"').startswith("#")), None)
         if hashed is not None and not self._hashes:
             raise InputError(
                 f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; leave it "
                 "out if it is a comment, else write its first cell without #."
             )
-        self._check_end(picked)
+        # A file without a last line's end may be cut: then its last number has fewer decimals than the others.
+        decimals = [len(row[-1].partition(self._decimal)[2]) for row in self._rows]
+        if self.width - 1 in picked and not self._ended and len(decimals) >= _FEW and decimals[-1] < min(decimals[:-1]):
+            raise InputError(
+                f"{self.path} line {self._lines[-1]}: the last number, {quoted(self._rows[-1][-1])}, has fewer digits "
+                "than all above it and no end of the line after it, so the file may be cut; copy it again, or end that "
+                "line if it is complete."
+            )
         table = np.stack([self._column(i) for i in picked], axis=1)
-        if measured:
-            self._check_measured(picked, table, stated)
+        if not measured:
+            return table
+        cells, count = [self._rows[0][i] for i in picked], len(picked)
+        if count > 1 and any(sorted(cells) == sorted(map(str, range(i, i + count))) for i in (0, 1)):
+            order = ", ".join(str(picked[i] + 1) for i in np.argsort(table[0]))
+            raise InputError(
+                f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; add "
+                f"skip = {self._lines[0]} and columns = [{order}], or write it with decimal points if it was measured."
+            )
+        for (i, column), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
+            if not stated and self.length >= _FEW and np.ptp(column) > 0 and np.array_equal(column, other):
+                raise InputError(
+                    f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
+                    f"columns = [{', '.join(str(index + 1) for index in picked)}] if these are right."
+                )
         return table
 
     def _column(self, index: int) -> np.ndarray:
-        cells = [row[index].strip(" \t") for row in self._rows]
+        cells = [row[index] for row in self._rows]
         # Together where they are plain numbers: one by one they are most of the time that a large table takes.
         if set().union(*cells) <= _PLAIN | {self._decimal}:
             with contextlib.suppress(ValueError):
@@ -230,48 +242,12 @@ class TextTable:
             raise InputError(f"{place} is not finite, or larger than anything that is measured; correct it.")
         return value
 
-    def is_numeric(self, index: int) -> bool:
-        """Whether a column begins and ends with a number, also with a decimal comma."""
-        return all(is_number(row[index].strip(" \t").replace(",", ".", 1)) for row in (self._rows[0], self._rows[-1]))
-
-    def ascends(self, index: int) -> bool:
-        """Whether every number of a column is larger than the one before it, as those of times and indices are."""
-        try:
-            values = [float(row[index].replace(",", ".")) for row in self._rows]
-        except ValueError:
-            return False
-        return len(values) > 1 and bool(np.all(np.diff(values) > 0))
+    def cells(self, index: int) -> list[str]:
+        """The cells of a column, from 0, with decimal points."""
+        return [row[index].replace(",", ".", 1) for row in self._rows]
 
     def texts(self, column: Column) -> np.ndarray:
         """The cells of one column."""
         (index,) = self.pick([column])
         self._hashes = self._hashes or index == 0  # "#2" is a text
-        return np.array([row[index].strip(" \t").strip("\"'") for row in self._rows])
-
-    def _check_measured(self, picked: Sequence[int], table: np.ndarray, stated: bool) -> None:
-        """Refuse numbers of columns as the first row, and a column that is there twice."""
-        cells = [self._rows[0][i].strip(" \t") for i in picked]
-        count = len(cells)
-        if count > 1 and any(sorted(cells) == sorted(map(str, range(i, i + count))) for i in (0, 1)):
-            order = ", ".join(str(picked[i] + 1) for i in np.argsort(table[0]))
-            raise InputError(
-                f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; add "
-                f"skip = {self._lines[0]} and columns = [{order}], or write it with decimal points if it was measured."
-            )
-        for (i, one), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
-            if not stated and self.length >= _FEW and np.ptp(one) > 0 and np.array_equal(one, other):
-                raise InputError(
-                    f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
-                    f"columns = [{', '.join(str(column + 1) for column in picked)}] if these are right."
-                )
-
-    def _check_end(self, picked: Sequence[int]) -> None:
-        """Refuse a last number with fewer decimals than all others of its column, in a file without a last line's end,
-        which may be cut."""
-        decimals = [len(row[-1].strip(" \t").partition(self._decimal)[2]) for row in self._rows]
-        if self.width - 1 in picked and not self._ended and len(decimals) >= _FEW and decimals[-1] < min(decimals[:-1]):
-            raise InputError(
-                f"{self.path} line {self._lines[-1]}: the last number, {quoted(self._rows[-1][-1])}, has fewer digits "
-                "than all above it and no end of the line after it, so the file may be cut; copy it again, or end that "
-                "line if it is complete."
-            )
+        return np.array([row[index].strip("\"'") for row in self._rows])

@@ -70,21 +70,18 @@ def _check_content(path: str | os.PathLike, value: Any, place: str = "", depth: 
     """Refuse depth, numbers and characters that no file of this package has, with the key at which they are."""
     if depth > _DEEPEST:
         raise InputError(f"{path} nests tables or lists too deeply; no such file has more than {_DEEPEST}.")
-    if isinstance(value, Mapping | list):
-        for key, item in value.items() if isinstance(value, Mapping) else enumerate(value, start=1):
-            inside = f"{place} {key}" if isinstance(key, int) else f"{place}.{key}" if place else key
-            _check_characters(path, inside, str(key))
-            _check_content(path, item, inside, depth + 1)
-    elif isinstance(value, str):
-        _check_characters(path, place, value)
+    for text in (place, value if isinstance(value, str) else ""):
+        control = next(filter(is_control, text), None)
+        if control is not None:
+            raise InputError(f"{path}: {quoted(place)} holds the control character U+{ord(control):04X}; take it out.")
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_content(path, item, f"{place}.{key}" if place else key, depth + 1)
+    elif isinstance(value, list):
+        for number, item in enumerate(value, start=1):
+            _check_content(path, item, f"{place} {number}", depth + 1)
     elif isinstance(value, int | float) and _LARGEST < abs(value) < math.inf:
         raise InputError(f"{path}: '{place}' is larger than any number that is meant; correct it.")
-
-
-def _check_characters(path: str | os.PathLike, place: str, text: str) -> None:
-    control = next(filter(is_control, text), None)
-    if control is not None:
-        raise InputError(f"{path}: {quoted(place)} holds the control character U+{ord(control):04X}; take it out.")
 
 
 def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Model:

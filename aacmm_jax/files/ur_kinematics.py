@@ -21,7 +21,6 @@ from ..core.text import number, quoted
 from ..kinematics.arm import Arm, arm_of
 from ..kinematics.axes_to_dh import (
     Axes,
-    Transform,
     canonical_origins,
     dh_of_axes,
     geometry_of,
@@ -53,7 +52,11 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
         except UnicodeDecodeError as error:
             raise InputError("it is not text in UTF-8; name a YAML file.") from error
         entries = _entries(text)
-        geometry = _of_parameters(entries) if any(name in entries for name in _DH) else _of_origins(entries)
+        if any(name in entries for name in _DH):
+            theta, a, d, alpha = (_numbers_of(entries, name, len(_JOINTS)) for name in _DH)
+            geometry = Geometry(alpha, 1000 * a, 1000 * d, theta, None, np.zeros(3))
+        else:
+            geometry = _of_origins(entries)
         arm = without_far_frames(arm_of(geometry, [_LIMITS] * len(_JOINTS)))
         if probe is not None:
             arm = with_tool(arm, probe)
@@ -69,9 +72,6 @@ def ur_kinematics_yaml(arm: Arm) -> str:
     Args:
         arm: One arm; mm and rad become m and rad in the file.
 
-    Raises:
-        InputError: The arm does not have six joints.
-
     Example:
         >>> for line in aj.files.ur_kinematics_yaml(aj.load_arm("ur10e")).splitlines()[-3:]:
         ...     print(line)
@@ -81,32 +81,26 @@ def ur_kinematics_yaml(arm: Arm) -> str:
     """
     if single(arm).joints != len(_JOINTS):
         raise InputError(f"kinematics.yaml is of six joints, but the arm has {arm.joints}; choose another --format.")
-    *origins, tip = canonical_origins(geometry_of(without_far_frames(arm)))
+    values = [
+        # 0.0 is added, as -0.0 becomes 0.0.
+        [repr(float(x) + 0.0) for x in (*origin[:3, 3] / 1000, *roll_pitch_yaw(origin[:3, :3]))]
+        for origin in canonical_origins(geometry_of(without_far_frames(arm)))
+    ]
     lines = [
         "# Written by aacmm_jax: origins of the joints of a calibrated arm, m and rad.",
         "# The driver warns that the hash is not the controller's, as the parameters are not those of the factory.",
-        f"# The tip in the tool flange's frame, for the controller's TCP: {_numbers(tip)}",
+        f"# The tip in the tool flange's frame, for the controller's TCP: {' '.join(values[-1])}",
         "kinematics:",
     ]
-    for name, origin in zip(_JOINTS, origins, strict=True):
-        values = zip(_COORDINATES, _numbers(origin).split(), strict=True)
-        lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in values)]
+    for name, numbers in zip(_JOINTS, values[:-1], strict=True):
+        lines += [f"  {name}:", *(f"    {key}: {text}" for key, text in zip(_COORDINATES, numbers, strict=True))]
     return "\n".join([*lines, "  hash: aacmm_jax_calibration"]) + "\n"
-
-
-def _numbers(transform: Transform) -> str:
-    values = (*transform[:3, 3] / 1000, *roll_pitch_yaw(transform[:3, :3]))
-    return " ".join(repr(float(value) + 0.0) for value in values)  # -0.0 becomes 0.0
 
 
 def _of_origins(entries: dict[str, str]) -> Geometry:
     directions, points, frame = [], [], np.eye(4)
     for name in _JOINTS:
-        names = [f"kinematics.{name}.{key}" for key in _COORDINATES]
-        missing = next((name for name in names if name not in entries), None)
-        if missing is not None:
-            raise InputError(f"'{missing}' is missing; a kinematics.yaml has it for each of six joints.")
-        numbers = np.concatenate([_numbers_of(entries, name, 1) for name in names])
+        numbers = np.concatenate([_numbers_of(entries, f"kinematics.{name}.{key}", 1) for key in _COORDINATES])
         origin = np.eye(4)
         origin[:3, :3] = roll_pitch_yaw_matrix(numbers[3:])
         origin[:3, 3] = 1000 * numbers[:3]
@@ -119,23 +113,18 @@ def _of_origins(entries: dict[str, str]) -> Geometry:
     return geometry
 
 
-def _of_parameters(entries: dict[str, str]) -> Geometry:
-    missing = next((name for name in _DH if name not in entries), None)
-    if missing is not None:
-        raise InputError(f"'{missing}' is missing; add it.")
-    theta, a, d, alpha = (_numbers_of(entries, name, len(_JOINTS)) for name in _DH)
-    return Geometry(alpha, 1000 * a, 1000 * d, theta, None, np.zeros(3))
-
-
 def _numbers_of(entries: dict[str, str], name: str, count: int) -> Float[np.ndarray, " k"]:
     """The numbers of an entry, m and rad."""
-    asked = "a finite number" if count == 1 else "six finite numbers"
+    if name not in entries:
+        of_joints = "; a kinematics.yaml has it for each of six joints." if count == 1 else "; add it."
+        raise InputError(f"'{name}' is missing{of_joints}")
     parts = entries[name].strip("[] ").replace(",", " ").split()
     try:
         numbers = np.array([number(part) for part in parts])
     except ValueError:
         numbers = np.array([math.nan])
     if len(parts) != count or not np.all(np.abs(numbers) < _LARGEST):
+        asked = "a finite number" if count == 1 else "six finite numbers"
         raise InputError(f"'{name}' is {quoted(entries[name])}; give {asked} below {_LARGEST:g}, m or rad.")
     return numbers
 

@@ -121,9 +121,6 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
     Args:
         source: The text of the file and the names of the links.
 
-    Raises:
-        InputError: There is no chain, or a joint in it is of a kind that an arm does not have.
-
     Example:
         >>> chain = aj.files.urdf_chain(aj.files.load_specification("robot.urdf").urdf)
         >>> print([joint.name for joint in chain.joints])
@@ -198,9 +195,6 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
         arm: The calibrated arm.
         nominal: The arm that `read_urdf` gave.
 
-    Raises:
-        InputError: The nominal arm is not from a URDF, or the arms do not fit together.
-
     Example:
         >>> robot = aj.files.load_specification("robot.urdf")
         >>> exported = aj.files.urdf_of(robot.arm.replace(a_2=401.0), robot)
@@ -248,9 +242,6 @@ def save_urdf(arm: Arm, path: str | os.PathLike, *, nominal: ArmSpecification) -
         arm: The calibrated arm.
         path: The file to write.
         nominal: The arm as `read_urdf` or `load_specification` gave it.
-
-    Raises:
-        InputError: The nominal arm is not from a URDF, or the file cannot be written.
 
     Example:
         >>> robot = aj.files.load_specification("robot.urdf")

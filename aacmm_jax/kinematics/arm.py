@@ -23,6 +23,8 @@ LENGTHS = ("a", "d", "probe")
 DOWN = (0.0, 0.0, -1.0)
 _AXES = ("x", "y", "z")
 _LENGTH_STEP, _ANGLE_STEP = 1.0, 1e-3  # comparable at the tip of an arm of about 1 m
+Limits = Sequence[Sequence[float]]  # lowest and highest reading of each joint
+JointLimits = Float[np.ndarray, "n 2"]
 _BY_JOINT, _BY_TERM, _VECTOR = (Float[Array, shape] for shape in ("... joints", "... coefficients", "... 3"))
 _LARGEST = 20_000  # configurations: up to here NumPy is sooner done than a compiler
 
@@ -83,7 +85,7 @@ class Arm(eqx.Module):
         theta: Numbers | None = None,
         beta: Numbers | None = None,
         probe: Numbers = (0.0, 0.0, 0.0),
-        limits: Sequence[Sequence[float]] | None = None,
+        limits: Limits | None = None,
         prismatic: Iterable[int] = (),
         coefficients: Numbers | None = None,
         gravity: Numbers | None = None,
@@ -145,16 +147,9 @@ class Arm(eqx.Module):
     def jacobian(self, q: Numbers, names: Sequence[str] | None = None) -> Float[AnyArray, "... 3 p"]:
         """Exact derivative of the tip by named parameters: analytic, equal to ``jax.jacfwd`` to rounding.
 
-        Args:
-            q: Joint readings ``(..., n)``, rad, or mm of prismatic joints.
-            names: Parameter names (``alpha_1`` ... ``probe_z``) or joint readings ``q_1`` ... ``q_n``, or one of
-                them; by default all parameters, in the order of `parameter_names`.
-
-        Returns:
-            ``(..., 3, p)``, mm per mm or mm per rad.
-
-        Raises:
-            InputError: A name is unknown, or q has another number of joints.
+        ``(..., n) -> (..., 3, p)``, mm per mm or mm per rad. ``names`` are parameters (``alpha_1`` ... ``probe_z``) or
+        joint readings ``q_1`` ... ``q_n``, or one of them; by default all, in the order of `parameter_names`.
+        `InputError` where a name is unknown, or q has another number of joints.
         """
         names = parameter_names(self) if names is None else (names,) if isinstance(names, str) else names
         joints, corrections = self.joints, correction_names(self)
@@ -164,12 +159,8 @@ class Arm(eqx.Module):
     def replace(self, **changes: Any) -> "Arm":
         """The same arm with some values replaced, checked as a new arm is; also on traced values.
 
-        Args:
-            **changes: By parameter name (``d_3=750.0``), or a whole argument of the constructor (``probe=(0, 0, 131)``,
-                ``beta=None``); mm and rad. A single parameter is set after whole arguments.
-
-        Raises:
-            InputError: A name is unknown, or the arm that results is refused.
+        By parameter name (``d_3=750.0``), or a whole argument of the constructor (``probe=(0, 0, 131)``); mm and rad. A
+        single parameter is set after whole arguments.
         """
         whole = [field.name for field in dataclasses.fields(self)]
         arguments: dict[str, Any] = {name: changes.pop(name, getattr(self, name)) for name in whole}
@@ -217,9 +208,7 @@ def check_columns(arm: Arm, columns: int) -> None:
         )
 
 
-def checked_limits(
-    limits: Sequence[Sequence[float]], joints: int, prismatic: tuple[int, ...] = ()
-) -> tuple[tuple[float, float], ...]:
+def checked_limits(limits: Limits, joints: int, prismatic: tuple[int, ...] = ()) -> tuple[tuple[float, float], ...]:
     """Lowest and highest reading of each joint, rad or mm, or `InputError` that names the joint."""
     try:
         rows = [tuple(float(reading) for reading in row) for row in limits]
@@ -235,7 +224,7 @@ def checked_limits(
     return tuple((low, high) for low, high in rows)
 
 
-def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[np.ndarray, "n 2"]:
+def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
     """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad, or mm.
 
     Raises `InputError` where a prismatic joint has neither.
@@ -251,7 +240,7 @@ def joint_limits(arm: Arm, limits: Sequence[Sequence[float]] | None) -> Float[np
     return np.asarray(checked_limits(rows, arm.joints, arm.prismatic))
 
 
-def arm_of(geometry: Geometry, limits: Sequence[Sequence[float]] | None = None) -> Arm:
+def arm_of(geometry: Geometry, limits: Limits | None = None) -> Arm:
     """The arm of a geometry."""
     prismatic = () if geometry.kinds is None else geometry.kinds.prismatic
     arrays = {name: value for name, value in geometry._asdict().items() if name != "kinds"}

@@ -15,7 +15,7 @@ from ..core.arguments import Positive, Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, in_chunks, namespace, to_numpy
 from ..core.rotations import rotation_matrix
-from .arm import Arm
+from .arm import Arm, JointLimits
 from .chain import Vectors, forward_pass, frame_axes, joint_motion
 
 _SHORTEST = 1e-6  # mm: shorter links have no capsule
@@ -28,6 +28,7 @@ _SAMPLES = 500
 _MOSTLY = 0.5  # of random configurations: capsules that touch in so many overlap by their shapes
 
 Vector = tuple[float, float, float]
+Distances = Float[AnyArray, "... N"]
 
 
 class Body(NamedTuple):
@@ -119,7 +120,7 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     """Capsules about an arm's offsets d, lengths a and its probe, as the D-H table has them.
 
     That is the body of an arm whose links are where its table's frames are; of a robot with links beside its axes, its
-    URDF's shapes are nearer to the truth (`files.urdf_body`). The tool's capsule ends two radii before the tip, so that
+    URDF's shapes are nearer to the truth (`files.load_cell`). The tool's capsule ends two radii before the tip, so that
     it clears a surface that the tip is in up to a tilt of 60 deg. Capsules that little of the arm joins touch at their
     joint, and are no pair.
 
@@ -164,9 +165,7 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     return Body(names, start_frame, start, end_frame, end, widths, np.column_stack([first, second])[apart])
 
 
-def capsule_ends(
-    body: Body, arm: Arm, q: Float[AnyArray, "N n"]
-) -> tuple[Float[AnyArray, "k 3 N"], Float[AnyArray, "k 3 N"]]:
+def capsule_ends(body: Body, arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[Vectors, Vectors]:
     """Where the capsules' segments begin and end at N configurations, in the base frame, mm."""
     forward = forward_pass(arm.geometry, joint_motion(arm.geometry, q))
     xp, (x, y, z) = namespace(forward), frame_axes(forward)
@@ -181,9 +180,7 @@ def capsule_ends(
     return placed(body.start_frame, body.start), placed(body.end_frame, body.end)
 
 
-def segment_distance(
-    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
-) -> Float[AnyArray, "... N"]:
+def segment_distance(start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors) -> Distances:
     """Distance between two segments, mm; a segment may be a point.
 
     The point of one segment that is nearest to the line of the other, the point of the other that is nearest to that,
@@ -202,7 +199,7 @@ def segment_distance(
     return _length(between + first[..., None, :] * along - second[..., None, :] * other_along)
 
 
-def distance_from_box(start: Vectors, end: Vectors, half: Float[AnyArray, "... 3 1"]) -> Float[AnyArray, "... N"]:
+def distance_from_box(start: Vectors, end: Vectors, half: Float[AnyArray, "... 3 1"]) -> Distances:
     """Distance of a segment from a solid box about the origin with half edges ``half`` along the axes, mm.
 
     The squared distance along the segment is convex, and its derivative is linear between the places where the segment
@@ -289,7 +286,7 @@ def check_obstacle(obstacle: Obstacle) -> None:
         raise InputError(f"the normal of obstacle '{obstacle.name}' has the length 0; give a direction.")
 
 
-def checked_cell(arm: Arm, cell: Cell, limits: Float[np.ndarray, "n 2"]) -> Cell:
+def checked_cell(arm: Arm, cell: Cell, limits: JointLimits) -> Cell:
     """The cell without pairs that touch wherever the arm is, which are named in ``unchecked``.
 
     A body touches itself at its joints, and its foot touches what it stands on. Pairs of capsules that touch in half of

@@ -21,17 +21,18 @@ imitation by all other free parameters. Then
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import in_chunks
 from ..core.text import listed
 from .arm import (
     Arm,
+    JointLimits,
     check_columns,
     correction_names,
     is_length,
@@ -55,13 +56,12 @@ _PARTNER = 0.05  # of the largest partner of a parameter: smaller ones are not n
 _PARTNERS_NAMED = 3
 _EQUAL = 1e-6  # relative differences below this are rounding
 
+Readings = Float[np.ndarray, "m n"]
 PoseRows = Float[np.ndarray, "N 3 p"]
 LengthRows = Float[np.ndarray, "l p"]
 
 
-def equations(
-    arm: Arm, capture: SocketPoses, names: Sequence[str], q: Float[np.ndarray, "N n"]
-) -> tuple[PoseRows, LengthRows]:
+def equations(arm: Arm, capture: SocketPoses, names: Sequence[str], q: Readings) -> tuple[PoseRows, LengthRows]:
     """Derivatives of tips less their socket's mean, and of reference lengths, at configurations; mm per mm or rad."""
     starts = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
 
@@ -122,15 +122,12 @@ def _independent(order: list[str], rows: Float[np.ndarray, "r p"]) -> tuple[str,
 
 
 def determined_at(
-    arm: Arm,
-    capture: SocketPoses,
-    order: Sequence[str],
-    change: Callable[[Float[np.ndarray, "m n"]], Float[np.ndarray, "m n"]],
+    arm: Arm, capture: SocketPoses, order: Sequence[str], change: Callable[[Readings], Readings]
 ) -> tuple[str, ...]:
     """The first of these parameters that are independent at the poses of a capture, once ``change`` has made other
     readings of them. Tips that do not meet in their socket then are no matter: what imitates what stays the same."""
 
-    def changed(q: Any) -> Float[np.ndarray, "m n"]:
+    def changed(q: Any) -> Readings:
         return change(np.array(q)[:, : arm.joints])
 
     poses, lengths = _determining(arm, capture, order, changed(capture.q) if capture.sizes else None, changed)
@@ -209,30 +206,13 @@ def _order(arm: Arm, parallel: list[int]) -> list[str]:
     return [*(name for name in dict.fromkeys(order) if name != longest), *([longest] if longest else [])]
 
 
-@dataclass
-class PosesInSockets:
-    """`SocketPoses` with a reference length that joins the first two sockets, or a socket to itself."""
-
-    q: Float[np.ndarray, "N n"]
-    sizes: tuple[int, ...]
-    observations: tuple[Any, ...] = ()
-
-    @property
-    def columns(self) -> int:
-        """Number of columns of the readings."""
-        return self.q.shape[1]
-
-    @property
-    def owner(self) -> Int[np.ndarray, " N"]:
-        """Index of the socket of each pose."""
-        return np.repeat(np.arange(len(self.sizes)), self.sizes)
-
-    def ends(self) -> Int[np.ndarray, "l 2"]:
-        """Socket indices of both ends of the length."""
-        return np.array([[0, min(1, len(self.sizes) - 1)]])
+def poses_in_sockets(q: Float[np.ndarray, "N n"], sizes: tuple[int, ...]) -> SocketPoses:
+    """Poses, socket after socket, with a reference length that joins the first two sockets, or a socket to itself."""
+    owner, ends = np.repeat(np.arange(len(sizes)), sizes), np.array([[0, min(1, len(sizes) - 1)]])
+    return SimpleNamespace(q=q, columns=q.shape[1], sizes=sizes, owner=owner, observations=(), ends=lambda: ends)
 
 
-def generic_poses(arm: Arm, limits: Float[np.ndarray, "n 2"] | None = None) -> SocketPoses:
+def generic_poses(arm: Arm, limits: JointLimits | None = None) -> SocketPoses:
     """What a thorough calibration would record, without noise: poses in several sockets and one reference length.
 
     The sockets are where random configurations within the limits (default: the arm's own) put the tip; the same arm
@@ -245,7 +225,7 @@ def generic_poses(arm: Arm, limits: Float[np.ndarray, "n 2"] | None = None) -> S
     starts = random.uniform(limits[:, 0], limits[:, 1], (len(owner), arm.joints))
     q, arrived = project_to_targets(arm, starts, np.asarray(arm.position(first))[owner], limits)
     sockets = [np.concatenate([first[i : i + 1], q[arrived & (owner == i)]]) for i in range(_SOCKETS)]
-    return PosesInSockets(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
+    return poses_in_sockets(np.concatenate(sockets), tuple(len(socket) for socket in sockets))
 
 
 class TradeOff(NamedTuple):

@@ -23,8 +23,17 @@ from ..core.linear_algebra import solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, compiled, in_chunks, namespace, numpy_if_known, set_at, to_numpy
 from ..core.random_keys import random_numbers
 from ..core.rotations import cross
-from .arm import Arm, checked_limits, is_single
-from .chain import ForwardPass, Geometry, forward_pass, joint_motion, joint_motion_of_rows, length_scale, reading_units
+from .arm import Arm, JointLimits, Limits, checked_limits, is_single
+from .chain import (
+    ByJoint,
+    ForwardPass,
+    Geometry,
+    forward_pass,
+    joint_motion,
+    joint_motion_of_rows,
+    length_scale,
+    reading_units,
+)
 from .jacobian import reading_columns, reading_rotations
 
 _BATCH = 256  # candidates per call: one compiled shape for every number of targets
@@ -124,7 +133,7 @@ def least_norm_inverse(geometry: Geometry, q: Float[AnyArray, "N n"]) -> Float[A
     return weighted_inverse(forward_pass(geometry, joint_motion(geometry, q)), np.zeros(q.shape[0]))
 
 
-def weighted_inverse(forward: ForwardPass, damping: Float[AnyArray, "... N"]) -> Float[AnyArray, "n ... 3 N"]:
+def weighted_inverse(forward: ForwardPass, damping: Float[AnyArray, "... N"]) -> ByJoint:
     """`damped_inverse` by the readings, whose squares are counted in their units; rad and mm per mm."""
     columns = reading_columns(forward)
     if forward.kinds is None:
@@ -133,9 +142,7 @@ def weighted_inverse(forward: ForwardPass, damping: Float[AnyArray, "... N"]) ->
     return units * damped_inverse(columns * units, damping)
 
 
-def damped_inverse(
-    columns: Float[AnyArray, "n ... 3 N"], damping: Float[AnyArray, "... N"]
-) -> Float[AnyArray, "n ... 3 N"]:
+def damped_inverse(columns: ByJoint, damping: Float[AnyArray, "... N"]) -> ByJoint:
     """J^T (J J^T + damping)^-1 for each configuration, from ``columns``, the derivatives of the tip by the joints, mm.
 
     The inverse is written out (adjugate over determinant): for matrices this small a library call costs ten times the
@@ -196,7 +203,7 @@ def project_to_targets(
     arm: Arm,
     q: Float[np.ndarray, "N columns"],
     targets: Float[np.ndarray, "N 3"],
-    limits: Float[np.ndarray, "n 2"] | None = None,
+    limits: JointLimits | None = None,
     steps: int = _STEPS,
 ) -> tuple[Float[np.ndarray, "N columns"], Bool[np.ndarray, " N"]]:
     """Configurations moved by least-norm steps until the tip is at its target.
@@ -251,9 +258,7 @@ class ReadingsAtPoses(NamedTuple):
     reached: Bool[AnyArray, "..."]  # within 1 nm and 1 nrad; with fewer than six joints within 1 nm
 
 
-def corrected_readings(
-    nominal: Arm, calibrated: Arm, q: Numbers, limits: Sequence[Sequence[float]] | None = None
-) -> ReadingsAtPoses:
+def corrected_readings(nominal: Arm, calibrated: Arm, q: Numbers, limits: Limits | None = None) -> ReadingsAtPoses:
     """Readings that put the calibrated arm where a controller with the nominal arm believes it to be at ``q``.
 
     What the controller means by the readings ``q`` is the pose ``nominal.pose(q)``; the readings found make
@@ -285,7 +290,7 @@ def corrected_readings(
 
 @numpy_if_known
 def readings_at_poses(
-    arm: Arm, q: Numbers, poses: Float[AnyArray, "... 4 4"], limits: Sequence[Sequence[float]] | None = None
+    arm: Arm, q: Numbers, poses: Float[AnyArray, "... 4 4"], limits: Limits | None = None
 ) -> ReadingsAtPoses:
     """Readings near ``q`` at which the arm has given poses.
 
@@ -338,7 +343,7 @@ def readings_at_poses(
 
 
 def _solve_to_poses(
-    geometry: Geometry, q: Float[AnyArray, "n c"], poses: Float[AnyArray, "c 4 4"], limits: Float[np.ndarray, "n 2"]
+    geometry: Geometry, q: Float[AnyArray, "n c"], poses: Float[AnyArray, "c 4 4"], limits: JointLimits
 ) -> Float[AnyArray, "c columns"]:
     """Readings by damped least-norm steps to the poses, and the distance (mm) and angle (rad) that remain."""
     xp, whole = namespace(geometry, q, poses), q.shape[0] >= FULL_POSE
@@ -368,9 +373,7 @@ def _solve_to_poses(
     return xp.column_stack([q.T, xp.linalg.norm(shift, axis=0), xp.linalg.norm(rotation, axis=0)])
 
 
-def _remaining(
-    forward: ForwardPass, wanted: Float[AnyArray, "3 4 N"]
-) -> tuple[Float[AnyArray, "3 N"], Float[AnyArray, "3 N"]]:
+def _remaining(forward: ForwardPass, wanted: Float[AnyArray, "3 4 N"]) -> tuple[AnyArray, AnyArray]:
     """The shift (mm) and the rotation vector (rad) from poses to those wanted.
 
     With the axes r_k of a frame and w_k of the one wanted, the sum of r_k x w_k is twice the sine times the axis of the

@@ -40,14 +40,8 @@ _HalfWidth = Annotated[float, Range(least=0, infinite=True)]
 class Parameters(eqx.Module):
     """The free parameters of an arm, in order, and the arm that supplies the fixed ones.
 
-    ``vector(arm)`` reads them into ``(p,)`` (mm and rad mixed); ``arm(vector)`` writes them back.
-
-    Args:
-        base: The arm that fixed parameters are taken from.
-        names: Names of the free parameters.
-
-    Raises:
-        InputError: A name is there twice.
+    ``vector(arm)`` reads them into ``(p,)`` (mm and rad mixed); ``arm(vector)`` writes them back. An `InputError` names
+    a parameter that is there twice, or that the arm does not have.
 
     Example:
         >>> some = aj.Parameters.free_of(arm, held=("d_1", "a_2"))
@@ -59,8 +53,8 @@ class Parameters(eqx.Module):
         [  36.437  104.848 -111.66 ]
     """
 
-    base: Arm
-    names: Annotated[tuple[str, ...], NOT_EMPTY] = eqx.field(static=True)
+    base: Arm  # from which fixed parameters are taken
+    names: Annotated[tuple[str, ...], NOT_EMPTY] = eqx.field(static=True)  # of the free ones
 
     def __check_init__(self):
         checked_fields(self)
@@ -158,14 +152,8 @@ class Parameters(eqx.Module):
         return self.names.index(name)
 
     def vector(self, arm: Arm | None = None) -> Float[AnyArray, "... p"]:
-        """The free parameters of an arm as ``(..., p)``, mm and rad.
-
-        Args:
-            arm: An arm with as many joints as the base arm; by default the base arm.
-
-        Raises:
-            InputError: The arm has another number of joints.
-        """
+        """The free parameters of an arm (default: the base arm) as ``(..., p)``, mm and rad; `InputError` where it has
+        another number of joints."""
         arm = self.base if arm is None else arm
         if arm.joints != self.base.joints:
             raise InputError(
@@ -179,14 +167,8 @@ class Parameters(eqx.Module):
         return np.stack(rows, axis=-1) if namespace(arm) is np else joined(rows, axis=-1, new=True)
 
     def arm(self, vector: Numbers) -> Arm:
-        """The base arm with its free parameters taken from a vector.
-
-        Args:
-            vector: Values in the order of ``names``, ``(..., p)``, mm and rad; leading axes give a batch of arms.
-
-        Raises:
-            InputError: The vector does not have p values.
-        """
+        """The base arm with its free parameters taken from ``(..., p)`` values in the order of ``names``, mm and rad;
+        leading axes give a batch of arms. `InputError` where there are not p values."""
         geometry = self.geometry(self.checked_vector(vector, "vector"))
         return with_arrays(self.base, **{kind: getattr(geometry, kind) for kind, _ in self.indices()})
 
@@ -229,15 +211,7 @@ def based_on(space: Parameters, arm: Arm) -> Parameters:
 
 
 class Bounds(eqx.Module):
-    """Bounds of the free parameters.
-
-    Args:
-        space: The free parameters.
-        lower: Lower bounds ``(p,)``, mm and rad; may be infinite.
-        upper: Upper bounds ``(p,)``.
-
-    Raises:
-        InputError: A lower bound is above its upper one, or shapes do not fit.
+    """Bounds of the free parameters; `InputError` where a lower bound is above its upper one, or shapes do not fit.
 
     Example:
         >>> box = aj.Bounds.around(arm, space, length=5.0, angle=0.01, override={"probe_z": 60.0})
@@ -247,7 +221,7 @@ class Bounds(eqx.Module):
     """
 
     space: Parameters
-    lower: Float[AnyArray, " p"]
+    lower: Float[AnyArray, " p"]  # mm and rad; may be infinite
     upper: Float[AnyArray, " p"]
 
     @checked_arguments
@@ -333,32 +307,21 @@ class UrdfSource(NamedTuple):
 class ArmSpecification(NamedTuple):
     """An arm as a file states it, with the identification that the file proposes.
 
-    Args:
-        arm: The nominal arm.
-        name: What people call it.
-        held: Names of the fixed parameters; None for the default of `Parameters.free_of`.
-        length: Half-width of the bounds of lengths, mm.
-        angle: Half-width of the bounds of angles, rad.
-        override: Half-widths of single parameters by name, mm or rad.
-        free: Names that are free in addition, such as Hayati's ``beta_2``.
-        urdf: The URDF that the arm was read from; None for others.
-        prior: Prior of the parameters; None where the file states none.
-
     Example:
         >>> mine = aj.kinematics.ArmSpecification(arm, "my arm", length=5.0, override={"probe_z": 60.0})
         >>> print(mine.name, len(mine.space().names), mine.bounds().upper[-1] - arm.probe[2])
         my arm 21 60.0
     """
 
-    arm: Arm
-    name: str = ""
-    held: tuple[str, ...] | None = None
-    length: float = 10.0
-    angle: float = 0.0175
-    override: Mapping[str, float] = MappingProxyType({})
-    free: tuple[str, ...] = ()
-    urdf: UrdfSource | None = None
-    prior: Prior | None = None
+    arm: Arm  # the nominal one
+    name: str = ""  # what people call it
+    held: tuple[str, ...] | None = None  # names of the fixed parameters; None for the default of `Parameters.free_of`
+    length: float = 10.0  # half-width of the bounds of lengths, mm
+    angle: float = 0.0175  # half-width of the bounds of angles, rad
+    override: Mapping[str, float] = MappingProxyType({})  # half-widths of single parameters by name, mm or rad
+    free: tuple[str, ...] = ()  # names that are free in addition, such as Hayati's ``beta_2``
+    urdf: UrdfSource | None = None  # that the arm was read from; None for others
+    prior: Prior | None = None  # of the parameters; None where the file states none
 
     def space(self) -> Parameters:
         """The free parameters that the file proposes."""

@@ -4,7 +4,6 @@ A tool may come to a socket from the directions of a cone alone.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ..core.arguments import Range, checked
 from ..core.errors import InputError
 from ..core.numpy_or_jax import in_chunks, to_numpy
-from .arm import Arm, joint_limits
+from .arm import Arm, JointLimits, Limits, joint_limits
 from .chain import ForwardPass, forward_pass, joint_motion, reading_units
 from .collisions import Cell, checked_cell, is_clear
 from .inverse_kinematics import ARRIVED, EXACT, LARGEST_STEP, ROWS, damped_inverse, project_to_targets, repeated
@@ -27,6 +26,9 @@ _INSIDE = 1e-4  # rad: what is brought into a cone ends this far inside it
 _LEVER = 100.0  # mm: a rotation of the tool counts as what it moves at this distance
 
 Configurations = Float[np.ndarray, "c n"]
+Targets = Float[np.ndarray, "c 3"]
+Chosen = Bool[np.ndarray, " c"]
+Places = Int[np.ndarray, " c"]
 
 
 class Reach(NamedTuple):
@@ -175,7 +177,7 @@ class Cones(NamedTuple):
         """Whether some cone leaves out directions."""
         return bool(np.any(self.half_angles < math.pi))
 
-    def at(self, sockets: Int[np.ndarray, " c"]) -> "Cones":
+    def at(self, sockets: Places) -> "Cones":
         """The cone of each of these sockets."""
         return self._replace(normals=self.normals[sockets], half_angles=self.half_angles[sockets])
 
@@ -203,19 +205,14 @@ def tilts(arm: Arm, q: Configurations, cones: Cones) -> Float[np.ndarray, " c"]:
     return _angle(rotations @ cones.tool_axis, cones.normals)
 
 
-def _angle(tool: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, " c"]:
+def _angle(tool: Targets, normal: Targets) -> Float[np.ndarray, " c"]:
     """Angle between the reversed tool and a normal; by its tangent, so that small ones are exact."""
     return np.arctan2(np.linalg.norm(np.cross(tool, normal), axis=-1), -np.sum(tool * normal, axis=-1))
 
 
 def into_cones(
-    arm: Arm,
-    q: Configurations,
-    targets: Float[np.ndarray, "c 3"],
-    limits: Float[np.ndarray, "n 2"],
-    cones: Cones,
-    steps: int,
-) -> tuple[Configurations, Bool[np.ndarray, " c"]]:
+    arm: Arm, q: Configurations, targets: Targets, limits: JointLimits, cones: Cones, steps: int
+) -> tuple[Configurations, Chosen]:
     """Configurations moved by least-norm steps until the tip is at its target (mm) and the tool in its cone.
 
     Each step closes the gap of the tip, as `solve_to_targets` does, and where the tool is outside its cone turns it
@@ -267,7 +264,7 @@ class SearchRegion(NamedTuple):
     """Where configurations are looked for, and the random numbers that the search uses."""
 
     arm: Arm
-    limits: Float[np.ndarray, "n 2"]  # lowest and highest reading of each joint, rad, or mm of prismatic ones
+    limits: JointLimits  # lowest and highest reading of each joint, rad, or mm of prismatic ones
     above: float  # height in the base frame below which no joint and no tip comes, mm
     random: np.random.Generator
     cones: Cones | None = None  # of approach to each socket; None where the tool may have any direction
@@ -280,7 +277,7 @@ class SearchRegion(NamedTuple):
 
 def search_region(
     arm: Arm,
-    limits: Sequence[Sequence[float]] | None,
+    limits: Limits | None,
     margin: float,
     above: float,
     seed: int,
@@ -303,11 +300,11 @@ def search_region(
 def reached(
     region: SearchRegion,
     starts: Configurations,
-    targets: Float[np.ndarray, "c 3"],
+    targets: Targets,
     steps: int = _REACHING,
-    sockets: Int[np.ndarray, " c"] | None = None,
+    sockets: Places | None = None,
     scattered: bool = False,
-) -> tuple[Configurations, Bool[np.ndarray, " c"]]:
+) -> tuple[Configurations, Chosen]:
     """Configurations moved from their starts to the targets, and which of them arrived and can be taken: above the
     table, within the cone of approach, and clear of obstacles.
 
@@ -331,7 +328,7 @@ def reached(
 
 def configurations_at(
     region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
-) -> tuple[Configurations, Int[np.ndarray, " c"]]:
+) -> tuple[Configurations, Places]:
     """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point.
 
     With several cones, point i has the cone i; or modulo their number, for several placements of the same sockets.

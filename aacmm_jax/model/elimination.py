@@ -17,7 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..core.linear_algebra import inverse_cholesky, inverse_positive_definite, semidefinite_eigen
+from ..core.linear_algebra import (
+    inverse_cholesky,
+    inverse_positive_definite,
+    length_and_direction,
+    semidefinite_eigen,
+)
 from ..core.numpy_or_jax import AnyArray, added_to, namespace
 from ..data.observations.observation import Rows
 from ..kinematics.parameters import Parameters
@@ -27,15 +32,7 @@ from .layout import Group
 from .observed import Observed
 from .robust import Loss
 from .rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at
-from .sockets import (
-    counts,
-    means_over_sockets,
-    membership,
-    owner_of,
-    starts,
-    sums_over_sockets,
-    to_poses,
-)
+from .sockets import counts, means_over_sockets, owner_of, sums_over_sockets, to_poses
 
 _LONG = 40  # poses of a component, from which a product of matrices each is the fastest sum over them
 _NULL = 1e-12  # eigenvalues of a component's information below this, of the largest, are zero
@@ -69,33 +66,18 @@ def sums_by_component(
     if not count:
         return xp.zeros((0, first.shape[0], second.shape[0]))
     if len(set(sizes)) == 1 and (xp is not np or sizes[0] >= _LONG):
-        left, right = (_by_component(part, count) for part in (first, second))
+        split = (part.reshape(*part.shape[:2], count, -1) for part in (first, second))
+        left, right = (xp.moveaxis(part, 2, 0).reshape(count, part.shape[0], -1) for part in split)
         return left @ xp.swapaxes(right, -1, -2)
     if sum(sizes) >= _LONG * count:
         return xp.stack([flat(first[..., poses]) @ flat(second[..., poses]).T for poses in _slices(sizes)])
     products: Any = sum(first[:, None, r] * second[None, :, r] for r in range(first.shape[1]))
-    return xp.moveaxis(_summed(products, sizes), -1, 0)
+    return xp.moveaxis(sums_over_sockets(products, sizes), -1, 0)
 
 
 def _slices(sizes: tuple[int, ...]) -> list[slice]:
     ends = np.cumsum(sizes).tolist()
     return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-
-
-def _by_component(rows: Float[AnyArray, "k r m"], count: int) -> Float[AnyArray, "K k _"]:
-    """Rows of components with as many poses each, component by component."""
-    k, r, m = rows.shape
-    split = namespace(rows).moveaxis(rows.reshape(k, r, count, m // count), 2, 0)
-    return split.reshape(count, k, -1)
-
-
-def _summed(values: Float[AnyArray, "... m"], sizes: tuple[int, ...]) -> Float[AnyArray, "... K"]:
-    """Sums over the poses of each component, of which some may have none."""
-    xp, some = namespace(values), tuple(size for size in sizes if size)
-    sums = np.add.reduceat(values, starts(some), axis=-1) if xp is np else values @ xp.asarray(membership(some).T)
-    if len(some) == len(sizes):
-        return sums
-    return added_to(xp.zeros((*values.shape[:-1], len(sizes))), (..., np.flatnonzero(sizes)), sums)
 
 
 def followed(
@@ -104,9 +86,8 @@ def followed(
     """The rows by numbers of their component, times a matrix of each component."""
     xp, (k, r, _) = namespace(by_own, matrices), by_own.shape
     if sum(sizes) >= _LONG * len(sizes):
-        shapes = [(matrices.shape[-1], r, size) for size in sizes]
-        parts = zip(matrices, _slices(sizes), shapes, strict=True)
-        pieces = [(matrix.T @ flat(by_own[..., poses])).reshape(shape) for matrix, poses, shape in parts]
+        products = [matrix.T @ flat(by_own[..., poses]) for matrix, poses in zip(matrices, _slices(sizes), strict=True)]
+        pieces = [product.reshape(len(product), r, -1) for product in products]
         return pieces[0] if len(pieces) == 1 else xp.concatenate(pieces, axis=-1)
     owner = owner_of(sizes)
     total: Any = 0.0
@@ -132,9 +113,7 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
 
 def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
     """Rows whose products have the curvature of a robust loss (`Loss.along`) and the gradient of these."""
-    xp = namespace(block.white)
-    size = xp.sqrt(xp.sum(block.white**2, axis=0))
-    direction = block.white / xp.where(size > 0, size, 1.0)[None]
+    xp, (_, direction) = namespace(block.white), length_and_direction(block.white)
 
     def changed(by: Float[AnyArray, "k r m"] | None) -> Float[AnyArray, "k r m"] | None:
         if by is None:
@@ -245,9 +224,9 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
     """Cost and gradient of `observed_rows`, and their information: with a robust loss the curvature of the cost, as far
     as it is positive, or that of the weighted rows where it is not to be ``curved``."""
     layout, p, prior = args.observed.layout, len(args.space.names), args.whitening.prior
-    blocks = _blocks(z, args)
-    cost, weights = cost_and_weights(blocks, args.loss, len(layout.groups))
-    plain, blocks = blocks, [weighted(block, weight) for block, weight in zip(blocks, weights, strict=True)]
+    plain = _blocks(z, args)
+    cost, weights = cost_and_weights(plain, args.loss, len(layout.groups))
+    blocks = [weighted(block, weight) for block, weight in zip(plain, weights, strict=True)]
     if args.loss is not None and curved:
         for number in range(len(layout.groups)):
             blocks[number] = _curved(blocks[number], args.loss.along(plain[number].white))
@@ -274,11 +253,10 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
 def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
     """Whitened residuals of observations, lengths, certified values and the prior; half their sum of squares is what
     is minimised."""
-    groups, rows = len(args.observed.layout.groups), []
-    for number, block in enumerate(_blocks(z, args)):
-        of_poses = number < groups
-        rows.append(args.loss.transformed(block.white) if args.loss is not None and of_poses else block.white)
-    prior = args.whitening.prior
+    rows, prior = [block.white for block in _blocks(z, args)], args.whitening.prior
+    if args.loss is not None:
+        poses = slice(0, len(args.observed.layout.groups))
+        rows[poses] = [args.loss.transformed(white) for white in rows[poses]]
     return tuple(rows) if prior is None else (*rows, prior.residual(z))
 
 

@@ -15,7 +15,7 @@ Example: of two sockets that a length joins, and a tracker that saw two targets,
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -113,7 +113,13 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
     # A length with one shared end says something of what is shared alone.
     half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
     alone = {name: number for name, number in alone.items() if name not in half}
-    first = _connected(len(observations), [(alone[a], alone[b]) for a, b in ends if a in alone])
+    # The first observation of the component of each: a length makes one component of those that it joins.
+    of_each = np.arange(len(observations))
+    for pair in ends:
+        if pair[0] in alone:
+            low, high = sorted(of_each[alone[name]] for name in pair)
+            of_each[of_each == high] = low
+    first = of_each.tolist()
     sizes = Counter[int]()  # numbers of each component
     for name, number in alone.items():
         sizes[first[number]] += len(units[name])
@@ -152,22 +158,6 @@ def _by(label: Callable[["_Member"], Hashable], members: Sequence["_Member"]) ->
     for member in members:
         together.setdefault(label(member), []).append(member)
     return list(together.values())
-
-
-def _connected(count: int, pairs: Iterable[tuple[int, int]]) -> list[int]:
-    """For each of some things the first of those that pairs connect it with."""
-    parents = list(range(count))
-
-    def root(number: int) -> int:
-        while parents[number] != number:
-            parents[number] = parents[parents[number]]
-            number = parents[number]
-        return number
-
-    for pair in pairs:
-        low, high = sorted(map(root, pair))
-        parents[high] = low
-    return [root(number) for number in range(count)]
 
 
 class _Member(NamedTuple):

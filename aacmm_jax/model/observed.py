@@ -17,14 +17,13 @@ from jaxtyping import Float
 from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
 from ..core.pytree import pytree, static
 from ..data.capture import Capture, check_one_capture, check_readings
-from ..data.observations.held import platform_frames, position_of, sockets_of
-from ..data.observations.measured import AbstractMeasured
+from ..data.observations.held import platform_frames, position_of
 from ..data.observations.observation import AbstractObservation, Tips, offset_of
 from ..kinematics.arm import Arm
-from ..kinematics.chain import ForwardPass, Geometry, JointMotion, forward_pass, joint_motion
+from ..kinematics.chain import Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
 from ..solver.arrow import split
-from .layout import Group, Layout, layout_of, unknowns_of
+from .layout import Layout, layout_of, unknowns_of
 from .sockets import means_over_sockets
 
 _STEPS = {"mm": 1.0, "rad": 1e-3}  # natural steps, as those of the arm's parameters
@@ -46,16 +45,12 @@ class Observed:
     @classmethod
     def of(cls, capture: Capture, arm: Arm | None, *, lengths: bool = True) -> "Observed":
         """What a capture observed, by an arm with such joints; None where only what is unknown matters. Without its
-        reference ``lengths`` sockets are independent of each other.
-
-        Raises `InputError` for a batch of captures.
-        """
+        reference ``lengths`` sockets are independent of each other. Raises `InputError` for a batch of captures."""
         check_one_capture(capture)
         capture = to_numpy(capture)
         if arm is not None:
             check_readings(capture, arm)
-        xp = namespace(capture)
-        observations = to_numpy((*sockets_of(capture.sockets), *capture.observations))
+        xp, observations = namespace(capture), to_numpy(capture.parts)
         q = xp.concatenate([observation.q for observation in observations])
         references, ends = (capture.lengths, ends_of(capture)) if lengths else ((), ())
         layout = layout_of(observations, ends)
@@ -74,27 +69,11 @@ class Observed:
         self, arm: Arm, q: Float[AnyArray, "M n"], observations: tuple[AbstractObservation, ...] | None = None
     ) -> "Observed":
         """The same at other readings, and with observations that have changed along."""
-        changed = self if observations is None else self._with_observations(observations)
-        return dataclasses.replace(changed, q=q, motion=joint_motion(arm.geometry, q))
+        changed = {} if observations is None else self._changed(observations)
+        return dataclasses.replace(self, q=q, motion=joint_motion(arm.geometry, q), **changed)
 
-    def measured_without_errors(
-        self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]
-    ) -> "Observed":
-        """The same, had every instrument measured exactly the tips of this arm in this geometry."""
-        if not any(isinstance(observation, AbstractMeasured) for observation in self.observations):
-            return self
-        forward, parts = self.forward(space, vector, geometry), self.split(geometry)
-        return self._with_observations(
-            tuple(
-                observation.without_errors(tips_of(forward, rows), parts)
-                if isinstance(observation, AbstractMeasured)
-                else observation
-                for observation, rows in zip(self.observations, self.slices, strict=True)
-            )
-        )
-
-    def _with_observations(self, observations: tuple[AbstractObservation, ...]) -> "Observed":
-        return dataclasses.replace(self, observations=observations, stacks=_stacks(observations, self.layout))
+    def _changed(self, observations: tuple[AbstractObservation, ...]) -> dict[str, Any]:
+        return {"observations": observations, "stacks": _stacks(observations, self.layout)}
 
     @cached_property
     def blocks(self) -> dict[str, tuple[str, ...]]:
@@ -119,10 +98,8 @@ class Observed:
     @cached_property
     def slices(self) -> list[slice]:
         """The poses of each observation."""
-        ends = np.cumsum([observation.q.shape[0] for observation in self.observations]).tolist()
-        return [
-            slice(end - observation.q.shape[0], end) for observation, end in zip(self.observations, ends, strict=True)
-        ]
+        ends = np.cumsum([0, *(observation.q.shape[0] for observation in self.observations)]).tolist()
+        return [slice(first, end) for first, end in itertools.pairwise(ends)]
 
     @cached_property
     def equations(self) -> int:
@@ -132,11 +109,10 @@ class Observed:
 
     def split(self, geometry: Float[AnyArray, " g"]) -> dict[str, Float[AnyArray, " k"]]:
         """The numbers of each part."""
-        parts, first = {}, 0
-        for name, units in self.layout.parts:
-            parts[name] = geometry[first : first + len(units)]
-            first += len(units)
-        return parts
+        ends = np.cumsum([0, *(len(units) for _, units in self.layout.parts)]).tolist()
+        return {
+            name: geometry[i:j] for (name, _), (i, j) in zip(self.layout.parts, itertools.pairwise(ends), strict=True)
+        }
 
     def distances(
         self, geometry: Float[AnyArray, " g"], ends: Sequence[tuple[str, str]]
@@ -163,32 +139,21 @@ class Observed:
     def certified(self) -> dict[str, tuple[Float[AnyArray, " k"], Float[AnyArray, " k"]]]:
         """Parts that have certified values: the values and their standard uncertainties."""
         values: dict[str, Any] = {}
-        # Sockets have none, and there may be thousands.
-        others = [
-            group.members for group, stack in zip(self.layout.groups, self.stacks, strict=True) if not stack.linear
-        ]
-        for number in sorted(itertools.chain(*others)):
-            values |= self.observations[number].certified_values()
+        for observation in self.observations:
+            if not observation.linear:  # sockets have none, and there may be thousands
+                values |= observation.certified_values()
         return values
-
-    def forward(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> ForwardPass:
-        """All poses by an arm, each with the tip that it held."""
-        return forward_pass(self.chain(space, vector, geometry), self.motion)
 
     def chain(self, space: Parameters, vector: Float[AnyArray, " p"], geometry: Float[AnyArray, " g"]) -> Geometry:
         """The chain with the tip that each pose held."""
         arm = space.geometry(vector)
-        if any(group.targeted for group in self.layout.groups):
-            xp, parts = namespace(arm, geometry), self.split(geometry)
-            offsets = [
-                xp.broadcast_to(
-                    parts[offset_of(observation.target)] if observation.target else arm.probe,
-                    (observation.q.shape[0], 3),
-                )
-                for observation in self.observations
-            ]
-            arm = arm._replace(probe=xp.concatenate(offsets))
-        return arm
+        if not any(group.targeted for group in self.layout.groups):
+            return arm
+        xp, parts, probes = namespace(arm, geometry), self.split(geometry), []
+        for observation in self.observations:
+            probe = parts[offset_of(observation.target)] if observation.target else arm.probe
+            probes.append(xp.broadcast_to(probe, (observation.q.shape[0], 3)))
+        return arm._replace(probe=xp.concatenate(probes))
 
     def start(self, space: Parameters, vector: Float[AnyArray, " p"]) -> Float[AnyArray, " g"]:
         """The unknown geometry as the observations say, one after the other, by an arm that is nearly right; the frames
@@ -230,11 +195,8 @@ def ends_of(capture: Capture) -> tuple[tuple[str, str], ...]:
 
 
 def _stacks(observations: tuple[AbstractObservation, ...], layout: Layout) -> tuple[AbstractObservation, ...]:
-    def stack(group: Group) -> AbstractObservation:
-        members = [observations[number] for number in group.members]
-        return members[0] if len(members) == 1 else type(members[0]).stacked(members)
-
-    return tuple(stack(group) for group in layout.groups)
+    members = [[observations[number] for number in group.members] for group in layout.groups]
+    return tuple(some[0] if len(some) == 1 else type(some[0]).stacked(some) for some in members)
 
 
 def tips_of(forward: Any, rows: Any) -> Tips:

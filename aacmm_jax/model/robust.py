@@ -36,12 +36,6 @@ def _root_outside(xp: Any, s: Any) -> Any:
     return xp.sqrt(xp.where(s <= 1, 1.0, s))
 
 
-def _rho_of_tukey(xp: Any, s: Any) -> Any:
-    """(1 - (1 - s)^3) / 3 up to 1, without its cancellation at small s."""
-    inside = xp.minimum(s, 1.0)
-    return inside * (1 - inside + inside**2 / 3)
-
-
 _SHAPES: dict[LossName, _Shape] = {
     "huber": _Shape(
         rho=lambda xp, s: xp.where(s <= 1, s, 2 * _root_outside(xp, s) - 1),
@@ -54,7 +48,8 @@ _SHAPES: dict[LossName, _Shape] = {
         curvature=lambda xp, s: (1 - s) / (1 + s),
     ),
     "tukey": _Shape(
-        rho=_rho_of_tukey,
+        # (1 - (1 - s)^3) / 3 up to 1, without its cancellation at small s.
+        rho=lambda xp, s: xp.minimum(s, 1.0) * (1 - xp.minimum(s, 1.0) + xp.minimum(s, 1.0) ** 2 / 3),
         weight=lambda xp, s: (1 - xp.minimum(s, 1.0)) ** 2,
         curvature=lambda xp, s: (1 - 5 * xp.minimum(s, 0.5)) / (1 - xp.minimum(s, 0.5)),  # negative beyond a fifth
     ),

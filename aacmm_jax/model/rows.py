@@ -81,22 +81,16 @@ def rows_at(space: Parameters, observed: Observed, z: Float[AnyArray, " z"], bat
     else:
         forward = forward_pass(chain, observed.motion)
     for group, stack in zip(observed.layout.groups, observed.stacks, strict=True):
-        unknowns = {
-            name: _columns_of_role(z[p:], role.first, role.size, group.counts)
-            for name, role in zip(stack.unknowns, group.roles, strict=False)
-        }
+        unknowns = {}
+        for name, role in zip(stack.unknowns, group.roles, strict=False):
+            # One column where all poses share the numbers, else one for each pose.
+            if len(set(role.first)) == 1:
+                unknowns[name] = z[p + role.first[0] :][: role.size, None]
+            else:
+                index = np.asarray(role.first)[None, :] + np.arange(role.size)[:, None]
+                unknowns[name] = to_poses(z[p:][index], group.counts)
         rows.append(stack.residual_with_errors(tips_of(forward, group.index), unknowns))
     return PointRows(forward, rows)
-
-
-def _columns_of_role(
-    geometry: Float[AnyArray, " g"], first: tuple[int, ...], size: int, counts: tuple[int, ...]
-) -> Float[AnyArray, "k _"]:
-    """The numbers of a role: one column where all poses share them, else one for each pose."""
-    if len(set(first)) == 1:
-        return geometry[first[0] : first[0] + size][:, None]
-    index = np.asarray(first)[None, :] + np.arange(size)[:, None]
-    return to_poses(geometry[index], counts)
 
 
 def row_blocks(
@@ -136,8 +130,8 @@ def row_blocks(
         if group.targeted:
             by_roles.append(times(rows.by_tip, xp.stack([axis[:, poses] for axis in forward.frame])))
         by_head = _by_head(by_parameters, by_roles, group, layout.shared)
-        size = 0 if group.of < 0 else layout.classes[group.of][1]
-        blocks.append(RowBlock(rows.values, by_head, _by_own(by_roles, group, size), group.of, group.sizes))
+        by_own = None if group.of < 0 else _by_own(by_roles, group, layout.classes[group.of][1])
+        blocks.append(RowBlock(rows.values, by_head, by_own, group.of, group.sizes))
     return [*blocks, *_relations(observed, z[p:], whitening, p)]
 
 
@@ -156,23 +150,18 @@ def _by_head(
                 piece = derivative if uses.all() else xp.where(uses[owner], derivative, 0.0)
                 pieces[first] = pieces[first] + piece if first in pieces else piece
     parts, reached = [by_parameters], 0
-    for first in sorted(pieces):
-        if first > reached:
-            parts.append(xp.zeros((first - reached, *by_parameters.shape[1:])))
-        parts.append(pieces[first])
-        reached = first + pieces[first].shape[0]
-    if reached < shared:
-        parts.append(xp.zeros((shared - reached, *by_parameters.shape[1:])))
+    for first, piece in [*sorted(pieces.items()), (shared, None)]:
+        parts.append(xp.zeros((first - reached, *by_parameters.shape[1:])))
+        if piece is not None:
+            parts.append(piece)
+            reached = first + piece.shape[0]
     return xp.concatenate(parts)
 
 
-def _by_own(by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, size: int) -> Float[AnyArray, "k r m"] | None:
+def _by_own(by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, size: int) -> Float[AnyArray, "k r m"]:
     """Derivatives by the numbers of the component of each pose, in their order."""
-    if group.of < 0:
-        return None
-    private = [one for one, role in zip(by_roles, group.roles, strict=True) if role.private]
-    xp = namespace(private)
-    own = private[0] if len(private) == 1 else xp.concatenate(private)
+    xp = namespace(by_roles)
+    own = xp.concatenate([by for by, role in zip(by_roles, group.roles, strict=True) if role.private])
     if own.shape[0] == size:
         return own
     start = np.repeat(np.asarray(group.start), group.counts)
@@ -226,19 +215,18 @@ def _relations_by_class(layout: Layout, first: tuple[int, ...]) -> dict[int, tup
 
 def _whitened(rows: Rows, root: Float[AnyArray, "m r r"]) -> Rows:
     """Rows in standard deviations: their few derivatives by tip and geometry cost less than those by all parameters."""
-    roots = namespace(rows.values, root).moveaxis(root, 0, -1)
+    xp = namespace(rows.values, root)
+    roots = xp.moveaxis(root, 0, -1)
+
+    def product(other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
+        return xp.moveaxis(times(roots, xp.moveaxis(other, 1, 0)), 0, 1)
+
     return rows._replace(
         values=times(roots, rows.values[None])[0],
-        by_tip=_product(roots, rows.by_tip),
-        by_rotation=None if rows.by_rotation is None else _product(roots, rows.by_rotation),
+        by_tip=product(rows.by_tip),
+        by_rotation=None if rows.by_rotation is None else product(rows.by_rotation),
         by_unknowns={name: times(roots, derivative) for name, derivative in rows.by_unknowns.items()},
     )
-
-
-def _product(one: Float[AnyArray, "r s m"], other: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
-    """The product of two matrices a pose."""
-    xp = namespace(one, other)
-    return xp.moveaxis(times(one, xp.moveaxis(other, 1, 0)), 0, 1)
 
 
 def times(matrices: Float[AnyArray, "r c m"], columns: Float[AnyArray, "k c m"]) -> Float[AnyArray, "k r m"]:

@@ -124,7 +124,6 @@ def fix_scale(
     check_finite(arm=arm, capture=capture)
     if not is_single(arm):
         raise InputError("the arm is a batch, but one scale is fixed here; map over its arms with jax.vmap.")
-    scatter = None if sigma is None else namespace(sigma).asarray(sigma, dtype=float)
     check_one_capture(capture)
     if capture.observations:
         names = shorten([observation.name for observation in capture.observations])
@@ -133,6 +132,7 @@ def fix_scale(
             "make a capture without them."
         )
     check_readings(capture, arm)
+    scatter = None if sigma is None else namespace(sigma).asarray(sigma, dtype=float)
     return to_jax(_fixed(*to_numpy((arm, capture, scatter))))
 
 
@@ -154,28 +154,22 @@ class MeasuredEnds(NamedTuple):
     u: Float[AnyArray, " l"]
 
     @property
-    def vectors(self) -> Float[AnyArray, "l 3"]:
-        """From the start to the end of each length."""
-        return self.positions[self.ends[:, 1]] - self.positions[self.ends[:, 0]]
-
-    @property
     def measured(self) -> Float[AnyArray, " l"]:
         """The measured lengths."""
-        return namespace(self.positions).linalg.norm(self.vectors, axis=-1)
+        between = self.positions[self.ends[:, 1]] - self.positions[self.ends[:, 0]]
+        return namespace(self.positions).linalg.norm(between, axis=-1)
 
     @property
     def by_positions(self) -> Float[AnyArray, "l e 3"]:
         """Derivatives of the measured lengths."""
         xp, unit = namespace(self.positions), np.eye(len(self.positions))
         pull = xp.asarray(unit[self.ends[:, 1]] - unit[self.ends[:, 0]])
-        return pull[:, :, None] * (self.vectors / self.measured[:, None])[:, None, :]
+        between = self.positions[self.ends[:, 1]] - self.positions[self.ends[:, 0]]
+        return pull[:, :, None] * (between / self.measured[:, None])[:, None, :]
 
     def covariance(self, scale_factor: Float[AnyArray, "..."] | float = 1.0) -> Float[AnyArray, "l l"]:
-        """Of measured minus nominal lengths, mm^2, by an arm that is ``scale_factor`` times too large.
-
-        Each length's own u, and the scatter at each end. Lengths that share a socket share its scatter, so they are
-        correlated.
-        """
+        """Of measured minus nominal lengths, mm^2, by an arm that is ``scale_factor`` times too large: each length's
+        own u, and the scatter at each end, which lengths that share a socket share."""
         xp, by = namespace(self.positions, self.u, scale_factor), self.by_positions
         scatter = xp.einsum("lec,ecd,med->lm", by, self.covariances, by)
         # The least variance, (1e-12 mm)^2, only keeps a noise-free simulation's weights finite.

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -102,17 +103,10 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         recording = recording._replace(capture=part)
     bounds = recording.nominal.bounds()
     recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
-    solving = CalibrationOptions(
-        method=chosen.method,
-        hold=chosen.hold,
-        noise=chosen.noise,
-        robust=chosen.robust,
-        prior=recording.nominal.prior if isinstance(chosen.prior, str) else chosen.prior,
-        replace_noise=chosen.replace_noise,
-        shared_errors=chosen.shared_errors,
-        undetermined="raise" if chosen.strict else "ignore",  # the record says it
-        max_steps=chosen.max_steps,
-    )
+    prior = recording.nominal.prior if isinstance(chosen.prior, str) else chosen.prior
+    undetermined = "raise" if chosen.strict else "ignore"  # the record says it
+    same = {name: value for name, value in chosen._asdict().items() if name in CalibrationOptions._fields}
+    solving = CalibrationOptions(**same | {"prior": prior, "undetermined": undetermined})
 
     def solved(capture: Capture) -> Calibration | Identification:
         if chosen.scale == "measured":
@@ -134,12 +128,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         if _to_cross_validate(record.recording, solving, chosen):
             if chosen.scale != "measured":
                 raise InputError("--cross-validate needs a calibrated scale; leave out --scale nominal (scale).")
-            left_out = chosen.stage("Cross-validating", lambda: cross_validate(
-                *(bounds.space.base, record.recording.capture, bounds),
-                groups=chosen.leave_out or None,
-                **solving._asdict() | {"undetermined": "ignore"},
-            ))  # fmt: skip
-            record = record._replace(validation=left_out)
+            groups, capture = chosen.leave_out or None, record.recording.capture
+            run = partial(cross_validate, bounds.space.base, capture, bounds, groups=groups, **solving._asdict())
+            record = record._replace(validation=chosen.stage("Cross-validating", run))
         if chosen.monte_carlo:
             result = solved(record.recording.capture) if record.removed else result
             if not isinstance(result, Calibration) or chosen.robust is not None:

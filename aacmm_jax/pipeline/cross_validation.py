@@ -6,7 +6,7 @@ Cook and Weisberg 1982, section 3.6). Weights and the learned standard deviation
 which one region hardly changes.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -185,11 +185,7 @@ def _check_some_left(pattern: str, some: bool) -> None:
         raise InputError(f"nothing is left without '{pattern}', so nothing can be calibrated; leave out less.")
 
 
-class Region(NamedTuple):
-    """Poses that are left out together."""
-
-    label: str
-    poses: Bool[np.ndarray, " M"]  # of all, sockets first
+Region = Bool[np.ndarray, " M"]  # poses that are left out together; of all, sockets first
 
 
 class UnseenRegion(NamedTuple):
@@ -201,9 +197,7 @@ class UnseenRegion(NamedTuple):
     ratio: float  # mean of (error / predicted standard deviation)^2 over coordinates
 
 
-def regions_of(
-    capture: Capture, patterns: Iterable[str] | None = None, joints: int | None = None
-) -> tuple[Region, ...]:
+def regions_of(capture: Capture, patterns: Iterable[str] | None = None, joints: int | None = None) -> dict[str, Region]:
     """The regions to leave out: groups by name; or placements, stations and the like, where there are at least three;
     or either half of each joint's travel, of the first ``joints`` columns of readings.
 
@@ -214,24 +208,23 @@ def regions_of(
     owner, groups = np.repeat(np.array(names_in(capture)), sizes), groups_of(capture)
     if patterns is not None:
         members = {pattern: names_in(capture.select(pattern)) for pattern in items_of(patterns, "regions")}
-        regions = [Region(pattern, np.isin(owner, group)) for pattern, group in members.items()]
+        regions = {pattern: np.isin(owner, group) for pattern, group in members.items()}
     elif len(groups) >= _GROUPS:
         labelled = zip(common_labels(groups), groups, strict=True)
-        regions = [Region(label, np.isin(owner, group)) for label, group in labelled]
+        regions = {label: np.isin(owner, group) for label, group in labelled}
     else:
-        q, regions = np.asarray(capture.readings)[:, :joints], []
+        q, regions = np.asarray(capture.readings)[:, :joints], {}
         for joint in np.flatnonzero(np.ptp(q, axis=0) > _MOVES):
             upper = q[:, joint] >= np.median(q[:, joint])
-            halves = {"lower": ~upper, "upper": upper}
-            regions += [Region(f"joint {joint + 1}, {half} half", poses) for half, poses in halves.items()]
-    for region in regions:
-        _check_some_left(region.label, not region.poses.all())
-    regions = [region for region in regions if _POSES <= region.poses.sum() <= len(owner) - _POSES]
+            regions |= {f"joint {joint + 1}, lower half": ~upper, f"joint {joint + 1}, upper half": upper}
+    for label, poses in regions.items():
+        _check_some_left(label, not poses.all())
+    regions = {label: poses for label, poses in regions.items() if _POSES <= poses.sum() <= len(owner) - _POSES}
     if len(regions) < 2:
         raise InputError(
             "models are compared by regions that they have not seen, and these poses make fewer than two; record more."
         )
-    return tuple(regions)
+    return regions
 
 
 class _Dense(NamedTuple):
@@ -273,7 +266,7 @@ def _dense(equations: Equations, parameters: int) -> _Dense:
 
 
 def unseen_regions(
-    record: CalibrationRecord, regions: Iterable[Region], equations: Equations | None = None
+    record: CalibrationRecord, regions: Mapping[str, Region], equations: Equations | None = None
 ) -> tuple[UnseenRegion, ...]:
     """Errors of each region, of a calibration without it; geometry that only the region shows is fitted to its poses.
 
@@ -283,13 +276,13 @@ def unseen_regions(
     equations = equations_of(record) if equations is None else equations
     dense = _dense(equations, len(record.names) - (record.hold is not None))
     whole = dense.white.T @ dense.white, dense.white.T @ dense.residual
-    return tuple(_without(dense, *whole, region) for region in regions)
+    return tuple(_without(dense, *whole, *region) for region in regions.items())
 
 
 def _without(
-    dense: _Dense, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"], region: Region
+    dense: _Dense, gram: Float[np.ndarray, "P P"], gradient: Float[np.ndarray, " P"], label: str, region: Region
 ) -> UnseenRegion:
-    out, left = region.poses[dense.pose], region.poses[dense.poses]
+    out, left = region[dense.pose], region[dense.poses]
     gone = dense.white[out]
     lost = dense.geometry & ~np.any(dense.white[~out] != 0, axis=0)
     kept = ~lost
@@ -314,4 +307,4 @@ def _without(
     seen = variance > _NOTHING
     poses = int(seen.reshape(-1, 3).any(axis=1).sum())
     ratio = float(np.mean(errors[seen] ** 2 / variance[seen])) if poses else np.nan
-    return UnseenRegion(region.label, poses, float(np.sum(errors[seen] ** 2)) / max(poses, 1), ratio)
+    return UnseenRegion(label, poses, float(np.sum(errors[seen] ** 2)) / max(poses, 1), ratio)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ..calibration.results import Calibration, Identification
-from ..calibration.scale_anchor import Method, method_of, warn_of_known_scale
+from ..calibration.scale_anchor import Method, method_of, scale_set_by_clause
 from ..calibration.stages import Stages, identified, in_two_stages, jointly
 from ..calibration.task import Solving, Task, task_of, without_lengths
 from ..core._compat import inside_trace
@@ -203,8 +203,11 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
     task = task_of(arm, capture, bounds, given.solving._replace(hold=None))
     if given.undetermined != "ignore":
         _check_identifiable(capture, task.bounds, prior, given.undetermined == "raise")
-    if method == "two-stage" and first is not None and not inside_trace():
-        warn_of_known_scale(first.anchor.set_by, bool(arm.prismatic))
+    set_by = first.anchor.set_by if method == "two-stage" and first is not None and not inside_trace() else ()
+    if set_by:  # a division by k changes nothing
+        says = f"{scale_set_by_clause(set_by)}, so the reference lengths change nothing"
+        other_way = "" if arm.prismatic else "free one of these lengths, or "
+        warnings.warn(f"{says}; {other_way}use both with method='joint'.", IdentifiabilityWarning, stacklevel=3)
     first, task, capture = to_numpy((first, task, capture))
     if namespace((first, task, capture)) is not np:
         return to_jax(_traced(first, task, capture, method))

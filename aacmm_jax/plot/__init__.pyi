@@ -3,7 +3,6 @@ from .arm import arm_poses as arm_poses
 from .arm import arm_workspace as arm_workspace
 from .arm import save_arm_figure as save_arm_figure
 from .drift import drift_trend as drift_trend
-from .drift import parameter_trend as parameter_trend
 from .drift import save_drift_trend as save_drift_trend
 from .lengths import acceptance_metrics as acceptance_metrics
 from .lengths import reference_length_errors as reference_length_errors

@@ -81,9 +81,7 @@ def arm_workspace(arm: Arm, axes: Any = None) -> Any:
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
-        >>> axes = aj.plot.arm_workspace(arm)
-        >>> print(axes.get_ylabel())
-        height [mm]
+        >>> aj.plot.arm_workspace(arm).figure.savefig("figure.svg")
     """
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_TIPS, arm.joints))

@@ -50,7 +50,18 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
     if len(trend.drifts) == 1:
         plots = _changes_of_two(trend.drifts[0]), _lengths_of_two(trend.drifts[0])
     else:
-        x, positions = _time_axis(trend)
+        seconds = np.array([date.timestamp() for date in trend.dates])
+        span, count = seconds[-1] - seconds[0], len(seconds)
+        # By date unless they would overlap.
+        even = span <= 0 or np.min(np.diff(seconds)) < _CROWDED * span
+        positions = np.arange(count, dtype=float) if even else (seconds - seconds[0]) / span * (count - 1)
+        by_file = trend.dated_by_file or (False,) * count
+        form = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
+        dates = [f"{date:{form}}{'*' if file else ''}" for date, file in zip(trend.dates, by_file, strict=True)]
+        title = "calibration" + (", evenly spaced" if even else "")
+        title += " (*: when its file was made; the manifest states no date)" if any(by_file) else ""
+        ticks = tuple(zip(positions.tolist(), dates, strict=True))
+        x = linear(title, positions, margin=0.03)._replace(ticks=ticks, named=True)
         # The dates stand below the lower axes alone.
         undated = x._replace(title="", ticks=tuple((at, "") for at, _ in x.ticks))
         plots = _changes_over_time(trend, undated, positions), _lengths_over_time(trend, x, positions)
@@ -59,28 +70,9 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
     return axes
 
 
-def parameter_trend(trend: Trend, axes: Any, positions: np.ndarray | None = None) -> Any:
-    """Plot each parameter's change from the first calibration over its expanded uncertainty.
-
-    The parameters that are beyond it in the last calibration are named.
-
-    Args:
-        trend: The comparison of three calibrations or more (`drift.trend`).
-        axes: Axes to plot into, which are returned.
-        positions: Abscissa of each calibration; evenly spaced if None.
-
-    Example:
-        >>> import matplotlib.pyplot as plt
-        >>> dates = ["2026-01-31", "2026-06-30", "2026-12-31"]
-        >>> trend = aj.drift.trend([record, record_in_june, record], dates, points=20)
-        >>> axes = aj.plot.parameter_trend(trend, plt.subplots()[1])
-    """
-    positions = np.arange(len(trend.dates)) if positions is None else positions
-    return draw(_changes_over_time(trend, linear("", positions, margin=0.03), positions), axes)
-
-
 def _changes_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
-    drift, ratio = trend.drifts[-1], _ratio(trend.change, trend.expanded)
+    drift = trend.drifts[-1]
+    ratio = np.divide(trend.change, trend.expanded, out=np.full_like(trend.change, np.nan), where=trend.expanded > 0)
     ratio[0] = 0.0
     last = np.abs(np.nan_to_num(ratio[-1]))
     named = [i for i in np.argsort(-last) if last[i] > 1][: len(SERIES)]
@@ -128,13 +120,10 @@ def _changes_of_two(drift: Drift) -> Plot:
     chosen = [
         i for i, name in enumerate(drift.names) if not drift.reasons[i] and (name in listed or bool(drift.moved[i]))
     ]
-    ratio, moved = _ratio(drift.change, drift.expanded)[chosen], drift.moved[chosen]
-    x = np.arange(len(chosen))
-    labels = [
-        drift.names[i] + (f" {in_words(drift.units[i], float(drift.change[i]))}" if drift.moved[i] else "")
-        for i in chosen
-    ]
-    axis = names("", labels)
+    change, expanded, moved = drift.change[chosen], drift.expanded[chosen], drift.moved[chosen]
+    ratio, x = np.divide(change, expanded, out=np.full_like(change, np.nan), where=expanded > 0), np.arange(len(chosen))
+    said = [f" {in_words(drift.units[i], float(drift.change[i]))}" if drift.moved[i] else "" for i in chosen]
+    axis = names("", [drift.names[i] + words for i, words in zip(chosen, said, strict=True)])
     marks = (
         _within(axis),
         Marks("", x, ratio, "bars", low=np.minimum(ratio, 0), high=np.maximum(ratio, 0), size=2),
@@ -165,11 +154,6 @@ def _lengths_of_two(drift: Drift) -> Plot:
     return Plot(linear(title, edges, *(part.x for part in marks)), linear("lengths", counts, zero=True), tuple(marks))
 
 
-def _ratio(change: np.ndarray, expanded: np.ndarray) -> np.ndarray:
-    """Changes over their expanded uncertainty; NaN without one."""
-    return np.where(expanded > 0, change / np.where(expanded > 0, expanded, 1.0), np.nan)
-
-
 def _ratio_axis(ratio: np.ndarray) -> Axis:
     """The axis of changes over their expanded uncertainty: that of the inverse hyperbolic sine if any is far out."""
     largest = np.nanmax(np.abs(ratio), initial=1.0)
@@ -191,18 +175,3 @@ def _within(x: Axis) -> Marks:
 def _not_shown(drift: Drift) -> str:
     without = len(drift.names) - drift.reasons.count("")
     return f"\nnot shown: {without} without an uncertainty of change" if without else ""
-
-
-def _time_axis(trend: Trend) -> tuple[Axis, np.ndarray]:
-    """The axis of the calibrations, and their abscissas: by date unless they would overlap, else in steps of one."""
-    seconds = np.array([date.timestamp() for date in trend.dates])
-    span, count = seconds[-1] - seconds[0], len(seconds)
-    even = span <= 0 or np.min(np.diff(seconds)) < _CROWDED * span
-    positions = np.arange(count, dtype=float) if even else (seconds - seconds[0]) / span * (count - 1)
-    by_file = trend.dated_by_file or (False,) * count
-    form = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
-    dates = [f"{date:{form}}{'*' if file else ''}" for date, file in zip(trend.dates, by_file, strict=True)]
-    label = "calibration" + (", evenly spaced" if even else "")
-    label += " (*: when its file was made; the manifest states no date)" if any(by_file) else ""
-    ticks = tuple(zip(positions.tolist(), dates, strict=True))
-    return linear(label, positions, margin=0.03)._replace(ticks=ticks, named=True), positions

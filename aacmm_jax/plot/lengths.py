@@ -10,6 +10,7 @@ from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.errors import InputError
 from ..core.units import DEG
 from ..diagnostics.joint_travel import TriedPoses
+from ..summaries.calibration import metrics_by_socket_and_length
 from ..summaries.tables import decimals_for, format_number
 from ..uncertainty.volume import VolumetricUncertainty
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, ordinates, runs, shades, thinned
@@ -50,18 +51,21 @@ def _errors_plot(axis: Axis, edges: np.ndarray, marks: Sequence[Marks]) -> Plot:
     return Plot(axis, linear(_TITLE, *ordinates(marks), [0.0]), (*marks, borders(edges), level(0.0)))
 
 
-def length_chart(between: Sequence[tuple[str, str]], errors: Mapping[str, np.ndarray], expanded: np.ndarray) -> Chart:
-    """Errors of reference lengths, given by their ends, by one arm or two, mm; the last with its U, NaN where there is
-    none."""
-    x, axis, edges = by_placement(between)
-    *earlier, (last, error) = errors.items()
+def length_chart(rows: Sequence[Mapping[str, Any]], earlier: Mapping[str, np.ndarray]) -> Chart:
+    """Errors of reference lengths by the calibrated arm, with U where there is one, and by an earlier one; mm.
+
+    Rows are those of a summary, with "from", "to", "error_mm" and "expanded_mm".
+    """
+    x, axis, edges = by_placement([(row["from"], row["to"]) for row in rows])
+    error = np.array([row["error_mm"] for row in rows])
+    expanded = np.array([np.nan if row["expanded_mm"] is None else row["expanded_mm"] for row in rows])
     words = [
-        f"{start} – {end}: {format_number(value, signed=True)} mm"
-        + (f", U {format_number(bar)} mm" if np.isfinite(bar) else "")
-        for (start, end), value, bar in zip(between, error.tolist(), expanded.tolist(), strict=True)
+        f"{row['from']} – {row['to']}: {format_number(row['error_mm'], signed=True)} mm"
+        + ("" if row["expanded_mm"] is None else f", U {format_number(row['expanded_mm'])} mm")
+        for row in rows
     ]
-    marks = [Marks(name, x, values, "diamond", "accent") for name, values in earlier]
-    name = f"{last}, with U (95 %)" if np.any(np.isfinite(expanded)) else last
+    marks = [Marks(name, x, values, "diamond", "accent") for name, values in earlier.items()]
+    name = "calibrated" + (", with U (95 %)" if np.any(np.isfinite(expanded)) else "")
     marks.append(Marks(name, x, error, "square", "main", words, error - expanded, error + expanded, size=7))
     description = "Measured minus calibrated value" + (", before and after the scale fix." if earlier else ".")
     return Chart("lengths", "Errors of the reference lengths", description, (_errors_plot(axis, edges, marks),))
@@ -100,19 +104,14 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
-        >>> axes = aj.plot.reference_length_errors(record)
-        >>> print(axes.get_ylabel())
-        measured − value [mm]
+        >>> aj.plot.reference_length_errors(record).figure.savefig("figure.svg")
     """
-    lengths = record.recording.capture.lengths
-    if not lengths:
+    capture, evaluations = record.recording.capture, record.evaluations()
+    if not capture.lengths:
         raise InputError("the calibration has no reference lengths, so there are no errors of lengths to draw.")
-    evaluations = record.evaluations()
-    stages = {"stage 1": "stage1", "calibrated": "calibrated"} if record.stage1_apart else {"calibrated": "calibrated"}
-    errors = {name: np.asarray(evaluations[stage].error) for name, stage in stages.items()}
-    u, stated = np.asarray(evaluations["calibrated"].u), np.array([float(length.u) for length in lengths])
-    expanded = np.where(np.isfinite(u), uncertainty_of(record).expanded_by_scatter(u, stated), np.nan)
-    return draw(length_chart([(length.start, length.end) for length in lengths], errors, expanded).plots[0], axes)
+    rows = metrics_by_socket_and_length(capture, evaluations["calibrated"], uncertainty_of(record))["lengths"]
+    earlier = {"stage 1": np.asarray(evaluations["stage1"].error)} if record.stage1_apart else {}
+    return draw(length_chart(rows, earlier).plots[0], axes)
 
 
 def metrics_chart(tests: Sequence[AcceptanceTest]) -> Chart:

@@ -67,9 +67,7 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
-        >>> axes = aj.plot.parameter_changes(record, "angle")
-        >>> print(axes.get_ylabel())
-        calibrated − nominal [deg]
+        >>> aj.plot.parameter_changes(record, "angle").figure.savefig("figure.svg")
     """
     if kind not in _UNITS:
         raise InputError(f"kind is '{kind}'; it must be length or angle.")
@@ -97,9 +95,7 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 
     Example:
         >>> simulated = recording._replace(true=nominal._replace(arm=true))
-        >>> axes = aj.plot.length_parameter_errors(aj.calibration.record_of(result, simulated))
-        >>> print(axes.get_ylabel())
-        error against the true arm [mm]
+        >>> aj.plot.length_parameter_errors(aj.calibration.record_of(result, simulated)).figure.savefig("figure.svg")
     """
     return draw(error_plot(record), axes)
 

@@ -63,6 +63,11 @@ class Groups(NamedTuple):
         return cls(names, sizes, kinds, "observation" if others else "socket")
 
     @property
+    def centre(self) -> str:
+        """What the distance of a pose is from."""
+        return "geometry" if self.word == "observation" else "socket's centroid"
+
+    @property
     def owner(self) -> np.ndarray:
         """Index of the group of each pose."""
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
@@ -124,9 +129,8 @@ def pose_chart(
     ticks, edges = groups.parts()
     x = linear("pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}",
                [0.0, len(last) + 1.0], margin=0.0)  # fmt: skip
-    centre = "geometry" if groups.word == "observation" else "socket's centroid"
     y = {"standard deviations": "residual", "deg": "angle between orientations"}.get(
-        unit, f"distance from the {centre}"
+        unit, f"distance from the {groups.centre}"
     )
     plot = Plot(
         x._replace(ticks=ticks, named=True) if ticks else x,
@@ -166,8 +170,8 @@ def distances_in(capture: Capture, evaluation: Evaluation) -> np.ndarray:
 
 def arms_chart(capture: Capture, arms: Mapping[str, np.ndarray], most: int | None = None) -> Chart:
     """Distances of all poses by the nominal and by the calibrated arm."""
-    what = "geometry" if capture.observations else "socket's centroid"
-    return pose_chart("stages", f"Distance of every pose from its {what}", Groups.of(capture), arms, most=most)
+    groups = Groups.of(capture)
+    return pose_chart("stages", f"Distance of every pose from its {groups.centre}", groups, arms, most=most)
 
 
 def distances_by_arm(record: CalibrationRecord) -> dict[str, np.ndarray]:
@@ -188,9 +192,7 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
-        >>> axes = aj.plot.pose_distances(record)
-        >>> print(axes.get_ylabel())
-        distance from the socket's centroid [mm]
+        >>> aj.plot.pose_distances(record).figure.savefig("figure.svg")
     """
     return draw(arms_chart(record.recording.capture, distances_by_arm(record)).plots[0], axes)
 
@@ -297,6 +299,12 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
         (order, "pose, in the order of the capture", residuals.vector[:, i], f"along {axis}")
         for i, axis in enumerate("xyz")
     ]
+    values = residuals.normalised[np.isfinite(residuals.normalised)]
+    edges, fine = np.linspace(-4.5, 4.5, 31), np.linspace(-4.5, 4.5, 121)
+    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
+    normal = len(values) * (edges[1] - edges[0]) * np.exp(-(fine**2) / 2) / math.sqrt(2 * math.pi)
+    marks = histogram(counts, edges, "residuals"), Marks("normal distribution", fine, normal, "line", "accent")
+    x = linear("residual [standard deviations]", edges, margin=0.0)
     rows = (
         (
             "by-joint",
@@ -316,20 +324,10 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
             "histogram",
             "Histogram of the residuals",
             "All coordinates of all poses; those beyond 4.5 standard deviations stand in the outermost boxes.",
-            (_histogram(residuals.normalised[np.isfinite(residuals.normalised)]),),
+            (Plot(x, linear("coordinates", counts, normal, zero=True), marks, height=220),),
         ),
     )
     return [Chart(*row) for row in rows]
-
-
-def _histogram(values: np.ndarray) -> Plot:
-    edges = np.linspace(-4.5, 4.5, 31)
-    counts, _ = np.histogram(np.clip(values, edges[0], edges[-1]), edges)
-    fine = np.linspace(edges[0], edges[-1], 121)
-    normal = len(values) * (edges[1] - edges[0]) * np.exp(-(fine**2) / 2) / math.sqrt(2 * math.pi)
-    marks = histogram(counts, edges, "residuals"), Marks("normal distribution", fine, normal, "line", "accent")
-    x = linear("residual [standard deviations]", edges, margin=0.0)
-    return Plot(x, linear("coordinates", counts, normal, zero=True), marks, height=220)
 
 
 def _patterns(panels: Sequence[tuple[np.ndarray, str, np.ndarray, str]], most: int) -> tuple[Plot, ...]:

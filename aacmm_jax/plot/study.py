@@ -35,9 +35,7 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
-        >>> axes = aj.plot.study_metric(results, "de_stage1")
-        >>> print(axes.get_xlabel(), axes.get_ylabel())
-        half-width of lengths [mm] DE before the scale fix [mm]
+        >>> aj.plot.study_metric(results, "de_stage1").figure.savefig("figure.svg")
     """
     if metric not in METRICS:
         raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")

@@ -137,25 +137,21 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
             "u [mm]": lambda length: to_u(length.u, length.u),
         }
         blocks.append(listed("Reference lengths", capture.lengths, columns))
-    blocks += [*removed_tables(record), _traceability(summary["scale_from"])]
-    return Section("data", "What was calibrated, and from which data", blocks)
-
-
-def _traceability(sources: list[str]) -> str:
+    sources = summary["scale_from"]
+    start = "Measurements of the arm are"
     if not sources:
-        return (
-            "Measurements of the arm are not traceable to the metre by this calibration: nothing that was measured set "
-            "its scale."
+        traceable = f"{start} not traceable to the metre by this calibration: nothing that was measured set its scale."
+    elif sources == ["the reference lengths"]:
+        traceable = (
+            f"{start} traceable to the metre through these reference lengths alone, as far as their calibration "
+            "certificates are."
         )
-    if sources == ["the reference lengths"]:
-        return (
-            "Measurements of the arm are traceable to the metre through these reference lengths alone, as far as their "
-            "calibration certificates are."
+    else:
+        traceable = (
+            f"{start} traceable to the metre as far as the calibration certificates are of what sets its scale: "
+            f"{', '.join(sources)}."
         )
-    return (
-        "Measurements of the arm are traceable to the metre as far as the calibration certificates are of what sets "
-        f"its scale: {', '.join(sources)}."
-    )
+    return Section("data", "What was calibrated, and from which data", [*blocks, *removed_tables(record), traceable])
 
 
 def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
@@ -197,14 +193,11 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
         if single
         else " U of a length contains the uncertainty of its certificate and the scatter of the poses at its ends."
     )
-    errors = {stage: np.asarray(evaluations[stage].error) for stage in ("nominal", "stage1", "calibrated")}
-    stage1 = {"stage 1": errors["stage1"]} if record.stage1_apart else {}
-    rows, before = summary["lengths"], {"nominal": errors["nominal"]} | stage1
+    stage1 = {"stage 1": np.asarray(evaluations["stage1"].error)} if record.stage1_apart else {}
+    rows, before = summary["lengths"], {"nominal": np.asarray(evaluations["nominal"].error)} | stage1
     block: Block = length_table("Reference lengths [mm]", rows, before, 0 if single else None)
     if not single:
-        between = [(row["from"], row["to"]) for row in rows]
-        expanded = np.array([row["expanded_mm"] or np.nan for row in rows])
-        block = length_chart(between, stage1 | {"calibrated": errors["calibrated"]}, expanded)._replace(table=block)
+        block = length_chart(rows, stage1)._replace(table=block)
     return Section("scale", "Scale and reference lengths", [introduction, block])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.units import DEG, people_read
-from ..diagnostics.joint_travel import TriedPoses, tried_poses
+from ..diagnostics.joint_travel import tried_poses
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import joint_limits, parameter_unit
 from ..model.sockets import pose_outliers
@@ -187,16 +187,12 @@ def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[S
     poses = tried_poses(arm, readings, volume.q)
     summary = {"poses": len(poses.distance), "tried": int(poses.tried.sum()), "spacing_rad": poses.spacing}
     chart = tried_chart(volume, np.asarray(arm.position(readings)), poses)
-    blocks = [tried_sentence(summary) + _u_within(volume, poses), chart, _travel(record, readings)]
-    return [Section("tried", "Coverage of the working volume", blocks)]
-
-
-def _u_within(volume: VolumetricUncertainty, poses: TriedPoses) -> str:
+    sentence = tried_sentence(summary)
     medians = [float(np.median(volume.expanded_tip[part])) for part in (poses.tried, ~poses.tried) if np.any(part)]
-    if len(medians) < 2 or not all(map(math.isfinite, medians)):
-        return ""
-    near, far = map(two_digits, medians)
-    return f" The median U of a tip is {near} mm where it was tried and {far} mm elsewhere."
+    if len(medians) == 2 and all(map(math.isfinite, medians)):
+        near, far = map(two_digits, medians)
+        sentence += f" The median U of a tip is {near} mm where it was tried and {far} mm elsewhere."
+    return [Section("tried", "Coverage of the working volume", [sentence, chart, _travel(record, readings)])]
 
 
 def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
@@ -205,8 +201,12 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
     units = np.where(slides, 1.0, DEG)
     limits, shown = np.asarray(joint_limits(arm, None)) / units[:, None], readings[:, : arm.joints] / units
-    x = np.arange(arm.joints)
-    used = [_share(*joint) for joint in zip(shown.T, limits, slides, strict=True)]
+    x, used = np.arange(arm.joints), []
+    for values, (low, high), slide in zip(shown.T, limits, slides, strict=True):
+        # The part of the travel, in twentieths, that has readings; the full turn of a joint without limits.
+        high = high if slide else min(high, low + _FULL_TURN)
+        around = values if slide else (values - low) % _FULL_TURN + low
+        used.append(np.mean(np.histogram(around, 20, (low, high))[0] > 0))
     columns = {
         "joint": (x + 1).tolist(),
         "unit": ["mm" if slide else "deg" for slide in slides],
@@ -225,14 +225,6 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     plot = Plot(names("", [f"joint {i + 1}" for i in x]), axis, marks, height=260)
     description = "The travel of each joint within its limits, and the readings of the calibration in it."
     return Chart("travel", "Travel of the joints", description, (plot,), by_columns("Travel by joint", columns))
-
-
-def _share(readings: np.ndarray, limits: np.ndarray, slides: bool) -> float:
-    """The part of a joint's travel, in twentieths, that has readings; the full turn of a joint without limits."""
-    low, high = limits if slides else (limits[0], min(limits[1], limits[0] + _FULL_TURN))
-    around = readings if slides else (readings - low) % _FULL_TURN + low
-    counts, _ = np.histogram(around, 20, (low, high))
-    return float(np.mean(counts > 0))
 
 
 def monte_carlo(record: CalibrationRecord) -> list[Section]:

@@ -16,6 +16,7 @@ from ..data.recording import ProbedSphere
 from ..plot.lengths import metrics_chart, reading_errors_chart
 from ..plot.residuals import arms_chart, distances_in
 from ..summaries import result_tables
+from ..summaries.calibration import metrics_by_socket_and_length
 from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import Cell, Table, decimals_for, format_number, listed, number
@@ -122,21 +123,15 @@ def _acceptance(
     lengths: Sequence[ReferenceLength],
     spheres: Sequence[ProbedSphere],
 ) -> list[Section]:
-    """The acceptance tests, if there were any, and the artefacts."""
-    rows, artefacts = summary["acceptance"], _artefacts(lengths, spheres)
-    if rows:
-        blocks = _acceptance_blocks(tests, rows, summary["u_test_mm"])
-        return [Section("acceptance", "Acceptance tests", [*blocks, *artefacts])]
-    return [Section("artefacts", "Artefacts", artefacts)] if artefacts else []
-
-
-def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], u_test: float) -> list[Block]:
-    """Every test as a table, what its full procedure would also need, and the parts of its metrics."""
-    stated = (
-        f"{format_number(1000 * u_test, 1)} µm of standard uncertainty were stated for seat, fixture and temperature"
-        if u_test
-        else "nothing was stated for seat, fixture and temperature"
-    )
+    """The acceptance tests, if there were any: tables, what a full procedure would also need, parts of metrics; and the
+    artefacts."""
+    rows, artefacts, u_test = summary["acceptance"], _artefacts(lengths, spheres), summary["u_test_mm"]
+    if not rows:
+        return [Section("artefacts", "Artefacts", artefacts)] if artefacts else []
+    stated = "nothing was stated for seat, fixture and temperature"
+    if u_test:
+        u = format_number(1000 * u_test, 1)
+        stated = f"{u} µm of standard uncertainty were stated for seat, fixture and temperature"
     blocks: list[Block] = [
         "Every metric is of single readings. U, with coverage factor 2, is what the tester contributes: the artefacts' "
         f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). What standards allow about "
@@ -149,32 +144,26 @@ def _acceptance_blocks(tests: list[AcceptanceTest], rows: list[dict[str, Any]], 
     if limited:
         used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
         blocks.append(f"Decision rules: {'; '.join(used)}. What no rule decides is undecided.")
-    value = "calibrated" if nominal else "value"
     for test, metrics_of_test in zip(rows, result_tables.acceptance_tables(rows), strict=True):
         blocks.append(metrics_of_test)
         if test["missing"]:
             blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
-    parts = [
-        (part, metric, test)
-        for test in tests
-        for metric in test.metrics
-        for part in metric.values
-        if not limited or part.limit is not None
-    ]
+    parts = [(part, metric, test) for test in tests for metric in test.metrics for part in metric.values]
     every = listed(
-        "Every part of every metric with a limit [mm]" if limited else "Every part of every metric [mm]",
-        parts,
+        f"Every part of every metric{' with a limit' if limited else ''} [mm]",
+        [row for row in parts if not limited or row[0].limit is not None],
         {
             "at": lambda row: row[0].where,
             "decision": lambda row: Cell(row[0].decision or "–", None, result_tables.MARKS[row[0].decision]),
-            value: lambda row: number(row[0].value, decimals_for(row[0].expanded)),
+            "calibrated" if nominal else "value": lambda row: number(row[0].value, decimals_for(row[0].expanded)),
             "U": lambda row: result_tables.stated_expanded(row[0].expanded),
             "MPE": lambda row: row[0].limit,
             "metric": lambda row: row[1].name,
             "standard": lambda row: row[2].standard,
         },
     )
-    return [*blocks, metrics_chart(tests)._replace(table=every, printed=limited)]
+    chart = metrics_chart(tests)._replace(table=every, printed=limited)
+    return [Section("acceptance", "Acceptance tests", [*blocks, chart, *artefacts])]
 
 
 def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSphere]) -> list[Table]:
@@ -220,16 +209,10 @@ def _lengths(
     capture, chart, calibrated = record.recording.capture, reading_errors_chart(tests), evaluations["calibrated"]
     if not capture.lengths:
         return []
-    rows = [
-        {
-            "from": length.start,
-            "to": length.end,
-            "value_mm": float(length.value),
-            "error_mm": float(calibrated.error[i]),
-            "expanded_mm": COVERAGE_FACTOR * float(calibrated.u[i]) if np.isfinite(calibrated.u[i]) else None,
-        }
-        for i, length in enumerate(capture.lengths)
-    ]
+    rows = metrics_by_socket_and_length(capture, calibrated)["lengths"]
+    u = [row["error_u_mm"] for row in rows]
+    expanded = [None if value is None else COVERAGE_FACTOR * value for value in u]
+    rows = [row | {"expanded_mm": value} for row, value in zip(rows, expanded, strict=True)]
     caption, before = "Lengths between the mean points of their sockets [mm]", np.asarray(evaluations["nominal"].error)
     means = length_table(caption, rows, {"nominal": before}, record.length_that_fixed_scale())
     note = (

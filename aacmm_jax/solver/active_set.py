@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, PyTree
 from ..core.numpy_or_jax import AnyArray, cond, namespace, while_loop
 from .arrow import Arrow
 
+Mask = Bool[AnyArray, "*slots p"]
 Flat = Float[AnyArray, "*slots p"]
 Number = Float[AnyArray, "*slots"]
 
@@ -57,7 +58,7 @@ class Box(NamedTuple):
         """The nearest point of the box."""
         return namespace(y).clip(y, self.lower, self.upper)
 
-    def pinned(self, y: Flat, gradient: Flat) -> Bool[AnyArray, "*slots p"]:
+    def pinned(self, y: Flat, gradient: Flat) -> Mask:
         """Unknowns on a bound with the gradient pushing outwards."""
         return ((y <= self.lower) & (gradient >= 0)) | ((y >= self.upper) & (gradient <= 0))
 
@@ -116,9 +117,7 @@ def propose(
     return choose(usable, Step(trial, predicted, length), nowhere), damping
 
 
-def _solve_within(
-    gram: Arrow, right: Flat, fixed: Bool[AnyArray, "*slots p"], damping: Number, radius: Number
-) -> tuple[Flat, Number]:
+def _solve_within(gram: Arrow, right: Flat, fixed: Mask, damping: Number, radius: Number) -> tuple[Flat, Number]:
     """The damped solution, with the damping raised as far as it needs to be no longer than ``radius``; and that
     damping."""
 

@@ -15,6 +15,9 @@ from jaxtyping import Bool, Float, Shaped
 from ..core.linear_algebra import inverse_cholesky, solve_positive_definite
 from ..core.numpy_or_jax import AnyArray, namespace
 
+Vector = Float[AnyArray, "*batch z"]
+Mask = Bool[AnyArray, "*batch z"]
+
 
 class Arrow(NamedTuple):
     """A symmetric matrix in arrow form; ``crossed`` and ``own`` have one entry for each class of blocks."""
@@ -37,7 +40,7 @@ class Arrow(NamedTuple):
         """The head of a vector, and its blocks ``(*batch, K, k)`` class by class."""
         return split(vector, self.head.shape[-1], self.shape)
 
-    def diagonal(self) -> Float[AnyArray, "*batch z"]:
+    def diagonal(self) -> Vector:
         """The diagonal."""
         parts = (namespace(part).diagonal(part, axis1=-2, axis2=-1) for part in (self.head, *self.own))
         return joined(*parts)
@@ -50,14 +53,14 @@ class Arrow(NamedTuple):
             total = total + xp.sum(part, axis=(-3, -2, -1))
         return total
 
-    def scaled(self, scale: Float[AnyArray, "*batch z"]) -> "Arrow":
+    def scaled(self, scale: Vector) -> "Arrow":
         """S A S with a diagonal S."""
         head, parts = self.split(scale)
         crossed = (c * s[..., None] * head[..., None, None, :] for c, s in zip(self.crossed, parts, strict=True))
         own = (d * s[..., :, None] * s[..., None, :] for d, s in zip(self.own, parts, strict=True))
         return Arrow(self.head * head[..., :, None] * head[..., None, :], tuple(crossed), tuple(own))
 
-    def times(self, vector: Float[AnyArray, "*batch z"]) -> Float[AnyArray, "*batch z"]:
+    def times(self, vector: Vector) -> Vector:
         """The product with a vector."""
         head, parts = self.split(vector)
         top, below = (self.head @ head[..., None])[..., 0], []
@@ -68,9 +71,7 @@ class Arrow(NamedTuple):
             below.append((own @ part[..., None])[..., 0] + of_head.reshape(part.shape))
         return joined(top, *below)
 
-    def damped_solution(
-        self, right: Float[AnyArray, "*batch z"], fixed: Bool[AnyArray, "*batch z"], damping: Float[AnyArray, "*batch"]
-    ) -> Float[AnyArray, "*batch z"]:
+    def damped_solution(self, right: Vector, fixed: Mask, damping: Float[AnyArray, "*batch"]) -> Vector:
         """Solution x of (A + damping I) x = right in the unknowns that are not fixed; 0 for those that are."""
         xp = namespace(self, right, fixed, damping)
         right = xp.where(fixed, 0.0, right)
@@ -107,7 +108,7 @@ def split(
     return vector[..., :head], parts
 
 
-def joined(head: Float[AnyArray, "*batch h"], *parts: Float[AnyArray, "*batch _ _"]) -> Float[AnyArray, "*batch z"]:
+def joined(head: Float[AnyArray, "*batch h"], *parts: Float[AnyArray, "*batch _ _"]) -> Vector:
     """The vector with this head and these blocks."""
     if not parts:
         return head

@@ -1,61 +1,37 @@
-"""Box-bounded nonlinear least squares as an Optimistix solver, and `least_squares`, whose derivatives are exact.
+"""Box-bounded nonlinear least squares with exact derivatives, also where bounds are active.
 
-The adjoint differentiates the stationarity of a box-bounded minimum, also where bounds are active.
+The minimum is found by the steps of `levenberg_marquardt`, which are not differentiated, and then takes its derivatives
+from its stationarity, y = clip(y - gradient), by the implicit function theorem. A common implicit adjoint takes the
+gradient to vanish, which is false on an active bound: there the solution follows the bound. Exact (full Hessian, not
+Gauss-Newton's), forward and reverse.
 """
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from ..core import _compat
 from ..core.arguments import Count, checked
 from ..core.arrays import as_array, is_concrete
 from ..core.errors import InputError
 from ..core.jax_setup import check_x64
 from ..core.linear_algebra import singular_values
+from ..core.numpy_or_jax import stop_gradient
 from .active_set import Box, Flat, QuadraticModel
-from .levenberg_marquardt import Progress, Rules, advance, begin
-from .reason import MAX_STEPS, NONFINITE, RUNNING, STALLED, Reason, reasons
+from .levenberg_marquardt import Progress, Rules, minimise
+from .reason import MAX_STEPS, NONFINITE, STALLED, Reason, reasons
+
+_UNDETERMINED = 1e-14  # of the largest singular value
 
 
-def box_of(y: PyTree[Array], options: dict[str, Any]) -> Box:
-    """The box that the options of a solve describe: trees like ``y`` whose leaves broadcast, numbers for all, or None.
-
-    Raises `InputError` where one of them does not fit.
-    """
-
-    def flat(name: str, absent: float) -> Flat:
-        given = options.get(name)
-        if given is None or (jax.tree_util.all_leaves([given]) and jnp.ndim(given) == 0):
-            given = jax.tree.map(lambda _: given, y)
-
-        def leaf_of(leaf: Array, value: Any) -> Array:
-            return jnp.broadcast_to(jnp.asarray(absent if value is None else value, dtype=jnp.float64), leaf.shape)
-
-        try:
-            return ravel_pytree(jax.tree.map(leaf_of, y, given))[0]
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{name} does not fit the start; give a number, or a PyTree like it ({error}).") from error
-
-    scale = None if options.get("scale") is None else flat("scale", 1.0)
-    return Box(flat("lower", -jnp.inf), flat("upper", jnp.inf), scale)
-
-
-class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
-    """Levenberg-Marquardt within a box, as an Optimistix least-squares solver.
-
-    The box is in ``options``: ``lower``, ``upper`` and ``scale`` as in `least_squares`, and ``normal``. ``stats`` of
-    the solution holds ``reason``, ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
-
-    Use it through `least_squares`, which also brings the adjoint that takes the bounds into account.
+class BoundedLevenbergMarquardt(Rules):
+    """Tolerances and initial damping of `least_squares`: ``rtol``, ``atol``, ``gtol`` and ``initial_damping``.
 
     Example:
         >>> import jax.numpy as jnp
@@ -64,133 +40,6 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         >>> print(aj.least_squares(lambda y, target: y - target, jnp.zeros(2), target, upper=2.0, solver=loose).value)
         [1. 2.]
     """
-
-    # As in `Rules`.
-    rtol: float = Rules().rtol
-    atol: float = Rules().atol
-    gtol: float = Rules().gtol
-    initial_damping: float | None = Rules().initial_damping
-    # Optimistix asks for a norm; every test here is written out, since it scales by unknowns.
-    norm: Callable[[PyTree], Array] = optx.max_norm
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
-        form = None
-        if options.get("normal") is not None:
-            form = jax.eval_shape(options["normal"], y, args).gram
-            form = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
-        return begin(ravel_pytree(y)[0], box_of(y, options), form)
-
-    def step(self, fn, y, args, options, state, tags):
-        unravel: Callable = ravel_pytree(y)[1]
-
-        def residual(point: Flat) -> tuple[Array, tuple[Array, PyTree]]:
-            out, aux = fn(unravel(point), args)
-            value = ravel_pytree(out)[0]
-            if not value.size or jnp.iscomplexobj(value):
-                raise InputError("the residual must be real numbers, at least one; look at what the function returns.")
-            return value, (value, aux)
-
-        trial, aux = state.step.trial, None
-        if options.get("normal") is None:
-            jacobian, (value, aux) = jax.jacfwd(residual, has_aux=True)(trial)
-            evaluated = QuadraticModel(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian)
-        else:
-            evaluated = options["normal"](unravel(trial), args)
-        rules = Rules(self.rtol, self.atol, self.gtol, self.initial_damping)
-        state = advance(state, evaluated, box_of(y, options), rules)
-        return unravel(state.y), state, aux
-
-    def terminate(self, fn, y, args, options, state, tags):
-        result = optx.RESULTS.where(state.reason == STALLED, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
-        result = optx.RESULTS.where(state.reason == NONFINITE, optx.RESULTS.nonfinite, result)
-        return state.reason != RUNNING, result
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        # Optimistix itself stops, before any step, where y is not finite.
-        unfinished = jnp.where(result == optx.RESULTS.nonfinite, NONFINITE, MAX_STEPS)
-        stats = {
-            "reason": reasons(jnp.where(state.reason == RUNNING, unfinished, state.reason)),
-            "num_accepted_steps": state.accepted,
-            "cost": state.model.cost,
-            "gradient": state.model.gradient,
-            "optimality": state.optimality,
-        }
-        return y, aux, stats
-
-
-class EquilibratedPseudoInverse(lx.AbstractLinearSolver):
-    """Pseudo-inverse of a square operator whose rows and columns are first scaled to size 1.
-
-    So no choice of units makes a direction look undetermined.
-    """
-
-    rcond: float = 1e-14
-
-    def init(self, operator, options):
-        def inverse(size: Array) -> Array:
-            return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 1.0)
-
-        matrix = operator.as_matrix()
-        row = inverse(jnp.max(jnp.abs(matrix), axis=1))
-        column = inverse(jnp.max(jnp.abs(row[:, None] * matrix), axis=0))
-        row = row * inverse(jnp.max(jnp.abs(row[:, None] * matrix * column[None, :]), axis=1))
-        decomposed = singular_values(row[:, None] * matrix * column[None, :])
-        return decomposed, row, column, _compat.Static((operator.in_structure(), operator.out_structure()))
-
-    def compute(self, state, vector, options):
-        (u, s, v), row, column, structures = state
-        determined = s > self.rcond * s[0]
-        inverse = jnp.where(determined, 1 / jnp.where(determined, s, 1.0), 0.0)
-        solution = column * (v @ (inverse * (u.T @ (row * ravel_pytree(vector)[0]))))
-        like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), structures.value[0])
-        return ravel_pytree(like)[1](solution), lx.RESULTS.successful, {}
-
-    def assume_full_rank(self):
-        return False
-
-    def transpose(self, state, options):
-        (u, s, v), row, column, structures = state
-        inside, outside = structures.value
-        return ((v, s, u), column, row, _compat.Static((outside, inside))), options
-
-    def conj(self, state, options):
-        return state, options
-
-
-class BoundedAdjoint(optx.AbstractAdjoint):
-    """Implicit differentiation of the stationarity of a box-bounded minimum: y = clip(y - gradient).
-
-    Optimistix's own implicit adjoint takes the gradient to vanish, which is false on an active bound: there the
-    solution follows the bound. Exact (full Hessian, not Gauss-Newton's), forward and reverse.
-    """
-
-    linear_solver: lx.AbstractLinearSolver = EquilibratedPseudoInverse()
-
-    def apply(self, primal_fn, rewrite_fn, inputs, tags):
-        del rewrite_fn
-        inputs = (*inputs, _compat.while_loop)
-        # Optimistix wants a plain global function, not one that a run-time type checker has wrapped.
-        return _compat.implicit_jvp(primal_fn, inspect.unwrap(_stationarity), inputs, tags, self.linear_solver)
-
-
-def _stationarity(y: PyTree[Array], solved: PyTree, inputs: PyTree) -> Flat:
-    """Zero at a bounded minimum: the gradient where an unknown is free, its distance from the bound where pinned."""
-    del solved
-    fn, _, _, args, options, *_ = inputs
-    flat, unravel = ravel_pytree(y)
-    box = box_of(y, options)
-
-    def cost(point: Array) -> Array:
-        value = ravel_pytree(fn(unravel(point), args)[0])[0]
-        return 0.5 * jnp.dot(value, value)
-
-    gradient = jax.grad(cost)(flat)
-    point, slope = jax.lax.stop_gradient((flat, gradient))
-    nearer_lower = point - box.lower <= box.upper - point
-    # An absent bound is infinite; it is never the nearer one of a pinned unknown, but must not make NaN in the other
-    # branch.
-    lower, upper = (jnp.where(jnp.isfinite(bound), bound, 0.0) for bound in (box.lower, box.upper))
-    return jnp.where(box.pinned(point, slope), flat - jnp.where(nearer_lower, lower, upper), gradient)
 
 
 def least_squares(
@@ -202,7 +51,7 @@ def least_squares(
     upper: PyTree = None,
     scale: PyTree = None,
     normal: Callable[[PyTree, PyTree], QuadraticModel] | None = None,
-    solver: BoundedLevenbergMarquardt = BoundedLevenbergMarquardt(),
+    solver: Rules = BoundedLevenbergMarquardt(),
     max_steps: int = 1000,
     throw: bool = True,
 ) -> optx.Solution:
@@ -224,7 +73,8 @@ def least_squares(
         throw: Whether a failure is an exception; otherwise it is only data (``result``), as a batch needs it.
 
     Returns:
-        An `optimistix.Solution`; its ``stats["reason"]`` is the `Reason` why the solve ended.
+        An `optimistix.Solution`; its ``stats`` hold the `Reason` why the solve ended (``reason``), ``num_steps``,
+        ``num_accepted_steps``, ``cost``, ``gradient`` and ``optimality``.
 
     Raises:
         InputError: Where a lower bound is above its upper one, or bounds do not fit the start; with ``throw``, where
@@ -241,8 +91,8 @@ def least_squares(
     if not sum(leaf.size for leaf in jax.tree.leaves(y0)):
         raise InputError("the start holds no number, so nothing is unknown; give at least one.")
     checked(max_steps, Count, "max_steps")
-    given = {"lower": lower, "upper": upper, "scale": scale}
-    box, unravel = box_of(y0, given), ravel_pytree(y0)[1]
+    steps = None if scale is None else _flat(y0, scale, 1.0, "scale")
+    box = Box(_flat(y0, lower, -jnp.inf, "lower"), _flat(y0, upper, jnp.inf, "upper"), steps)
     if is_concrete(box.lower, box.upper):
         low, high = np.asarray(box.lower), np.asarray(box.upper)
         for i in np.flatnonzero(~(low <= high))[:1]:
@@ -250,15 +100,125 @@ def least_squares(
                 f"lower bound {low[i]:g} of unknown {i + 1} is above its upper bound {high[i]:g}; exchange or widen "
                 "them."
             )
-    options = {name: None if tree is None else unravel(getattr(box, name)) for name, tree in given.items()}
-    options["normal"] = normal
-    steps = {"max_steps": max_steps, "adjoint": BoundedAdjoint(), "throw": False}
-    solution = optx.least_squares(fn, solver, y0, args, options, **steps)
+    value, last = _minimum(fn, y0, args, box, normal, Rules(*solver), max_steps)
+    failures = {STALLED: "nonlinear_divergence", NONFINITE: "nonfinite", MAX_STEPS: "nonlinear_max_steps_reached"}
+    result = optx.RESULTS.successful
+    for number, name in failures.items():
+        result = optx.RESULTS.where(last.reason == number, getattr(optx.RESULTS, name), result)
+    stats = {
+        "reason": reasons(last.reason),
+        "num_steps": last.steps,
+        "num_accepted_steps": last.accepted,
+        "cost": last.model.cost,
+        "gradient": last.model.gradient,
+        "optimality": last.optimality,
+    }
+    solution = optx.Solution(value=value, result=result, aux=None, stats=stats, state=None)
     if not throw:
         return solution
-    failed = solution.result != optx.RESULTS.successful
+    failed = result != optx.RESULTS.successful
     if not is_concrete(failed):
-        return solution.result.error_if(solution, failed)
+        return result.error_if(solution, failed)
     if bool(failed):
-        raise InputError(Reason[solution.stats["reason"]])
+        raise InputError(Reason[stats["reason"]])
     return solution
+
+
+def _flat(y: PyTree[Array], given: PyTree, absent: float, what: str) -> Flat:
+    """A bound or a scale as a vector: of a tree like ``y`` whose leaves broadcast, or of a number for all; None stands
+    for ``absent``."""
+    if given is None or (jax.tree_util.all_leaves([given]) and jnp.ndim(given) == 0):
+        given = jax.tree.map(lambda _: given, y)
+
+    def leaf_of(leaf: Array, value: Any) -> Array:
+        return jnp.broadcast_to(jnp.asarray(absent if value is None else value, dtype=jnp.float64), leaf.shape)
+
+    try:
+        return ravel_pytree(jax.tree.map(leaf_of, y, given))[0]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} does not fit the start; give a number, or a PyTree like it ({error}).") from error
+
+
+@eqx.filter_jit
+def _minimum(
+    fn: Callable, y0: PyTree[Array], args: PyTree, box: Box, normal: Callable | None, rules: Rules, max_steps: int
+) -> tuple[PyTree[Array], Progress]:
+    """The minimum with its derivatives, and the last state of the solve."""
+    start, unravel = ravel_pytree(y0)
+
+    def residual(point: Array, args: PyTree) -> Float[Array, " r"]:
+        value = ravel_pytree(fn(unravel(point), args))[0]
+        if not value.size or jnp.iscomplexobj(value):
+            raise InputError("the residual must be real numbers, at least one; look at what the function returns.")
+        return value
+
+    # What the function closes over becomes an argument, so that derivatives by it pass too.
+    inputs = (eqx.filter_closure_convert(residual, start, args), args, box)
+    constant_residual, constant_args, still_box = stop_gradient(inputs)
+
+    def model(point: Array, _: None) -> QuadraticModel:
+        if normal is not None:
+            return normal(unravel(point), constant_args)
+        value = constant_residual(point, constant_args)
+        jacobian = jax.jacfwd(constant_residual)(point, constant_args)
+        return QuadraticModel(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian)
+
+    lower, upper, scale = still_box
+    last = minimise(
+        model, stop_gradient(start), None, lower=lower, upper=upper, scale=scale, rules=rules, max_steps=max_steps
+    )
+    return unravel(_with_derivatives(last.y, inputs)), last
+
+
+@eqx.filter_custom_jvp
+def _with_derivatives(y: Array, inputs: PyTree) -> Array:
+    """The minimum, whose derivatives by its inputs are those that keep it stationary."""
+    del inputs
+    return y
+
+
+@_with_derivatives.def_jvp
+def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    (y, inputs), (_, change) = primals, tangents
+    y = _with_derivatives(y, inputs)  # so that derivatives of any order pass
+    _, slope = eqx.filter_jvp(lambda inputs: _stationarity(y, inputs), (inputs,), (change,))
+    return y, -_solved(jax.jacfwd(lambda y: _stationarity(y, inputs))(y), slope)
+
+
+def _stationarity(y: Array, inputs: PyTree) -> Array:
+    """Zero at a bounded minimum: the gradient where an unknown is free, its distance from the bound where pinned."""
+    residual, args, box = inputs
+
+    def cost(point: Array) -> Array:
+        value = residual(point, args)
+        return 0.5 * jnp.dot(value, value)
+
+    gradient = jax.grad(cost)(y)
+    point, slope = jax.lax.stop_gradient((y, gradient))
+    nearer_lower = point - box.lower <= box.upper - point
+    # An absent bound is infinite; it is never the nearer one of a pinned unknown, but must not make NaN in the other
+    # branch.
+    lower, upper = (jnp.where(jnp.isfinite(bound), bound, 0.0) for bound in (box.lower, box.upper))
+    return jnp.where(box.pinned(point, slope), y - jnp.where(nearer_lower, lower, upper), gradient)
+
+
+@jax.custom_jvp
+def _solved(matrix: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
+    """The least solution by the pseudo-inverse of the matrix with its rows and columns first scaled to size 1, so that
+    no choice of units makes a direction look undetermined."""
+
+    def inverse(size: Array) -> Array:
+        return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 1.0)
+
+    row = inverse(jnp.max(jnp.abs(matrix), axis=1))
+    column = inverse(jnp.max(jnp.abs(row[:, None] * matrix), axis=0))
+    row = row * inverse(jnp.max(jnp.abs(row[:, None] * matrix * column[None, :]), axis=1))
+    u, s, v = singular_values(row[:, None] * matrix * column[None, :])
+    determined = s > _UNDETERMINED * s[0]
+    return column * (v @ (jnp.where(determined, 1 / jnp.where(determined, s, 1.0), 0.0) * (u.T @ (row * right))))
+
+
+@_solved.defjvp
+def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    solution = _solved(*primals)
+    return solution, _solved(primals[0], tangents[1] - tangents[0] @ solution)

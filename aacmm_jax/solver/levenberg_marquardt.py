@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from ..core.numpy_or_jax import AnyArray, namespace, while_loop
 from .active_set import Box, Flat, Number, QuadraticModel, Step, choose, norm, propose
@@ -129,12 +129,12 @@ def _next_radius(progress: Progress, y: Flat, model: QuadraticModel, scale: Flat
 
 def minimise(
     model: Callable[[Any, Any], QuadraticModel],
-    start: Float[AnyArray, " p"],
+    start: Flat,
     args: Any,
     *,
-    lower: Float[AnyArray, " p"],
-    upper: Float[AnyArray, " p"],
-    scale: Float[AnyArray, " p"] | None,
+    lower: Flat,
+    upper: Flat,
+    scale: Flat | None,
     rules: Rules,
     max_steps: int,
 ) -> Progress:

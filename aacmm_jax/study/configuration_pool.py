@@ -127,23 +127,20 @@ def pool_key(seed: int, fixture: Fixture, limits: tuple, capacity: tuple[int, in
 
 def check_reach(study: Study) -> None:
     """Raise `InputError` where a fixture is out of reach, or has no placement in its region: before any work."""
-    arm = study.plain_arm
-    # Reach does not depend on the number of poses, nor for random placements on the number in the name.
-    fixtures = {
-        (fixture._replace(name=fixture.name if fixture.points else fixture.name[0], poses=0), setting.limits)
-        for setting in dict.fromkeys(study.settings)
-        if not setting.recorded
-        for fixture in setting.fixtures
-    }
-    for fixture, joint_limits in sorted(fixtures, key=repr):
-        limits, key = jnp.asarray(joint_limits), random_key(study.specification.seed)
-        if fixture.points is None:
-            _placements(arm, fixture, limits, key, 1)
-            continue
-        points = np.repeat(np.array(fixture.points), _ROWS // fixture.ends // 4, axis=0)
-        _, good = _solved(arm, _uniform(key, limits, len(points)), points, limits)
-        if good.reshape(fixture.ends, -1).mean(axis=1).min() < 0.05:
-            raise _out_of_reach(fixture)
+    arm, key, seen = study.plain_arm, random_key(study.specification.seed), set()
+    for setting in dict.fromkeys(study.settings):
+        for fixture in () if setting.recorded else setting.fixtures:
+            # Reach does not depend on the number of poses, nor for random placements on the number in the name.
+            alike = fixture._replace(name=fixture.name if fixture.points else fixture.name[0], poses=0), setting.limits
+            limits = jnp.asarray(setting.limits)
+            if alike not in seen and fixture.points is None:
+                _placements(arm, fixture, limits, key, 1)
+            elif alike not in seen:
+                points = np.repeat(np.array(fixture.points), _ROWS // fixture.ends // 4, axis=0)
+                _, good = _solved(arm, _uniform(key, limits, len(points)), points, limits)
+                if good.reshape(fixture.ends, -1).mean(axis=1).min() < 0.05:
+                    raise _out_of_reach(fixture)
+            seen.add(alike)
 
 
 def _out_of_reach(fixture: Fixture) -> InputError:

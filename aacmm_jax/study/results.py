@@ -18,7 +18,7 @@ from ..files.hdf5 import undamaged
 from ..kinematics.arm import parameter_unit
 from ..solver.reason import Reason, numbers_of
 from .blocks import DIMENSIONS, METRICS, VARIABLES
-from .specification import label
+from .definition import POOL_PARTS
 from .store import Results, factor_columns
 
 if TYPE_CHECKING:
@@ -54,18 +54,16 @@ def open_study(path: str | os.PathLike) -> "xarray.Dataset":
     results = Results.of(path)
     study = results.study
     with undamaged(path):
-        if not results.in_blocks:
+        if results.finished:
             data = xarray.open_dataset(results.path, group="trials", engine="h5netcdf")
         else:
-            arrays = {name: results.empty(name) for name in VARIABLES}
+            data = xarray.Dataset(coords={"parameter": list(study.space.names)})
+            for name, kind in VARIABLES.items():
+                values, described = results.empty(name), {"units": kind.units, "long_name": kind.long_name}
+                data[name] = xarray.Variable(DIMENSIONS[: values.ndim], values, described)
             for block in results.finished_blocks():
                 for name, values in results.of_block(block).items():
-                    arrays[name][block.slices] = values
-            variables = {
-                name: (DIMENSIONS[: x.ndim], x, {key: getattr(VARIABLES[name], key) for key in ("units", "long_name")})
-                for name, x in arrays.items()
-            }
-            data = xarray.Dataset(variables, coords={"parameter": list(study.space.names)})
+                    data[name].values[block.slices] = values
         labels = {
             name: ("cell", np.asarray(column.values), {"units": column.units, "long_name": column.long_name})
             for name, column in factor_columns(study).items()
@@ -137,12 +135,7 @@ def cell_summary(results: Results, cell: int) -> dict[str, Any]:
     ran = columns["converged"] >= 0
     columns = {name: values[ran] for name, values in columns.items()}
     good = columns["converged"] == 1
-    levels = results.study.cells[cell]
-    # A factor is shown by numbers where all of its levels are numbers.
-    labels = {
-        name: label(levels[name]) if isinstance(values[0], float) else str(label(levels[name]))
-        for name, values in results.study.factors.items()
-    }
+    labels = {column.long_name: column.values[cell] for column in factor_columns(results.study).values()}
     reasons = {name: int(numbers_of(getattr(Reason, name))) for name in _REASONS}
     summary: dict[str, Any] = {
         "cell": cell + 1,
@@ -205,30 +198,30 @@ def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
 def _parameters(results: Results, cell: int) -> dict[str, Any]:
     """Bias and standard deviation of every parameter that the cell identifies, and how often it is on a bound, from
     sums over groups."""
-    study = results.study
-    space, groups = study.space, {}
-    names, identified = space.names, study.identified(study.settings[cell])[0].names
+    study, space = results.study, results.study.space
+    identified = study.identified(study.settings[cell])[0].names
+    # By group: number of trials, errors, their squares, active bounds, trials with any.
+    sums = np.zeros((5, POOL_PARTS, len(space.names)))
     for error, active, group in results.errors(cell):
         for g in np.unique(group):
             rows = group == g
             on_bound = active[rows] != 0
-            moments = (rows.sum(), error[rows].sum(axis=0), (error[rows] ** 2).sum(axis=0))
-            sums = (*moments, on_bound.sum(axis=0), int(on_bound.any(axis=1).sum()))
-            groups[g] = tuple(a + b for a, b in zip(groups.get(g, (0, 0, 0, 0, 0)), sums, strict=True))
-    if not groups:
+            moments = rows.sum(), error[rows].sum(axis=0), (error[rows] ** 2).sum(axis=0)
+            for total, part in zip(sums, (*moments, on_bound.sum(axis=0), on_bound.any(axis=1).sum()), strict=True):
+                total[g] += part
+    sums = sums[:, sums[0, :, 0] > 0]
+    if not sums.size:
         return {"on_a_bound": {"value": None, "se": None}, "parameters": []}
-    count, first, second, active, any_active = (np.array(column) for column in zip(*groups.values(), strict=True))
 
-    def statistics(chosen: np.ndarray) -> np.ndarray:
-        n = max(count[chosen].sum(), 1)
-        mean = first[chosen].sum(axis=0) / n
-        deviation = np.sqrt(np.maximum(second[chosen].sum(axis=0) / n - mean**2, 0) * n / max(n - 1, 1))
-        fraction = active[chosen].sum(axis=0) / n
-        return np.stack([mean, deviation, fraction, np.full(len(names), any_active[chosen].sum() / n)])
+    def statistics(groups: np.ndarray) -> np.ndarray:
+        n, first, second, active, any_active = groups.sum(axis=1)
+        n = np.maximum(n, 1)
+        deviation = np.sqrt(np.maximum(second / n - (first / n) ** 2, 0) * n / np.maximum(n - 1, 1))
+        return np.stack([first / n, deviation, active / n, any_active / n])
 
-    value, se = statistics(np.full(len(count), True)), np.full((4, len(names)), np.nan)
-    if len(count) > 1:
-        se = _jackknife(np.array([statistics(np.arange(len(count)) != g) for g in range(len(count))]))
+    value, se = statistics(sums), np.full((4, len(space.names)), np.nan)
+    if sums.shape[1] > 1:
+        se = _jackknife(np.array([statistics(np.delete(sums, g, axis=1)) for g in range(sums.shape[1])]))
 
     def entry(row: int, i: int) -> dict[str, Any]:
         return {"value": float(value[row, i]), "se": None if np.isnan(se[row, i]) else float(se[row, i])}
@@ -236,7 +229,7 @@ def _parameters(results: Results, cell: int) -> dict[str, Any]:
     parameters = [
         {"parameter": name, "unit": parameter_unit(space.base, name)}
         | {key: entry(row, i) for row, key in enumerate(("bias", "spread", "on_a_bound"))}
-        for i, name in enumerate(names)
+        for i, name in enumerate(space.names)
         if name in identified
     ]
     return {"on_a_bound": entry(3, 0), "parameters": parameters}

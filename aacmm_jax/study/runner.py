@@ -65,7 +65,6 @@ def run_study(
     workers: int | None = None,
     chunk: int | None = None,
     shards: bool = False,
-    keep_parts: bool = False,
     watch: Callable[[StudyProgress], None] | None = None,
 ) -> Outcome:
     """Run a study into an HDF5 file, or continue the one that the file contains.
@@ -85,7 +84,6 @@ def run_study(
         chunk: Trials in a block, which is one call of `identify_many`; default 1,000 (65,536 on a GPU). It changes no
             number, and stays what it was when the file was begun.
         shards: Let workers write their blocks themselves, into ``FILE.parts`` in a folder that all of them share.
-        keep_parts: Leave the blocks in their folder at the end: for results too large to copy.
         watch: Called with a `StudyProgress` at the beginning, after every block, and when an interrupt has come.
 
     Returns:
@@ -108,14 +106,12 @@ def run_study(
         for left in parts_of(path).glob(".*.????????.part"):  # of killed processes
             left.unlink(missing_ok=True)
         results = _opened(study, path, chunk, executor)
-        if not results.in_blocks:
+        if results.finished:
             shutil.rmtree(parts_of(path), ignore_errors=True)  # left by a killed process
             return Outcome(path, total, total, 0)
         # Blocks of earlier runs are read completely: a damaged one runs again.
         kept = {block for block in results.finished_blocks() if results.is_readable(block)}
         missing = [block for block in results.blocks if block not in kept]
-        if results.finished and not missing:
-            return Outcome(path, total, total, 0)
         done = before = total - sum(block.size for block in missing)
         first, others = _in_order(study, missing)
         progress = StudyProgress(done, total, len(first), len(first))
@@ -136,7 +132,7 @@ def run_study(
                     done, compiling = done + block.size, max(progress.compiling - 1, 0)
                     tell(progress := progress._replace(done=done, compiling=compiling))
             if done == total:  # interrupts are still caught: one within HDF5 could damage the file
-                results.finish(keep_parts or results.finished)
+                results.finish()
         return Outcome(path, done, total, done - before)
 
 
@@ -226,9 +222,9 @@ def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | No
         raise InputError(
             f"{path} holds another study ({_difference(results.study, study)}); choose another output path."
         )
-    if results.in_blocks and chunk not in (None, results.chunk):
+    if not results.finished and chunk not in (None, results.chunk):
         raise InputError(f"{path} was begun with chunks of {results.chunk} trials; leave the chunk out to continue.")
-    if results.in_blocks and executor is None:
+    if not results.finished and executor is None:
         check_same(results.computed_with, str(path), "choose another output path")
     return results
 
@@ -297,22 +293,21 @@ def _completed(
     submitted: dict[Future, Block] = {}
     try:
         for blocks, most in zip(phases, (len(phases[0]), queued), strict=True):
-            waiting, told = deque(blocks), False
-            while submitted or (waiting and not stopped.is_set()):
-                while waiting and len(submitted) < most and not stopped.is_set():
+            waiting = deque(blocks)
+            while submitted or waiting:
+                if stopped.is_set():
+                    if blocks is phases[0]:
+                        return
+                    if waiting:
+                        waiting.clear()
+                        yield None, None
+                while waiting and len(submitted) < most:
                     block = waiting.popleft()
                     submitted[submit(block)] = block
                 ended, _ = wait(submitted, timeout=0.2, return_when=FIRST_COMPLETED)
                 # Successful blocks first: they are kept even where another block failed at the same moment.
                 for future in sorted(ended, key=lambda future: future.exception() is not None):
                     yield (block := submitted.pop(future)), _result(future, f"block {block}")
-                if not stopped.is_set():
-                    continue
-                if blocks is phases[0]:
-                    return
-                if submitted and not told:
-                    told = True
-                    yield None, None
     finally:
         for future in submitted:
             future.cancel()

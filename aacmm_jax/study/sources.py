@@ -2,8 +2,8 @@
 
 import os
 from collections.abc import Mapping
+from contextlib import nullcontext
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError, naming, nearest
@@ -21,6 +21,7 @@ from ..kinematics.parameters import ArmSpecification
 from .definition import Study
 from .specification import Specification, checked
 
+_SHIPPED = resources.files("aacmm_jax.study") / "shipped_studies"
 _TABLES = ("deviation", "noise", "bounds", "reference", "identification")
 
 
@@ -65,15 +66,15 @@ def make_study(
     for key in tables:
         if key not in _TABLES:
             raise InputError(f"a study has no table '{key}'{nearest(key, _TABLES)}")
-    if not isinstance(capture, Capture | Mapping):
-        raise InputError(
-            f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets, file or kit), or a Capture."
-        )
     if isinstance(capture, Capture):
         nominal = _nominal(arm, capture)
         recording, capture = Recording(capture, nominal), {"file": "(in memory)"}
-    else:
+    elif isinstance(capture, Mapping):
         nominal, recording = _contents(arm, capture.get("file"), capture.get("kit"), seed)
+    else:
+        raise InputError(
+            f"capture is a {type(capture).__name__}; give a table (positions_mm, sockets, file or kit), or a Capture."
+        )
     specification = checked(name=storable(name), arm=nominal.name, trials=trials, seed=seed, capture=capture, **tables)
     return Study(specification, nominal, recording)
 
@@ -88,9 +89,7 @@ def shipped_studies() -> tuple[str, ...]:
         >>> print(aj.study.shipped_studies())
         ('bound-sensitivity', 'joint-models', 'noise', 'pose-count', 'reference-length')
     """
-    return tuple(
-        sorted(item.name.removesuffix(".toml") for item in _shipped().iterdir() if item.name.endswith(".toml"))
-    )
+    return tuple(sorted(item.name.removesuffix(".toml") for item in _SHIPPED.iterdir() if item.name.endswith(".toml")))
 
 
 def read_study(source: str | os.PathLike) -> Study:
@@ -111,29 +110,20 @@ def read_study(source: str | os.PathLike) -> Study:
         >>> print(len(shipped.cells), shipped.trials)
         20 1000
     """
-    if isinstance(source, str) and source in shipped_studies():
-        with resources.as_file(_shipped() / f"{source}.toml") as path:
-            return _study_of_file(path)
+    shipped = isinstance(source, str) and source in shipped_studies()
     path = as_path(source)
-    if not os.path.exists(path) and path.suffix != ".toml":
+    if not shipped and not os.path.exists(path) and path.suffix != ".toml":
         hint = nearest(str(source), shipped_studies())
         raise InputError(f"'{source}' is neither a file nor a study that ships with the package{hint}")
-    return _study_of_file(path)
-
-
-def _shipped() -> Any:
-    return resources.files("aacmm_jax.study") / "shipped_studies"
-
-
-def _study_of_file(path: Path) -> Study:
-    specification = read_toml(path, Specification)
-    capture = specification.capture
-    if not specification.arm and capture.file is None:
-        raise InputError(f"{path}: 'arm' is missing; add it.")
-    with naming(path):
-        arm = arm_beside(path.parent, specification.arm) if specification.arm else None
-        file, kit = (None if name is None else path.parent / name for name in (capture.file, capture.kit))
-        return Study(specification, *_contents(arm, file, kit, specification.seed))
+    with resources.as_file(_SHIPPED / f"{source}.toml") if shipped else nullcontext(path) as path:
+        specification = read_toml(path, Specification)
+        capture = specification.capture
+        if not specification.arm and capture.file is None:
+            raise InputError(f"{path}: 'arm' is missing; add it.")
+        with naming(path):
+            arm = arm_beside(path.parent, specification.arm) if specification.arm else None
+            file, kit = (None if name is None else path.parent / name for name in (capture.file, capture.kit))
+            return Study(specification, *_contents(arm, file, kit, specification.seed))
 
 
 def _nominal(arm: Any, capture: Capture | None) -> ArmSpecification:

@@ -8,24 +8,13 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    Field,
-    FiniteFloat,
-    NonNegativeFloat,
-    PositiveFloat,
-    PositiveInt,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, model_validator
 
 from ..files.toml import Strict, validated
 
 # More cells than a grid of four factors with ten levels each are a mistake.
 MOST_CELLS = 10_000
 MOST_TRIALS = 10**10
-MOST_POOL = 2**24
 
 
 def _depth(value: Any) -> int:
@@ -47,22 +36,21 @@ def _different(levels: list) -> list:
     return levels
 
 
-Level = TypeVar("Level")
-Levels = Annotated[list[Level], _levels_of(0), Field(min_length=1), AfterValidator(_different)]
-Finite = FiniteFloat
-Amount = Annotated[NonNegativeFloat, Field(allow_inf_nan=False)]
-Positive = Annotated[PositiveFloat, Field(allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1, le=100_000)]
-Pair = Annotated[tuple[Finite, Finite], Field(strict=False), AfterValidator(lambda pair: _ordered(pair))]
-Point = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]
-Points = Annotated[list[Point], Field(min_length=1)]
-Ends = Annotated[tuple[Point, Point], Field(strict=False)]
-
-
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     if not pair[0] < pair[1]:
         raise ValueError(f"{pair[0]:g} to {pair[1]:g} is not a range; give the lower number first.")
     return pair
+
+
+Level = TypeVar("Level")
+Levels = Annotated[list[Level], _levels_of(0), Field(min_length=1), AfterValidator(_different)]
+Amount = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Few = Annotated[int, Field(ge=1, le=1000)]
+Pair = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ordered)]
+Point = Annotated[tuple[float, float, float], Field(strict=False)]
+Points = Annotated[list[Point], Field(min_length=1)]
+Ends = Annotated[list[Annotated[tuple[Point, Point], Field(strict=False)]], Field(min_length=1)]
 
 
 class _Table(BaseModel):
@@ -140,11 +128,11 @@ class CaptureTable(_Table):
     file: str | None = None
     kit: str | None = None
     positions_mm: Annotated[list[Points], _levels_of(2), Field(min_length=1), AfterValidator(_different)] | None = None
-    sockets: Levels[Annotated[int, Field(ge=1, le=1000)]] | None = None
+    sockets: Levels[Few] | None = None
     poses: Levels[Count] = [70]
     region: Levels[Region] | None = None
     joint_limits_deg: Annotated[list[list[Pair]], _levels_of(2), Field(min_length=1)] | None = None
-    pool: PositiveInt = 32_768
+    pool: Annotated[int, Field(ge=4096, le=2**24)] = 32_768
 
     @model_validator(mode="after")
     def _one(self) -> "CaptureTable":
@@ -158,8 +146,6 @@ class CaptureTable(_Table):
             raise ValueError(
                 f"{min(generated)} is for generated poses, but {source} gives them; leave one of the two out."
             )
-        if not 4096 <= self.pool <= MOST_POOL:
-            raise ValueError(f"pool is {self.pool}; give 4096 to {MOST_POOL} poses, or leave it out.")
         return self
 
     @property
@@ -189,8 +175,8 @@ class BoundsTable(_Table):
 
     length_mm: Levels[Amount] | None = None
     angle_deg: Levels[Amount] | None = None
-    length_shift_mm: Levels[Finite] = [0.0]
-    angle_shift_deg: Levels[Finite] = [0.0]
+    length_shift_mm: Levels[float] = [0.0]
+    angle_shift_deg: Levels[float] = [0.0]
     override: dict[str, Amount] | None = None  # half-widths by name, mm or deg
 
 
@@ -201,11 +187,9 @@ class ReferenceTable(_Table):
     length.
     """
 
-    length_mm: Levels[Positive] | None = None
-    positions: Levels[Annotated[int, Field(ge=1, le=1000)]] = [1]
-    ends_mm: Annotated[list[Annotated[list[Ends], Field(min_length=1)]], _levels_of(3), Field(min_length=1)] | None = (
-        None
-    )
+    length_mm: Levels[Annotated[float, Field(gt=0)]] | None = None
+    positions: Levels[Few] = [1]
+    ends_mm: Annotated[list[Ends], _levels_of(3), Field(min_length=1)] | None = None
     poses: Levels[Count] = [5]
     u_mm: Levels[Amount] = [0.0]
     region: Levels[Region] | None = None

@@ -15,7 +15,7 @@ import os
 import shutil
 import stat
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +40,7 @@ from .specification import Specification, unit
 _ADVICE = "free some space there, then run the same command again: what is finished is kept"
 _TRIALS_IN_MEMORY = 50_000
 _LARGEST = 1e20  # mm, rad, or a factor
+_BY_TRIAL = tuple(name for name, kind in VARIABLES.items() if not kind.by_parameter)
 
 
 def parts_of(path: Path) -> Path:
@@ -70,8 +71,7 @@ class Results:
     study: Study
     chunk: int  # trials in a block
     computed_with: str
-    finished: bool = False  # whether every trial has run
-    in_blocks: bool = True  # whether results are in blocks still, and not in the file
+    finished: bool = False  # whether every trial has run: results are in the file then, before in blocks
 
     @classmethod
     def of(cls, path: str | os.PathLike) -> "Results":
@@ -87,15 +87,11 @@ class Results:
             InputError: Where the file is missing, damaged or no study, or its folder of blocks is missing.
         """
         results = read(Path(os.path.realpath(as_path(path))))
-        missing = len(results.blocks) - len(results.finished_blocks()) if results.in_blocks else 0
-        if results.finished and missing:
-            raise InputError(
-                f"{missing} blocks are missing in {parts_of(results.path).name}; put them there, or run the study "
-                "again with --resume to make them."
-            )
-        if not results.in_blocks:
-            with opened(results.path, ("study",), verify=False) as content:
-                arrays = {name: content.dataset("trials", name) for name in VARIABLES}
+        if not results.finished:
+            results.finished_blocks()  # refuses those of somebody else
+        else:
+            with opened(results.path, ("study",), verify=False) as file:
+                arrays = {name: file["trials"][name] for name in VARIABLES}
                 shapes = any(array.shape != results.empty(name).shape for name, array in arrays.items())
                 check_sense(results.path, {"its results have other shapes than its study": shapes})
                 ran = (arrays["converged"][()] != VARIABLES["converged"].fill).all()
@@ -152,28 +148,25 @@ class Results:
 
     def column(self, name: str, cell: int) -> np.ndarray:
         """One array of results of one cell (counted from 0)."""
-        return self._columns([name], cell)[name]
+        return self.columns(cell, (name,))[name]
 
-    def columns(self, cell: int) -> dict[str, np.ndarray]:
-        """Arrays of one cell with one number a trial; ``group`` is the part of the pool that a trial drew from."""
-        columns = self._columns([name for name, kind in VARIABLES.items() if not kind.by_parameter], cell)
-        return columns | {"group": np.arange(self.study.trials) % POOL_PARTS}
-
-    def _columns(self, names: list[str], cell: int) -> dict[str, np.ndarray]:
+    def columns(self, cell: int, names: Sequence[str] = _BY_TRIAL) -> dict[str, np.ndarray]:
+        """Arrays of one cell, by default those with one number a trial; ``group`` is the part of the pool that a trial
+        drew from."""
         columns = {name: self.empty(name, self.study.trials) for name in names}
-        for trials, rows in self._checked_rows([*{*names, "converged"}], cell):
+        for trials, rows in self._checked_rows({*names, "converged"}, cell):
             for name in names:
                 columns[name][trials] = rows[name]
-        return columns
+        return columns | {"group": np.arange(self.study.trials) % POOL_PARTS}
 
     def errors(self, cell: int) -> Iterator[tuple[Float[np.ndarray, "t p"], np.ndarray, np.ndarray]]:
         """Of converged trials, some at a time: parameter errors (estimate minus truth), active bounds, groups."""
-        for trials, rows in self._checked_rows(["converged", "estimate", "true", "active"], cell):
+        for trials, rows in self._checked_rows({"converged", "estimate", "true", "active"}, cell):
             good = rows["converged"] == 1
             group = np.arange(trials.start, trials.stop) % POOL_PARTS
             yield (rows["estimate"] - rows["true"])[good], rows["active"][good], group[good]
 
-    def _checked_rows(self, names: list[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    def _checked_rows(self, names: Set[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
         """Results of one cell, some trials at a time. Raises `InputError` for results that no trial has.
 
         A trial that failed may have NaN or an infinite number; a converged one NaN for what the study does not compute,
@@ -195,23 +188,23 @@ class Results:
                 check_sense(self.path, problems)
                 yield trials, rows
 
-    def rows(self, names: list[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    def rows(self, names: Set[str], cell: int) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
         """Results of one cell as they are in the file or in the blocks: which trials, and their arrays."""
-        if self.in_blocks:
+        if not self.finished:
             for block in self.finished_blocks():
                 if block.first_cell <= cell < block.last_cell:
                     arrays = self.of_block(block)
                     yield block.slices[1], {name: arrays[name][cell - block.first_cell] for name in names}
             return
-        with opened(self.path, ("study",), verify=False) as content:
-            arrays = {name: content.dataset("trials", name) for name in names}
+        with opened(self.path, ("study",), verify=False) as file:
+            arrays = {name: file["trials"][name] for name in names}
             for first in range(0, self.study.trials, _TRIALS_IN_MEMORY):
                 trials = slice(first, min(first + _TRIALS_IN_MEMORY, self.study.trials))
                 yield trials, {name: arrays[name][cell, trials] for name in names}
 
     def create(self) -> None:
         """Make the file of a new study, and the folder of its blocks."""
-        folder = parts_of(self.path)
+        folder, _ = parts_of(self.path), self.blocks  # of which too many are refused
         try:
             folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
             check_owners(self.path)
@@ -228,17 +221,13 @@ class Results:
                 folder.rmdir()
             raise
 
-    def finish(self, keep_parts: bool = False) -> None:
-        """Copy all blocks into the study's file and remove their folder; with ``keep_parts``, leave them there."""
-        replace(self, finished=True, in_blocks=keep_parts)._write()
-        if not keep_parts:
-            shutil.rmtree(parts_of(self.path), ignore_errors=True)
+    def finish(self) -> None:
+        """Copy all blocks into the study's file, and remove their folder."""
+        replace(self, finished=True)._write()
+        shutil.rmtree(parts_of(self.path), ignore_errors=True)
 
     def _write(self, advice: str = _ADVICE) -> None:
-        """Write the study's file, with the results of all blocks if they are to be in it.
-
-        ``advice`` says what to do where it fails.
-        """
+        """Write the study's file, with all results once it is finished. ``advice``: what to do where it fails."""
         study = self.study
         attributes = {
             "name": study.specification.name,
@@ -247,7 +236,7 @@ class Results:
             "chunk": self.chunk,
             "computed_with": self.computed_with,
             "finished": int(self.finished),
-            "parts": parts_of(self.path).name if self.in_blocks else None,
+            "parts": None if self.finished else parts_of(self.path).name,
         }
         names = list(study.space.names)
         parameter = columns("parameter", parameter=(names, "", "free parameter"))
@@ -262,7 +251,7 @@ class Results:
                 parameter | columns("parameter", unit=(units, "", "unit of the parameter"), nominal=nominal)
             ),
         }
-        if not self.in_blocks:
+        if self.finished:
             trial = columns("trial", trial=(np.arange(1, study.trials + 1), "1", "trial in the cell"))
             tables["trials"] = Table(cell | trial | parameter)
         if study.recording is None:
@@ -270,7 +259,7 @@ class Results:
         else:
             tables |= recording_tables(study.recording._replace(nominal=study.nominal))
             attributes = dict(recording_attributes(study.recording)) | attributes
-        extend = None if self.in_blocks else self._add_results
+        extend = self._add_results if self.finished else None
         write_tables(self.path, "study", tables, attributes, extend=extend, advice=advice)
 
     def _add_results(self, file: Any) -> None:
@@ -309,8 +298,8 @@ def read(path: Path) -> Results:
         study = Study(specification, nominal, recording_of(path, stored) if "capture" in stored.tables else None)
         different = study.digest != attributes["digest"]
         check_sense(path, {"its specification does not match its results": different})
-        parts, finished = attributes.get("parts"), bool(attributes["finished"])
-        results = Results(path, study, attributes["chunk"], attributes["computed_with"], finished, parts is not None)
+        parts = attributes.get("parts")
+        results = Results(path, study, attributes["chunk"], attributes["computed_with"], finished=parts is None)
     if parts is None:
         return results
     if parts != parts_of(path).name:

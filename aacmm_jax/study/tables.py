@@ -18,9 +18,7 @@ _FACTORS = {
     "bounds.length_shift_mm": "shift of the centre, lengths [mm]",
     "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
     "identification.hold": "scale anchor",
-    "identification.method": "method",
     "identification.model": "model of the joints",
-    "identification.prior": "prior",
     "deviation.model": "what the true joints do",
     "deviation.harmonics_arcsec": "encoder harmonics [arcsec]",
     "deviation.gear_ppm": "errors of gear ratios [ppm]",
@@ -31,7 +29,6 @@ _FACTORS = {
     "noise.linear_encoder_mm": "noise of linear encoders [mm]",
     "noise.seating_mm": "seating noise [mm]",
     "capture.poses": "poses in a socket",
-    "capture.sockets": "sockets",
     "reference.positions": "positions of the reference length",
 }
 

@@ -97,7 +97,7 @@ def _lengths(lengths: LengthChange) -> dict[str, Any]:
         "places": len(lengths.change),
         "rms_mm": lengths.rms,
         "rms_by_chance_mm": plain(lengths.rms_by_chance),
-        "percentile_95_mm": lengths.percentile_95,
+        "percentile_95_mm": float(np.quantile(np.abs(lengths.change), 0.95)),
         "largest_mm": lengths.largest,
         "mean_mm": float(np.mean(lengths.change)),
         "mean_um_per_m": 1e6 * lengths.scale_change,

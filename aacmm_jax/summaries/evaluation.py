@@ -258,6 +258,6 @@ def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
         **part(metric.worst),
         "as_found_mm": None if earlier is None else earlier.value,
         "as_found_decision": None if earlier is None else earlier.decision,
-        "failing": metric.failing,
+        "failing": sum(value.decision == "fails" for value in metric.values),
         "parts": [part(value) | {"decision": value.decision} for value in metric.values],
     }

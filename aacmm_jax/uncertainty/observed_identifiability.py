@@ -59,7 +59,7 @@ class Agreeing(NamedTuple):
 
     @classmethod
     def of(cls, capture: Capture, space: Parameters, targets_of: Arm | None = None) -> "Agreeing":
-        """Fit the geometry, and make measured values and configurations agree with it.
+        """Fit the geometry, and make configurations agree with it.
 
         The geometry is that of ``targets_of``, by default of the arm itself.
         """
@@ -75,7 +75,6 @@ class Agreeing(NamedTuple):
             if step < _FITTED:
                 break
         z = np.concatenate([np.asarray(space.vector()), z[p:]])
-        observed = observed.measured_without_errors(space, z[:p], z[p:])
         for _ in range(_ROUNDS):
             linear = _linear(space, observed, z)
             if max(np.abs(rows.values).max() for rows in linear.point.rows) < _AGREES:

@@ -1,13 +1,15 @@
 """One good file of every kind, small: what the attacks start from."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import aacmm_jax as aj
+from aacmm_jax.study.blocks import computed_with
+from aacmm_jax.study.store import write_block
+from aacmm_jax.study.trials import run_block
 from aacmm_jax.summaries.compared_models import compared_models_summary
 
 STUDY = """
@@ -111,10 +113,12 @@ def make(folder: Path) -> None:
         write(folder / f"{kind}.h5")
     (folder / "study.toml").write_text(STUDY)
     study = aj.study.read_study(folder / "study.toml")
-    run = partial(aj.study.run_study, study, chunk=BLOCK)
-    run(folder / "study.h5")
+    aj.study.run_study(study, folder / "study.h5", chunk=BLOCK)
     (folder / "parts").mkdir()
-    run(folder / "parts" / "study.h5", keep_parts=True)
+    stored = aj.study.Results(folder / "parts" / "study.h5", study, BLOCK, computed_with())
+    stored.create()
+    for block in stored.blocks:
+        write_block(stored.file_of(block), run_block(study, block))
 
 
 def studies(folder: Path) -> dict[str, tuple[Path, Path]]:

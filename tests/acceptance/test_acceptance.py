@@ -15,9 +15,9 @@ from scipy import stats
 import aacmm_jax as aj
 from aacmm_jax import acceptance
 from aacmm_jax.acceptance import Limit, Measured, enclosing_sphere, fit_sphere, measured_by, run
-from aacmm_jax.acceptance.all_tests import checked_limits
 from aacmm_jax.acceptance.judgement import read_limits
 from aacmm_jax.acceptance.procedure import plan_procedure, simulate_procedure
+from aacmm_jax.acceptance.record import checked_limits
 from aacmm_jax.acceptance.standards import EDITIONS, STANDARDS
 from aacmm_jax.files.plans import plan_csv, plan_manifest
 from aacmm_jax.kinematics.workspace import Reach

@@ -383,7 +383,7 @@ def test_acceptance_results_have_their_conformity_beside_them(evaluation, certif
 )
 def test_decisions_in_the_words_of_the_certificate(value, decision, word):
     from aacmm_jax.acceptance.results import MetricValue
-    from aacmm_jax.certificate.acceptance_results import _conformity
+    from aacmm_jax.certificate.document import _conformity
 
     assert _conformity(MetricValue("x", value, 0.01, None, 0.05, decision)) == word
 

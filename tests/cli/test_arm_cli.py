@@ -9,7 +9,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.diagnostics import reading_check, reading_search
-from aacmm_jax.files.commanded_poses import read_known_poses
+from aacmm_jax.files.pose_tables import read_poses
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.planning import first_capture
 from aacmm_jax.summaries import arm_survey
@@ -94,7 +94,10 @@ def test_positions_in_metres_are_no_matter_of_the_angles(aacmm, tmp_path, few, m
     assert said.startswith("The positions are in m, and were taken for mm. Correcting it")
     assert 'units = { points = "m" }' in said
     assert "[angles]" not in said
-    np.testing.assert_allclose(read_known_poses(tmp_path / "p.csv", 6, unit="rad").positions, 1000 * points)
+    arm = aj.load_arm("cheng2018-simulation")
+    np.testing.assert_allclose(
+        read_poses(tmp_path / "p.csv", arm, unit="rad", recorded=True).poses[:, :3, 3], 1000 * points
+    )
 
 
 def test_poses_of_a_urdf_are_in_its_base_link(aacmm, tmp_path, few):

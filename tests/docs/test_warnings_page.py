@@ -20,12 +20,12 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "summaries/correction.py": ("correction_summary",),
     "cli/compare_commands.py": ("_compared",),
     "drift/comparison.py": ("_warnings",),
-    "data/copies.py": ("sentences",),
-    "uncertainty/identifiability.py": ("sentences", "_by_more_sockets"),
+    "data/capture_data.py": ("sentences",),
+    "uncertainty/identifiability.py": ("sentences", "by_more_sockets"),
     "calibration/scale_anchor.py": ("warn_of_known_scale",),
     "acceptance/record.py": ("evaluation_of", "unstated_uncertainty_warning", "SIMULATED"),
-    "acceptance/procedure_items.py": ("socket_in_zone",),
-    "report/study.py": ("_warnings",),
+    "acceptance/procedure.py": ("_socket_in_zone",),
+    "report/studies.py": ("_warnings",),
     "solver/reason.py": ("Reason",),
     "core/jax_setup.py": ("set_up",),
 }
@@ -48,6 +48,7 @@ PARTS = (
     "... is not a plausible scale",
     "k = ... is not a plausible scale",
     "No Reason",
+    "Fix one of each (--held).",
 )
 
 

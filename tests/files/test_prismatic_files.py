@@ -10,8 +10,8 @@ from aacmm_jax.data.observations.held import Socket
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files import controllers, plans
 from aacmm_jax.files.captures import load_capture, save_capture
-from aacmm_jax.files.commanded_poses import corrected_csv, read_commanded_poses
 from aacmm_jax.files.manifest import read_manifest
+from aacmm_jax.files.pose_tables import corrected_csv, read_poses
 from aacmm_jax.files.text_table import TextTable
 from aacmm_jax.kinematics.parameters import ArmSpecification, perturbed_arm
 from aacmm_jax.planning.kit import KitPlan
@@ -125,14 +125,14 @@ def test_plans_are_tables_with_the_unit_of_each_joint():
 def test_commanded_readings_and_their_correction(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text("q_1_deg,q_2_deg,q_3_mm,q_4_deg\n10,20,100,30\n-10,20,200,-30\n")
-    commanded = read_commanded_poses(path, SCARA)
+    commanded = read_poses(path, SCARA)
     rows = np.array([[10, 20, 100, 30], [-10, 20, 200, -30]])
     np.testing.assert_allclose(commanded.q, rows * [np.pi / 180, np.pi / 180, 1, np.pi / 180])
     text = corrected_csv(commanded, np.asarray(commanded.q), np.array([True, True]))
     (tmp_path / "again.csv").write_text(text)
     np.testing.assert_allclose(TextTable(tmp_path / "again.csv").numbers(range(rows.shape[1])), rows, rtol=1e-12)
     path.write_text("q_1_deg,q_2_deg,q_3_um,q_4_deg\n10,20,1e5,30\n")
-    assert_refused(lambda: read_commanded_poses(path, SCARA), "states um for readings of prismatic joints")
+    assert_refused(lambda: read_poses(path, SCARA), "states um for readings of prismatic joints")
 
 
 def test_for_controllers():

@@ -13,7 +13,7 @@ from aacmm_jax.data.recording import Recording
 from aacmm_jax.diagnostics.equations import equations_of
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.parameters import ArmSpecification
-from aacmm_jax.pipeline.cross_validation import Region, UnseenRegion, _dense, regions_of, unseen_regions
+from aacmm_jax.pipeline.cross_validation import UnseenRegion, _dense, regions_of, unseen_regions
 from aacmm_jax.pipeline.model_ladder import (
     DEFAULT_MODELS,
     ComparedModel,
@@ -61,7 +61,7 @@ def test_a_region_is_predicted_as_by_a_calibration_without_it(paper_arm, space, 
     )
     for names in (("A", "B"), ("C",)):
         left = np.isin(np.array(capture.names)[capture.owner], names)
-        (found,) = unseen_regions(record, [Region("", left)])
+        (found,) = unseen_regions(record, {"": left})
         rest = aj.Capture(
             {name: q for name, q in capture.sockets.items() if name not in names},
             [] if "A" in names else capture.lengths,
@@ -79,11 +79,11 @@ def test_half_of_a_travel_is_predicted_as_by_a_calibration_without_it(paper_arm,
     capture, prior = seen_by_a_tracker(paper_arm, space), aj.Prior({"lengths": 0.3, "angles": 5e-4})
     solving = {"noise": NOISE, "prior": prior, "undetermined": "ignore"}
     result = aj.calibrate(paper_arm, capture, bounds, **solving)
-    region = regions_of(capture)[3]
-    assert region.label == "joint 2, upper half"
-    (found,) = unseen_regions(record_of(result, Recording(capture, ArmSpecification(paper_arm))), [region])
+    label, region = list(regions_of(capture).items())[3]
+    assert label == "joint 2, upper half"
+    (found,) = unseen_regions(record_of(result, Recording(capture, ArmSpecification(paper_arm))), {label: region})
     (points,) = capture.observations
-    parts = [aj.Capture({}, [], [points.select(np.flatnonzero(which))]) for which in (~region.poses, region.poses)]
+    parts = [aj.Capture({}, [], [points.select(np.flatnonzero(which))]) for which in (~region, region)]
     alone = aj.calibrate(paper_arm, parts[0], bounds, **solving)
     errors = aj.evaluate(alone.arm, parts[1], geometry=alone.stage1.observed.geometry).observed
     assert found.poses == 25
@@ -138,9 +138,9 @@ def test_a_model_by_name_is_a_corrected_arm_with_its_prior(paper_arm, space, bou
 
 def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
     capture = sockets(paper_arm, space)
-    assert [region.label for region in regions_of(capture)] == ["A, B", "C", "D"]
-    assert [region.label for region in regions_of(capture, ["A", "[BC]"])] == ["A", "[BC]"]
-    assert regions_of(capture, ["A", "[BC]"])[1].poses.sum() == 28
+    assert [*regions_of(capture)] == ["A, B", "C", "D"]
+    assert [*regions_of(capture, ["A", "[BC]"])] == ["A", "[BC]"]
+    assert regions_of(capture, ["A", "[BC]"])["[BC]"].sum() == 28
     with pytest.raises(aj.InputError, match="nothing is left without"):
         regions_of(capture, ["*"])
     with pytest.raises(aj.InputError, match="fewer than two"):

@@ -129,7 +129,7 @@ class Declared(abc.ABC):
             parameters = [one for one in parameters if one.default is not REQUIRED]
             parameters = [*(one for one in stated if one.kind is not one.VAR_KEYWORD), *parameters]
         cls.__signature__ = inspect.Signature(parameters)
-        if cls.__doc__ and "    Args:" not in cls.__doc__:
+        if cls.__doc__:
             cls.__doc__ = _documented(cls.__doc__, cls.entries)
 
     def __init__(self, name: str, *values: Any, **options: Any):
@@ -168,12 +168,15 @@ class Declared(abc.ABC):
 
 
 def _documented(doc: str, entries: Sequence[Entry]) -> str:
-    """A docstring with the arguments, before the errors and examples."""
-    lines = ["name: Name of the observation.", *(entry.described for entry in entries)]
-    arguments = "".join(f"\n        {line}" for line in lines)
+    """A docstring with the arguments, before the errors and examples; of a constructor of its own the class states
+    those without a default itself."""
+    stated = "\n    Args:" in doc
+    lines = [entry.described for entry in entries if not (stated and entry.required)]
+    lines = lines if stated else ["Args:", "    name: Name of the observation.", *(f"    {line}" for line in lines)]
+    indent = "\n        " if stated else "\n    "
     divided = [doc.partition(f"\n\n    {word}:") for word in ("Raises", "Example")]
     before, heading, rest = min(divided, key=lambda parts: len(parts[0]))
-    return f"{before.rstrip()}\n\n    Args:{arguments}{heading}{rest}"
+    return before.rstrip() + ("" if stated else "\n") + "".join(indent + line for line in lines) + heading + rest
 
 
 def _signature(entries: Sequence[Entry], keyword_only: bool) -> inspect.Signature:

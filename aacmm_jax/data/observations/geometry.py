@@ -119,6 +119,14 @@ def heights(
     return height - plane[2], xp.broadcast_to(normal, tips.shape), xp.stack([*by_turn, -xp.ones_like(height)])
 
 
+def distances_from_point(
+    tips: Float[AnyArray, "3 m"], point: Float[AnyArray, "3 p"]
+) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "3 m"]]:
+    """Distances of tips from a point (or from one each), mm, and their derivatives by tips and point."""
+    distance, direction = length_and_direction(tips - point)
+    return distance, direction, -direction
+
+
 def distances_from_axis(
     tips: Float[AnyArray, "3 m"], axis: Float[AnyArray, "4 ..."]
 ) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "4 m"]]:
@@ -145,30 +153,31 @@ def _about_middle(
     return middle, size, (points - middle) / size
 
 
-def fitted_centre(
-    tips: Float[AnyArray, "3 m"], values: Float[AnyArray, " m"] | None = None, constant: bool = False
+def fitted_pivot(
+    tips: Float[AnyArray, "3 m"], values: Float[AnyArray, " m"] | float, constant: bool
 ) -> tuple[Float[AnyArray, " 3"], Float[AnyArray, ""]]:
-    """The centre of the sphere through points and its radius; or the point at measured distances from them, with a
-    constant that is added to all.
+    """The point at measured distances from tips, and the constant that is added to all of them; with the distances 0,
+    the centre and the radius of a sphere.
 
-    By linear least squares: |t - p|^2 = (v + c)^2 is linear in p, in c^2 - |p|^2 and, with distances v, in c.
+    By linear least squares: |t - p|^2 = (v + c)^2 is linear in p, in c^2 - |p|^2 and, with a ``constant``, in c.
     """
     xp = namespace(tips, values)
     middle, size, centred = _about_middle(tips)
-    columns, right = [2 * centred, xp.ones_like(centred[:1])], xp.sum(centred**2, axis=0)
-    if values is not None:
-        right = right - (values / size) ** 2
-    if constant:
-        assert values is not None
-        columns.append(2 * (values / size)[None])
+    values = values / size
+    columns = [2 * centred, xp.ones_like(centred[:1])] + ([2 * values[None]] if constant else [])
     design = xp.concatenate(columns)
     normal = design @ design.T + 1e-12 * tips.shape[1] * xp.asarray(np.eye(len(design)))
-    solution = solve_positive_definite(normal, design @ right)
+    solution = solve_positive_definite(normal, design @ (xp.sum(centred**2, axis=0) - values**2))
     radius = xp.sqrt(xp.maximum(solution[3] + xp.sum(solution[:3] ** 2), 0.0))
     return middle[:, 0] + size * solution[:3], size * (solution[4] if constant else radius)
 
 
-def fitted_plane(tips: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 3"]:
+def fitted_sphere(tips: Float[AnyArray, "3 m"], radius: Any) -> tuple[Float[AnyArray, " 3"], Float[AnyArray, ""]]:
+    """Centre and radius of the sphere through points, whatever radius is certified."""
+    return fitted_pivot(tips, 0.0, constant=False)
+
+
+def fitted_plane(tips: Float[AnyArray, "3 m"], size: Any) -> tuple[Float[AnyArray, " 3"], None]:
     """The plane that points are closest to: its numbers as `heights` takes them, with the normal upwards."""
     xp = namespace(tips)
     middle = xp.mean(tips, axis=1)
@@ -177,7 +186,7 @@ def fitted_plane(tips: Float[AnyArray, "3 m"]) -> Float[AnyArray, " 3"]:
     _, vectors = semidefinite_eigen(scatter / (xp.trace(scatter) + 1e-300))
     normal = vectors[:, 2] / xp.sqrt(xp.sum(vectors[:, 2] ** 2))
     normal = xp.where(normal[2] < 0, -normal, normal)
-    return xp.concatenate([turned_z(normal), (normal @ middle)[None]])
+    return xp.concatenate([turned_z(normal), (normal @ middle)[None]]), None
 
 
 def turned_z(direction: Float[AnyArray, " 3"]) -> Float[AnyArray, " 2"]:

@@ -76,12 +76,6 @@ class Artefact(AbstractObservation):
         name: Name of the observation, and of its placement where that has none.
         points: Name of a point -> its certified coordinates ``(3,)``, mm, in the artefact's frame.
         q: Name of a point -> joint readings in it ``(m, n)``, rad.
-        u: Standard uncertainty (k = 1) of each coordinate, mm. Its error is the same in every placement.
-        artefact: Name of the artefact; observations of one artefact share the errors of its coordinates.
-        placement: Name of the placement; observations of one placement share its frame.
-        index: Name of the index of an indexed platform that carries the artefact. The placement is then one on the
-            platform, and the platform has a frame for each index, shared by all that stands on it.
-        target: Name of the tip, by default the arm's own probe.
 
     Raises:
         InputError: A point with poses has no coordinates, or shapes do not fit.
@@ -98,10 +92,17 @@ class Artefact(AbstractObservation):
     point: tuple[str, ...] = declared("point of the artefact that held the tip", "", "pose")
     names: tuple[str, ...] = declared("point of the artefact", "", "names")
     coordinates: Float[AnyArray, "c 3"] = declared("certified coordinates", "mm", "names", "axis", uncertainty="u")
-    u: Float[AnyArray, ""] = declared("standard uncertainty of a coordinate", "mm", default=0.0)
-    artefact: str = declared("name of the artefact", default=NAME)
-    placement: str = declared("name of its placement", default=NAME, of_session=True)
-    index: str | None = declared("index of the platform that carries it", default=None, of_session=True)
+    u: Float[AnyArray, ""] = declared(
+        "standard uncertainty of a coordinate", "mm", default=0.0, more="its error is the same in every placement"
+    )
+    artefact: str = declared("name of the artefact", default=NAME, more="observations of one share its errors")
+    placement: str = declared(
+        "name of its placement", default=NAME, of_session=True, more="those of one share its frame"
+    )
+    index: str | None = declared(
+        "index of the platform that carries it", default=None, of_session=True,
+        more="the placement is then one on the platform, which has a frame for each index",
+    )  # fmt: skip
     derived = ("free",)  # whether the coordinates are unknowns with certified values
     frame = Part("placement {placement}", *FRAME)
     platform = Part("index {index}", *FRAME, when="index")

@@ -1,6 +1,5 @@
 """What an instrument measured of the tip: points, transforms of a target, and distances from a pivot."""
 
-import abc
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,7 +8,7 @@ from jaxtyping import Float
 
 from ...core.arrays import is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import length_and_direction, products_by_column
+from ...core.linear_algebra import products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.rotations import (
     fitted_frame,
@@ -20,7 +19,8 @@ from ...core.rotations import (
 )
 from .declared import NAME, Part, declared
 from .geometry import (
-    fitted_centre,
+    distances_from_point,
+    fitted_pivot,
     frame_and_offset,
     placed,
     rotation_logarithm,
@@ -80,10 +80,6 @@ class AbstractMeasured(AbstractObservation):
                 raise InputError(f"covariance of {where} is not symmetric and positive; give variances in mm^2.")
         return {}
 
-    @abc.abstractmethod
-    def without_errors(self, tips: Tips, unknowns: Parts) -> "AbstractMeasured":
-        """The same observation, had the instrument measured exactly these tips."""
-
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         where, points = f"observation '{self.name}'", np.asarray(self.points)
         if len(points) < 3:
@@ -122,9 +118,6 @@ class MeasuredPoints(AbstractMeasured):
         seen = placed(unknowns[self.frame], self.points.T)
         measured = turned_covariances(seen.rotation, self.covariance)
         return rows_of_points(tips, seen.points, {self.frame: seen.by_frame}, measured)
-
-    def without_errors(self, tips: Tips, unknowns: Parts) -> "MeasuredPoints":
-        return self.changed(points=seen_from(unknowns[self.frame], tips.position.T))
 
 
 class MeasuredTransforms(AbstractMeasured):
@@ -198,12 +191,6 @@ class MeasuredTransforms(AbstractMeasured):
             by_rotation=xp.concatenate([none, left]),
         )
 
-    def without_errors(self, tips: Tips, unknowns: Parts) -> "MeasuredTransforms":
-        xp, frame = namespace(tips, unknowns), unknowns[self.frame]
-        station, target = rotation_matrix(frame[:3]), rotation_matrix(unknowns[self.orientation])
-        axes = xp.moveaxis(xp.stack(tips.axes, axis=1), -1, 0)  # (m, 3, 3)
-        return self.changed(points=seen_from(frame, tips.position.T), rotations=station.T @ axes @ target)
-
 
 class Distances(AbstractObservation):
     """Measured distances of the tip from a pivot whose position is unknown: a telescoping ball bar, a draw wire.
@@ -236,13 +223,13 @@ class Distances(AbstractObservation):
         return {}
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
-        pivot, zero = fitted_centre(tips.position, self.values, self.constant)
+        pivot, zero = fitted_pivot(tips.position, self.values, self.constant)
         return {self.pivot: pivot} | ({self.zero: zero[None]} if self.constant else {})
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         xp, m = namespace(tips, unknowns, self.values), self.q.shape[0]
-        distance, towards = length_and_direction(tips.position - unknowns[self.pivot])
-        by_unknowns, values = {self.pivot: -towards[:, None]}, self.values
+        distance, towards, by_pivot = distances_from_point(tips.position, unknowns[self.pivot])
+        by_unknowns, values = {self.pivot: by_pivot[:, None]}, self.values
         if self.constant:
             values = values + unknowns[self.zero][0]
             by_unknowns[self.zero] = -xp.ones((1, 1, m))

@@ -8,7 +8,6 @@ for all kinds. Beside it stands what simulates it: the true geometry, where the 
 import abc
 import functools
 import importlib
-import inspect
 import itertools
 import pkgutil
 from collections.abc import Hashable, Mapping, Sequence
@@ -347,11 +346,11 @@ OTHER_KINDS: list[type[Declared]] = []  # observations and what simulates them, 
 def _classes_of_files() -> list[type[Declared]]:
     names = [f"{__package__}.{module.name}" for module in pkgutil.iter_modules([str(Path(__file__).parent)])]
     members = [one for name in names for one in vars(importlib.import_module(name)).values() if isinstance(one, type)]
-    return [one for one in dict.fromkeys(members) if issubclass(one, Declared) and not inspect.isabstract(one)]
+    return [one for one in dict.fromkeys(members) if issubclass(one, Declared)]
 
 
 def _classes_by(base: type, label: str) -> dict[str, Any]:
-    classes = [one for one in (*_classes_of_files(), *OTHER_KINDS) if issubclass(one, base)]
+    classes = [one for one in (*_classes_of_files(), *OTHER_KINDS) if issubclass(one, base) and hasattr(one, label)]
     return {getattr(one, label): one for one in sorted(classes, key=lambda one: one.__name__)}
 
 

@@ -4,7 +4,6 @@ All state one residual a touch: the distance of the tip's centre from a geometry
 size that may be certified (the radius of a sphere with the tip's ball on it, the distance between two planes).
 """
 
-import abc
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -13,10 +12,17 @@ from jaxtyping import Float
 
 from ...core.arrays import Numbers, is_concrete
 from ...core.errors import InputError
-from ...core.linear_algebra import length_and_direction
 from ...core.numpy_or_jax import AnyArray, namespace, to_numpy
 from .declared import Part, checked_readings, declared, is_exact
-from .geometry import distances_from_axis, fitted_centre, fitted_cylinder, fitted_plane, heights, variances
+from .geometry import (
+    distances_from_axis,
+    distances_from_point,
+    fitted_cylinder,
+    fitted_plane,
+    fitted_sphere,
+    heights,
+    variances,
+)
 from .observation import (
     AXIS,
     PLANE,
@@ -38,8 +44,7 @@ SIDES = ("one", "other")
 # sphere of unknown radius is touched up to 26 degrees from the middle, and a plane beside a line.
 _LEAST_SINGULAR = 0.02
 
-Distances = tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "k m"]]
-Fitted = tuple[Float[AnyArray, " k"], Float[AnyArray, ""] | None]
+Fitted = tuple[Float[AnyArray, " k"], Float[AnyArray, ""] | None]  # a geometry and its size
 
 
 class AbstractTouched(AbstractObservation):
@@ -61,21 +66,20 @@ class AbstractTouched(AbstractObservation):
     geometry: Any  # a part
     size: Any  # another, unless there is no ``certificate``
 
-    @abc.abstractmethod
-    def distances(self, tips: Float[AnyArray, "3 m"], geometry: Float[AnyArray, "k p"]) -> Distances:
-        """Distances of tips from the geometry, mm, and their derivatives by the tips and by its numbers."""
+    # Distances of tips from the geometry, mm, and their derivatives by the tips and by its numbers.
+    distances: ClassVar[Any]
+    # The geometry closest to nearly right tips, of this size where that is known.
+    closest: ClassVar[Any]
 
-    @abc.abstractmethod
     def fitted(self, tips: Float[AnyArray, "3 m"]) -> Fitted:
         """The geometry closest to nearly right tips, and its size."""
+        return self.closest(tips, self.certified_size)
 
     def sides(self, distances: Float[AnyArray, " m"]) -> Float[AnyArray, " m"]:
         """How many times the size each touch is away from the geometry: 1, or 1 and 0 of the two sides of something."""
         return namespace(distances).ones_like(distances)
 
     def completed(self, where: str) -> Mapping[str, Any]:
-        if not self.certificate:
-            return {}
         size = self.certified_size
         if size is not None and is_concrete(size) and float(size) <= 0:
             value, stylus = float(getattr(self, self.certificate)), float(self.stylus)
@@ -83,7 +87,7 @@ class AbstractTouched(AbstractObservation):
                 f"{where}: a stylus of {stylus:g} mm inside a {self.certificate} of {value:g} mm; give the "
                 f"{self.certificate} of the artefact and the diameter of a ball that fits into it, in mm."
             )
-        return {"free": size is None or not is_exact(self.u)}
+        return {"free": size is None or not is_exact(self.u)} if self.certificate else {}
 
     @property
     def certified_size(self) -> Float[AnyArray, "*batch"] | None:
@@ -179,13 +183,7 @@ class Sphere(AbstractRound):
     geometry = Part("centre of {name}", *POINT)
     size = Part("radius of {name}", "mm", when="free")
     advice = "touch it all over, or give its diameter"
-
-    def distances(self, tips: Float[AnyArray, "3 m"], geometry: Float[AnyArray, "k p"]) -> Distances:
-        distance, towards = length_and_direction(tips - geometry)
-        return distance, towards, -towards
-
-    def fitted(self, tips: Float[AnyArray, "3 m"]) -> Fitted:
-        return fitted_centre(tips)
+    distances, closest = staticmethod(distances_from_point), staticmethod(fitted_sphere)
 
 
 class Cylinder(AbstractRound):
@@ -210,12 +208,7 @@ class Cylinder(AbstractRound):
     geometry = Part("axis of {name}", *AXIS)
     size = Part("radius of {name}", "mm", when="free")
     advice = "touch it all round at two heights, or give its diameter"
-
-    def distances(self, tips: Float[AnyArray, "3 m"], geometry: Float[AnyArray, "k p"]) -> Distances:
-        return distances_from_axis(tips, geometry)
-
-    def fitted(self, tips: Float[AnyArray, "3 m"]) -> Fitted:
-        return fitted_cylinder(tips, self.radius)
+    distances, closest = staticmethod(distances_from_axis), staticmethod(fitted_cylinder)
 
 
 class Plane(AbstractTouched):
@@ -236,12 +229,7 @@ class Plane(AbstractTouched):
     form: Float[AnyArray, ""] = declared("standard deviation of the surface about its plane", "mm", default=0.0)
     geometry = Part("plane {name}", *PLANE)
     advice = "touch it in places that are not on one line"
-
-    def distances(self, tips: Float[AnyArray, "3 m"], geometry: Float[AnyArray, "k p"]) -> Distances:
-        return heights(tips, geometry)
-
-    def fitted(self, tips: Float[AnyArray, "3 m"]) -> Fitted:
-        return fitted_plane(tips), None
+    distances, closest = staticmethod(heights), staticmethod(fitted_plane)
 
 
 class ParallelPlanes(Plane):
@@ -252,11 +240,6 @@ class ParallelPlanes(Plane):
         one: Joint readings on one plane ``(m, n)``, rad.
         other: Joint readings on the other plane ``(k, n)``, rad.
         distance: Certified distance between the planes, mm.
-        u: Standard uncertainty (k = 1) of the distance, mm.
-        stylus: Diameter of the tip's ball, mm.
-        inside: Whether the ball was between the planes (a gap), and not outside them (a block).
-        form: Standard deviation of the surfaces about their planes, mm.
-        target: Name of the tip, by default the arm's own probe.
 
     Raises:
         InputError: The planes have different numbers of joints, or a value is negative.
@@ -274,7 +257,7 @@ class ParallelPlanes(Plane):
     )
     u: Float[AnyArray, ""] = declared("standard uncertainty of the distance", "mm", default=0.0)
     stylus: Float[AnyArray, ""] = declared("diameter of the tip's ball", "mm", default=0.0)
-    inside: bool = declared("whether the ball was between the planes", default=False)
+    inside: bool = declared("whether the ball was between the planes (a gap), not outside (a block)", default=False)
     derived, certificate = ("free",), "distance"
     size = Part("distance of {name}", "mm", when="free")  # from the plane of the first side
     stacks = False  # which way the other plane is follows from all of its poses
@@ -297,26 +280,22 @@ class ParallelPlanes(Plane):
 
     def sides(self, distances: Float[AnyArray, " m"]) -> Float[AnyArray, " m"]:
         # The normal may point either way; which way the other plane is follows from the tips.
-        xp, first, second = namespace(distances), *self._poses_of_sides()
+        xp, (first, second) = namespace(distances), [np.flatnonzero(np.array(self.side) == side) for side in SIDES]
         upwards = xp.mean(distances[second]) >= xp.mean(distances[first])
-        return xp.where(upwards, 1.0, -1.0) * xp.asarray((np.array(self.side) == SIDES[1]).astype(float))
+        return xp.where(upwards, 1.0, -1.0) * xp.asarray(np.isin(np.arange(len(self.side)), second).astype(float))
 
     def fitted(self, tips: Float[AnyArray, "3 m"]) -> Fitted:
-        # Both planes have one normal: that of all touches, each side about its middle.
-        xp = namespace(tips)
-        sides = [tips[:, rows] for rows in self._poses_of_sides()]
-        middles = [xp.mean(side, axis=1, keepdims=True) for side in sides]
-        centred = [side - middle for side, middle in zip(sides, middles, strict=True)]
-        return fitted_plane(xp.concatenate(centred, axis=1) + middles[0]), None
+        centred, middle = self._about_sides(tips)
+        return fitted_plane(centred + middle, None)
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        tips = np.array(tips)
-        for rows in self._poses_of_sides():
-            tips[:, rows] -= tips[:, rows].mean(axis=1, keepdims=True)
-        super().check_determined(tips)
+        super().check_determined(np.asarray(self._about_sides(tips)[0]))
 
-    def _poses_of_sides(self) -> list[np.ndarray]:
-        return [np.flatnonzero(np.array(self.side) == side) for side in SIDES]
+    def _about_sides(self, tips: Float[AnyArray, "3 m"]) -> tuple[Float[AnyArray, "3 m"], Float[AnyArray, "3 1"]]:
+        """The touches of each side about its middle, which have the normal of both planes; and the first middle."""
+        xp, other = namespace(tips), np.array(self.side) == SIDES[1]
+        first, second = (xp.mean(tips[:, np.flatnonzero(rows)], axis=1, keepdims=True) for rows in (~other, other))
+        return tips - xp.where(other, second, first), first
 
 
 class AbstractSimulatedRound(AbstractSimulated):
@@ -382,8 +361,7 @@ class SimulatedCylinder(AbstractSimulatedRound):
         return self.ends[0] + random.uniform(size=(self.poses, 1)) * along + radius * directions
 
     def recorded(self, q: Readings, transforms: Transforms, random: np.random.Generator) -> Cylinder:
-        certificate = self.certificate(random)
-        return Cylinder(self.name, q, **certificate, inside=bool(certificate) and self.inside)
+        return Cylinder(self.name, q, **self.certificate(random), inside=self.certified and self.inside)
 
 
 class SimulatedPlanes(AbstractSimulated):
