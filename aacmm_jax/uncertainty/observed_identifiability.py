@@ -89,7 +89,7 @@ class Agreeing(NamedTuple):
         agree = [np.abs(rows.values).max(axis=0) < _AGREES for rows in agreeing.point.rows]
         if np.mean(np.concatenate(agree)) < _MOST:  # another arm's: what is left of it says as little
             agree = [np.ones_like(mask) for mask in agree]
-        linear = _linear(agreeing.space, agreeing.observed, agreeing.z, weigh)
+        linear = _linear(agreeing.space, agreeing.observed, np.asarray(agreeing.z), weigh)
         pairs = zip(linear.whitening.roots, agree, strict=True)
         roots = tuple(root * kept[:, None, None] for root, kept in pairs if root is not None)
         linear = Linearisation.of(*linear[:5], linear.whitening._replace(roots=roots), None)
