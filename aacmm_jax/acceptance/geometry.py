@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from ..core.arrays import Numbers, as_floats
 from ..core.errors import InputError
-from ..data.recording import Recording
 from ..kinematics.arm import Arm
 from ..kinematics.workspace import Reach, skeleton
-from .results import Measured, Postures
+from .results import Measured
 
 EXACT_POINTS = 4  # a sphere goes through so many points exactly, so they have no form error
 _COINCIDENT = 1e-7  # distance of two points, relative to the extent of all, below which they count as one
@@ -253,23 +252,6 @@ def bar_positions(measured: Measured) -> BarPositions:
         unit_rows(end - start),
         np.array([min(map(len, pair)) for pair in ends], dtype=int),
     )
-
-
-def postures_of(arm: Arm, recording: Recording, reach: Reach) -> Postures:
-    """The sides of the elbow in sockets, and the directions of the probe on spheres: from the last frame's origin to
-    the tip, or of its z axis where these coincide."""
-    sockets = recording.capture.sockets
-    q = [np.asarray(readings) for readings in sockets.values()]
-    sides = elbow_sides(arm, np.concatenate(q), reach) if q else np.zeros(0)
-    elbows = np.split(sides, np.cumsum([len(readings) for readings in q])[:-1]) if q else []
-    probe = np.asarray(arm.probe) if np.any(arm.probe) else np.array([0.0, 0.0, 1.0])
-    probes = {
-        (sphere.name, sphere.test): tuple(
-            unit_rows(np.asarray(arm.pose(np.asarray(group)))[:, :3, :3] @ probe) for group in sphere.groups
-        )
-        for sphere in recording.spheres
-    }
-    return Postures(dict(zip(sockets, elbows, strict=True)), probes)
 
 
 def elbow_sides(arm: Arm, q: Float[np.ndarray, "m n"], reach: Reach) -> Float[np.ndarray, " m"]:

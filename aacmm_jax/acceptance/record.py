@@ -28,10 +28,10 @@ from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach
 from ..model.observed import Observed
 from ..uncertainty.arm_uncertainty import Uncertainty
-from .geometry import points_of, postures_of
+from .geometry import elbow_sides, points_of, unit_rows
 from .judgement import MOST, Influences, Limit, Rule, checked_influences, checked_limit, decide, without_test
 from .requirements import TESTS
-from .results import METRICS, AcceptanceTest, Measured, Metric
+from .results import METRICS, AcceptanceTest, Measured, Metric, Postures
 from .standards import DEFAULT_RULES, OF_SPHERES, STANDARDS, checked_standards
 
 NO_INFLUENCES = Influences()
@@ -64,7 +64,15 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
     lengths = tuple(length for length in capture.lengths if length.start in sockets and length.end in sockets)
     spheres = tuple(sphere._replace(groups=tuple(next(points) for _ in sphere.groups)) for sphere in recording.spheres)
     reach = arm_reach(arm)
-    postures = postures_of(arm, recording, reach)
+    sides = elbow_sides(arm, np.concatenate([*readings[: len(sockets)], none]), reach)
+    elbows = dict(zip(sockets, np.split(sides, ends[: len(sockets)])[:-1], strict=True))
+    # From the last frame's origin to the tip, or of its z axis where these coincide.
+    probe = np.asarray(arm.probe) if np.any(arm.probe) else np.array([0.0, 0.0, 1.0])
+    probes = {
+        (sphere.name, sphere.test): tuple(unit_rows(np.asarray(arm.pose(q))[:, :3, :3] @ probe) for q in sphere.groups)
+        for sphere in recording.spheres
+    }
+    postures = Postures(elbows, probes)
     return Measured(sockets, lengths, spheres, reach, measuring_range=recording.measuring_range, postures=postures)
 
 
@@ -285,13 +293,10 @@ def evaluation_of(
     Args:
         record: The calibration.
         recording: The capture; its nominal arm should be that of the calibration.
-        limits: MPE by the name of a metric: a `Limit`, or a number of mm.
-        u_test: Standard uncertainty that seat and fixture add to every test value, mm.
+        limits: MPE of metrics, mm, as for `run`, like all arguments that are not named here.
         maxima: Limits of the quantities in `MAXIMA`, mm.
         standards: Standards whose acceptance tests are run: "jjf", "asme", "iso". Default: those whose procedure the
             recording was made for. Tests with a limit are run in any case.
-        influences: What else adds uncertainty: in proportion to a length, and thermal expansion.
-        rule: Decision rule, a key of `RULES`; by default that of each standard.
 
     Example:
         >>> limits = {"Length": 0.1}

@@ -239,6 +239,15 @@ def _statement(name: str, words: str, verdict: Element | None = None, *, norm: s
 def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
     """The measurement results of the acceptance tests of an evaluation, if it has any."""
     which = "." if record.independent else ", as far as there are any: here there are none."
+    # With the uncertainties of their own certificates.
+    lengths = [record.recording.capture.lengths[i] for i in record.held_out_lengths()]
+    values = {f"Length {x.start} - {x.end}": (float(x.value), float(x.u)) for x in lengths}
+    values |= {f"Diameter of sphere {sphere.name}": (sphere.diameter, sphere.u) for sphere in record.recording.spheres}
+    quantities = [equipment_quantity(name, value, MILLIMETRE, u) for name, (value, u) in values.items()]
+    artefacts = named(
+        "measuringEquipment", "Artefacts of the tests", element("measuringEquipmentQuantities", quantities)
+    )
+    artefacts = element("measuringEquipments", artefacts) if values else None
     for stage, tests in record.acceptance().items():
         if not tests:
             continue
@@ -258,7 +267,7 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
                 xml.method(evaluation, contributions, "JCGM 100:2008", of_uncertainty=True),
             ),
             xml.software("usedSoftware"),
-            _artefacts(record),
+            artefacts,
             element("influenceConditions", condition),
             element("results", (_test(test, judged=record.recording.true is None) for test in tests)),
             says=f"Of single readings in poses that the calibration has not used{which}",
@@ -277,18 +286,6 @@ def _influences(record: EvaluationRecord) -> str:
                 f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected"
             )
     return "; ".join(parts) + ". The arm's own scatter is what is tested."
-
-
-def _artefacts(record: EvaluationRecord) -> Element | None:
-    """The lengths and spheres that were measured, with the uncertainties of their own certificates."""
-    lengths = [record.recording.capture.lengths[i] for i in record.held_out_lengths()]
-    values = {f"Length {x.start} - {x.end}": (float(x.value), float(x.u)) for x in lengths}
-    values |= {f"Diameter of sphere {sphere.name}": (sphere.diameter, sphere.u) for sphere in record.recording.spheres}
-    if not values:
-        return None
-    quantities = (equipment_quantity(name, value, MILLIMETRE, u) for name, (value, u) in values.items())
-    quantities = element("measuringEquipmentQuantities", quantities)
-    return element("measuringEquipments", named("measuringEquipment", "Artefacts of the tests", quantities))
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:

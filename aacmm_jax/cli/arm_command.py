@@ -13,7 +13,7 @@ from ..core.text import pluralise
 from ..files.inputs import InputFile
 from ..files.outputs import together, write_text
 from ..summaries.tables import Styled, View, formatted, listed, number, warnings_of, written_of
-from . import calibration_views, options
+from . import options, views
 from .app import app, examples, show_summary, with_spinner
 from .options import argument, numbers_option, option
 from .plan_commands import assumed_noise
@@ -220,7 +220,7 @@ def reading_check(summary: dict[str, Any]) -> View:
 
 def survey(summary: dict[str, Any]) -> View:
     """An arm before its first calibration."""
-    yield from calibration_views.arm(summary)
+    yield from views.arm(summary)
     yield from warnings_of(summary)
     rows = [
         (

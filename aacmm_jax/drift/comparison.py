@@ -79,10 +79,7 @@ def trend(
         records: Two or more calibrations of one arm, in any order.
         dates: Their dates: datetimes or ISO 8601 texts, such as the attribute ``created`` of a calibration's file; UTC
             without a time zone.
-        level: As for `compare`.
-        points: As for `compare`.
-        length: As for `compare`.
-        seed: As for `compare`.
+        level: As for `compare`, like all arguments that are not named here.
         labels: How sentences name the calibrations (default: number and date).
 
     Example:

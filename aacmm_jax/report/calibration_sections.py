@@ -154,29 +154,26 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
         ("with readings [mm]", volume.expanded_length_reading),
     ):
         positions[name] = [with_u_digits(float(value)) for value in u]
+    uncertainty = summary["uncertainty"]
+    seating = 1e3 * uncertainty["seating_mm"]
+    words = f"{encoders_in_words(uncertainty)}, {seat_in_words(summary)} {seating:.3g} µm"
+    basis = "All uncertainties are based on"
+    joints = ", ".join(str(row["joint"]) for row in uncertainty.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}, whose noise was estimated" if joints else ""
+    noise = {
+        "given": f"{basis} the given noise{replaced}: {words}. Residuals are {uncertainty['misfit'] or 0:.2f} times "
+        "its prediction.",
+        "estimated": f"{basis} the noise estimated from the residuals: {words}.",
+        "common": f"{basis} one variance for all poses: {seating:.3g} µm in each coordinate.",
+        "robust": "Each pose's own residual is taken as its error (robust covariance).",
+    }
     blocks = [
         introduction,
         by_columns("Expanded uncertainty over the working volume [mm]", columns),
         volume_chart(volume)._replace(table=by_columns("All positions", positions)),
-        _noise_sentence(summary),
+        noise[uncertainty["form"]],
     ]
     return Section("volume", "Uncertainty over the working volume", blocks)
-
-
-def _noise_sentence(summary: dict[str, Any]) -> str:
-    uncertainty = summary["uncertainty"]
-    seating = 1e3 * uncertainty["seating_mm"]
-    noise = f"{encoders_in_words(uncertainty)}, {seat_in_words(summary)} {seating:.3g} µm"
-    basis = "All uncertainties are based on"
-    joints = ", ".join(str(row["joint"]) for row in uncertainty.get("noisy_encoders", ()))
-    replaced = f", but for joint {joints}, whose noise was estimated" if joints else ""
-    return {
-        "given": f"{basis} the given noise{replaced}: {noise}. Residuals are {uncertainty['misfit'] or 0:.2f} times "
-        "its prediction.",
-        "estimated": f"{basis} the noise estimated from the residuals: {noise}.",
-        "common": f"{basis} one variance for all poses: {seating:.3g} µm in each coordinate.",
-        "robust": "Each pose's own residual is taken as its error (robust covariance).",
-    }[uncertainty["form"]]
 
 
 def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[Section]:

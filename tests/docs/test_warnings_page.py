@@ -18,7 +18,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "summaries/arm_survey.py": ("arm_survey",),
     "summaries/compared_models.py": ("_warnings",),
     "summaries/correction.py": ("correction_summary",),
-    "cli/compare_commands.py": ("_compared",),
+    "cli/calibration_commands.py": ("_compared",),
     "drift/comparison.py": ("_warnings",),
     "data/capture_data.py": ("sentences",),
     "uncertainty/identifiability.py": ("sentences", "by_more_sockets"),
