@@ -28,8 +28,8 @@ from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
 from ..model.sockets import membership
+from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.linearisation import Linearisation, ObservationRows
-from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .results import Calibration
 from .task import configurations

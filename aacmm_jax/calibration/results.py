@@ -24,8 +24,7 @@ from ..kinematics.workspace import total_link_length
 from ..model.scale import Scale
 from ..model.sockets import Repeatability
 from ..solver.reason import Reason
-from ..uncertainty.covariance import NoiseModel, ParameterCovariance
-from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.covariance import NoiseModel, ParameterCovariance, SharedErrors
 from .scale_anchor import ScaleAnchor
 
 _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]

@@ -24,11 +24,10 @@ from ..data.capture import Capture
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.observed import Observed, ends_of
 from ..model.scale import MeasuredEnds, Scale, divide_lengths, divisible, replaced_lengths, scale_and_weights
-from ..uncertainty.active_bounds import of_active_bounds
 from ..uncertainty.covariance import DISAGREEMENT, STATED
 from ..uncertainty.degrees_of_freedom import Components
 from ..uncertainty.linear_propagation import by_covariances, rows_of_functions
-from ..uncertainty.linearisation import Linearisation
+from ..uncertainty.linearisation import Linearisation, of_active_bounds
 from .results import Calibration, Identification, ObservedMetrics
 from .scale_anchor import ScaleAnchor, fixed_lengths, fixes_scale
 from .solve import Solution, repeatability_of, solve

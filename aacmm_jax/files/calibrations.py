@@ -13,9 +13,8 @@ from ..calibration.results import NoisyEncoder, ObservedMetrics, PriorMetrics
 from ..data.capture import Capture
 from ..kinematics.arm import parameter_unit
 from ..model.observed import Observed
-from ..uncertainty.covariance import NOISE_MODELS
+from ..uncertainty.covariance import NOISE_MODELS, SharedErrors
 from ..uncertainty.degrees_of_freedom import Components
-from ..uncertainty.shared_errors import SharedErrors
 from . import schema
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables

@@ -25,7 +25,7 @@ from ..planning.first_capture import (
     still_joints,
 )
 from .calibration import arm_summary
-from .tables import plain
+from .tables import attributes, plain
 
 _SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
 _SHOWN = (15, 30, 60, 120)  # poses
@@ -128,19 +128,15 @@ def _determined_row(data: Determined) -> dict[str, Any]:
 
 def _needed(capture: FirstCapture, source: str) -> dict[str, Any]:
     return {
-        "class": capture.arm_class,
+        **attributes(capture, **{"class": "arm_class"}, u_reading_mm="u_reading"),
         "noise_source": source,
         "u_length_mm": U_LENGTH,
         "u_tracker_mm": U_TRACKER,
         "encoder_arcsec": float(np.max(np.asarray(capture.noise.encoder))) / ARCSEC,
         "seating_mm": float(capture.noise.seating),
-        "u_reading_mm": capture.u_reading,
         "rows": [
             {
-                "data": row.data,
-                "sockets": row.sockets,
-                "lengths": row.lengths,
-                "enough_poses": row.enough,
+                **attributes(row, "data", "sockets", "lengths", enough_poses="enough"),
                 "u_mm": {str(count): plain(row.u[count]) for count in _SHOWN},
             }
             for row in capture.expected
