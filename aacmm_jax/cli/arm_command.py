@@ -185,7 +185,7 @@ def _check_summary(
     manifest: Path | None = None,
 ) -> dict[str, Any]:
     from ..diagnostics.joint_travel import standing_rows
-    from ..diagnostics.reading_words import reading_check_summary
+    from ..diagnostics.reading_check import reading_check_summary
     from ..files.reading_checks import angles_toml, units_toml
 
     angles = check.explained and check.best.hypothesis._replace(length=1.0).changes
@@ -200,7 +200,7 @@ def _check_summary(
 
 def reading_check(summary: dict[str, Any]) -> View:
     """Readings compared with an arm."""
-    from ..diagnostics.reading_words import alternatives_sentence
+    from ..diagnostics.reading_check import alternatives_sentence
 
     yield Styled(summary["sentence"], "green" if summary["fits"] else "yellow" if summary["explained"] else "red")
     outside = (summary["found"] or summary["given"])["readings_outside_limits"]

@@ -16,8 +16,8 @@ from ..core.arguments import checked
 from ..kinematics.arm import parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.degrees_of_freedom import Components
-from ..uncertainty.shared_errors import SharedErrors
 from . import captures, schema
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, opened, undamaged, write_tables
 from .records import Fields, Within, number, records_within, rows_table, table_of, tables_within, text, truth, values_in

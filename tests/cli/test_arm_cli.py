@@ -50,7 +50,7 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
 
 @pytest.mark.slow
 def test_a_urdf_in_its_base_link(aacmm, monkeypatch):
-    monkeypatch.setattr(arm_survey, "still_joints", lambda arm: ())  # half of the time
+    monkeypatch.setattr(arm_survey, "still_joints", lambda arm: [])  # half of the time
     monkeypatch.setattr(first_capture, "_PLACEMENTS", 1)
     found = json.loads(aacmm("arm", URDF, "--tip", "tool0", "--encoder-arcsec", 5, "--json").stdout)
     chain = aj.files.urdf_chain(aj.files.load_specification(URDF, tip="tool0").urdf)
