@@ -26,7 +26,7 @@ from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_o
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .observations import capture_observations, observed_summary
 from .tables import attributes, plain, rows_of
