@@ -9,7 +9,6 @@ import typer
 
 from .. import data, files, kinematics, pipeline, plot, summaries
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.text import number as number_of
 from ..core.units import DEG
 from ..files.hdf5 import read_tables
 from ..files.inputs import InputFile, fingerprint
@@ -17,7 +16,7 @@ from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
 from . import options, views
 from .app import command, show_summary, with_spinner
-from .options import argument, bad_option, flag, names_option, option, output, seed
+from .options import argument, flag, names_option, option, output, seed
 
 
 @command(
@@ -162,21 +161,13 @@ def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bou
     """The arm with the bounds of its parameters, as its file or the command line says."""
     from ..kinematics.arm import is_length
 
-    widths: dict[str, float] = {}
-    for text in bounds:
-        name, _, width = text.partition("=")
-        if name in widths:
-            raise InputError(f"--bound gives {name} two half-widths; give it one.")
-        try:
-            value = number_of(width.strip())
-        except ValueError:
-            bad_option("--bound", text, "NAME=WIDTH, in mm or deg")
-        widths[name] = value if is_length(name) else value * DEG
+    widths = options.numbers_by_name("--bound", bounds, "NAME=WIDTH, in mm or deg", 1)
+    of_bounds = {name: width if is_length(name) else width * DEG for name, (width,) in widths.items()}
     identified = nominal.space().names
     return nominal._replace(
         length=nominal.length if length_mm is None else length_mm,
         angle=nominal.angle if angle_deg is None else angle_deg * DEG,
-        override={name: width for name, width in nominal.override.items() if name in identified} | widths,
+        override={name: width for name, width in nominal.override.items() if name in identified} | of_bounds,
     )
 
 

@@ -276,16 +276,15 @@ def assumed_noise(
 
 def _cones(given: Mapping[str, Any], default: float, sockets: list[str]) -> Any:
     """One cone for all sockets, or one for each where some are named."""
-    tilts = options.numbers_by_socket("--cone-deg", given["cone_deg"], 1, "DEG or NAME=DEG")
-    normals = options.numbers_by_socket("--normal", given["normal"], 3, "X,Y,Z or NAME=X,Y,Z")
+    tilts = options.numbers_by_name("--cone-deg", given["cone_deg"], "DEG or NAME=DEG", 1, named=False)
+    normals = options.numbers_by_name("--normal", given["normal"], "X,Y,Z or NAME=X,Y,Z", 3, named=False)
 
-    def cone(name: str | None) -> Any:
-        tilt, normal = tilts.get(name, tilts.get(None)), normals.get(name, normals.get(None, (0.0, 0.0, 1.0)))
-        x, y, z = normal
+    def cone(name: str) -> Any:
+        tilt, (x, y, z) = tilts.get(name, tilts.get("")), normals.get(name, normals.get("", (0.0, 0.0, 1.0)))
         return kinematics.Cone(default if tilt is None else math.radians(tilt[0]), (x, y, z))
 
-    named = [name for name in (*tilts, *normals) if name is not None]
-    return {name: cone(name) for name in dict.fromkeys([*sockets, *sorted(named)])} if named else cone(None)
+    named = sorted(filter(None, (*tilts, *normals)))
+    return {name: cone(name) for name in dict.fromkeys([*sockets, *named])} if named else cone("")
 
 
 def arm_for(manifest: Path, arm: str) -> str:

@@ -262,7 +262,7 @@ def test_options_are_refused_before_any_work(run, tmp_path, arguments, said):
 def test_a_bound_given_twice(run):
     run("simulate", "panda", "-o", "c.h5", "--socket", "A=400,0,300", "--poses", 2)
     error = run("calibrate", "c.h5", "-o", "x.h5", "--bound", "d_3=1", "--bound", "d_3=2").exception
-    assert "--bound gives d_3 two half-widths" in str(error)
+    assert "--bound is given twice for 'd_3'" in str(error)
 
 
 @pytest.mark.parametrize(
