@@ -99,10 +99,8 @@ class ExportedUrdf(NamedTuple):
 def read_urdf(
     path: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
 ) -> ArmSpecification:
-    """The arm of a serial chain of a URDF, with the text of the file, for `save_urdf`; arguments as of `load_arm`.
-
-    The arm is in the first D-H frame, which is the base link's frame where the first axis is its z axis.
-    """
+    """The arm of a serial chain of a URDF, in the first D-H frame, with the text of the file; arguments as of
+    `load_arm`."""
     file = InputFile(path)
     with naming(path):
         try:
