@@ -282,8 +282,8 @@ def _check_moving(joint: UrdfJoint) -> None:
     """Refuse a joint that an arm does not have."""
     what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
     if joint.kind not in ("revolute", "continuous", "prismatic"):
-        known = joint.kind in ("floating", "planar")
-        kind = f"is {joint.kind}" if known else f"has the unknown type {quoted(joint.kind)}"
+        of_format = joint.kind in ("floating", "planar")
+        kind = f"is {joint.kind}" if of_format else f"has the unknown type {quoted(joint.kind)}"
         raise InputError(f"{what} {kind}, which is no joint of an arm; name links without it between them.")
     if joint.mimics is not None:
         raise InputError(
