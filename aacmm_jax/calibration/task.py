@@ -33,6 +33,7 @@ from ..model.loss_names import LossName
 from ..model.observed import Observed
 from ..model.robust import Loss
 from ..model.rows import PointRows, PriorRows, Whitening, rows_at, whitening_of
+from ..solver.active_set import Box
 from ..solver.levenberg_marquardt import Rules, minimise
 from ..solver.reason import GRADIENT, Reason, reasons
 from ..uncertainty import tip_errors
@@ -382,19 +383,18 @@ def args_of(task: Task, whitening: Whitening, loss: Loss | None, z: Float[AnyArr
 
 
 def fit(task: Task, args: Args, z: Float[AnyArray, " n"], begun: Begun, rules: Rules, differentiable: bool) -> Fit:
-    """A least squares within bounds: by Optimistix for arrays of JAX, unless no derivative is needed; else by its bare
-    steps. The steps of what is begun scale the unknowns."""
+    """A least squares within bounds: differentiable for arrays of JAX, unless no derivative is needed. The steps of
+    what is begun scale the unknowns."""
     xp, count = namespace(z, args, begun.sides), z.shape[0]
     if not task.fitted[:count].any():
         return Fit(z, xp.zeros((), dtype=int), reasons(xp.asarray(GRADIENT)), xp.zeros(()))
     (lower, upper), scale = (side[:count] for side in begun.sides), begun.steps[:count]
-    box: dict[str, Any] = {"lower": lower, "upper": upper, "scale": scale, "max_steps": task.max_steps}
     if xp is np or not differentiable:
-        last = minimise(observed_model, z, args, rules=rules, **box)
+        last = minimise(observed_model, z, args, Box(lower, upper, scale), rules, task.max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     # Optimistix takes 0.2 s to import, and NumPy needs none of it.
-    from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
+    from ..solver.bounded import least_squares
 
-    solver = BoundedLevenbergMarquardt(**rules._asdict())
-    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=solver, throw=False, **box)
+    box: dict[str, Any] = {"lower": lower, "upper": upper, "scale": scale, "max_steps": task.max_steps}
+    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=rules, throw=False, **box)
     return Fit(solution.value, *(solution.stats[name] for name in ("num_steps", "reason", "optimality")))

@@ -107,8 +107,8 @@ def solve_to_targets(
     Example:
         >>> limits = np.tile([-np.pi, np.pi], (6, 1))
         >>> target = np.array([[100.0, 150.0, -100.0]])
-        >>> found, distance = aj.kinematics.solve_to_targets(true.geometry, q[None], target, limits)
-        >>> print(true.position(found).round(3), (distance < 1e-6).all())
+        >>> readings, distance = aj.kinematics.solve_to_targets(true.geometry, q[None], target, limits)
+        >>> print(true.position(readings).round(3), (distance < 1e-6).all())
         [[ 100.  150. -100.]] True
     """
     xp, low, high = namespace(geometry, q, targets), limits[:, 0, None, None], limits[:, 1, None, None]
@@ -219,8 +219,8 @@ def project_to_targets(
         The joint readings ``(N, n)``, rad or mm, and whether the tip arrived ``(N,)``.
 
     Example:
-        >>> found, arrived = aj.kinematics.project_to_targets(true, q[None], np.array([[100.0, 150.0, -100.0]]))
-        >>> print(true.position(found).round(3), arrived)
+        >>> readings, arrived = aj.kinematics.project_to_targets(true, q[None], np.array([[100.0, 150.0, -100.0]]))
+        >>> print(true.position(readings).round(3), arrived)
         [[ 100.  150. -100.]] [ True]
     """
     allowed = np.tile([-np.inf, np.inf], (arm.joints, 1)) if limits is None else np.asarray(limits)

@@ -163,10 +163,7 @@ def _minimum(
         jacobian = jax.jacfwd(constant_residual)(point, constant_args)
         return QuadraticModel(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian)
 
-    lower, upper, scale = still_box
-    last = minimise(
-        model, stop_gradient(start), None, lower=lower, upper=upper, scale=scale, rules=rules, max_steps=max_steps
-    )
+    last = minimise(model, stop_gradient(start), None, still_box, rules, max_steps)
     return unravel(_with_derivatives(last.y, inputs)), last
 
 

@@ -128,23 +128,14 @@ def _next_radius(progress: Progress, y: Flat, model: QuadraticModel, scale: Flat
 
 
 def minimise(
-    model: Callable[[Any, Any], QuadraticModel],
-    start: Flat,
-    args: Any,
-    *,
-    lower: Flat,
-    upper: Flat,
-    scale: Flat | None,
-    rules: Rules,
-    max_steps: int,
+    model: Callable[[Any, Any], QuadraticModel], start: Flat, args: Any, box: Box, rules: Rules, max_steps: int
 ) -> Progress:
     """The steps of `solver.least_squares` in NumPy, with nothing to compile, or in JAX for a batch; not differentiable.
 
-    ``model`` is a function of (y, args); ``start`` is clipped to the box, and ``scale``, the natural step of each
-    unknown, taken from the curvature where it is None. The reason of the last state is the step limit where that was
-    reached.
+    ``model`` is a function of (y, args); ``start`` is clipped to the box. The reason of the last state is the step
+    limit where that was reached.
     """
-    box, form = Box(lower, upper, scale), None
+    form = None
     if namespace(start, args) is not np:
         form = jax.eval_shape(model, start, args).gram
         form = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)

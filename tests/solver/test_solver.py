@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 
 import aacmm_jax as aj
-from aacmm_jax.solver.active_set import QuadraticModel
+from aacmm_jax.solver.active_set import Box, QuadraticModel
 from aacmm_jax.solver.levenberg_marquardt import Rules, minimise
 from aacmm_jax.solver.reason import numbers_of, reasons
 from tests.refusals import assert_refused
@@ -127,16 +127,7 @@ def _by_steps(data):
         start = np.asarray(start, dtype=float)
         free = np.full(start.shape, np.inf)
         with np.errstate(all="ignore"):
-            last = minimise(
-                model,
-                start,
-                None,
-                lower=-free,
-                upper=free,
-                scale=None,
-                rules=Rules(),
-                max_steps=1000,
-            )
+            last = minimise(model, start, None, Box(-free, free, None), Rules(), 1000)
         return last.y, last.model.cost, reasons(last.reason)
 
     return fit
@@ -225,7 +216,7 @@ def test_derivative_does_not_depend_on_units(unit):
 def test_a_false_derivative_is_not_called_converged(start):
     wrong = lambda y, _: QuadraticModel(0.5 * (y - 1) @ (y - 1), 1 - y, np.eye(len(y)))  # noqa: E731
     free = np.full(len(start), np.inf)
-    ended = minimise(wrong, start, None, lower=-free, upper=free, scale=None, rules=Rules(), max_steps=1000)
+    ended = minimise(wrong, start, None, Box(-free, free, None), Rules(), 1000)
     assert ended.reason == numbers_of(aj.Reason.stalled)
 
 
