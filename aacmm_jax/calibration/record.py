@@ -19,8 +19,8 @@ from ..kinematics.corrections import Term
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.degrees_of_freedom import Components
-from ..uncertainty.shared_errors import SharedErrors
 from .evaluation import Evaluation, evaluate
 from .prediction import CrossValidation
 from .results import (

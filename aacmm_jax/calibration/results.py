@@ -24,8 +24,7 @@ from ..kinematics.workspace import total_link_length
 from ..model.scale import Scale
 from ..model.sockets import Repeatability
 from ..solver.reason import Reason
-from ..uncertainty.covariance import NoiseModel, ParameterCovariance
-from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.covariance import NoiseModel, ParameterCovariance, SharedErrors
 from .scale_anchor import ScaleAnchor
 
 _GOOD = [int(member_numbers(reason)) for reason in (Reason.gradient, Reason.step, Reason.rounding)]
@@ -251,8 +250,7 @@ class Calibration(AbstractSingleResult):
         d_3 = 750.579 mm, u = 0.010 mm
     """
 
-    length_before: Float[AnyArray, " l"]  # measured reference lengths, mm: at the start
-    length_after: Float[AnyArray, " l"]  # by the calibrated arm
+    length_after: Float[AnyArray, " l"]  # the reference lengths as the calibrated arm measures them, mm
     stage1: Identification
     method: str = eqx.field(static=True)  # "two-stage" or "joint", as it was asked for or chosen
     # Whether the result is stage 1 divided by k; not where a bound or a fixed length stood against that, and everything

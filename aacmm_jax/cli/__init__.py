@@ -18,11 +18,9 @@ _FAMILIES = (
     "capture_commands",
     "calibration_commands",
     "result_commands",
-    "export_command",
-    "correct_command",
+    "controller_commands",
     "study_commands",
     "plan_commands",
-    "compare_commands",
 )
 
 
@@ -81,18 +79,22 @@ def main() -> None:
     except Exception as error:
         if debug:
             raise
-        from ..core.jax_setup import check_backend
-
-        try:
-            check_backend()
-        except RuntimeError as without_jax:
-            _fail(str(without_jax), 2)
+        _fail_without_jax()
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             _discard_output()
             _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
         _fail(f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.", 1)
     finally:
         gc.freeze()
+
+
+def _fail_without_jax() -> None:
+    from ..core.jax_setup import check_backend
+
+    try:
+        check_backend()
+    except RuntimeError as error:
+        _fail(str(error), 2)
 
 
 def _interrupted() -> NoReturn:

@@ -13,7 +13,7 @@ from ..core.text import pluralise
 from ..files.inputs import InputFile
 from ..files.outputs import together, write_text
 from ..summaries.tables import Styled, View, formatted, listed, number, warnings_of, written_of
-from . import calibration_views, options
+from . import options, views
 from .app import app, examples, show_summary, with_spinner
 from .options import argument, numbers_option, option
 from .plan_commands import assumed_noise
@@ -90,7 +90,7 @@ def arm(
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
     if model is not None:
-        from ..files.joint_options import with_model
+        from ..files.arm_tables import with_model
 
         specification = with_model(specification, model)
     frame = first_frame(specification)
@@ -139,7 +139,7 @@ def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]
 
 
 def _checked_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
-    from ..files.pose_tables import read_poses
+    from ..files.table_columns import read_poses
 
     table, frame = read_poses(InputFile(path), specification.arm, unit=unit, recorded=True), first_frame(specification)
     positions = None if table.poses is None else table.poses[:, :3, 3]
@@ -185,7 +185,7 @@ def _check_summary(
     manifest: Path | None = None,
 ) -> dict[str, Any]:
     from ..diagnostics.joint_travel import standing_rows
-    from ..diagnostics.reading_words import reading_check_summary
+    from ..diagnostics.reading_check import reading_check_summary
     from ..files.reading_checks import angles_toml, units_toml
 
     angles = check.explained and check.best.hypothesis._replace(length=1.0).changes
@@ -200,7 +200,7 @@ def _check_summary(
 
 def reading_check(summary: dict[str, Any]) -> View:
     """Readings compared with an arm."""
-    from ..diagnostics.reading_words import alternatives_sentence
+    from ..diagnostics.reading_check import alternatives_sentence
 
     yield Styled(summary["sentence"], "green" if summary["fits"] else "yellow" if summary["explained"] else "red")
     outside = (summary["found"] or summary["given"])["readings_outside_limits"]
@@ -220,7 +220,7 @@ def reading_check(summary: dict[str, Any]) -> View:
 
 def survey(summary: dict[str, Any]) -> View:
     """An arm before its first calibration."""
-    yield from calibration_views.arm(summary)
+    yield from views.arm(summary)
     yield from warnings_of(summary)
     rows = [
         (

@@ -1,4 +1,4 @@
-"""The commands ``calibrate`` and ``compare-models``."""
+"""The commands ``calibrate``, ``compare-models`` and ``compare``."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,10 +11,11 @@ from .. import data, files, kinematics, pipeline, plot, summaries
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.text import number as number_of
 from ..core.units import DEG
+from ..files.hdf5 import read_tables
 from ..files.inputs import InputFile, fingerprint
-from ..files.outputs import reading, together
+from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
-from . import calibration_views, options
+from . import options, views
 from .app import app, examples, show_summary, with_spinner
 from .options import argument, bad_option, flag, names_option, option, output, seed
 
@@ -112,7 +113,7 @@ def calibrate(
     of one arm.
     """
     from ..diagnostics.usability import does_not_fit
-    from ..files.joint_options import with_model
+    from ..files.arm_tables import with_model
     from ..pipeline.capture_calibration import calibrate_capture
 
     # Options that have the name and the values of an argument of `calibrate_capture` are passed as they are.
@@ -141,7 +142,7 @@ def calibrate(
         files.save_calibration(output, record, summary)
         if figure is not None:
             plot.save_calibration_figure(record, figure)
-    show_summary(summary | {"written": str(output)}, as_json, calibration_views.calibration)
+    show_summary(summary | {"written": str(output)}, as_json, views.calibration)
     if not record.converged or not record.plausible_scale or record.implausible_residual or does_not_fit(record):
         raise typer.Exit(1)
 
@@ -184,7 +185,7 @@ def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bou
 def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
     """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
     if text is not None:
-        from ..files.joint_options import prior_of_text
+        from ..files.arm_tables import prior_of_text
 
         return prior_of_text(text, nominal.arm)
     of_model = nominal.prior is None and model is not None and nominal.arm.corrections is not None
@@ -237,7 +238,7 @@ def compare_models(
     Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
     """
     from ..data.capture import draw_poses
-    from ..files.joint_options import masses_of
+    from ..files.arm_tables import masses_of
     from ..pipeline.model_ladder import compare_models as run
 
     with together(output):
@@ -263,3 +264,83 @@ def compare_models(
     show_summary(summary, as_json, summaries.compared_models.compared_models)
     if not compared.recommended.result.converged:
         raise typer.Exit(1)
+
+
+@app.command(
+    epilog=examples(
+        "aacmm compare march.h5 september.h5",
+        "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05",
+    )
+)
+def compare(
+    paths: list[Path] = argument(
+        "OLD.h5 NEW.h5 [MORE.h5 ...]",
+        "Calibrations of one arm, written by calibrate: two in this order; more than two are ordered by date.",
+    ),
+    level: float = option("P", "Coverage probability of the expanded uncertainties.", default=0.95),
+    length_mm: float | None = option(
+        "MM",
+        "Compute the change of this length all over the volume. Default: 300, or half a small arm's reach.",
+    ),
+    figure: Path | None = option(
+        "FILE", "Plot the changes, over time for three calibrations or more: PNG, SVG or PDF by the name."
+    ),
+    csv: Path | None = option("FILE", "Write every parameter of every calibration."),
+    max_length_change_mm: float | None = option(
+        "MM", "Exit code 1 where a length changes by more than this from the first to the last.", min=0
+    ),
+    as_json: bool = options.JSON,
+) -> None:
+    """Compare calibrations of one arm.
+
+    Reports which parameters changed beyond their uncertainty, and what that does to lengths.
+    """
+    if len(paths) < 2:
+        raise InputError(f"{paths[0]} alone cannot be compared; name at least two calibrations.")
+    options.check_figure(figure)
+    words = summaries.drift
+    with together(figure, csv):
+        records = [files.load_calibration(path) for path in paths]
+        created = [
+            record.recording.measured or read_tables(path, ("calibration",)).attributes["created"]
+            for record, path in zip(records, paths, strict=True)
+        ]
+        labels = [str(path) for path in paths]
+        settings = {"level": level, "length": length_mm, "labels": labels}
+        trend = with_spinner("Comparing", lambda: _compared(records, created, settings))
+        trend = trend._replace(dated_by_file=tuple(not records[i].recording.measured for i in trend.order))
+        summary: dict[str, Any] = words.compared_summary(trend, labels, records[0].recording.nominal.name)
+        summary["kept"], summary["failed"] = words.change_exceeded(trend.drifts[-1].lengths, max_length_change_mm)
+        if figure is not None:
+            plot.save_drift_trend(trend, figure)
+        if csv is not None:
+            write_text(csv, words.drift_csv(trend, labels))
+    written = ", ".join(str(path) for path in (figure, csv) if path is not None)
+    show_summary(summary | ({"written": written} if written else {}), as_json, words.comparison)
+    if summary["failed"]:
+        raise typer.Exit(1)
+
+
+def _compared(records: list, created: list[str], settings: dict[str, Any]) -> Any:
+    """The trend over all files; of two, in the order in which they are named, whatever their dates."""
+    from ..drift.comparison import compare, moment, trend
+    from ..drift.results import Trend
+
+    labels = settings["labels"]
+    if len(records) == 2:
+        drift, (old, new) = compare(*records, **settings), map(moment, created)
+        warning = (
+            f"{labels[1]} was made before {labels[0]} ({new:%Y-%m-%d %H:%M} and {old:%Y-%m-%d %H:%M}): is the order "
+            "right?"
+        )
+        warnings = (*drift.warnings, warning) if new < old else drift.warnings
+        return Trend((old, new), (0, 1), (drift._replace(warnings=warnings),))
+    by_date = trend(records, created, **settings)
+    if list(by_date.order) == sorted(by_date.order):
+        return by_date
+    warning = (
+        f"Ordered by date, not as named: {', '.join(labels[i] for i in by_date.order)}. The date is when the poses "
+        "were measured, where the manifest states it, and otherwise when the file was made."
+    )
+    first, *others = by_date.drifts
+    return by_date._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *others))

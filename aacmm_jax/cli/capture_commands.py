@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
 from ..files.outputs import together
-from . import calibration_views, options
+from . import options, views
 from .app import app, examples, show_summary, with_spinner
 from .arm_command import checked_recording, reading_check
 from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
@@ -35,7 +35,7 @@ def demo(
     from .demo import run
 
     summary = with_spinner("Simulating and calibrating", lambda: run(folder, seed))
-    show_summary(summary, as_json, calibration_views.demo)
+    show_summary(summary, as_json, views.demo)
 
 
 @app.command(
@@ -130,7 +130,7 @@ def simulate(
         recording = recording._replace(usual=files.usual_noise(arm, base=base, tip=tip))
         summary = summaries.calibration.capture_summary(recording)
         files.save_capture(output, recording, summary)
-    show_summary(summary | {"written": str(output)}, as_json, calibration_views.capture)
+    show_summary(summary | {"written": str(output)}, as_json, views.capture)
 
 
 def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, int]:
@@ -174,9 +174,9 @@ def import_(
             files.save_capture(output, recording, summary)
             summary["written"] = str(output)
     if not check:
-        show_summary(summary, as_json, calibration_views.capture)
+        show_summary(summary, as_json, views.capture)
         return
     summary["check"] = checked_recording(recording.nominal, recording, manifest)
-    show_summary(summary, as_json, lambda s: (*calibration_views.capture(s), "", *reading_check(s["check"])))
+    show_summary(summary, as_json, lambda s: (*views.capture(s), "", *reading_check(s["check"])))
     if not summary["check"]["explained"]:
         raise typer.Exit(1)

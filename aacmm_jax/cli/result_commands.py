@@ -13,8 +13,8 @@ from ..core.text import shorten
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from ..files.sense import check_shown
-from . import calibration_views, evaluation_views, options
+from ..files.schema import check_shown
+from . import options, views
 from .app import app, examples, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame
 from .options import argument, option, output
@@ -22,10 +22,10 @@ from .options import argument, option, output
 _ARM_SUFFIXES = ("", ".toml", ".urdf", ".xacro", ".yaml", ".yml")
 # What reads each kind of file, what makes its summary, and what people see of it.
 _KINDS = {
-    "capture": ("load_capture", "calibration.capture_summary", calibration_views.capture),
-    "calibration": ("load_calibration", "calibration.calibration_summary", calibration_views.calibration),
-    "evaluation": ("load_evaluation", "evaluation.evaluation_summary", evaluation_views.evaluation),
-    "points": ("load_evaluation", "evaluation.points_summary", evaluation_views.points),
+    "capture": ("load_capture", "calibration.capture_summary", views.capture),
+    "calibration": ("load_calibration", "calibration.calibration_summary", views.calibration),
+    "evaluation": ("load_evaluation", "evaluation.evaluation_summary", views.evaluation),
+    "points": ("load_evaluation", "evaluation.points_summary", views.points),
 }
 
 
@@ -106,7 +106,7 @@ def evaluate(
             paths, choice = (InputFile(calibration), InputFile(capture)), (only or None, without or ())
             summary = _evaluated(paths, output, choice, range_mm, of_test)
     summary |= {} if output is None else {"written": str(output)}
-    show_summary(summary, as_json, evaluation_views.points if capture is None else evaluation_views.evaluation)
+    show_summary(summary, as_json, views.points if capture is None else views.evaluation)
     if summary["failed"] or any(test["decision"] in ("fails", "undecided") for test in summary["acceptance"]):
         raise typer.Exit(1)
 
@@ -189,7 +189,7 @@ def report(
     with together(output):
         stated = None if about is None else files.read_administrative_data(about)
         summary = with_spinner("Writing the report", lambda: write_report(file, output, stated))
-    show_summary(summary, as_json, evaluation_views.report)
+    show_summary(summary, as_json, views.report)
 
 
 @app.command(epilog=examples("aacmm show calibration.h5", "aacmm show panda"))
@@ -213,7 +213,7 @@ def show(
         summary = summaries.calibration.arm_summary(specification)
         if specification.urdf is not None:
             summary["urdf"]["first_frame_in_base_mm"] = first_frame(specification).tolist()
-        show_summary(summary, as_json, calibration_views.arm)
+        show_summary(summary, as_json, views.arm)
         return
     if base is not None or tip is not None:
         raise InputError(f"--base and --tip are links of a URDF, and {file} is none; leave them out.")

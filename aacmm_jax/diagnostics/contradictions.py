@@ -12,9 +12,8 @@ from ..core.errors import InputError
 from ..core.units import DEG
 from ..data.capture import Capture, names_in, part_of
 from ..data.observations.held import Socket
-from .equations import EXACT, PROBE, Equations, Rows
+from .equations import EXACT, PROBE, Block, Equations, GroupTest, Rows, contradicting_groups, different_groups, fit_of
 from .findings import Case, Finding, case_of, chance_text
-from .group_test import Block, GroupTest, contradicting_groups, different_groups, fit_of
 
 ORDER, NEEDS = 30, "scale"
 LEFT_OUT = "left-out"  # code of the finding on a group that the calibration left out
@@ -150,7 +149,7 @@ def groupings(capture: Capture) -> dict[str, dict[str, str | None]]:
 def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
     """The groups that contradict the others; nearly always none.
 
-    Every group is tested by the poses of the others (`diagnostics.group_test`), which takes milliseconds. Of all kinds
+    Every group is tested by the poses of the others (`diagnostics.equations`), which takes milliseconds. Of all kinds
     of groups the one that shows the contradiction best is reported: an error of a whole placement shows less in one of
     its sockets, and that of one socket less in its placement.
 

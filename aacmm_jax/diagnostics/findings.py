@@ -28,8 +28,7 @@ from ..data.capture import Capture
 from ..data.noise import ArmNoise, Noise
 from ..data.recording import Recording
 from ..kinematics.parameters import ArmSpecification
-from .equations import EXACT, Equations, Rows, equations_of, in_chunks, residual_rms
-from .group_test import Block
+from .equations import EXACT, Block, Equations, Rows, equations_of, in_chunks, residual_rms
 from .residual_tests import Residuals
 
 Severity = Literal["unusable", "doubt", "note"]

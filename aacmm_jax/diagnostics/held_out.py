@@ -22,51 +22,8 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
     """Groups whose errors exceed what their prediction allows, where there are any."""
     if not validation.surprising:
         return []
-    count, named = len(validation.disagreeing), _disagreement(validation)
-    doubt = "held-out data disagree by more than predicted"
-    concerns = tuple(validation.labels[i] for i in validation.disagreeing)
-    if 0 < count < len(validation.groups) / 2:
-        return [
-            Finding(
-                "held-out-group",
-                f"Held out one after the other, some groups disagree with the others by more than predicted: {named}; "
-                f"the other {len(validation.groups) - count} agree.",
-                advice="Look for what differs there (a socket or tool that moved, a wrong length, poses far from all "
-                "others).",
-                severity="doubt",
-                doubt=doubt,
-                concerns=concerns,
-            )
-        ]
-    pairs = (
-        ("poses", validation.rms, validation.rms_predicted),
-        ("reference lengths", validation.length_rms, validation.length_u),
-    )
-    ratios = [
-        f"{name} {error:.3g} mm RMS, {error / predicted:.1f} times the predicted {predicted:.3g} mm"
-        for name, error, predicted in pairs
-        if predicted > 0 and math.isfinite(error)
-    ]
-    return [
-        Finding(
-            "held-out-all",
-            f"Held out one after the other, placements have larger errors than predicted: {'; '.join(ratios)}"
-            + (f"; worst in {named}" if named else "")
-            + ". Errors of neighbouring poses are alike, as of effects outside the D-H model (compliant joints, "
-            "eccentric encoders).",
-            "Every stated uncertainty is too small.",
-            "Use the cross-validated values.",
-            severity="doubt",
-            doubt=doubt,
-            concerns=concerns,
-        )
-    ]
-
-
-def _disagreement(validation: CrossValidation) -> str:
-    """The most improbable groups: by how much their poses, or else their lengths, exceed the prediction."""
-    texts = []
-    for i in validation.disagreeing:
+    count, texts = len(validation.disagreeing), []
+    for i in validation.disagreeing:  # the most improbable ones first, by their poses, or else their lengths
         label, group = validation.labels[i], validation.groups[i]
         poses, lengths = group.probabilities
         if not lengths < poses:
@@ -75,7 +32,35 @@ def _disagreement(validation: CrossValidation) -> str:
         else:
             error = float(np.sqrt(np.mean(np.square(group.length_error))))
             texts.append(f"{label} (lengths off by {error:.3g} mm, {group.length_ratio:.1f} times their u)")
-    return shorten(texts, 3)
+    named, doubt = shorten(texts, 3), "held-out data disagree by more than predicted"
+    concerns = tuple(validation.labels[i] for i in validation.disagreeing)
+    if 0 < count < len(validation.groups) / 2:
+        finding = Finding(
+            "held-out-group",
+            f"Held out one after the other, some groups disagree with the others by more than predicted: {named}; "
+            f"the other {len(validation.groups) - count} agree.",
+            advice="Look for what differs there (a socket or tool that moved, a wrong length, poses far from all "
+            "others).",
+        )
+        return [finding._replace(severity="doubt", doubt=doubt, concerns=concerns)]
+    ratios = []
+    for name, error, predicted in (
+        ("poses", validation.rms, validation.rms_predicted),
+        ("reference lengths", validation.length_rms, validation.length_u),
+    ):
+        if predicted > 0 and math.isfinite(error):
+            times = f"{error / predicted:.1f} times the predicted {predicted:.3g} mm"
+            ratios.append(f"{name} {error:.3g} mm RMS, {times}")
+    finding = Finding(
+        "held-out-all",
+        f"Held out one after the other, placements have larger errors than predicted: {'; '.join(ratios)}"
+        + (f"; worst in {named}" if named else "")
+        + ". Errors of neighbouring poses are alike, as of effects outside the D-H model (compliant joints, "
+        "eccentric encoders).",
+        "Every stated uncertainty is too small.",
+        "Use the cross-validated values.",
+    )
+    return [finding._replace(severity="doubt", doubt=doubt, concerns=concerns)]
 
 
 def surprise(
@@ -86,9 +71,9 @@ def surprise(
     ``parts`` are the sockets and observations, of which the most improbable are named; ``refitted`` says how all poses
     agree where the place of the probe is fitted to them: where that removes most of the excess, it is the cause.
     """
-    tested = sum(math.isfinite(agreement.probability) for agreement in (poses, lengths))
-    texts, worst = [], []
-    if poses.probability < LEVEL / max(tested, 1):
+    probabilities = [p for p in (poses.probability, lengths.probability) if math.isfinite(p)]
+    texts, worst, level = [], [], LEVEL / max(len(probabilities), 1)
+    if poses.probability < level:
         improbable = sorted((p.probability, name) for name, p in parts.items() if p.probability < LEVEL / len(parts))
         worst = [name for _, name in improbable[:3]]
         most = [
@@ -98,39 +83,39 @@ def surprise(
             f"poses are {poses.rms:.3g} mm RMS from their geometry, {poses.rms / poses.predicted:.1f} times the "
             f"predicted {poses.predicted:.3g} mm" + (f", most of all in {', '.join(most)}" if most else "")
         )
-    if lengths.probability < LEVEL / max(tested, 1):
+    if lengths.probability < level:
         texts.append(
             f"reference lengths err by {lengths.rms / lengths.predicted:.1f} times their standard uncertainty (RMS)"
         )
     if not texts:
         return []
-    says = f"Data that the calibration has not seen disagree with it by more than chance: {'; '.join(texts)}."
-    probability = min(p for p in (poses.probability, lengths.probability) if math.isfinite(p))
+    finding = Finding(
+        "unseen-data",
+        f"Data that the calibration has not seen disagree with it by more than chance: {'; '.join(texts)}.",
+        "The arm or its probe has changed since (a remounted tip), these data have errors of their own, or the model "
+        "misses effects that poses of the calibration did not show: its uncertainties do not hold here.",
+        severity="doubt",
+        probability=min(probabilities),
+        concerns=tuple(worst),
+    )
     again = refitted() if poses.probability < LEVEL else None
     # Most of the excess: more than half of it, in squares.
     if again is not None and poses.rms**2 - again.rms**2 > (poses.rms**2 - poses.predicted**2) / 2:
-        says += (
+        says = (
             f" With the probe's place in the last frame fitted to them, they are {again.rms:.3g} mm RMS: the tip was "
             "remounted, or is another one."
         )
         advice = "Calibrate such data as a session with a probe of its own (aacmm calibrate A.h5 B.h5)."
-        return [Finding("unseen-probe", says, "", advice, "doubt", probability=probability, concerns=tuple(worst))]
-    costs = (
-        "The arm or its probe has changed since (a remounted tip), these data have errors of their own, or the model "
-        "misses effects that poses of the calibration did not show: its uncertainties do not hold here."
-    )
-    return [Finding("unseen-data", says, costs, "", "doubt", probability=probability, concerns=tuple(worst))]
+        return [finding._replace(code="unseen-probe", says=finding.says + says, costs="", advice=advice)]
+    return [finding]
 
 
 def no_better(nominal: float | None, calibrated: float | None) -> list[Finding]:
     """That the calibration has not improved the RMS distance of held-out poses, mm."""
     if nominal is None or calibrated is None or calibrated < nominal:
         return []
-    return [
-        Finding(
-            "no-better-than-nominal",
-            f"On data that it has not seen, the calibrated arm is no better than the nominal one: {calibrated:.3g} mm "
-            f"RMS instead of {nominal:.3g} mm.",
-            severity="doubt",
-        )
-    ]
+    says = (
+        f"On data that it has not seen, the calibrated arm is no better than the nominal one: {calibrated:.3g} mm "
+        f"RMS instead of {nominal:.3g} mm."
+    )
+    return [Finding("no-better-than-nominal", says, severity="doubt")]

@@ -13,9 +13,8 @@ from ..core.distributions import chi_square_tail, f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..model.observed import Observed
 from ..uncertainty.shared_kinds import PLACES
-from .equations import EXACT, LEAST_U, PRIOR, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
+from .equations import EXACT, LEAST_U, PRIOR, Block, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
 from .findings import Case, Finding, chance_text
-from .group_test import Block
 from .residual_tests import LEVEL, consistency
 
 ORDER, NEEDS = 66, "fit"

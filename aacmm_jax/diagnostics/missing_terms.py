@@ -21,9 +21,8 @@ from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
 from ..kinematics.corrections import Term, all_sought, model_of, model_with, terms_of
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .equations import Rows, wider
+from .equations import Block, Rows, wider
 from .findings import Case, Finding, chance_text, rounded
-from .group_test import Block
 from .residual_tests import LEVEL, Residuals, ScoreTest, score_tests
 
 ORDER, NEEDS = 60, "fit"

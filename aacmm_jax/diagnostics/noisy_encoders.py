@@ -25,9 +25,8 @@ from ..calibration.results import Calibration, Identification, NoisyEncoder
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.noise import Noise, one_arcsec
-from .equations import Rows
+from .equations import Block, Rows
 from .findings import Case, Finding, chance_text, reading_text
-from .group_test import Block
 from .missing_terms import MOST_TERMS, explained, found_terms, missing
 from .residual_tests import LEVEL, Residuals, chance_above_zero
 

@@ -1,4 +1,5 @@
-"""Residuals of a calibration pose by pose, in mm and in standard deviations, with the weights of its last solve."""
+"""Residuals of a calibration pose by pose, in mm and in standard deviations, with the weights of its last solve; and
+poses that are far from their socket, beside what is typical."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,12 +9,36 @@ from jaxtyping import Float, Int
 
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
+from ..core.text import shorten
 from ..data.capture import Capture
 from ..data.observations.observation import AbstractObservation
+from ..model.sockets import pose_outliers
 from .equations import equations_of, linearisation_of
+from .findings import Case, Finding
 
+ORDER, NEEDS = 90, "scale"
 _POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 _LEAST_LEVER = 1e-6  # mm per rad: a joint whose axis the tip is on explains nothing
+
+
+def test(case: Case) -> list[Finding]:
+    """Outlying poses of a calibration from sockets alone: robust losses list the poses of all observations."""
+    capture = case.record.recording.capture
+    if capture.observations:
+        return []
+    distances, owner = np.asarray(case.record.evaluations()["calibrated"].distances), capture.owner
+    first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
+    far, typical = pose_outliers(distances, capture.sizes)
+    worst = sorted(far, key=lambda i: -distances[i])
+    poses = [f"{capture.names[owner[i]]} pose {i - first[owner[i]] + 1}" for i in worst]
+    texts = [f"{pose} ({distances[i]:.3g} mm)" for pose, i in zip(poses, worst, strict=True)]
+    finding = Finding(
+        "outlying-poses",
+        f"Poses far from their socket, where {typical:.2g} mm is typical: {shorten(texts)}.",
+        advice="Was the tip seated?",
+        concerns=tuple(poses),
+    )
+    return [finding] if poses else []
 
 
 class ObservationResiduals(NamedTuple):
@@ -45,11 +70,11 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
     """
     residuals = []
     for part in linearisation_of(record, record.names, noise=record.given_noise).parts():
-        values, moved = np.asarray(part.values), np.asarray(part.by_readings)[:_POSITION_ROWS]
-        position, angles = values[:_POSITION_ROWS], values[_POSITION_ROWS:]
+        position, angles = np.split(np.asarray(part.values), [_POSITION_ROWS])
+        moved = np.asarray(part.by_readings)[:_POSITION_ROWS]
+        u, u_angle = np.split(np.diagonal(np.asarray(part.measured), axis1=1, axis2=2), [_POSITION_ROWS], axis=1)
         lever = np.linalg.norm(moved, axis=0)
-        white = np.einsum("mab,bm->am", part.root, values)
-        variances = np.diagonal(np.asarray(part.measured), axis1=1, axis2=2)
+        white = np.einsum("mab,bm->am", part.root, part.values)
         residuals.append(
             ObservationResiduals(
                 observation=part.observation,
@@ -57,8 +82,8 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
                 angle=np.linalg.norm(angles, axis=0) if len(angles) else None,
                 normalised=np.sqrt(np.mean(white**2, axis=0)),
                 weight=np.asarray(part.weight),
-                u=float(np.sqrt(np.mean(variances[:, :_POSITION_ROWS]))),
-                u_angle=float(np.sqrt(np.mean(variances[:, _POSITION_ROWS:]))) if len(angles) else None,
+                u=float(np.sqrt(np.mean(u))),
+                u_angle=float(np.sqrt(np.mean(u_angle))) if len(angles) else None,
                 by_joint=-np.einsum("rm,rnm->nm", position, moved) / np.maximum(lever, _LEAST_LEVER) ** 2,
                 lever=lever,
             )
@@ -97,18 +122,17 @@ def signed_residuals(record: CalibrationRecord) -> SignedResiduals | None:
     Args:
         record: The calibration.
     """
-    rows, joints = equations_of(record).rows, record.calibrated.arm.joints
+    rows, joints, parts = equations_of(record).rows, record.calibrated.arm.joints, []
     if not rows:
         return None
-    parts = []
-    for each in rows:
-        in_mm = np.einsum("mcr,mr->mc", each.in_mm, each.residual)
-        vector = np.einsum("mcr,mrx,mc->mx", each.in_mm, each.by_tip, in_mm)
-        moves = each.in_mm @ each.extra[..., :joints]
+    for part in rows:
+        in_mm = np.einsum("mcr,mr->mc", part.in_mm, part.residual)
+        vector = np.einsum("mcr,mrx,mc->mx", part.in_mm, part.by_tip, in_mm)
+        moves = part.in_mm @ part.extra[..., :joints]
         size = np.linalg.norm(moves, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
             along = np.where(size > 1e-6 * size.max(), np.einsum("mc,mcn->mn", in_mm, moves) / size, np.nan)
-        parts.append((each.poses, vector, along, each.residual.ravel()))
-    poses, *arrays = (np.concatenate(part) for part in zip(*parts, strict=True))
+        parts.append((part.poses, vector, along, part.residual.ravel()))
+    poses, vector, along, normalised = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     order = np.argsort(poses, kind="stable")
-    return SignedResiduals(poses[order], arrays[0][order], arrays[1][order], arrays[2])
+    return SignedResiduals(poses[order], vector[order], along[order], normalised)

@@ -16,8 +16,7 @@ from jaxtyping import Float
 from ..calibration.record import CalibrationRecord
 from ..calibration.stages import Sensitivities
 from ..uncertainty.evidence import Groups, PriorModel, covariance_of_log_variances, learned_log_variances
-from .equations import LEAST_U, PRIOR, Rows, lengths_in_solve
-from .group_test import Block
+from .equations import LEAST_U, PRIOR, Block, Rows, lengths_in_solve
 from .length_consistency import lengths_of_sockets
 from .residual_tests import Residuals
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.linear_algebra import inverse_cholesky
-from .group_test import Block
+from .equations import Block
 
 LEVEL = 0.01  # of false alarms of one family of tests
 _NULL = 1e-5  # singular values of scaled columns below this, of the largest, are zero

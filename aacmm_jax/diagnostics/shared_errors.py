@@ -2,7 +2,7 @@
 
 Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
 all poses of a visit share (marked in the capture, or successive poses where none are), and functions of the readings
-that the model lacks (`uncertainty.shared_errors`). The gate keeps the intervals of a calibration in which nothing is
+that the model lacks (`uncertainty.covariance`). The gate keeps the intervals of a calibration in which nothing is
 wrong as they are. Errors that all poses of a socket share, which only reference lengths show, are always allowed for
 where three lengths or more compare them, as far as these leave them possible. After a robust loss, poses count with the
 weights of the solution, as if these were given, and bad ones, which lost most of it, not at all.
@@ -26,9 +26,8 @@ from ..kinematics.arm import Arm, correction_names, natural_steps
 from ..kinematics.corrected_arm import with_corrections, with_further_corrections
 from ..kinematics.corrections import coefficient_of, shared_model
 from ..kinematics.priors import default_prior
-from ..uncertainty.covariance import DISAGREEMENT
+from ..uncertainty.covariance import DISAGREEMENT, SharedErrors
 from ..uncertainty.degrees_of_freedom import Law
-from ..uncertainty.shared_errors import SharedErrors
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import EXACT, PRIOR, Rows, lengths_in_solve, residual_rms
 from .findings import Case

@@ -9,7 +9,7 @@ from ..kinematics.parameters import Parameters
 from .contradictions import session_metrics
 from .equations import EXACT
 from .findings import Case, Finding
-from .likely_cause import likely_cause
+from .recorded import likely_cause
 
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm

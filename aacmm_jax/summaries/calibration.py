@@ -26,10 +26,10 @@ from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_o
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.shared_errors import SharedErrors
+from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.volume import VolumetricUncertainty, volumetric_uncertainty
 from .observations import capture_observations, observed_summary
-from .tables import plain, rows_of
+from .tables import attributes, plain, rows_of
 from .verdicts import calibration_verdict, checked_lengths
 
 _CORRELATED = 0.95
@@ -159,20 +159,12 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
     summary: dict[str, Any] = {
         "kind": "calibration",
         "arm": recording.nominal.name,
-        "method": record.method,
-        "converged": record.converged,
+        **attributes(record, "method", "converged", "reason", "steps", "fixed_by_one_length", "held", "hold"),
+        **attributes(record, scale_plausible="plausible_scale", scale_k="k", scale_u="u_k", monte_carlo="sampled_says"),
         "residual_plausible": not record.implausible_residual,
-        "scale_plausible": record.plausible_scale,
-        "reason": record.reason,
-        "steps": record.steps,
         "poses": len(recording.capture.readings),
         "sockets_used": list(recording.capture.names),
-        "scale_k": plain(record.k),
-        "scale_u": plain(record.u_k),
         "scale_expanded": uncertainty.expanded_k() if math.isfinite(record.u_k) else None,
-        "fixed_by_one_length": record.fixed_by_one_length,
-        "held": list(record.held),
-        "hold": record.hold,
         "active_stage1": on_bounds(record),
         "active": on_bounds(record, final=True),
         **{stage: metrics(evaluation) for stage, evaluation in evaluations.items()},
@@ -187,7 +179,6 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
         ),
         "uncertainty": _uncertainty_summary(record, volume),
         "cross_validation": None if record.validation is None else cross_validation_summary(record.validation),
-        "monte_carlo": record.sampled_says,
         "model_tests": rows_of_tests(model_tests(record)) if fits else None,
         "prior": None if record.prior is None else prior_rows(record.prior),
         "shared_errors": None if record.shared is None else shared_rows(record.shared),
@@ -222,20 +213,17 @@ def _uncertainty_summary(record: CalibrationRecord, volume: VolumetricUncertaint
         values = {name: getattr(encoder, name) / size for name in ("expected", "found", "u")}
         noisy.append({"joint": encoder.joint, "probability": encoder.probability, "unit": unit, **values})
     return {
-        "form": record.noise_model,
+        **attributes(record, form="noise_model", misfit="reduced_chi"),
         "encoder_arcsec": np.asarray(record.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(record.noise, record.calibrated.arm),
         "seating_mm": float(record.noise.seating),
         "noisy_encoders": noisy,
-        "misfit": record.reduced_chi,
         # Of the unknown geometry, whose uncertainty follows from the scatter of single poses.
         "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(1), np.zeros(1))[0]),
         "volume": plain(volume.summary),
         "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
-        "rank": observability.rank,
+        **attributes(observability, "rank", "condition", "indices"),
         "parameters": len(observability.names),
-        "condition": plain(observability.condition),
-        "indices": observability.indices,
         "tried": nearby,
     }
 
@@ -274,38 +262,20 @@ def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
     rows = []
     for i, (label, group, chance) in enumerate(zip(validation.labels, validation.groups, chances, strict=True)):
         error, u = (rms(values) for values in (group.length_error, group.length_u))
-        rows.append({
-            "group": label,
-            "members": group.sockets,
-            "poses": group.poses,
-            "converged": group.converged,
-            "rms_mm": group.rms,
-            "rms_predicted_mm": group.rms_predicted,
-            "lengths": len(group.length_error),
-            "length_error_rms_mm": error,
-            "length_u_mm": u,
-            "probability": chance,
-            "disagrees": i in validation.disagreeing,
-        })  # fmt: skip
-    return plain({
+        names = {"members": "sockets", "rms_mm": "rms", "rms_predicted_mm": "rms_predicted"}
+        row = {"group": label, **attributes(group, "poses", "converged", **names), "lengths": len(group.length_error)}
+        row |= {"length_error_rms_mm": plain(error), "length_u_mm": plain(u)}
+        rows.append(row | {"probability": plain(chance), "disagrees": i in validation.disagreeing})
+    names = {"rms_mm": "rms", "rms_predicted_mm": "rms_predicted", "length_error_rms_mm": "length_rms"}
+    by_chance = sorted(rows, key=lambda row: 2.0 if row["probability"] is None else row["probability"])
+    return {
         "groups": len(rows),
-        "rms_mm": validation.rms,
-        "rms_predicted_mm": validation.rms_predicted,
-        "length_error_rms_mm": validation.length_rms,
-        "length_u_mm": validation.length_u,
-        "excess": validation.excess,
-        "surprising": validation.surprising,
-        "left_out": sorted(rows, key=lambda row: 2.0 if math.isnan(row["probability"]) else row["probability"]),
-    })  # fmt: skip
+        **attributes(validation, "excess", "surprising", **names, length_u_mm="length_u"),
+        "left_out": by_chance,
+    }
 
 
 def agreement_row(agreement: Agreement) -> dict[str, Any]:
     """Errors found and predicted of some poses, mm and in standard deviations."""
-    return plain({
-        "poses": agreement.count,
-        "rms_mm": agreement.rms,
-        "rms_predicted_mm": agreement.predicted,
-        "reduced_chi": agreement.reduced_chi,
-        "rms_angle_rad": agreement.rms_angle,
-        "probability": agreement.probability,
-    })  # fmt: skip
+    names = {"rms_mm": "rms", "rms_predicted_mm": "predicted", "rms_angle_rad": "rms_angle"}
+    return attributes(agreement, "reduced_chi", "probability", poses="count", **names)

@@ -5,7 +5,7 @@ from typing import Any
 
 from ..pipeline.model_ladder import ComparedModels
 from .result_tables import MODELS_MEANING, model_tables
-from .tables import Styled, View, rms_difference, warnings_of, written_of
+from .tables import Styled, View, attributes, rms_difference, warnings_of, written_of
 
 _EXCESS = 2.0  # of the mean squared normalised error, from which the uncertainty is said to be too small
 
@@ -19,7 +19,7 @@ def compared_models_summary(compared: ComparedModels, arm: str) -> dict[str, Any
     """What ``compare-models`` reports of the arm of this name; mm, and mm^2 of differences of mean squares."""
     chosen, best = compared.recommended, compared.models[compared.best]
     rows = [
-        {name: getattr(model, name) for name in _COPIED}
+        attributes(model, *_COPIED)
         | {
             "difference": difference,
             "u_difference": u_difference,

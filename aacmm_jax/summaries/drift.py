@@ -13,6 +13,7 @@ from .tables import (
     Cell,
     Styled,
     View,
+    attributes,
     decimals_for,
     limits_of,
     listed,
@@ -30,30 +31,17 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
     probe = joint.probe
     return {
         "kind": "comparison",
-        "level": drift.level,
-        "warnings": list(drift.warnings),
+        **attributes(drift, "level", "warnings", "compared", moved_by_chance="by_chance"),
         "findings": drift.findings(),
         "parameters": _rows(drift),
-        "compared": drift.compared,
         "moved": int(drift.moved.sum()),
-        "moved_by_chance": drift.by_chance,
         "joint": {
-            "statistic": plain(joint.statistic),
-            "rank": joint.rank,
-            "freedom": plain(joint.degrees_of_freedom),
-            "p": plain(joint.p),
-            "parameters": list(joint.names),
+            **attributes(joint, "statistic", "rank", "p", freedom="degrees_of_freedom", parameters="names"),
             "causes": [{"parameter": name, "unit": units[name], "change": amount} for name, amount in joint.causes],
             # Of the hypothesis that only the probe changed.
             "probe": probe
-            and {
-                "remounted": bool(probe.remounted),
-                "statistic_left": probe.statistic,
-                "rank": probe.rank,
-                "p": plain(probe.p),
-                "ratio": probe.ratio,
-                "change_mm": dict(probe.change),
-            },
+            and attributes(probe, "remounted", "rank", "p", "ratio", statistic_left="statistic")
+            | {"change_mm": dict(probe.change)},
         },
         "lengths": _lengths(drift.lengths),
     }
@@ -92,13 +80,10 @@ def change_exceeded(lengths: LengthChange, limit: float | None) -> tuple[list[st
 
 def _lengths(lengths: LengthChange) -> dict[str, Any]:
     """Changes of lengths over the working volume."""
-    return {
-        "length_mm": lengths.length,
+    names = ("rms", "rms_by_chance", "largest", "length")
+    return attributes(lengths, **{f"{name}_mm": name for name in names}) | {
         "places": len(lengths.change),
-        "rms_mm": lengths.rms,
-        "rms_by_chance_mm": plain(lengths.rms_by_chance),
         "percentile_95_mm": float(np.quantile(np.abs(lengths.change), 0.95)),
-        "largest_mm": lengths.largest,
         "mean_mm": float(np.mean(lengths.change)),
         "mean_um_per_m": 1e6 * lengths.scale_change,
         "mean_expanded_um_per_m": plain(1e6 * lengths.expanded_scale_change),

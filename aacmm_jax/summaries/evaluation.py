@@ -18,7 +18,7 @@ from ..diagnostics.held_out import no_better, surprise
 from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import agreement_row, length_metrics, metrics, metrics_by_socket_and_length
-from .tables import plain, rows_of
+from .tables import attributes, plain, rows_of
 from .verdicts import evaluation_verdict
 
 _LIMITED = {"rms_mm": "RMS distance", "deltam_mm": "Deltam", "length_error_largest_mm": "largest length error"}
@@ -222,18 +222,13 @@ def _judged(
     influences = record.influences
     bodies = {"artefact": influences.artefact, "arm": influences.arm}
     expansions = {
-        f"{of}_expansion": None if body is None else {key: getattr(body, name) for key, name in _EXPANSION.items()}
-        for of, body in bodies.items()
+        f"{of}_expansion": None if body is None else attributes(body, **_EXPANSION) for of, body in bodies.items()
     }
     return {
         "acceptance": [
-            {
-                "standard": test.standard,
-                "called": test.called,
+            attributes(test, "standard", "called", "title", "decision", "missing")
+            | {
                 "rule": RULES[test.rule],
-                "title": test.title,
-                "decision": test.decision,
-                "missing": list(test.missing),
                 "figures": [
                     _metric(metric, earlier.get((test.title, metric.name))) | {"symbol": test.symbol(metric)}
                     for metric in test.metrics
@@ -241,20 +236,18 @@ def _judged(
             }
             for test in tests
         ],
-        "standards": list(record.standards),
-        "u_test_mm": record.u_test,
+        **attributes(record, "standards", u_test_mm="u_test"),
         "influences": {"u_relative": influences.u_relative} | expansions,
     }
 
 
 def _metric(metric: Metric, earlier: Metric | None) -> dict[str, Any]:
     def part(value: MetricValue) -> dict[str, Any]:
-        return {"where": value.where, "value_mm": value.value, "expanded_mm": value.expanded, "limit_mm": value.limit}
+        return attributes(value, "where", value_mm="value", expanded_mm="expanded", limit_mm="limit")
 
     return {
-        "name": metric.name,
+        **attributes(metric, "name", "decision"),
         "what": METRICS[metric.name],
-        "decision": metric.decision,
         **part(metric.worst),
         "as_found_mm": None if earlier is None else earlier.value,
         "as_found_decision": None if earlier is None else earlier.decision,

@@ -23,7 +23,7 @@ from ..data.observations.observation import (
 from ..diagnostics.contradictions import session_metrics
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..model.observed import Observed
-from .tables import observed_words, plain, rows_of
+from .tables import attributes, observed_words, plain, rows_of
 
 _LITTLE_WEIGHT = 0.5
 
@@ -31,15 +31,12 @@ _LITTLE_WEIGHT = 0.5
 def capture_observations(capture: Capture) -> list[dict[str, Any]]:
     """What a capture holds besides sockets and lengths: unknowns of each observation, and what is certified of it."""
     return [
-        {
-            "observation": observation.name,
-            "kind": observation.kind,
+        attributes(observation, "kind", "target", "fixes_scale", observation="name")
+        | {
             "poses": len(observation.q),
-            "target": observation.target,
             "unknowns": list(_parts(observation)),
             "certified": list(map(_row, certified_quantities(observation))),
             "stated": list(map(_row, stated_quantities(observation))),
-            "fixes_scale": bool(observation.fixes_scale),
         }
         for observation in capture.observations
     ]

@@ -16,7 +16,7 @@ from ..planning.kit import KitPlan
 from ..planning.motion import Motion
 from ..planning.problem import MORE, Prediction
 from .calibration import reference_length_rows
-from .tables import Styled, View, listed, number, warnings_of, written_of
+from .tables import Styled, View, attributes, listed, number, warnings_of, written_of
 
 _PREDICTED = {
     "predicted": "this plan",
@@ -87,9 +87,8 @@ def _stated(
         }
     return {
         "arm": arm,
-        "criterion": plan.criterion,
+        **attributes(plan, "criterion", check_length_mm="check_length"),
         "poses": len(owner),
-        "check_length_mm": plan.check_length,
         "encoder_arcsec": np.asarray(plan.noise.encoder_arcsec).tolist(),
         "linear_encoder_mm": linear_encoder_mm(plan.noise, plan.arm),
         "seating_mm": float(plan.noise.seating),
@@ -114,29 +113,16 @@ def procedure_summary(procedure: Procedure, arm: str) -> dict[str, Any]:
         "kind": "acceptance plan",
         "arm": arm,
         "standard": PLANNED[procedure.standard],
-        "poses": procedure.poses,
-        "reach_mm": procedure.reach.radius,
-        "measuring_range_mm": procedure.measuring_range,
-        "measuring_range_stated": procedure.range_stated,
-        "shoulder_mm": procedure.reach.shoulder.tolist(),
+        **attributes(procedure, "poses", measuring_range_mm="measuring_range", measuring_range_stated="range_stated"),
+        **attributes(procedure.reach, reach_mm="radius", shoulder_mm="shoulder"),
         "bars": [{"length_mm": value, "positions": count} for value, count in lengths.items()],
         "spheres": [
-            {
-                "name": sphere.name,
-                "test": sphere.test,
-                "diameter_mm": sphere.diameter,
-                "centre_mm": sphere.centre.tolist(),
-            }
+            attributes(sphere, "name", "test", diameter_mm="diameter", centre_mm="centre")
             for sphere in procedure.spheres
         ],
         "items": [
-            {
-                "test": item.test,
-                "name": item.name,
-                "group": item.group,
-                "position_mm": item.points.mean(axis=0).tolist(),
-                "poses": len(item.q),
-            }
+            attributes(item, "test", "name", "group")
+            | {"position_mm": item.points.mean(axis=0).tolist(), "poses": len(item.q)}
             for item in (*procedure.sockets, *procedure.touches)
         ],
         "warnings": list(procedure.left_out),

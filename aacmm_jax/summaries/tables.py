@@ -6,8 +6,6 @@ Example:
     >>> rows = [{"socket": "A", "rms_mm": 0.01234}, {"socket": "B", "rms_mm": None}]
     >>> listed("Sockets", rows, {"socket": "socket", "RMS [mm]": "rms_mm"}).rows
     [['A', 0.01234], ['B', None]]
-    >>> formatted(0.01234), formatted(None)
-    ('0.0123', '-')
 """
 
 import math
@@ -102,6 +100,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple | range):
         return [plain(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def attributes(item: Any, *names: str, **renamed: str) -> dict[str, Any]:
+    """Attributes of a record, under their own names or others (key="attribute"), as JSON can hold them."""
+    keys = {name: name for name in names} | renamed
+    return {key: plain(getattr(item, name)) for key, name in keys.items()}
 
 
 def rows_of(**columns: Any) -> list[dict[str, Any]]:

@@ -15,8 +15,8 @@ from ..kinematics.arm import Arm, checked_readings
 from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
+from .covariance import SharedErrors
 from .degrees_of_freedom import LEVEL, Components, Law, coverage_factor, degrees_of_freedom
-from .shared_errors import SharedErrors
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 
@@ -91,7 +91,7 @@ class Uncertainty(eqx.Module):
     def u(self) -> Float[AnyArray, " p"]:
         """Standard uncertainty of each free parameter; infinite where only a combination is determined.
 
-        0 on a bound, unless the data hardly determine the direction that it ends (`active_bounds`).
+        0 on a bound, unless the data hardly determine the direction that it ends (`linearisation.of_active_bounds`).
         """
         xp = namespace(self)
         return xp.where(xp.diagonal(self.open) > 1e-6, np.inf, xp.sqrt(xp.diagonal(self.covariance)))

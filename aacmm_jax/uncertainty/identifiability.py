@@ -32,8 +32,7 @@ from ..kinematics.independence import (
 )
 from ..kinematics.inverse_kinematics import project_to_targets
 from ..kinematics.parameters import Bounds, Parameters
-from .correction_limits import why_undetermined
-from .observed_identifiability import Agreeing
+from .observed_identifiability import Agreeing, why_undetermined
 
 _RANK = 1e-8  # singular values below this, of the largest, are zero
 _NAMED, _PARAMETERS_NAMED, _PARTS_NAMED = 4, 6, 3  # directions in a sentence, and parts of one
@@ -203,10 +202,10 @@ def _of_spectrum(spectrum: "_Spectrum", weak: tuple[TradeOff, ...], known: set[s
         groups.append((tuple(chief.tolist()), tuple(every.tolist())))
     # Of a trade-off, the parameter to fix, or its strongest partner where that is no coefficient.
     groups += [(trade_off.names[: 1 + (trade_off.names[0] not in functions)], trade_off.names) for trade_off in weak]
-    reasons, unexplained = why_undetermined(base, np.asarray(spectrum.agreeing.observed.q), groups)
+    reasons, unexplained = why_undetermined(base, np.asarray(spectrum.agreeing.linear.observed.q), groups)
     return Observability(
         names=names,
-        poses=len(spectrum.agreeing.observed.q),
+        poses=len(spectrum.agreeing.linear.observed.q),
         singular=spectrum.singular,
         condition=spectrum.condition,
         null=null,
@@ -266,7 +265,7 @@ class _Spectrum(NamedTuple):
         plain = agreeing.eliminated()
         whitened = plain if noise is None else agreeing.eliminated(noise)
         # Each pose has as many rows on average: only their number of poses counts.
-        poses = plain.poses * np.sqrt(len(plain.poses) / len(agreeing.observed.q))
+        poses = plain.poses * np.sqrt(len(plain.poses) / len(agreeing.linear.observed.q))
         # With as many rows of zeros as there are parameters all singular values and vectors are there.
         p = len(names)
         rows = np.concatenate([whitened.poses, whitened.relations, np.zeros((p, p))])

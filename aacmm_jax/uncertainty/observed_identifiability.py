@@ -4,27 +4,34 @@ A rank must not follow from errors of an arm that is not yet calibrated, so what
 replaced by what it would measure of this arm, in the geometry that fits best; the configurations of other observations,
 such as sockets, are moved, a few milliradians at most, to where the tips agree with that geometry. (An arm of few
 joints cannot be moved to agree with a measured transform.)
+
+Also why data do not determine a coefficient of a joint correction: in the poses of a capture its function is nearly 0,
+a constant (which is a zero offset) or a straight line (which is a gear ratio).
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_cholesky
+from ..core.text import listed, pluralise
 from ..data.capture import Capture
 from ..data.noise import Noise
 from ..data.observations.held import position_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import reading_units
+from ..kinematics.corrected_arm import function_values
+from ..kinematics.corrections import GearRatio, Gravity, Term
 from ..kinematics.parameters import Parameters
 from ..model.elimination import followed, pseudo_inverse, sums_by_component
 from ..model.observed import Observed, ends_of
-from ..model.rows import PointRows, Whitening, rows_at, whitening_of
+from ..model.rows import rows_at, whitening_of
 from ..solver.arrow import joined, split
 from .linear_propagation import Influence
 from .linearisation import Linearisation
-from .tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
+from .tip_errors import arm_errors, covariance_of_noise, covariance_of_sigma
 
 _ROUNDS = 15
 _FITTED = 1e-8  # mm or rad, a step of the geometry
@@ -46,11 +53,7 @@ class Eliminated(NamedTuple):
 class Agreeing(NamedTuple):
     """Observations whose configurations agree exactly with one arm and one geometry."""
 
-    observed: Observed  # without reference lengths
-    space: Parameters
-    z: Float[np.ndarray, " z"]
-    point: PointRows
-    errors: list[ArmErrors]
+    linear: Linearisation  # without reference lengths; rows in mm
     ends: tuple[tuple[str, str], ...]  # positions at the ends of the lengths
     u: Float[np.ndarray, " l"]  # standard uncertainties of the lengths, mm
 
@@ -62,42 +65,35 @@ class Agreeing(NamedTuple):
         """
         arm, p = space.base, len(space.names)
         observed = Observed.of(capture, arm, lengths=False)
-        fixed = np.arange(p + len(observed.steps)) < p
         source = space if targets_of is None else Parameters(targets_of, space.names)
         z = np.asarray(source.vector())
         z = np.concatenate([z, np.asarray(observed.start(source, z))])
         for _ in range(_ROUNDS):
-            point = rows_at(source, observed, z)
-            errors = arm_errors(point, observed)
-            whitening = _whitening(observed, point.rows, errors)
             # What is certified does not count: the fit in mm.
-            alone = whitening._replace(certified={name: 0 * weight for name, weight in whitening.certified.items()})
-            new = Linearisation.of(observed, source, z, point, errors, alone, None).fitted(fixed)
-            step, z = np.max(np.abs(new - z), initial=0.0), np.asarray(new)
+            new = np.asarray(_linear(source, observed, z, certified=0.0).fitted(np.arange(len(z)) < p))
+            step, z = np.max(np.abs(new - z), initial=0.0), new
             if step < _FITTED:
                 break
         z = np.concatenate([np.asarray(space.vector()), z[p:]])
         for _ in range(_ROUNDS):
-            point = rows_at(space, observed, z)
-            errors = arm_errors(point, observed)
-            if max(np.abs(rows.values).max() for rows in point.rows) < _AGREES:
+            linear = _linear(space, observed, z)
+            if max(np.abs(rows.values).max() for rows in linear.point.rows) < _AGREES:
                 break
-            observed = _moved(observed, arm, point, errors)
-        u = np.array([float(length.u) for length in capture.lengths])
-        return cls(observed, space, z, point, errors, ends_of(capture), u)
+            observed = _moved(linear)
+        return cls(linear, ends_of(capture), np.array([float(length.u) for length in capture.lengths]))
 
     def eliminated(self, weigh: Noise | float | None = None) -> Eliminated:
         """In standard deviations by the noise, or by that of a tip coordinate; else in mm."""
-        whitening = _whitening(self.observed, self.point.rows, self.errors, weigh)
+        agreeing, p = self.linear, len(self.linear.space.names)
         # Poses that this arm cannot take, next to a singularity, would look like information.
-        agree = [np.abs(rows.values).max(axis=0) < _AGREES for rows in self.point.rows]
+        agree = [np.abs(rows.values).max(axis=0) < _AGREES for rows in agreeing.point.rows]
         if np.mean(np.concatenate(agree)) < _MOST:  # another arm's: what is left of it says as little
             agree = [np.ones_like(mask) for mask in agree]
-        roots = tuple(root * kept[:, None, None] for root, kept in zip(whitening.roots, agree, strict=True))
-        linear = Linearisation.of(
-            self.observed, self.space, self.z, self.point, self.errors, whitening._replace(roots=roots), None
-        )
-        influence, p = linear.influence(), len(self.space.names)
+        linear = _linear(agreeing.space, agreeing.observed, np.asarray(agreeing.z), weigh)
+        pairs = zip(linear.whitening.roots, agree, strict=True)
+        roots = tuple(root * kept[:, None, None] for root, kept in pairs if root is not None)
+        linear = Linearisation.of(*linear[:5], linear.whitening._replace(roots=roots), None)
+        influence = linear.influence()
         rows = [part.reshape(linear.height, -1).T for part in _without_components(influence)]
         count = sum(len(part) for part in rows[: len(roots)])
         rows = np.concatenate(rows)
@@ -110,58 +106,60 @@ class Agreeing(NamedTuple):
         whole = np.concatenate([np.eye(p), shared])
         followers = (-np.moveaxis(np.asarray(by_head) @ whole, -1, 0) for by_head in influence.follow)
         geometry = np.asarray(joined(shared.T, *followers)).T
-        lengths = self._lengths(influence, inverse, geometry, weigh is not None)
-        return Eliminated(rest[:count], np.concatenate([rest[count:], lengths]), geometry)
+        by_lengths = self._lengths(influence, None if weigh is None else inverse) @ geometry
+        return Eliminated(rest[:count], np.concatenate([rest[count:], by_lengths]), geometry)
 
-    def _lengths(
-        self,
-        influence: Influence,
-        inverse: Float[np.ndarray, "s k"],
-        geometry: Float[np.ndarray, "g p"],
-        measured: bool,
-    ) -> Float[np.ndarray, "l p"]:
-        """How the lengths between the positions follow; where it is ``measured``, in standard deviations of what they
+    def _lengths(self, influence: Influence, inverse: Float[np.ndarray, "s k"] | None) -> Float[np.ndarray, "l g"]:
+        """How the lengths follow the geometry; with the inverse of the shared rows, in standard deviations of what they
         are by their own uncertainty and by the poses at their ends."""
-        observed, p = self.observed, len(self.space.names)
+        observed, geometry = self.linear.observed, self.linear.z[len(self.linear.space.names) :]
         positions, pull = observed.positions, np.zeros((len(self.ends), len(geometry)))
         for row, (start, end) in zip(pull, self.ends, strict=True):
-            between = self.z[p + positions[end]] - self.z[p + positions[start]]
+            between = geometry[positions[end]] - geometry[positions[start]]
             row[positions[end]] = between / np.linalg.norm(between)
             row[positions[start]] = -row[positions[end]]
         pull = pull * observed.steps
-        if not measured or not self.ends:
-            return pull @ geometry
+        if inverse is None or not self.ends:
+            return pull
         head, components = split(pull, observed.layout.shared, observed.layout.classes)
         covariance = np.diag(np.maximum(self.u, _LEAST_U) ** 2)
         for part, inverse_of_part, follow in zip(components, influence.own, influence.follow, strict=True):
-            head = head - np.einsum("lKk,Kkh->lh", part, follow[..., p:])
+            head = head - np.einsum("lKk,Kkh->lh", part, follow[..., len(self.linear.space.names) :])
             turned = np.einsum("lKk,Kkm->lKm", part, inverse_of_part)
             covariance += turned.reshape(len(pull), -1) @ part.reshape(len(pull), -1).T
         by_shared = head @ inverse
-        covariance += by_shared @ by_shared.T
-        return np.asarray(inverse_cholesky(covariance)) @ (pull @ geometry)
+        return np.asarray(inverse_cholesky(covariance + by_shared @ by_shared.T)) @ pull
 
     @property
     def parts(self) -> list[tuple[str, np.ndarray]]:
         """The parts of the geometry with their indices, but for sockets, which follow every arm."""
-        sockets = {position_of(part.name) for part in self.observed.observations if part.kind == "socket"}
-        return [(name, self.observed.positions[name]) for name in self.observed.names if name not in sockets]
+        observed = self.linear.observed
+        sockets = {position_of(part.name) for part in observed.observations if part.kind == "socket"}
+        return [(name, observed.positions[name]) for name in observed.names if name not in sockets]
 
 
-def _whitening(
-    observed: Observed, rows: list[Any], errors: list[ArmErrors], weigh: Noise | float | None = None
-) -> Whitening:
-    """By the noise, or the standard deviation of a tip coordinate; else rows in mm, whatever the uncertainty of what
-    was measured."""
+def _linear(
+    space: Parameters,
+    observed: Observed,
+    z: Float[np.ndarray, " z"],
+    weigh: Noise | float | None = None,
+    certified: float = 1.0,
+) -> Linearisation:
+    """By the noise, or the standard deviation of a tip coordinate; else in mm, whatever the uncertainty of what was
+    measured, with ``certified`` as the weight of what is certified."""
+    point = rows_at(space, observed, z)
+    rows, errors = point.rows, arm_errors(point, observed)
     if isinstance(weigh, Noise):
         of_arm = [covariance_of_noise(error, weigh) for error in errors]
     else:
         of_arm = [covariance_of_sigma(error, np.asarray(1.0 if weigh is None else weigh)) for error in errors]
-    if weigh is not None:
-        return whitening_of(rows, observed, of_arm, np.asarray(_LEAST_U))
-    rows = [part._replace(measured=np.zeros_like(part.measured)) for part in rows]
+    if weigh is None:
+        rows = [part._replace(measured=np.zeros_like(part.measured)) for part in rows]
     whitening = whitening_of(rows, observed, of_arm, np.asarray(_LEAST_U))
-    return whitening._replace(certified={name: np.ones_like(weight) for name, weight in whitening.certified.items()})
+    if weigh is None:
+        weights = {name: np.full_like(weight, certified) for name, weight in whitening.certified.items()}
+        whitening = whitening._replace(certified=weights)
+    return Linearisation.of(observed, space, z, point, errors, whitening, None)
 
 
 def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]]:
@@ -184,10 +182,11 @@ def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]
     return eliminated
 
 
-def _moved(observed: Observed, arm: Arm, point: PointRows, errors: list[ArmErrors]) -> Observed:
+def _moved(linear: Linearisation) -> Observed:
     """With configurations one step of Gauss and Newton closer to the geometry, of all such steps the shortest."""
+    observed, arm = linear.observed, linear.space.base
     units, q = reading_units(arm.geometry), np.array(observed.q)
-    for group, rows, error in zip(observed.layout.groups, point.rows, errors, strict=True):
+    for group, rows, error in zip(observed.layout.groups, linear.point.rows, linear.errors, strict=True):
         by_units = np.moveaxis(np.asarray(error.by_readings) * units[:, None], -1, 0)
         turned = by_units.swapaxes(-1, -2)
         step = turned @ pseudo_inverse(by_units @ turned) @ np.asarray(rows.values).T[..., None]
@@ -196,3 +195,76 @@ def _moved(observed: Observed, arm: Arm, point: PointRows, errors: list[ArmError
         poses = np.arange(len(q))[group.index]
         q[poses, : len(units)] -= units * step
     return observed.moved(arm, q)
+
+
+_ZERO = 1e-9  # of what the function is elsewhere
+# Of the whole function: what is left of it beside a constant, or a straight line. A first harmonic leaves 5 % of itself
+# over 20 deg, and 0.4 % beside a straight line over 60 deg.
+_NEARLY = 0.06
+_SENTENCES = {
+    "zero": "{names}: the function is 0 in all {poses}, as the moment of gravity about a vertical axis is; leave it "
+    "out, or let other joints move.",
+    "constant": "Over the {travel} that joint {joint} moves, {names} cannot be told from its zero offset, as the "
+    "function is nearly constant: let the arm move farther, and record poses in more sockets.",
+    "line": "Over the {travel} that joint {joint} moves, {names} cannot be told apart, from its zero offset or from "
+    "other parameters, as a straight line is nearly all of them: let it move farther.",
+}
+
+
+def why_undetermined(
+    arm: Arm, q: Float[np.ndarray, "N n"], groups: Iterable[tuple[tuple[str, ...], tuple[str, ...]]]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Reasons, one sentence for each joint and cause, and the names of coefficients without one.
+
+    ``q`` are the poses of the capture, ``groups`` the names of parameters that the data do not, or hardly, tell apart,
+    direction by direction: those that the direction is mostly of, and all.
+    """
+    if arm.corrections is None:
+        return (), ()
+    terms = {term.name: term for term in arm.corrections.functions.terms if isinstance(term, Term)}
+    causes: dict[str, str] = {}
+    for chief, names in groups:
+        for name in chief:
+            if name in terms and causes.get(name, "") != "line":  # which says more than that it is nearly constant
+                causes[name] = _cause(arm, q, terms[name], names) or causes.get(name, "")
+    names_by_cause: dict[tuple[str, int], list[str]] = {}
+    for name, cause in causes.items():
+        names_by_cause.setdefault((cause, terms[name].joint), []).append(name)
+    sentences = []
+    for (cause, joint), names in names_by_cause.items():
+        travel = float(np.ptp(q[:, joint - 1]))
+        moves = f"{travel:.3g} mm" if joint in arm.prismatic else f"{np.degrees(travel):.0f} deg"
+        if cause:
+            sentences.append(
+                _SENTENCES[cause].format(
+                    names=listed(names), joint=joint, travel=moves, poses=pluralise(len(q), "pose")
+                )
+            )
+    return tuple(sentences), tuple(name for name, cause in causes.items() if not cause)
+
+
+def _cause(arm: Arm, q: Float[np.ndarray, "N n"], term: Term, names: tuple[str, ...]) -> str:
+    """A key of `_SENTENCES`; empty where the function is none of these."""
+    assert arm.corrections is not None
+    elsewhere = q + np.random.default_rng(0).uniform(-np.pi, np.pi, q.shape)
+    everywhere, here = (
+        function_values(arm.corrections.nominal, [term], poses, np.asarray(arm.gravity))[0] for poses in (elsewhere, q)
+    )
+    size = np.abs(everywhere).max()
+    if size < _ZERO or np.abs(here).max() < _ZERO * size:
+        return "zero"
+    offset = f"{'d' if term.joint in arm.prismatic else 'theta'}_{term.joint}"
+    reading, one = q[:, term.joint - 1], np.ones(len(q))
+    if offset in names and _left(here, [one]) < _NEARLY * size:
+        return "constant"
+    lines = [] if isinstance(term.kind, Gravity) else [here]
+    if term.name == f"{GearRatio().words[0]}_{term.joint}":  # the line itself, which harmonics may imitate
+        waves = {f"cos1_{term.joint}": np.cos(reading), f"sin1_{term.joint}": np.sin(reading)}
+        lines = [values for name, values in waves.items() if name in names]
+    return "line" if any(_left(line, [one, reading]) < _NEARLY * np.abs(line).max() for line in lines) else ""
+
+
+def _left(values: Float[np.ndarray, " N"], rows: list[np.ndarray]) -> float:
+    """The largest part that no combination of rows explains."""
+    basis = np.stack(rows, axis=1)
+    return float(np.abs(values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]).max())

@@ -5,8 +5,8 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.redrawn import draw_shared
+from aacmm_jax.uncertainty.covariance import SharedErrors
 from aacmm_jax.uncertainty.degrees_of_freedom import Law
-from aacmm_jax.uncertainty.shared_errors import SharedErrors
 from aacmm_jax.uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 POSES, SD, CORRELATION = (3, 2), 0.1, 2.0

@@ -112,7 +112,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
 @pytest.mark.slow
 def test_names_of_points_are_shown_as_they_are(aacmm, folder, observed_record):
     """Brackets are markup for the terminal's library."""
-    from aacmm_jax.cli import calibration_views
+    from aacmm_jax.cli import views
     from aacmm_jax.cli.display import display
     from aacmm_jax.summaries.calibration import calibration_summary
 
@@ -129,7 +129,7 @@ def test_names_of_points_are_shown_as_they_are(aacmm, folder, observed_record):
         for quantity in row["quantities"]:
             quantity["quantity"] = f"[b]{quantity['quantity']}"
     with contextlib.redirect_stdout(io.StringIO()) as written:
-        display(calibration_views.calibration(summary))
+        display(views.calibration(summary))
     assert "[b]normal" in written.getvalue()
 
 

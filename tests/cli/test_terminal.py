@@ -12,7 +12,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import aacmm_jax as aj
-from aacmm_jax.cli import _FAMILIES, calibration_views, evaluation_views
+from aacmm_jax.cli import _FAMILIES, views
 from aacmm_jax.cli.app import app, examples
 from aacmm_jax.cli.display import display, new_console, print_table
 from aacmm_jax.cli.options import length_option
@@ -106,7 +106,7 @@ def test_acceptance_at_80_columns(monkeypatch, capsys):
     parts = {"failing": 2, "parts": [None] * 7, "decision": "undecided", "where": "500 mm bar at position 3, repeat 2"}
     parts |= {"as_found_decision": "fails", "what": "error"}
     test = TEST | {"missing": ["5 lengths"], "figures": [{"symbol": name} | numbers | parts for name in NAMES]}
-    display(evaluation_views.points(POINTS | {"acceptance": [test]}))
+    display(views.points(POINTS | {"acceptance": [test]}))
     shown = capsys.readouterr().out
     assert max(map(len, shown.splitlines())) <= 80
     words = shown.split()
@@ -129,7 +129,7 @@ def test_a_decision_rule_is_named_only_where_there_is_a_limit(monkeypatch, capsy
     }
     metric |= {"decision": decision, "failing": 0, "parts": [], "where": ""}
     test = TEST | {"decision": decision, "figures": [metric]}
-    display(evaluation_views.points(POINTS | {"acceptance": [test]}))
+    display(views.points(POINTS | {"acceptance": [test]}))
     assert ("ISO 14253-1" in capsys.readouterr().out) == said
 
 
@@ -159,7 +159,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
 )
 def test_verdict(capsys, converged, plausible, said, unsaid):
     summary = {"arm": "arm", "method": "joint", "steps": 3, "poses": 9, "sockets_used": ["A"], "observations": []}
-    display([calibration_views.solve(summary | {"converged": converged, "residual_plausible": plausible})])
+    display([views.solve(summary | {"converged": converged, "residual_plausible": plausible})])
     shown = " ".join(capsys.readouterr().out.split())
     assert said in shown
     assert unsaid not in shown
@@ -183,7 +183,7 @@ def test_what_was_observed_in_words(counts, words):
 def test_base_has_its_units_and_the_digits_of_its_uncertainty(capsys):
     row = {"in": "tracker", "position_mm": [507.922315, 1.0, 2.0], "position_u_mm": [0.08, 0.0031, None]}
     row |= {"rotation_rad": [0.1, 0.0, 0.0], "rotation_u_rad": [1e-3, 1e-3, 1e-3]}
-    display([calibration_views.base([row], 2.0)])
+    display([views.base([row], 2.0)])
     shown = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["tracker", "position", "[mm]", "507.92", "1.0000", "2.0000"] in shown
     assert ["U", "0.16", "0.0062", "-"] in shown

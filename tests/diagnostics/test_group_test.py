@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aacmm_jax.diagnostics.group_test import Block, contradicting_groups
+from aacmm_jax.diagnostics.equations import Block, contradicting_groups
 
 PARAMETERS = 4
 

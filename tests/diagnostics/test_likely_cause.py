@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
-from aacmm_jax.diagnostics.likely_cause import likely_cause
+from aacmm_jax.diagnostics.recorded import likely_cause
 
 BOX = [[200, -300, 100], [600, 300, 500]]
 FRAME = (0.1, 0.2, 0.3, 1000.0, 2000.0, -300.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from aacmm_jax.diagnostics.group_test import Block
+from aacmm_jax.diagnostics.equations import Block
 from aacmm_jax.diagnostics.residual_tests import Residuals, alike, consistency, form_test, score_tests
 
 SIZES, PARAMETERS = (12, 9, 15), 4

@@ -14,8 +14,8 @@ from aacmm_jax.calibration.sampling import Repeated
 from aacmm_jax.core.distributions import student_quantile
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data.noise import ArmNoise
+from aacmm_jax.diagnostics.equations import Block
 from aacmm_jax.diagnostics.findings import amendable
-from aacmm_jax.diagnostics.group_test import Block
 from aacmm_jax.diagnostics.random_effects import Effects, one_variance
 from aacmm_jax.diagnostics.residual_tests import LEVEL, Residuals
 from aacmm_jax.diagnostics.shared_errors import _USUAL, missing_functions

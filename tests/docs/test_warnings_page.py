@@ -14,11 +14,11 @@ PACKAGE = ROOT / "aacmm_jax"
 PAGE = (ROOT / "docs" / "warnings.md").read_text(encoding="utf-8")
 # Where warnings are worded: of a module all functions, or those that are named.
 SOURCES: dict[str, tuple[str, ...]] = {
-    "diagnostics/likely_cause.py": ("likely_cause",),
+    "diagnostics/recorded.py": ("likely_cause",),
     "summaries/arm_survey.py": ("arm_survey",),
     "summaries/compared_models.py": ("_warnings",),
     "summaries/correction.py": ("correction_summary",),
-    "cli/compare_commands.py": ("_compared",),
+    "cli/calibration_commands.py": ("_compared",),
     "drift/comparison.py": ("_warnings",),
     "data/capture_data.py": ("sentences",),
     "uncertainty/identifiability.py": ("sentences", "by_more_sockets"),

@@ -7,11 +7,11 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.certificate.measurement_results import _in_d_si
-from aacmm_jax.cli import calibration_views
+from aacmm_jax.cli import views
 from aacmm_jax.cli.display import display
 from aacmm_jax.diagnostics.model_errors import model_tests
 from aacmm_jax.diagnostics.shared_errors import missing_functions
-from aacmm_jax.files.joint_options import prior_of_text, with_model
+from aacmm_jax.files.arm_tables import prior_of_text, with_model
 from aacmm_jax.kinematics import corrections as kinds
 from aacmm_jax.kinematics import default_prior, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
@@ -127,7 +127,7 @@ def test_models_with_it_are_compared(paper_arm, captured):
 
 def test_the_arm_is_shown_with_it(capsys):
     specification = with_model(aj.files.load_specification("cheng2018-simulation"), "dh,bow")
-    display(calibration_views.arm(arm_summary(specification)))
+    display(views.arm(arm_summary(specification)))
     assert "6 coefficients, bows of scales (bow_1, bow_2" in " ".join(capsys.readouterr().out.split())
 
 

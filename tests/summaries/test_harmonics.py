@@ -7,7 +7,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration.record import function_of_joint
-from aacmm_jax.cli import calibration_views
+from aacmm_jax.cli import views
 from aacmm_jax.cli.display import display
 from aacmm_jax.report.calibration import calibration_report
 from aacmm_jax.summaries.calibration import calibration_summary
@@ -78,7 +78,7 @@ def test_the_report_shows_functions_and_folds_coefficients(record):
 
 @pytest.mark.slow
 def test_the_terminal_prints_a_row_a_joint(record, capsys):
-    display(calibration_views.calibration(calibration_summary(record)))
+    display(views.calibration(calibration_summary(record)))
     shown = capsys.readouterr().out
     assert "sin7_2 " not in shown
     assert "1 to 31" in shown

@@ -5,7 +5,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.kinematics import with_corrections
-from aacmm_jax.uncertainty.correction_limits import why_undetermined
+from aacmm_jax.uncertainty.observed_identifiability import why_undetermined
 
 RANDOM = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 6))
 STILL = RANDOM * np.array([1, 0, 1, 1, 1, 1])  # joint 2 stays at 0
