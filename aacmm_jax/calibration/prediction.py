@@ -18,17 +18,17 @@ from jaxtyping import Float
 from ..core.distributions import chance
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import common_labels
-from ..data.capture import Capture, visits_of
+from ..data.capture import Capture
 from ..data.observations.held import position_of
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .evaluation import POSITION_ROWS, fit_geometry
+from .redrawn import variances_in_places
 from .task import without_lengths
 
 LEVEL = 0.01  # probability below which errors beyond their prediction are not put down to chance
@@ -249,7 +249,7 @@ def _of_lengths(
     u = np.array([float(length.u) for length in capture.lengths])
     measured, by_geometry = observed.distances(np.asarray(linear.z)[p:], ends_of(capture))
     places = np.zeros((count, count))
-    for name, variance in zip(capture.names, _variances_in_places(uncertainty.shared, capture), strict=True):
+    for name, variance in zip(capture.names, variances_in_places(uncertainty.shared, capture), strict=True):
         if variance:
             by_place = by_geometry[:, observed.positions[position_of(name)]]
             places += variance * by_place @ by_place.T
@@ -268,25 +268,6 @@ def _of_lengths(
     if PLACES in (names := () if uncertainty.components is None else uncertainty.components.names):
         others[:, names.index(PLACES)] += np.diagonal(places)
     return error, covariance, np.column_stack([np.diagonal(covariance) - others.sum(axis=1), others]), law
-
-
-def _variances_in_places(shared: SharedErrors | None, capture: Capture) -> Float[np.ndarray, " s"]:
-    """What errors that poses share add to the variance of a coordinate of each socket's mean, beside the mean of so
-    many independent errors, mm^2."""
-    if shared is None:
-        return np.zeros(len(capture.sizes))
-    within, between = float(shared.sd_of(VISITS, SUCCESSIVE)) ** 2, float(shared.sd_of(PLACES)) ** 2
-    visits, length = visits_of(capture), float(shared.correlation_length)
-
-    variances = []
-    for name, size in zip(capture.names, capture.sizes, strict=True):
-        part_of_mean, order = 1.0, np.arange(size)
-        if name in visits:
-            part_of_mean = float(np.sum((np.unique(visits[name], return_counts=True)[1] / size) ** 2))
-        elif np.isfinite(length):
-            part_of_mean = float(np.mean(np.exp(-np.abs(order[:, None] - order) / length)))
-        variances.append(between + within * (part_of_mean - 1 / size))
-    return np.array(variances)
 
 
 class LeftOut(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture, ReferenceLength
+from ..data.capture import Capture, ReferenceLength, visits_of
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
 from ..kinematics.arm import Arm, by_joint
@@ -110,6 +110,25 @@ def covariance_of_lengths(
         columns = np.einsum("lc,lN,Nck->lk", directions, between, tips)
         covariance = covariance + columns @ np.asarray(shared.moments) @ columns.T
     return covariance
+
+
+def variances_in_places(shared: SharedErrors | None, capture: Capture) -> Float[np.ndarray, " s"]:
+    """What errors that poses share add to the variance of a coordinate of each socket's mean, beside the mean of so
+    many independent errors, mm^2."""
+    if shared is None:
+        return np.zeros(len(capture.sizes))
+    within, between = float(shared.sd_of(VISITS, SUCCESSIVE)) ** 2, float(shared.sd_of(PLACES)) ** 2
+    visits, length = visits_of(capture), float(shared.correlation_length)
+
+    variances = []
+    for name, size in zip(capture.names, capture.sizes, strict=True):
+        part_of_mean, order = 1.0, np.arange(size)
+        if name in visits:
+            part_of_mean = float(np.sum((np.unique(visits[name], return_counts=True)[1] / size) ** 2))
+        elif np.isfinite(length):
+            part_of_mean = float(np.mean(np.exp(-np.abs(order[:, None] - order) / length)))
+        variances.append(between + within * (part_of_mean - 1 / size))
+    return np.array(variances)
 
 
 def _by_name(capture: Capture) -> tuple[list[str], Float[np.ndarray, "k M"]]:

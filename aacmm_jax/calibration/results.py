@@ -250,8 +250,7 @@ class Calibration(AbstractSingleResult):
         d_3 = 750.579 mm, u = 0.010 mm
     """
 
-    length_before: Float[AnyArray, " l"]  # measured reference lengths, mm: at the start
-    length_after: Float[AnyArray, " l"]  # by the calibrated arm
+    length_after: Float[AnyArray, " l"]  # the reference lengths as the calibrated arm measures them, mm
     stage1: Identification
     method: str = eqx.field(static=True)  # "two-stage" or "joint", as it was asked for or chosen
     # Whether the result is stage 1 divided by k; not where a bound or a fixed length stood against that, and everything

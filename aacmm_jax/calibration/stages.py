@@ -315,17 +315,15 @@ def jointly(task: Task, capture: Capture, stage1: Identified | None, method: str
 def _calibration(
     task: Task, capture: Capture, stage1: Identification, result: Identification, method: str, divided: bool
 ) -> Calibration:
-    """With the fields of the last stage's result, and the measured lengths before and after."""
-    observed, ends = task.observed, ends_of(capture)
-    start = observed.start(task.space, task.start[task.free])
-    geometry = namespace(start).concatenate([result.observed.geometry[name] for name in observed.blocks])
+    """With the fields of the last stage's result, and the lengths as its arm measures them."""
+    xp, observed = namespace(result.parameters), task.observed
+    geometry = xp.concatenate([result.observed.geometry[name] for name in observed.blocks])
     names = ("arm", "parameters", "de", "deltam", "active", "steps", "result", "parameter_covariance")
     return Calibration(
         **{name: getattr(result, name) for name in (*names, "before", "after", "observed")},
         scale=stage1.scale,
-        length_before=observed.distances(start, ends)[0],
-        length_after=observed.distances(geometry, ends)[0],
+        length_after=observed.distances(geometry, ends_of(capture))[0],
         stage1=stage1,
         method=method,
-        divided=namespace(result.parameters).asarray(divided),
+        divided=xp.asarray(divided),
     )

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +19,11 @@ from . import schema
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Within, records_within, rows_in, rows_table, table_of, tables_within, values_in
-from .sense import read_checked
+from .schema import read_checked
 
 # Records within the record that are a table each.
 _RECORDS = {
+    "sampled": Within("monte_carlo", dict, schema.SAMPLED),
     "others": Within("other_poses", OtherPoses, schema.OTHER_POSES),
     "prior": Within("prior", PriorMetrics, schema.PRIOR),
     "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
@@ -30,38 +31,6 @@ _RECORDS = {
     "removed": Within("removed", Removed, schema.REMOVED, "removed_group"),
     "noisy_encoders": Within("noisy_encoders", NoisyEncoder, schema.NOISY_ENCODERS, "noisy_encoder"),
 }
-
-
-class _Agreement(NamedTuple):
-    """One observation of `ObservedMetrics`."""
-
-    name: str
-    kind: str
-    rms_before: float
-    rms_after: float
-    reduced_chi: float
-    weights: np.ndarray
-
-
-class _GeometryNumber(NamedTuple):
-    """One number of the geometry that was found."""
-
-    part: str
-    unit: str
-    value: float
-    covariance: np.ndarray  # with the numbers of its part
-
-
-class _Sampled(NamedTuple):
-    """Columns of a Monte Carlo simulation."""
-
-    quantity: np.ndarray
-    estimate: np.ndarray
-    u: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    linear_u: np.ndarray
-    agrees: np.ndarray
 
 
 def save_calibration(
@@ -93,8 +62,6 @@ def save_calibration(
     tables["sockets"] = _socket_table(record.recording.capture, evaluations)
     if record.validation is not None:
         tables["cross_validation"] = rows_table("group", record.validation.groups, schema.LEFT_OUT)
-    if record.sampled is not None:
-        tables["monte_carlo"] = table_of(_Sampled(**record.sampled), schema.SAMPLED)
     tables |= _observed_tables(record.observed, Observed.of(record.recording.capture, None).blocks)
     tables |= tables_within(record, _RECORDS)
     write_tables(path, "calibration", tables, recording_attributes(record.recording), summary=summary)
@@ -121,14 +88,12 @@ def load_calibration(path: str | os.PathLike) -> CalibrationRecord:
     with undamaged(path):
         stored = read_checked(path, ("calibration",))
         tables, recording = stored.tables, recording_of(path, stored)
-        sampled, groups = tables.get("monte_carlo"), tables.get("cross_validation")
-        table = tables["parameters"]
+        groups, table = tables.get("cross_validation"), tables["parameters"]
         record = CalibrationRecord(
             recording=recording,
             stage1=specification_of(path, stored, "stage1_arm"),
             calibrated=specification_of(path, stored, "calibrated_arm"),
             observed=_observed_of(path, stored, recording.capture),
-            sampled=None if sampled is None else {name: sampled[name] for name in schema.SAMPLED},
             validation=None if groups is None else CrossValidation(rows_in(LeftOut, schema.LEFT_OUT, "group", groups)),
             **records_within(stored.tables, _RECORDS),
             **values_in(CalibrationRecord, schema.CALIBRATION, table, table.attributes),
@@ -166,13 +131,15 @@ def _socket_table(capture: Capture, evaluations: Mapping[str, Evaluation]) -> Ta
 
 
 def _observed_tables(observed: ObservedMetrics, units: Mapping[str, tuple[str, ...]]) -> dict[str, Table]:
-    columns_of_all = (observed.names, observed.kinds, observed.rms_before, observed.rms_after, observed.reduced_chi)
-    table = rows_table("observation", map(_Agreement, *columns_of_all, observed.weights), schema.OBSERVED)
+    metrics = observed.rms_before, observed.rms_after, observed.reduced_chi
+    rows = zip(observed.names, observed.kinds, *metrics, observed.weights, strict=True)
+    agreements = [dict(zip(schema.OBSERVED, row, strict=True)) for row in rows]
+    table = rows_table("observation", agreements, schema.OBSERVED)
     attributes = {"sigma_mm": float(observed.sigma), "reduced_chi_of_all": float(observed.reduced_chi_of_all)}
     numbers = [
-        _GeometryNumber(name, units[name][i], float(value), np.asarray(observed.geometry_covariance[name])[i])
+        {"part": name, "unit": unit, "value": float(value), "covariance": np.asarray(row)}
         for name, values in observed.geometry.items()
-        for i, value in enumerate(values)
+        for unit, value, row in zip(units[name], values, observed.geometry_covariance[name], strict=True)
     ]
     geometry = rows_table("number", numbers, schema.GEOMETRY)
     return {"observed": table._replace(attributes=attributes), "geometry": geometry}
@@ -182,16 +149,17 @@ def _observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> O
     """How sockets and other observations of a file agree with its arm."""
     table: StoredTable = stored.tables["observed"]
     geometry = stored.tables["geometry"]
-    rows = rows_in(_Agreement, schema.OBSERVED, "observation", table)
-    numbers = rows_in(_GeometryNumber, schema.GEOMETRY, "number", geometry)
-    parts = {name: [number for number in numbers if number.part == name] for name in dict.fromkeys(geometry["part"])}
+    rows = rows_in(dict, schema.OBSERVED, "observation", table)
+    numbers = rows_in(dict, schema.GEOMETRY, "number", geometry)
+    names = dict.fromkeys(geometry["part"])
+    parts = {name: [number for number in numbers if number["part"] == name] for name in names}
     expected = (*capture.names, *(observation.name for observation in capture.observations))
     sizes = {name: len(units) for name, units in Observed.of(capture, None).blocks.items()}
-    square = all(len(number.covariance) == len(part) for part in parts.values() for number in part)
+    square = all(len(number["covariance"]) == len(part) for part in parts.values() for number in part)
     check_sense(
         path,
         {
-            "its results are of other observations": tuple(row.name for row in rows) != expected,
+            "its results are of other observations": tuple(row["name"] for row in rows) != expected,
             "its geometry is that of other observations": {name: len(part) for name, part in parts.items()} != sizes,
             "the covariance of its geometry has another size": not square,
             "a weight is above 1": np.any(table["weights"] > 1),
@@ -199,13 +167,13 @@ def _observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> O
     )
     return ObservedMetrics(
         names=expected,
-        kinds=tuple(row.kind for row in rows),
+        kinds=tuple(row["kind"] for row in rows),
         rms_before=table["rms_before"],
         rms_after=table["rms_after"],
         reduced_chi=table["reduced_chi"],
         reduced_chi_of_all=np.asarray(table.attributes["reduced_chi_of_all"]),
         sigma=np.asarray(table.attributes["sigma_mm"]),
-        geometry={name: np.array([number.value for number in part]) for name, part in parts.items()},
-        geometry_covariance={name: np.array([number.covariance for number in part]) for name, part in parts.items()},
-        weights=tuple(row.weights for row in rows),
+        geometry={name: np.array([number["value"] for number in part]) for name, part in parts.items()},
+        geometry_covariance={name: np.array([number["covariance"] for number in part]) for name, part in parts.items()},
+        weights=tuple(row["weights"] for row in rows),
     )

@@ -1,9 +1,9 @@
 """Records as tables: what a record holds is declared once, and written, read and checked by that.
 
-A record is a NamedTuple or a module of Equinox. Its `Field`s without dimensions are attributes of its table, the others
-arrays. Many records of one kind are the rows of a table; what differs in number from row to row (the sockets of a
-group) is stored one after the other, with the number of the row that each is of, as the conventions CF 1.11 (section
-9.3.4, indexed ragged arrays) have it.
+A record is a NamedTuple, a module of Equinox or a dictionary. Its `Field`s without dimensions are attributes of its
+table, the others arrays. Many records of one kind are the rows of a table; what differs in number from row to row (the
+sockets of a group) is stored one after the other, with the number of the row that each is of, as the conventions CF
+1.11 (section 9.3.4, indexed ragged arrays) have it.
 """
 
 import json
@@ -16,6 +16,7 @@ import numpy as np
 from .hdf5 import Entries, StoredTable, Table, Variable, check_sense
 
 Content = Literal["number", "count", "truth", "text", "json"]
+_TYPES = {"number": float, "count": int, "truth": bool, "text": str}  # of what stands in a dictionary
 
 
 class Field(NamedTuple):
@@ -73,9 +74,13 @@ def _flat(fields: Fields, record: Any = None) -> list[tuple[str, Field, Any]]:
     """Fields, those of records within the record too, with their values where there is a record."""
     rows = []
     for name, field in fields.items():
-        value = None if record is None else getattr(record, name)
+        value = None if record is None else _value(record, name)
         rows += [(name, field, value)] if field.fields is None else _flat(field.fields, value)
     return rows
+
+
+def _value(record: Any, name: str) -> Any:
+    return record[name] if isinstance(record, dict) else getattr(record, name)
 
 
 def _array(values: Any, field: Field) -> np.ndarray:
@@ -108,7 +113,7 @@ def rows_table(dimension: str, records: Iterable[Any], fields: Fields) -> Table:
     """The table of many records: a row each, and one after the other what has a dimension of its own."""
     records, variables = list(records), {}
     for name, field in fields.items():
-        values = [getattr(record, name) for record in records]
+        values = [_value(record, name) for record in records]
         dimensions = field.dimensions or (dimension,)
         if field.dimensions:
             row = np.repeat(np.arange(len(records)), [len(value) for value in values])
@@ -184,7 +189,7 @@ def row_values(cls: type, fields: Fields, dimension: str, table: StoredTable, i:
     for name, field in fields.items():
         column = table[field.name or name]
         chosen = column[table[_index(dimension, field)] == i] if field.dimensions else column[i]
-        values[name] = restored(hints[name], chosen)
+        values[name] = restored(hints.get(name, np.ndarray if field.dimensions else _TYPES[field.content]), chosen)
     return values
 
 
