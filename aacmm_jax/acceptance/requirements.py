@@ -89,12 +89,11 @@ def _groups(
     )
 
 
-def _sphere_positions(measured: Measured, test: SphereTest, positions: int) -> str | None:
+def _sphere_positions(measured: Measured, test: SphereTest, positions: int) -> int:
     groups = [group for sphere in spheres_for(measured, test) for group in sphere.groups if len(group) >= EXACT_POINTS]
-    count = len(groups)
-    if measured.size and groups:
-        count = len(separate(np.array([fit_sphere(group).centre for group in groups]), _LEAST_APART * measured.size))
-    return None if count >= positions else str(max(count, 1))
+    if not (measured.size and groups):
+        return max(len(groups), 1)
+    return len(separate(np.array([fit_sphere(group).centre for group in groups]), _LEAST_APART * measured.size))
 
 
 def _orientations(measured: Measured) -> str | None:
@@ -164,10 +163,6 @@ def _longest(measured: Measured) -> str | None:
     return None if longest >= least else sentence
 
 
-def _fewer(needed: int, number: int) -> str | None:
-    return None if number >= needed else str(number)
-
-
 def _bars(measured: Measured, by_bar: bool = True) -> list[BarPositions]:
     """The positions of each bar, or of all together."""
     positions = bar_positions(measured)
@@ -188,9 +183,9 @@ def _places(measured: Measured, by_bar: bool) -> str | None:
 
 
 # Requirements by kind: what they say; the sentence on what is lacking; and what puts that into words (None where
-# nothing is lacking, "" where the sentence has no room for words). In both texts, {0} are these words, {1} and so on
-# the numbers that a test gives.
-_KINDS: dict[str, tuple[str, str, Callable[..., str | None]]] = {
+# nothing is lacking, "" where the sentence has no room for words), or counts what the last number is the least of. In
+# both texts, {0} is what is lacking, {1} and so on the numbers that a test gives.
+_KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     "size": (
         "a sphere of {2} to {3} mm",
         "A sphere of {2} to {3} mm is required ({0}).",
@@ -247,22 +242,22 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | None]]] = {
     "lengths": (
         "{1} different calibrated lengths",
         "{1} different lengths are required ({0} given).",
-        lambda m, needed: _fewer(needed, len(_bars(m))),
+        lambda m, needed: len(_bars(m)),
     ),
     "readings": (
         "{1} readings of each length in each position",
         "{1} readings in each position are required (a position has {0}).",
-        lambda m, needed: _fewer(needed, min(bar_positions(m).readings.tolist(), default=0)),
+        lambda m, needed: min(bar_positions(m).readings.tolist(), default=0),
     ),
     "positions": (
         "{1} positions of the bars, different by 10 degrees, or in place by 5 % of the range",
         "{1} different positions are required ({0} given).",
-        lambda m, needed: _fewer(needed, sum(bar.distinct(m.size) for bar in _bars(m))),
+        lambda m, needed: sum(bar.distinct(m.size) for bar in _bars(m)),
     ),
     "positions of each": (
         "{1} positions of every length, different by 10 degrees, or in place by 5 % of the range",
         "{1} different positions of every length are required (one has {0}).",
-        lambda m, needed: _fewer(needed, min(bar.distinct(m.size) for bar in _bars(m))),
+        lambda m, needed: min(bar.distinct(m.size) for bar in _bars(m)),
     ),
     "directions": (
         "directions of the bars in all three dimensions, 10 degrees out of any plane (RMS)",
@@ -293,7 +288,8 @@ def _need(kind: str, origin: Origin, *numbers: int | str | bool) -> Requirement:
 
     def check(measured: Measured) -> str:
         words = lacking(measured, *numbers)
-        return "" if words is None else sentence.format(words, *numbers)
+        enough = words is None or (isinstance(words, int) and words >= int(numbers[-1]))
+        return "" if enough else sentence.format(words, *numbers)
 
     return Requirement(says.format("", *numbers), *origin, check)
 

@@ -76,18 +76,9 @@ class ReferenceLength(eqx.Module):
     ) -> "ReferenceLength":
         """A length that is certified at 20 C and was measured at another temperature: value (1 + expansion (T - 20)).
 
-        Args:
-            start: Name of the socket at one end.
-            end: Name of the socket at the other end.
-            value: Calibrated length at 20 C, mm.
-            u: Standard uncertainty of ``value``, mm.
-            expansion: Coefficient of thermal expansion of the artefact, 1/K.
-            temperature: Of the artefact when it was measured, C.
-            u_expansion: Standard uncertainty of ``expansion``, 1/K.
-            u_temperature: Standard uncertainty of ``temperature``, K.
-
-        Raises:
-            InputError: As of a `ReferenceLength`; or the temperature is not in C, or the expansion not in 1/K.
+        ``expansion`` is the artefact's coefficient of thermal expansion, 1/K, and ``temperature`` its own when it was
+        measured, C, each with its standard uncertainty. Raises `InputError` as a `ReferenceLength` does, and where the
+        temperature is not in C, or the expansion not in 1/K.
         """
         where = f"reference length '{start}' to '{end}'"
         check_temperatures(where, np.asarray(temperature, dtype=float))

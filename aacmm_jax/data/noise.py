@@ -60,10 +60,9 @@ class Noise(eqx.Module):
         """Standard deviation of readings, scalar or ``(n,)``, arcsec."""
         return self.encoder / ARCSEC
 
-    def _given(self, encoder: AnyArray) -> list[tuple[str, AnyArray]]:
-        """The arguments by name; ``encoder`` is that of the first."""
-        given = [("encoder_arcsec", encoder), ("linear_encoder", self.linear_encoder), ("seating", self.seating)]
-        return [(what, values) for what, values in given if values is not None]
+    def _given(self) -> dict[str, AnyArray]:
+        """The arguments by name."""
+        return {what: getattr(self, what) for what in _MOST if getattr(self, what) is not None}
 
     def of_readings(self, kinds: JointKinds | None) -> Float[AnyArray, "..."]:
         """Standard deviations of the readings of an arm with such joints, scalar or ``(n,)``, rad and mm."""
@@ -83,20 +82,20 @@ class Noise(eqx.Module):
 
         Raises `InputError` where all noise is zero, some is absurdly large, or encoders and joints differ in number.
         """
-        given = self._given(self.encoder_arcsec)
-        if is_concrete(*(values for _, values in given)) and not any(np.any(np.asarray(values)) for _, values in given):
+        given = self._given()
+        if is_concrete(*given.values()) and not any(np.any(np.asarray(values)) for values in given.values()):
             raise InputError(
                 "noise is zero everywhere, so poses cannot be weighted by it; give a standard deviation, or no noise."
             )
         # Not in the constructor: residuals of a failed calibration may be as large, and its file must still be read.
-        for what, values in given:
+        for what, values in given.items():
             if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
                 raise InputError(f"{what} is over {_MOST[what]:g}, more than any arm's; is it in another unit?")
         self.check_joints(joints)
 
     def check_joints(self, joints: int) -> None:
         """Raise `InputError` where the encoders have neither one value nor one a joint."""
-        for what, values in self._given(self.encoder):
+        for what, values in self._given().items():
             if values.ndim and values.shape != (joints,):
                 raise InputError(
                     f"{what} has {values.shape[0]} values, but the arm has {joints} joints; give one number, or one a "
@@ -113,10 +112,8 @@ def noise_of(encoder: Float[AnyArray, "..."], seating: Float[AnyArray, ""]) -> N
 
 
 def at_tip(noise: Noise, arm: Arm, distance: float) -> tuple[float, float, float]:
-    """What encoders of revolute joints at a distance (mm), those of prismatic joints, and the seat move the tip by; mm.
-
-    Standard deviations, each the root mean square of its joints; 0 without such joints.
-    """
+    """Standard deviations, mm, by which encoders of revolute joints at a distance (mm), those of prismatic joints, and
+    the seat move the tip: each the root mean square of its joints, 0 without such joints."""
     kinds = arm.geometry.kinds
     u = np.broadcast_to(np.asarray(noise.of_readings(kinds)), (arm.joints,))
     linear = np.zeros(arm.joints, dtype=bool) if kinds is None else kinds.mask()

@@ -139,8 +139,7 @@ class _Recorder(NamedTuple):
     def read(self, q: Float[np.ndarray, "m columns"], key: Array) -> Float[np.ndarray, "m columns"]:
         """What the encoders show; a thermometer is exact."""
         angles, temperature = q[:, : self.arm.joints], q[:, self.arm.joints :]
-        errors = self.noise.of_readings(self.arm.geometry.kinds) * random_numbers("normal", key, angles.shape)
-        shown = np.asarray(angles + errors)
+        shown = angles + self.noise.of_readings(self.arm.geometry.kinds) * random_numbers("normal", key, angles.shape)
         step = np.where(self.step > 0, self.step, 1.0)
         return np.concatenate([np.where(self.step > 0, np.round(shown / step) * step, shown), temperature], axis=1)
 

@@ -21,7 +21,7 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import listed
 from ..core.units import DEG, INCH, LENGTH_UNITS, M, length_unit
 from ..data.capture import Capture
-from ..data.observations.measured import AbstractMeasured
+from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm, is_single, joint_limits
 from ..kinematics.jacobian import tip_position
 from ..kinematics.workspace import total_link_length
@@ -176,7 +176,7 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     """
     if any(size > 1 for size in capture.sizes):
         return check_readings(arm, np.asarray(capture.q)[:, : arm.joints], sockets=capture.owner)
-    measured = [observation for observation in capture.observations if isinstance(observation, AbstractMeasured)]
+    measured = [observation for observation in capture.observations if isinstance(observation, MeasuredPoints)]
     if not measured:
         raise InputError(
             "readings are checked against poses in a socket, at least two, or measured points; the capture has neither."

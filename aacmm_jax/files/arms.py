@@ -19,9 +19,9 @@ from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
 from ..uncertainty.target_parameters import determined_parameters
 from .arm_tables import GEOMETRY, ArmFile, NoiseTable
+from .controllers import read_ur_kinematics
 from .outputs import as_path, storable, write_text
 from .toml import read_toml
-from .ur_kinematics import read_ur_kinematics
 from .urdf import read_urdf
 
 _SHIPPED = Path(__file__).with_name("shipped_arms")

@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from ..core.errors import InputError, nearest
 from ..core.rotations import roll_pitch_yaw_matrix
-from ..core.text import is_control, number, quoted
+from ..core.text import is_control, is_number, number, quoted
 from ..kinematics.axes_to_dh import Transform
 
 _MOST_CHARACTERS = 20_000_000  # the largest robots of public collections have a twentieth of it
@@ -99,17 +99,14 @@ class Element(NamedTuple):
         text = self.attributes.get(name)
         if text is None:
             return np.array(default)
-        stated = f"{self.where} has {name} = {quoted(text)}"
+        stated, count = f"{self.where} has {name} = {quoted(text)}", len(default)
         if "${" in text or "$(" in text:
             raise InputError(f"{stated}, {_EXPAND}")
-        try:
-            values = np.array([number(part) for part in text.split()])
-        except ValueError:
-            values = np.array([])
-        if len(default) == 3 and np.any(np.abs(values) >= _LARGEST):  # limits may be as large as one likes
+        values = np.array([number(part) for part in text.split()] if all(map(is_number, text.split())) else [])
+        if count == 3 and np.any(np.abs(values) >= _LARGEST):  # limits may be as large as one likes
             raise InputError(f"{stated}; it must be below {_LARGEST:g}.")
-        if len(values) != len(default) or not np.all(np.isfinite(values)):
-            raise InputError(f"{stated}; it must be {'a number' if len(default) == 1 else f'{len(default)} numbers'}.")
+        if len(values) != count or not np.all(np.isfinite(values)):
+            raise InputError(f"{stated}; it must be {'a number' if count == 1 else f'{count} numbers'}.")
         return values
 
     def origin(self) -> Transform:

@@ -12,6 +12,7 @@ A socket is the case in which B is minus the identity: D is the number m of its 
 residuals, and the sum over its poses of squared distances from their centroid is what stage 1 minimises.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,8 +77,7 @@ def sums_by_component(
 
 
 def _slices(sizes: tuple[int, ...]) -> list[slice]:
-    ends = np.cumsum(sizes).tolist()
-    return [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    return [slice(first, end) for first, end in itertools.pairwise(np.cumsum([0, *sizes]).tolist())]
 
 
 def followed(
@@ -92,8 +92,7 @@ def followed(
     owner = owner_of(sizes)
     total: Any = 0.0
     for i in range(k):
-        of_number = xp.moveaxis(matrices[:, i], 0, -1)  # (h, K)
-        total = total + (of_number.repeat(sizes, -1) if xp is np else of_number[:, owner])[:, None] * by_own[i][None]
+        total = total + xp.moveaxis(matrices[owner, i], 0, -1)[:, None] * by_own[i][None]
     return total
 
 
@@ -114,15 +113,14 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
 def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
     """Rows whose products have the curvature of a robust loss (`Loss.along`) and the gradient of these."""
     xp, (_, direction) = namespace(block.white), length_and_direction(block.white)
-
-    def changed(by: Float[AnyArray, "k r m"] | None) -> Float[AnyArray, "k r m"] | None:
-        if by is None:
-            return None
-        # (1 - (1 - along) u u^T) A, with the direction u of the residual.
-        less = (1 - along)[None] * xp.sum(direction[None] * by, axis=1)
-        return by - less[:, None] * direction[None]
-
-    return RowBlock(block.white / along[None], changed(block.by_head), changed(block.by_own), block.of, block.sizes)
+    changed = []
+    for by in (block.by_head, block.by_own):
+        if by is not None:
+            # (1 - (1 - along) u u^T) A, with the direction u of the residual.
+            by = by - ((1 - along)[None] * xp.sum(direction[None] * by, axis=1))[:, None] * direction[None]
+        changed.append(by)
+    by_head, by_own = changed
+    return RowBlock(block.white / along[None], by_head, by_own, block.of, block.sizes)
 
 
 def cost_and_weights(
@@ -144,17 +142,15 @@ def cost_and_weights(
 def arrow_of(
     blocks: list[RowBlock], classes: tuple[tuple[int, int], ...], height: int, prior: PriorRows | None
 ) -> tuple[Arrow, list[AnyArray]]:
-    """The information of rows with their weights; and of each class of components, its part of the gradient.
-
-    ``height`` is the number of unknowns of the head.
-    """
+    """The information of rows with their weights, and of each class of components its part of the gradient; ``height``
+    is the number of unknowns of the head."""
     xp = namespace([block.white for block in blocks])
     heads = [flat(block.by_head) for block in blocks if block.by_head is not None]
     whole = heads[0] if len(heads) == 1 else xp.concatenate(heads, axis=1)
     head = whole @ whole.T  # A A^T, over the rows of all blocks
     if prior is not None:
-        own = np.arange(prior.weight.shape[0])
-        head = added_to(head, (own, own), prior.weight**2)
+        diagonal = np.arange(prior.weight.shape[0])
+        head = added_to(head, (diagonal, diagonal), prior.weight**2)
     crossed, own, slopes = [], [], []
     for number, (count, size) in enumerate(classes):
         # C = B A^T, D = B B^T and the gradient B w, summed over the blocks with components of this class.
@@ -251,8 +247,7 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
 
 
 def observed_rows(z: Float[AnyArray, " z"], args: Args) -> tuple[AnyArray, ...]:
-    """Whitened residuals of observations, lengths, certified values and the prior; half their sum of squares is what
-    is minimised."""
+    """Whitened residuals of observations, lengths, certified values and the prior: half their squares are minimised."""
     rows, prior = [block.white for block in _blocks(z, args)], args.whitening.prior
     if args.loss is not None:
         poses = slice(0, len(args.observed.layout.groups))
@@ -307,11 +302,9 @@ def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArr
     """Information and gradient of the head, with the components eliminated."""
     xp = namespace(arrow, gradient)
     # A A^T - C^T D^-1 C, and the slope of the cost where the components follow the head.
-    slope, parts = arrow.split(gradient)
-    head = arrow.head
+    head, (slope, parts) = arrow.head, arrow.split(gradient)
     for crossed, own, part in zip(arrow.crossed, arrow.own, parts, strict=True):
-        inverse = pseudo_inverse(own)
-        follow = inverse @ crossed
+        follow = pseudo_inverse(own) @ crossed
         head = head - xp.einsum("Kkh,Kkg->hg", crossed, follow)
         slope = slope - xp.einsum("Kkh,Kk->h", follow, part)
     return head, slope

@@ -130,8 +130,7 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
         for number, (observation, parts, at) in enumerate(zip(observations, used, first, strict=True))
     ]
     classes = _by(lambda member: member.kind, [member for member in problem if member.private])
-    # Classes with linear rows come last.
-    classes = sorted(classes, key=lambda members: members[0].is_linear)
+    classes = sorted(classes, key=lambda members: members[0].is_linear)  # those with linear rows come last
     names, shapes, places, of = [name for name in units if name not in private], [], {}, {}
     shared = sum(len(units[name]) for name in names)
     for number, some in enumerate(classes):

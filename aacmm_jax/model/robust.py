@@ -102,8 +102,8 @@ class Loss(eqx.Module):
     def cost_and_weight(self, white: Float[AnyArray, "r m"]) -> tuple[Float[AnyArray, " m"], Float[AnyArray, " m"]]:
         """Cost and weight of every pose."""
         xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
-        shape, s = _SHAPES[self.name], xp.sum(white**2, axis=0) / c2
-        return 0.5 * c2 * shape.rho(xp, s), shape.weight(xp, s)
+        s = xp.sum(white**2, axis=0) / c2
+        return 0.5 * c2 * _SHAPES[self.name].rho(xp, s), _SHAPES[self.name].weight(xp, s)
 
     def along(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, " m"]:
         """Square roots of the ratios q of two curvatures of the cost of every pose: along its residual, and across it.
@@ -117,9 +117,8 @@ class Loss(eqx.Module):
 
     def transformed(self, white: Float[AnyArray, "r m"]) -> Float[AnyArray, "r m"]:
         """Residuals whose squares are twice the cost."""
-        xp, c2 = namespace(white), tuning_constant(self.name, white.shape[0]) ** 2
-        square = xp.sum(white**2, axis=0)
-        small = square < 1e-12 * c2
-        cost, _ = self.cost_and_weight(white)
-        factor = xp.sqrt(2 * xp.where(small, 0.5, cost) / xp.where(small, 1.0, square))
+        xp, square = namespace(white), namespace(white).sum(white**2, axis=0)
+        small = square < 1e-12 * tuning_constant(self.name, white.shape[0]) ** 2
+        cost = xp.where(small, 0.5, self.cost_and_weight(white)[0])
+        factor = xp.sqrt(2 * cost / xp.where(small, 1.0, square))
         return xp.where(small, 1.0, factor)[None] * white

@@ -20,6 +20,9 @@ _LARGEST_RADIUS = 30.0  # root mean square distances from the middle
 _TRIED = 16  # directions that are refined
 _FEW_STEPS, _STEPS = 5, 8  # of their refinement, and of the best one's
 
+# Distances of tips from a geometry, mm, and their derivatives by the tips, unit vectors, and by the geometry's numbers.
+Distances = tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "k m"]]
+
 
 def each_pose(matrix: Float[AnyArray, "r c"], poses: int) -> Float[AnyArray, "r c m"]:
     """The same matrix for every pose."""
@@ -47,7 +50,7 @@ def rows_of_points(
 
 
 class Placed(NamedTuple):
-    """Points of a frame as they are in the frame around it; p is 1 for one frame, m for a frame of each point."""
+    """Points of a frame in the frame around it; p is 1 for one frame, m for a frame of each point."""
 
     points: Float[AnyArray, "3 m"]  # mm
     by_frame: Float[AnyArray, "6 3 m"]  # derivatives by the six numbers of the frame
@@ -55,7 +58,7 @@ class Placed(NamedTuple):
 
 
 def placed(frame: Float[AnyArray, "6 ..."], coordinates: Float[AnyArray, "3 m"]) -> Placed:
-    """Points (mm) of a frame, ``(6,)`` or ``(6, 1)``, or of a frame each ``(6, m)``, in the frame around it."""
+    """Points (mm) of one frame, or of a frame each ``(6, m)``, in the frame around it."""
     xp, columns, m = namespace(frame, coordinates), frame.reshape(6, -1), coordinates.shape[1]
     rotation, axes = rotation_and_derivative(columns[:3])
     turned = products_by_column(rotation, coordinates)
@@ -71,10 +74,8 @@ def seen_from(frame: Float[AnyArray, " 6"], points: Float[AnyArray, "m 3"]) -> F
     return (points - frame[3:]) @ rotation_matrix(frame[:3])
 
 
-def turned_covariances(
-    rotation: Float[AnyArray, "3 3 p"], covariance: Float[AnyArray, "m 3 3"]
-) -> Float[AnyArray, "m 3 3"]:
-    """Covariances R C R^T of what is turned, by one rotation (p = 1) or by one each (p = m)."""
+def turned_covariances(rotation: Float[AnyArray, "3 3 p"], covariance: Float[AnyArray, "m 3 3"]) -> AnyArray:
+    """Covariances R C R^T ``(m, 3, 3)`` of what is turned, by one rotation (p = 1) or by one each (p = m)."""
     # As one product with the nine numbers of a covariance: for one rotation that takes an eighth of the time of two.
     both = (rotation[:, None, :, None] * rotation[None, :, None, :]).reshape(9, 9, -1)
     return products_by_column(both, covariance.reshape(-1, 9).T).T.reshape(-1, 3, 3)
@@ -105,33 +106,25 @@ def rotation_logarithm(
     return w, identity - skew / 2 + c[None, None] * twice, identity + skew / 2 + c[None, None] * twice
 
 
-def heights(
-    tips: Float[AnyArray, "3 m"], plane: Float[AnyArray, "3 p"]
-) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "3 m"]]:
-    """Heights of tips over a plane (or over one each), mm, and their derivatives by the tips, which are the unit
-    normal, and by the plane's numbers."""
+def heights(tips: Float[AnyArray, "3 m"], plane: Float[AnyArray, "3 p"]) -> Distances:
+    """Heights of tips over a plane, or over one each."""
     xp = namespace(tips, plane)
     rotation, axes = rotation_and_derivative(xp.concatenate([plane[:2], xp.zeros_like(plane[:1])]))
     normal = rotation[:, 2]
     # The normal, and its derivatives by the two components.
-    rows = xp.stack([normal, *(cross(axes[:, i], normal) for i in range(2))])
+    rows = xp.stack([normal, cross(axes[:, 0], normal), cross(axes[:, 1], normal)])
     height, *by_turn = products_by_column(rows, tips)
     return height - plane[2], xp.broadcast_to(normal, tips.shape), xp.stack([*by_turn, -xp.ones_like(height)])
 
 
-def distances_from_point(
-    tips: Float[AnyArray, "3 m"], point: Float[AnyArray, "3 p"]
-) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "3 m"]]:
-    """Distances of tips from a point (or from one each), mm, and their derivatives by tips and point."""
+def distances_from_point(tips: Float[AnyArray, "3 m"], point: Float[AnyArray, "3 p"]) -> Distances:
+    """Distances of tips from a point, or from one each."""
     distance, direction = length_and_direction(tips - point)
     return distance, direction, -direction
 
 
-def distances_from_axis(
-    tips: Float[AnyArray, "3 m"], axis: Float[AnyArray, "4 ..."]
-) -> tuple[Float[AnyArray, " m"], Float[AnyArray, "3 m"], Float[AnyArray, "4 m"]]:
-    """Distances of tips from an axis (or from one each), mm, the unit vectors from the axis to the tips, and the
-    derivatives of the distances by the axis' numbers."""
+def distances_from_axis(tips: Float[AnyArray, "3 m"], axis: Float[AnyArray, "4 ..."]) -> Distances:
+    """Distances of tips from an axis, or from one each."""
     xp, axis = namespace(tips, axis), axis.reshape(4, -1)
     rotation, axes = rotation_and_derivative(xp.concatenate([axis[:2], xp.zeros_like(axis[:1])]))
     across_axis = rotation[:, :2]
@@ -143,10 +136,8 @@ def distances_from_axis(
     return distance, direction, xp.concatenate([by_rotation, -across])
 
 
-def _about_middle(
-    points: Float[AnyArray, "3 m"],
-) -> tuple[Float[AnyArray, "3 1"], Float[AnyArray, ""], Float[AnyArray, "3 m"]]:
-    """The middle of points, their root mean square coordinate about it, and the points about it in this unit."""
+def _about_middle(points: Float[AnyArray, "3 m"]) -> tuple[AnyArray, AnyArray, Float[AnyArray, "3 m"]]:
+    """The middle of points ``(3, 1)``, their root mean square coordinate about it, and the points in this unit."""
     xp = namespace(points)
     middle = xp.mean(points, axis=1, keepdims=True)
     size = xp.sqrt(xp.mean((points - middle) ** 2)) + 1e-12
@@ -156,8 +147,8 @@ def _about_middle(
 def fitted_pivot(
     tips: Float[AnyArray, "3 m"], values: Float[AnyArray, " m"] | float, constant: bool
 ) -> tuple[Float[AnyArray, " 3"], Float[AnyArray, ""]]:
-    """The point at measured distances from tips, and the constant that is added to all of them; with the distances 0,
-    the centre and the radius of a sphere.
+    """The point at measured distances from tips, and the constant that is added to all; with the distances 0, the
+    centre and the radius of a sphere.
 
     By linear least squares: |t - p|^2 = (v + c)^2 is linear in p, in c^2 - |p|^2 and, with a ``constant``, in c.
     """
@@ -204,10 +195,8 @@ def _axis_through(turn: Float[AnyArray, " 2"], point: Float[AnyArray, " 3"]) -> 
     return xp.concatenate([turn, (rotation_matrix(xp.concatenate([turn, xp.zeros(1)])).T @ point)[:2]])
 
 
-def fitted_cylinder(
-    tips: Float[AnyArray, "3 m"], radius: Float[AnyArray, ""] | None
-) -> tuple[Float[AnyArray, " 4"], Float[AnyArray, ""]]:
-    """Axis and radius of the cylinder that points are closest to; of this radius where it is known.
+def fitted_cylinder(tips: Float[AnyArray, "3 m"], radius: Float[AnyArray, ""] | None) -> tuple[AnyArray, AnyArray]:
+    """Axis ``(4,)`` and radius of the cylinder that points are closest to; of this radius where it is known.
 
     For a given direction the best circle of the points' projections is a linear problem (|y|^2 = 2 c.y + k). Directions
     all over a hemisphere are tried, and the best of them are refined by Levenberg-Marquardt.
@@ -247,7 +236,7 @@ def _frames(centred: Float[AnyArray, "3 m"]) -> Float[AnyArray, "k 3 3"]:
     cylinder must be known to better than a step, and axes all over a hemisphere, by the golden angle."""
     xp = namespace(centred)
     _, principal = semidefinite_eigen(centred @ centred.T)
-    principal = principal / xp.sqrt(xp.sum(principal**2, axis=0) + 1e-300)[None]
+    _, principal = length_and_direction(principal)
     ordered = [principal[:, np.array(order)] for order in ((1, 2, 0), (2, 0, 1), (0, 1, 2))]
     height = (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     angle = np.pi * (3 - math.sqrt(5)) * np.arange(_DIRECTIONS)
@@ -280,9 +269,7 @@ def _refined(
     return solution, xp.sum(last[5] ** 2)
 
 
-def frame_and_offset(
-    coordinates: Float[AnyArray, "3 m"], tips: Tips, offset: Float[AnyArray, " 3"]
-) -> tuple[Float[AnyArray, " 6"], Float[AnyArray, " 3"]]:
+def frame_and_offset(coordinates: Float[AnyArray, "3 m"], tips: Tips, offset: AnyArray) -> tuple[AnyArray, AnyArray]:
     """A station's frame and the place of its target in the last frame, from points that the station measured.
 
     The tips are o + A p, with A the axes of the last frame; in the station's frame, whose rotation in the base frame is

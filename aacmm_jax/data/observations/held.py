@@ -135,8 +135,7 @@ class Artefact(AbstractObservation):
     @property
     def owner(self) -> np.ndarray:
         """Index of the point of each pose, ``(m,)``."""
-        numbers = {name: i for i, name in enumerate(self.names)}
-        return np.array([numbers[point] for point in self.point])
+        return np.array([self.names.index(point) for point in self.point])
 
     def quantities(self, part: str, values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
         if part != self.shape:
@@ -158,8 +157,7 @@ class Artefact(AbstractObservation):
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         # Where the platform's frames are unknown too, the placement carries all of it: `platform_frames` says more, by
         # all observations together.
-        frame = fitted_frame(self.coordinates[self.owner].T, tips.position)
-        parts: Parts = {self.frame: frame}
+        parts: Parts = {self.frame: fitted_frame(_coordinates(self), tips.position)}
         if self.index is not None:
             parts[self.platform] = namespace(tips, self.coordinates).zeros(6)
         if self.free:
@@ -181,7 +179,7 @@ class Artefact(AbstractObservation):
             rotation = products_by_column(outer, rotation)
         by_unknowns[self.frame] = by_frame
         if self.free:
-            chosen = xp.asarray((owner[None, :] == np.arange(len(self.names))[:, None]).astype(float))
+            chosen = xp.asarray(np.eye(len(self.names))[:, owner])
             by_point = chosen[:, None, None, :] * rotation.swapaxes(0, 1)[None]
             by_unknowns[self.shape] = by_point.reshape(-1, 3, m)
         return rows_of_points(tips, points, by_unknowns)
@@ -208,12 +206,12 @@ def platform_frames(observations: Sequence[AbstractObservation], tips: Sequence[
         return {}
     placements: dict[str, Frame] = {}
     indices: dict[str, Frame] = {}
+
+    def poses(name: str) -> int:
+        return sum(artefact.q.shape[0] for artefact, _ in waiting[name] if artefact.frame in placements)
+
     while waiting:
-        poses = {
-            name: sum(artefact.q.shape[0] for artefact, _ in held if artefact.frame in placements)
-            for name, held in waiting.items()
-        }
-        name = "" if "" in waiting else max(poses, key=lambda name: poses[name])
+        name = "" if "" in waiting else max(waiting, key=poses)
         held = waiting.pop(name)
         before = [(artefact, position) for artefact, position in held if artefact.frame in placements]
         index = np.zeros(6)

@@ -48,9 +48,20 @@ _FLAT = 1e-6  # second singular value of points on a line, of the first
 _SAME = 1e-9  # mm
 
 
-class AbstractMeasured(AbstractObservation):
-    """What an instrument measured in a frame of its own, which all observations of one station share."""
+class MeasuredPoints(AbstractObservation):
+    """Points of the tip, measured by an instrument in an unknown frame, which all observations of one station share.
 
+    Raises:
+        InputError: Shapes do not fit, a value is not finite, or a covariance is not positive.
+
+    Example:
+        >>> seen = true.position(capture.q) + np.array([1000.0, 2000.0, -300.0])
+        >>> tracker = aj.data.observations.MeasuredPoints("tracker", capture.q, seen, u=0.02)
+        >>> print(tracker.points.shape, [*tracker.unknowns])
+        (50, 3) ['frame of tracker']
+    """
+
+    kind, table, rows = "points", "points", 3
     points: Float[AnyArray, "m 3"] = declared("measured point", "mm", "pose", "axis")
     u: AnyArray | None = declared(
         "standard uncertainty of a coordinate", "mm", "pose", "axis", default=None, spread=0,
@@ -92,22 +103,6 @@ class AbstractMeasured(AbstractObservation):
                 "line."
             )
 
-
-class MeasuredPoints(AbstractMeasured):
-    """Points of the tip, measured by an instrument in a frame of its own, which is unknown.
-
-    Raises:
-        InputError: Shapes do not fit, a value is not finite, or a covariance is not positive.
-
-    Example:
-        >>> seen = true.position(capture.q) + np.array([1000.0, 2000.0, -300.0])
-        >>> tracker = aj.data.observations.MeasuredPoints("tracker", capture.q, seen, u=0.02)
-        >>> print(tracker.points.shape, [*tracker.unknowns])
-        (50, 3) ['frame of tracker']
-    """
-
-    kind, table, rows = "points", "points", 3
-
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
         if not self.target:
             return {self.frame: fitted_frame(self.points.T, tips.position)}
@@ -120,7 +115,7 @@ class MeasuredPoints(AbstractMeasured):
         return rows_of_points(tips, seen.points, {self.frame: seen.by_frame}, measured)
 
 
-class MeasuredTransforms(AbstractMeasured):
+class MeasuredTransforms(MeasuredPoints):
     """Positions and orientations of a target that is fixed to the last frame, measured by an instrument (6-D probe).
 
     Both frames are unknown: the instrument's in the base frame, and the target's in the last frame.
@@ -156,30 +151,28 @@ class MeasuredTransforms(AbstractMeasured):
         return super().completed(where)
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
-        frame, place = frame_and_offset(self.points.T, tips, offset)
+        parts = super().start(tips, offset)
         # The first pose says how the target is turned in the last frame; the fit does the rest.
-        axes = namespace(tips, self.points).stack(tips.axes, axis=1)[:, :, 0]
-        turned = axes.T @ rotation_matrix(frame[:3]) @ self.rotations[0]
-        return {self.frame: frame, offset_of(self.target): place, self.orientation: rotation_vector(turned)}
+        axes = namespace(tips).stack([axis[:, 0] for axis in tips.axes])
+        turned = axes @ rotation_matrix(parts[self.frame][:3]) @ self.rotations[0]
+        return parts | {self.orientation: rotation_vector(turned)}
 
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
-        xp, m, frame = namespace(tips, unknowns, self.points), self.q.shape[0], unknowns[self.frame]
-        place = placed(frame, self.points.T)
-        covariance = turned_covariances(place.rotation, self.covariance)
-        points = rows_of_points(tips, place.points, {self.frame: place.by_frame}, covariance)
+        xp, m, turn = namespace(tips, unknowns, self.points), self.q.shape[0], unknowns[self.frame][:3]
+        points = super().residual(tips, unknowns)
         axes = xp.stack(tips.axes)  # (i, 3, m): the axis i
         # The target's axes j as the arm has them, and as they were seen: (j, 3, m) and (3, j, m).
         target, by_target = rotation_and_derivative(unknowns[self.orientation])
         predicted = products_by_column(target.swapaxes(0, 1), axes)
-        seen = products_by_column(place.rotation, xp.moveaxis(self.rotations, 0, -1))
+        seen = products_by_column(rotation_matrix(turn), xp.moveaxis(self.rotations, 0, -1))
         angle, left, right = rotation_logarithm(products_by_column(predicted.swapaxes(0, 1), seen.swapaxes(0, 1)))
-        by_station = -products_by_column(rotation_derivative(frame[:3]).swapaxes(0, 1), right.swapaxes(0, 1))
+        by_station = -products_by_column(rotation_derivative(turn).swapaxes(0, 1), right.swapaxes(0, 1))
         inside = products_by_column(by_target.swapaxes(0, 1), axes)
         by_orientation = products_by_column(left, inside.swapaxes(0, 1)).swapaxes(0, 1)
         none, square = xp.zeros((3, 3, m)), xp.zeros((m, 3, 3))
         by_frame = xp.concatenate([by_station, none])
         angular = variances(self.u_angle, m) * xp.asarray(np.eye(3))[None]
-        measured = [xp.concatenate([covariance, square], axis=2), xp.concatenate([square, angular], axis=2)]
+        measured = [xp.concatenate([points.measured, square], axis=2), xp.concatenate([square, angular], axis=2)]
         return Rows(
             values=xp.concatenate([points.values, angle]),
             by_tip=xp.concatenate([points.by_tip, none]),

@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...core.errors import InputError
-from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
-from ...core.pytree import register
+from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known, register
 from ...core.rotations import rotation_matrix, rotation_vector
 from .declared import Declared, declared
 
@@ -109,9 +108,7 @@ class AbstractObservation(Declared):
     @abc.abstractmethod
     def residual(self, tips: Tips, unknowns: Unknowns) -> Rows:
         """The residuals at these tips and this geometry, whose numbers are columns: one for all poses, or one each.
-
-        Derivatives by unknowns are those of a pose by the numbers of its own column. A kind that is `stacked` takes
-        its `stated` numbers, too, as one for all poses or one each."""
+        A kind that is `stacked` takes its `stated` numbers, too, as one for all poses or one each."""
 
     @property
     def certified(self) -> Certified:
@@ -157,11 +154,8 @@ class AbstractObservation(Declared):
 
     @classmethod
     def stacked(cls, observations: Sequence["AbstractObservation"]) -> "AbstractObservation":
-        """The poses of observations that are `alike` as those of one, whose residual takes a column of unknowns for
-        each pose, by the names of the first observation: the unknowns of all have one order.
-
-        Only its residual means something: names, certified values and starts are those of each observation.
-        """
+        """The poses of observations that are `alike` as those of one, of which only the residual means something: it
+        takes a column of unknowns for each pose, by the names of the first observation."""
         first, fields = observations[0], {}
         for field in (*first.by_pose, *first.stated, "shift"):
             values = [getattr(observation, field) for observation in observations]
@@ -211,10 +205,9 @@ class AbstractObservation(Declared):
 
     def in_session(self, session: str, probe: str) -> "AbstractObservation":
         """The same observation in a session of several: with its name, and its own probe where there is one."""
-        names = {label: getattr(self, label) for label in ("name", *(e.name for e in self.entries if e.of_session))}
-        target = f"{session}/{self.target}" if self.target else probe
-        here = {label: f"{session}/{name}" for label, name in names.items() if name is not None}
-        return self.changed(**here, target=target)
+        labels = ("name", *(entry.name for entry in self.entries if entry.of_session))
+        here = {label: f"{session}/{getattr(self, label)}" for label in labels if getattr(self, label) is not None}
+        return self.changed(**here, target=f"{session}/{self.target}" if self.target else probe)
 
     def select(self, poses: Sequence[int] | np.ndarray) -> "AbstractObservation":
         """The same observation with some of its poses, in their order."""
@@ -229,8 +222,8 @@ class AbstractObservation(Declared):
     def places(self) -> Int[np.ndarray, " m"]:
         """A number for each pose, equal for poses with the same constraint: of one point of an artefact, of one
         plane."""
-        labels = [values for values in (getattr(self, field) for field in self.by_pose) if isinstance(values, tuple)]
-        rows = list(zip(*labels, strict=True)) if labels else [()] * self.q.shape[-2]
+        labels = [entry.name for entry in self.entries if entry.of_poses and entry.content == "text"]
+        rows = list(zip(*(getattr(self, label) for label in labels), strict=True)) or [()] * self.q.shape[-2]
         numbers = {row: place for place, row in enumerate(dict.fromkeys(rows))}
         return np.array([numbers[row] for row in rows])
 
@@ -256,30 +249,26 @@ def quantities_by_unit(units: Sequence[str], values: Float[np.ndarray, " k"]) ->
 
 
 def certified_quantities(observation: AbstractObservation) -> tuple[Quantity, ...]:
-    """What is certified of the artefact of an observation, by the entries of its kind: the values of its certificate,
-    one quantity for each row of a table such as the coordinates of points."""
+    """What is certified of the artefact of an observation: the values of its certificate, one quantity for each row of
+    a table such as the coordinates of points."""
     stored, certified = observation.stored(), []
-    for entry in observation.entries:
-        if not entry.uncertainty or entry.name not in stored:
-            continue
-        values, u = np.asarray(stored[entry.name]), float(stored.get(entry.uncertainty, 0.0))
-        if values.ndim < 2:
-            certified.append(Quantity(entry.says, np.atleast_1d(values), entry.unit, u))
-        else:
-            rows = zip(stored[entry.dimensions[0]], values, strict=True)
-            certified += [Quantity(f"{entry.says} of {name}", row, entry.unit, u) for name, row in rows]
+    for entry in (entry for entry in observation.entries if entry.uncertainty and entry.name in stored):
+        values, u = np.atleast_1d(stored[entry.name]), float(stored.get(entry.uncertainty, 0.0))
+        rows = {entry.says: values}
+        if values.ndim == 2:
+            names = [f"{entry.says} of {name}" for name in stored[entry.dimensions[0]]]
+            rows = dict(zip(names, values, strict=True))
+        certified += [Quantity(says, row, entry.unit, u) for says, row in rows.items()]
     return tuple(certified)
 
 
 def stated_quantities(observation: AbstractObservation) -> tuple[Quantity, ...]:
     """What else was stated of an observation as a whole, where it is not zero: the diameter of a stylus, an u."""
-    certified = {name for e in observation.entries if e.uncertainty for name in (e.name, e.uncertainty)}
-    values = {name: value for name, value in observation.stored().items() if name in observation.stated}
-    return tuple(
-        Quantity(entry.says, np.atleast_1d(np.asarray(values[entry.name])), entry.unit)
-        for entry in observation.entries
-        if entry.name not in certified and float(values.get(entry.name, 0.0)) != 0
-    )
+    entries, stored = observation.entries, observation.stored()
+    certified = {name for entry in entries if entry.uncertainty for name in (entry.name, entry.uncertainty)}
+    stated = {name: np.atleast_1d(stored[name]) for name in observation.stated if name in stored}
+    others = [entry for entry in entries if entry.name in stated and entry.name not in certified]
+    return tuple(Quantity(e.says, stated[e.name], e.unit) for e in others if float(stated[e.name][0]) != 0)
 
 
 def offset_of(target: str) -> str:

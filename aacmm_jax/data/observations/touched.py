@@ -66,8 +66,7 @@ class AbstractTouched(AbstractObservation):
     geometry: Any  # a part
     size: Any  # another, unless there is no ``certificate``
 
-    # Distances of tips from the geometry, mm, and their derivatives by the tips and by its numbers.
-    distances: ClassVar[Any]
+    distances: ClassVar[Any]  # of tips from the geometry, with their derivatives: a function of tips and numbers
     # The geometry closest to nearly right tips, of this size where that is known.
     closest: ClassVar[Any]
 
