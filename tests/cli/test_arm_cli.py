@@ -9,7 +9,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.diagnostics import reading_check, reading_search
-from aacmm_jax.files.pose_tables import read_poses
+from aacmm_jax.files.table_columns import read_poses
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.planning import first_capture
 from aacmm_jax.summaries import arm_survey
