@@ -234,31 +234,26 @@ def factor_words(volume: Mapping[str, Any]) -> str:
     return f"coverage factor {low:.2f}" + (f" to {high:.2f}" if f"{low:.2f}" != f"{high:.2f}" else "")
 
 
-def volume_rows(volume: Mapping[str, Any]) -> list[tuple[str, list[float | None]]]:
-    """U over the working volume: what it is of, and its median, 95th percentile and largest value, mm."""
-    length = f"{volume['length_mm']:g} mm length"
-    titles = {
-        "expanded_tip": "tip position (worst direction): from the calibration",
-        "expanded_length": f"{length}: from the calibration",
-        "expanded_length_reading": f"{length}: with the noise of both readings",
-    }
-    which = ("median", "95", "largest")
-    return [(title, [volume[f"{key}_{statistic}_mm"] for statistic in which]) for key, title in titles.items()]
-
-
-def encoders_in_words(noise: Mapping[str, Any]) -> str:
-    """The noise of the encoders of a summary: "encoders 2 arcsec, linear encoders 5 um"."""
+def noise_sentence(summary: Mapping[str, Any]) -> str:
+    """The noise that the uncertainties of a calibration rest on."""
 
     def joined(values: float | list[float], factor: float) -> str:
         return ", ".join(f"{factor * x:.3g}" for x in (values if isinstance(values, list) else [values]))
 
-    words, linear = f"encoders {joined(noise['encoder_arcsec'], 1.0)} arcsec", noise["linear_encoder_mm"]
-    return words if linear is None else f"{words}, linear encoders {joined(linear, 1e3)} um"
-
-
-def seat_in_words(summary: Mapping[str, Any]) -> str:
-    """What the noise is of that does not come from the joints: of the seat in a socket, or of the tip itself."""
-    return "seat" if summary["sockets_used"] else "each coordinate of the tip"
+    part = summary["uncertainty"]
+    linear, seating = part["linear_encoder_mm"], f"{1e3 * part['seating_mm']:.3g} um"
+    slides = "" if linear is None else f", linear encoders {joined(linear, 1e3)} um"
+    # What does not come from the joints is of the seat in a socket, or of the tip itself.
+    seat = "seat" if summary["sockets_used"] else "each coordinate of the tip"
+    noise = f"encoders {joined(part['encoder_arcsec'], 1.0)} arcsec{slides}, {seat} {seating}"
+    joints = ", ".join(str(row["joint"]) for row in part.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}" if joints else ""
+    return {
+        "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times what it predicts.",
+        "estimated": f"Noise estimated from the residuals: {noise} (only their combination is well determined).",
+        "common": f"One variance for all poses: {seating} a coordinate.",
+        "robust": "The variance of each pose is taken from its own residual (robust noise model).",
+    }[part["form"]]
 
 
 def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:
