@@ -263,18 +263,18 @@ def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, floa
     return row["difference"] / total, row["u_difference"] / total
 
 
-def lengths_sentence(found: Mapping[str, Any]) -> str:
+def lengths_sentence(row: Mapping[str, Any]) -> str:
     """What a calibration says of the lengths that it was tried on (`verdicts.checked_lengths`), in words."""
-    low, high = (f"{found[key]:.4g}" for key in ("shortest_mm", "longest_mm"))
+    low, high = (f"{row[key]:.4g}" for key in ("shortest_mm", "longest_mm"))
     size = f"{low} mm" if low == high else f"{low} to {high} mm"
     untested = f"Lengths over {high} mm are untested."
-    if found["rms_mm"] is None:
+    if row["rms_mm"] is None:
         return f"Lengths tested: none, as the only one ({size}) fixed the scale. {untested}"
-    held = f"{found['held_out']} of them" if found["held_out"] else "none"
-    predicted = "" if found["predicted_mm"] is None else f", predicted {two_digits(found['predicted_mm'])} mm"
+    held = f"{row['held_out']} of them" if row["held_out"] else "none"
+    predicted = "" if row["predicted_mm"] is None else f", predicted {two_digits(row['predicted_mm'])} mm"
     return (
-        f"Lengths tested: {found['lengths']} ({size}), {held} held out; RMS error "
-        f"{two_digits(found['rms_mm'])} mm{predicted}. {untested}"
+        f"Lengths tested: {row['lengths']} ({size}), {held} held out; RMS error "
+        f"{two_digits(row['rms_mm'])} mm{predicted}. {untested}"
     )
 
 
@@ -293,10 +293,10 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
     return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
 
 
-def tried_sentence(found: Mapping[str, Any]) -> str:
+def tried_sentence(row: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
-        f"{100 * found['tried'] / found['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
-        f"one as these are to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
+        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
+        f"one as these are to one another ({row['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
         "poses U is an extrapolation by the model."
     )
