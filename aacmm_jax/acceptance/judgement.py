@@ -68,8 +68,6 @@ def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule
         rule: A key of `RULES`.
 
     Example:
-        >>> print(aj.acceptance.decide(0.040, limit=0.050, expanded=0.010))
-        conforms
         >>> print(aj.acceptance.decide(0.048, limit=0.050, expanded=0.010))
         undecided
     """

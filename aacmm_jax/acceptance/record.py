@@ -102,12 +102,9 @@ def run(
 
     Example:
         >>> measured = aj.acceptance.measured_by(result.arm, aj.Recording(two_bars, nominal))
-        >>> for test in aj.acceptance.run(measured, limits={"SPAT": 0.1}):
-        ...     print(test.called, [(metric.name, metric.decision) for metric in test.metrics])
-        based on JJF 1408-2013 [('Deltam', None), ('Length', None), ('Length_Range', None), ('Length_2RMS', None)]
+        >>> test = aj.acceptance.run(measured, limits={"SPAT": 0.1})[1]
+        >>> print(test.called, [(metric.name, metric.decision) for metric in test.metrics])
         based on ASME B89.4.22-2004 [('SPAT', 'conforms'), ('SPAT_2s', None)]
-        based on ASME B89.4.22-2004 [('Volumetric', None), ('Volumetric_Range', None), ('Volumetric_2RMS', None)]
-        based on ISO 10360-12:2016 [('E_Uni', None)]
     """
     measured, influences, given = _checked(measured), checked_influences(influences), checked_limits(limits or {})
     influences = influences._replace(u=math.hypot(influences.u, u_test))
@@ -179,12 +176,8 @@ class EvaluationRecord(NamedTuple):
 
     Example:
         >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal), standards=["asme"])
-        >>> print(evaluation.calibrated.name)
-        Cheng 2018, simulated arm, calibrated
-        >>> for which, tests in evaluation.acceptance().items():
-        ...     print(which, [test.title for test in tests])
-        nominal ['single-point articulation', 'volumetric']
-        calibrated ['single-point articulation', 'volumetric']
+        >>> print([test.title for test in evaluation.acceptance()["calibrated"]])
+        ['single-point articulation', 'volumetric']
     """
 
     recording: Recording  # the capture, with the nominal arm of the calibration

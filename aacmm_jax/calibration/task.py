@@ -6,7 +6,7 @@ known to be wrong is refused here, before anything is solved.
 The unknowns z of a least squares are the free parameters, then the unknown geometry. Rows are whitened by the
 covariance of what was measured plus that of the tips' errors, which depends on the arm (`state_at`, `whitening_at`). So
 a problem is solved at least twice: with the weights of the start, and with those of that solution. Where the noise is
-not given, tips are taken to scatter as much as the residuals of the last solve do (`tip_errors.scatter_of`).
+not given, tips are taken to scatter as much as the residuals of the last solve do (`variance_components.scatter_of`).
 """
 
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ from ..model.rows import PointRows, PriorRows, Whitening, rows_at, whitening_of
 from ..solver.active_set import Box
 from ..solver.levenberg_marquardt import Rules, minimise
 from ..solver.reason import GRADIENT, Reason, reasons
-from ..uncertainty import tip_errors
+from ..uncertainty import linear_propagation, variance_components
 from ..uncertainty.covariance import NoiseModel
 from .scale_anchor import ScaleAnchor, fixes_scale, scale_anchor
 
@@ -254,7 +254,7 @@ class State(NamedTuple):
     """Everything at one point of a solve."""
 
     point: PointRows
-    errors: list[tip_errors.ArmErrors]
+    errors: list[linear_propagation.ArmErrors]
     sigma: Float[AnyArray, ""]  # standard deviation of a tip coordinate, mm
 
 
@@ -334,15 +334,15 @@ def state_at(
     ``effective`` is how many unknowns the data determine, by default all that are fitted."""
     point = rows_at(space, task.observed, z) if point is None else point
     # Where a batch needs no weights, nobody asks for errors.
-    errors = tip_errors.arm_errors(point, task.observed) if isinstance(point.forward, ForwardPass) else []
+    errors = linear_propagation.arm_errors(point, task.observed) if isinstance(point.forward, ForwardPass) else []
     if sigma is None:
         xp, spent = namespace(z, effective), task.fitted.sum() if effective is None else effective
         degrees_of_freedom = xp.maximum(xp.asarray(task.observed.equations - spent, dtype=float), 1.0)
         if task.needs_no_weights:
             squares: Any = sum(xp.sum(part.values**2) for part in point.rows)
-            sigma = tip_errors.root_of_sum(squares / degrees_of_freedom)
+            sigma = variance_components.root_of_sum(squares / degrees_of_freedom)
         else:
-            scatter = tip_errors.scatter_of if task.loss is None else tip_errors.robust_scatter_of
+            scatter = variance_components.scatter_of if task.loss is None else variance_components.robust_scatter_of
             sigma = scatter(point.rows, errors, degrees_of_freedom)
     return State(point, errors, sigma)
 
@@ -363,9 +363,9 @@ def _root_mean_square(rows: list[Rows]) -> Any:
 def whitening_at(task: Task, state: State, prior: PriorRows | None = None) -> Whitening:
     """The weights of everything by the state of a nearly right arm."""
     if task.noise is None:
-        of_arm = [tip_errors.covariance_of_sigma(errors, state.sigma) for errors in state.errors]
+        of_arm = [linear_propagation.covariance_of_sigma(errors, state.sigma) for errors in state.errors]
     else:
-        of_arm = [tip_errors.covariance_of_noise(errors, task.noise) for errors in state.errors]
+        of_arm = [linear_propagation.covariance_of_noise(errors, task.noise) for errors in state.errors]
     least = namespace(state.sigma).maximum(_LEAST * state.sigma, 1e-12)
     return whitening_of(state.point.rows, task.observed, of_arm, least)._replace(prior=prior)
 

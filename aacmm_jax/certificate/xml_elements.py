@@ -209,13 +209,11 @@ class _NoDocumentType(ElementTree.TreeBuilder):
 
 
 def _collect(element: Element, path: tuple[str, ...], values: dict[tuple[str, ...], CertifiedValue]) -> None:
-    name = element.find("dcc:name/dcc:content", _PREFIXES)
+    name, real = element.find("dcc:name/dcc:content", _PREFIXES), element.find("si:real", _PREFIXES)
     path = path if name is None else (*path, name.text or "")
-    real = element.find("si:real", _PREFIXES)
     if real is not None:
-        expanded = real.findtext(
-            "si:measurementUncertaintyUnivariate/si:expandedMU/si:valueExpandedMU", None, _PREFIXES
-        )
+        stated = "si:measurementUncertaintyUnivariate/si:expandedMU/si:valueExpandedMU"
+        expanded = real.findtext(stated, None, _PREFIXES)
         value = _number(real.findtext("si:value", "", _PREFIXES), "value", path)
         u = None if expanded is None else _number(expanded, "expanded uncertainty", path)
         values[path] = CertifiedValue(value, real.findtext("si:unit", "", _PREFIXES), u)

@@ -90,7 +90,7 @@ def arm(
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
     if model is not None:
-        from ..files.joint_options import with_model
+        from ..files.arm_tables import with_model
 
         specification = with_model(specification, model)
     frame = first_frame(specification)
@@ -139,7 +139,7 @@ def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]
 
 
 def _checked_table(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:
-    from ..files.pose_tables import read_poses
+    from ..files.table_columns import read_poses
 
     table, frame = read_poses(InputFile(path), specification.arm, unit=unit, recorded=True), first_frame(specification)
     positions = None if table.poses is None else table.poses[:, :3, 3]

@@ -113,7 +113,7 @@ def calibrate(
     of one arm.
     """
     from ..diagnostics.usability import does_not_fit
-    from ..files.joint_options import with_model
+    from ..files.arm_tables import with_model
     from ..pipeline.capture_calibration import calibrate_capture
 
     # Options that have the name and the values of an argument of `calibrate_capture` are passed as they are.
@@ -185,7 +185,7 @@ def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bou
 def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
     """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
     if text is not None:
-        from ..files.joint_options import prior_of_text
+        from ..files.arm_tables import prior_of_text
 
         return prior_of_text(text, nominal.arm)
     of_model = nominal.prior is None and model is not None and nominal.arm.corrections is not None
@@ -238,7 +238,7 @@ def compare_models(
     Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
     """
     from ..data.capture import draw_poses
-    from ..files.joint_options import masses_of
+    from ..files.arm_tables import masses_of
     from ..pipeline.model_ladder import compare_models as run
 
     with together(output):

@@ -224,7 +224,7 @@ def correct(
     reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
     """
     from ..core.numpy_or_jax import to_numpy
-    from ..files.pose_tables import corrected_csv, read_poses
+    from ..files.table_columns import corrected_csv, read_poses
 
     begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with a reading for each joint")
     picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]

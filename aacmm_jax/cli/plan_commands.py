@@ -174,7 +174,7 @@ def plan(
             others = tuple(name for name in specification.free if name not in fixed)
             specification = specification._replace(held=fixed, free=others)
         if model is not None:
-            from ..files.joint_options import with_model
+            from ..files.arm_tables import with_model
 
             specification = with_model(specification, model)
     _check_options(context, kit is not None, acceptance is not None)

@@ -13,7 +13,7 @@ from ..core.text import shorten
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from ..files.sense import check_shown
+from ..files.schema import check_shown
 from . import options, views
 from .app import app, examples, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame

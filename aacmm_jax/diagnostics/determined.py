@@ -47,8 +47,16 @@ def test(case: Case) -> list[Finding]:
     """Parameters on bounds, little redundancy, undetermined combinations, and parameters that are hardly known."""
     record, seen = case.record, case.once(determined)
     traded = {name for trade_off in seen.trade_offs for name in trade_off.names}
-    findings = [*_on_bounds(record, traded), *_redundancy(record)]
-    findings += [Finding("undetermined", sentence) for sentence in seen.sentences()]
+    # Without an anchor all lengths slide to bounds in stage 1, which the scale fix undoes.
+    sides = on_bounds(record, final=True) | (on_bounds(record) if is_anchored(record) else {})
+    findings = []
+    for code, (says, costs, advice) in _ON_BOUNDS.items():
+        names = [name for name in sides if (name in traded) == (code == "weak-on-bounds")]
+        if names and not many_on_bounds(record):
+            says = says.format(names=shorten([f"{name} ({sides[name]})" for name in names]))
+            doubt = f"on a bound: {shorten(sorted(names), 3)}"
+            findings.append(Finding(code, says, costs, advice, "doubt", doubt, concerns=tuple(names)))
+    findings += [*_redundancy(record), *(Finding("undetermined", sentence) for sentence in seen.sentences())]
     # Named above are those that the same capture could not determine without noise either, and near-degenerate ones.
     open_parts = np.flatnonzero(np.abs(seen.null).max(axis=1, initial=0.0) > _TOGETHER)
     named = traded | {record.names[i] for i in open_parts}
@@ -68,19 +76,6 @@ def test(case: Case) -> list[Finding]:
             )
         )
     return findings
-
-
-def _on_bounds(record: CalibrationRecord, traded: set[str]) -> Iterator[Finding]:
-    # Without an anchor all lengths slide to bounds in stage 1, which the scale fix undoes.
-    sides = on_bounds(record, final=True) | (on_bounds(record) if is_anchored(record) else {})
-    if many_on_bounds(record):
-        return
-    for code, (says, costs, advice) in _ON_BOUNDS.items():
-        names = [name for name in sides if (name in traded) == (code == "weak-on-bounds")]
-        says = says.format(names=shorten([f"{name} ({sides[name]})" for name in names]))
-        doubt = f"on a bound: {shorten(sorted(names), 3)}"
-        if names:
-            yield Finding(code, says, costs, advice, severity="doubt", doubt=doubt, concerns=tuple(names))
 
 
 def _redundancy(record: CalibrationRecord) -> Iterator[Finding]:

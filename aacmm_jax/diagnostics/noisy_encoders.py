@@ -44,25 +44,24 @@ Result = TypeVar("Result", Calibration, Identification)
 
 def test(case: Case) -> list[Finding]:
     """Encoders whose noise was replaced, and one that seems noisier than it was taken to be."""
-    record, findings = case.record, []
+    record, findings, texts = case.record, [], []
     slides, given = record.calibrated.arm.prismatic, record.given_noise is not None
-    texts = []
+    others, kept = ("given", "the noise as given") if given else ("those of the others", "one noise for all encoders")
     for encoder in record.noisy_encoders:
         # Of the others nothing may be left beside the noise of the tip, and what is given may be 0.
         comparable = encoder.found < _FAR_MORE * encoder.expected
         times = f"{encoder.found / encoder.expected:.2g} times as much as" if comparable else "far more than"
         scatter, u = (reading_text(value, encoder.joint in slides) for value in (encoder.found, encoder.u))
         texts.append(
-            f"joint {encoder.joint} scatter by {scatter} (u = {u.split(' ')[0]}), {times} "
-            f"{'given' if given else 'those of the others'} ({chance_text(encoder.probability)})"
+            f"joint {encoder.joint} scatter by {scatter} (u = {u.split(' ')[0]}), {times} {others} "
+            f"({chance_text(encoder.probability)})"
         )
     if texts:
         findings.append(
             Finding(
                 "noisy-encoders-replaced",
                 f"Readings of {shorten(texts, 3)}.",
-                "Their noise was re-estimated; weights and uncertainties use the estimate (--keep-noise: "
-                f"{'the noise as given' if given else 'one noise for all encoders'}).",
+                f"Their noise was re-estimated; weights and uncertainties use the estimate (--keep-noise: {kept}).",
                 "Check the encoder, and the joint for play.",
                 probability=max(encoder.probability for encoder in record.noisy_encoders),
                 concerns=tuple(f"joint {encoder.joint}" for encoder in record.noisy_encoders),
@@ -248,7 +247,6 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
         return None
     equations = _Equations.of(record, *case.chunks)
     given, joints = record.given_noise is not None, len(equations.unit)
-    noisy, probabilities, u = [], [], np.zeros(0)
     noisiest, now = _noisiest(record, equations)
     if noisiest is None or noisiest.probability >= LEVEL:
         return None
@@ -259,16 +257,16 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     within = now._replace(rows=loose).noisiest([j])
     if within is None or within.probability >= LEVEL:
         return None
+    noisy, u, others = [], np.zeros(0), list(range(joints))
     while noisiest is not None and noisiest.probability < LEVEL and len(noisy) < joints - 1:
-        noisy.append(noisiest.joint - 1)
-        probabilities.append(noisiest.probability)
-        others = [joint for joint in range(joints) if joint not in noisy]
-        groups = [[joint] for joint in noisy] + ([] if given else [others, [joints]])
+        noisy.append(noisiest)
+        others.remove(noisiest.joint - 1)
+        groups = [[test.joint - 1] for test in noisy] + ([] if given else [others, [joints]])
         now, u = equations.estimated(groups)
         noisiest = now.noisiest(others)
-    variances, seat = now.variances[:-1], now.variances[-1]
+    variances, index = now.variances[:-1], [test.joint - 1 for test in noisy]
     stated = equations.variances[:-1] if given else np.full(joints, variances[others[0]])
-    if np.any(variances[noisy] <= stated[noisy]):
+    if np.any(variances[index] <= stated[index]):
         return None
     arm, q = record.calibrated.arm, np.asarray(record.recording.capture.readings)
     if any(term.probability < _CLEAR for term in found_terms(arm, q, now.rows, now.relations)):
@@ -278,14 +276,15 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     expected, sd = np.sqrt(stated) * units, np.sqrt(variances) * units
     noise = Noise(
         encoder_arcsec=np.sqrt(variances),
-        seating=float(record.noise.seating) if given else np.sqrt(seat),
+        seating=float(record.noise.seating) if given else np.sqrt(now.variances[-1]),
         linear_encoder=None if kinds is None else np.where(kinds.mask(), sd, 0.0),
     )
-    encoders = [
+    encoders = []
+    for test, i, u_log in zip(noisy, index, u, strict=False):
         # u of a standard deviation is half of it times u of its log variance.
-        NoisyEncoder(joint + 1, float(expected[joint]), float(sd[joint]), float(sd[joint] * u_log / 2), probability)
-        for joint, u_log, probability in zip(noisy, u, probabilities, strict=False)
-    ]
+        encoders.append(
+            NoisyEncoder(test.joint, float(expected[i]), float(sd[i]), float(sd[i] * u_log / 2), test.probability)
+        )
     return noise, tuple(sorted(encoders))
 
 
@@ -305,8 +304,8 @@ def amend(result: Result, case: Case, again: Callable[[Noise], Result]) -> Resul
         warnings.simplefilter("ignore")  # the first calibration has said it
         weighted = again(noise)
     changes = {"noisy_encoders": encoders}
-    first = result if isinstance(result, Identification) else result.stage1
     if result.given_noise is None:  # it is still one that was estimated
+        first = result if isinstance(result, Identification) else result.stage1
         same = ("noise_model", "fitted_degrees_of_freedom", "reduced_chi")
         changes |= {name: getattr(first, name) for name in same}
     if isinstance(weighted, Identification):

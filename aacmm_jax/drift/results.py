@@ -18,8 +18,6 @@ class Drift(NamedTuple):
 
     Example:
         >>> changed = aj.drift.compare(record, record_in_june, points=20)
-        >>> print([name for name, moved in zip(changed.names, changed.moved) if moved])
-        ['probe_z']
         >>> at = changed.names.index("probe_z")
         >>> print(f"probe_z by {changed.change[at]:.3f} mm, U = {changed.expanded[at]:.3f} mm")
         probe_z by 0.100 mm, U = 0.005 mm

@@ -116,12 +116,8 @@ def read_points(path: str | os.PathLike) -> Measured:
     Example:
         >>> from pathlib import Path
         >>> np.savetxt("near.csv", true.position(capture.sockets["A"]), delimiter=",")
-        >>> _ = Path("points.toml").write_text('''[points]
-        ... unit = "mm"
-        ... [[socket]]
-        ... name = "near"
-        ... file = "near.csv"
-        ... ''')
+        >>> text = 'points = { unit = "mm" }\\nsocket = [{ name = "near", file = "near.csv" }]'
+        >>> _ = Path("points.toml").write_text(text)
         >>> print(aj.files.read_points("points.toml").sockets["near"].shape)
         (40, 3)
     """

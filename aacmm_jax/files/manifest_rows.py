@@ -167,12 +167,9 @@ def points_of(text: TextTable, wanted: Wanted, points: PointsTable) -> Float[np.
 
 
 class Source:
-    """The files of a manifest, in the order in which they are opened.
+    """The files of a manifest, to whose folder their paths are relative, in the order in which they are opened.
 
-    Args:
-        manifest: The manifest, to whose folder their paths are relative.
-        quantity: What a pose is: q (readings), or points.
-        rows: Makes the poses of a table, rad and mm.
+    ``quantity`` is what a pose is: q (readings), or points; ``rows`` makes the poses of a table, rad and mm.
     """
 
     def __init__(self, manifest: InputFile, quantity: str, rows: Callable[[TextTable, Wanted], np.ndarray]):
@@ -236,8 +233,7 @@ def parts(
         raise InputError(f"{where}: {both[0]} is given and also in columns; give it once.")
     for name, entry in reader.entries.items():
         if entry.required and name not in by_pose.keys() | stated.keys():
-            by_row = entry.dimensions[:1] == ("pose",)
-            todo = f"pick its columns with columns = {{ {name} = ... }}" if by_row else "state it"
+            todo = f"pick its columns with columns = {{ {name} = ... }}" if entry.of_poses else "state it"
             raise InputError(f"{where} has no '{name}' ({entry.says}); {todo}.")
     for session, group in dict.fromkeys(zip(sessions.tolist(), groups.tolist(), strict=True)):
         chosen = (groups == group) & (sessions == session)
@@ -332,7 +328,7 @@ class _Reader:
         )
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
-        if entry.dimensions[:1] != ("pose",):
+        if not entry.of_poses:
             raise InputError(f"{self._where}: {entry.name} is one for all poses; state it outside columns.")
         if entry.content == "text":
             if len(wanted) != 1:

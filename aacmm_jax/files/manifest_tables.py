@@ -25,7 +25,6 @@ from ..acceptance.standards import Standard
 from ..core.errors import InputError
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
 from ..data.capture import ReferenceLength
-from ..data.observations.declared import Entry
 from ..data.observations.held import Socket
 from ..data.observations.observation import AbstractObservation, kinds
 from ..data.recording import SphereTest
@@ -36,6 +35,8 @@ from .toml import Point, Strict, each_once
 
 NUMBERS_OF_ROTATION = {"vector": 3, "quaternion wxyz": 4, "quaternion xyzw": 4, "matrix": 9}
 _EULER = re.compile("[xyz]{3}|[XYZ]{3}")
+_OF_TIME = BeforeValidator(lambda time: time.date() if isinstance(time, datetime.datetime) else time)
+_Day = Annotated[datetime.date, Field(strict=False), _OF_TIME]
 _ByJoint = PositiveFloat | Annotated[list[PositiveFloat], Field(min_length=1)]
 
 
@@ -195,25 +196,21 @@ class _Table(_Named):
 
 
 def _model(kind: type[AbstractObservation]) -> type[_Named]:
+    """The table of a kind: what is stated in the manifest itself, and not in columns only."""
     if kind is Socket:
         return SocketTable
     fields: dict[str, Any] = {}
     for entry in kind.entries:
-        stated = _stated(entry)
+        stated: Any = None
+        if not entry.dimensions:
+            stated = {"number": FiniteFloat, "text": str, "truth": bool}[entry.content]
+        elif entry.dimensions in (("pose",), ("pose", "axis")) and entry.content == "number" and not entry.required:
+            stated = FiniteFloat  # the same for all
+        elif entry.dimensions[-1:] == ("axis",) and not entry.of_poses:
+            stated = dict[str, Point]
         if stated is not None:
             fields[entry.name] = (bool, False) if entry.content == "truth" else (stated | None, None)
     return create_model(f"{kind.__name__}Table", __base__=_Table, **fields)
-
-
-def _stated(entry: Entry) -> Any:
-    """The type of an entry that is stated in the manifest itself, or None for one that is in columns only."""
-    if not entry.dimensions:
-        return {"number": FiniteFloat, "text": str, "truth": bool}[entry.content]
-    if entry.dimensions in (("pose",), ("pose", "axis")) and entry.content == "number" and not entry.required:
-        return FiniteFloat  # the same for all
-    if entry.dimensions[-1:] == ("axis",) and entry.dimensions[0] != "pose":
-        return dict[str, Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]]
-    return None
 
 
 TABLES = {kind: _model(kind) for kind in kinds().values()}
@@ -272,14 +269,10 @@ class PointsTable(Strict):
         return self
 
 
-def _day(value: Any) -> Any:
-    return value.date() if isinstance(value, datetime.datetime) else value
-
-
 class Recorded(Strict):
     """What manifests of poses and of points have in common."""
 
-    date: Annotated[datetime.date, Field(strict=False), BeforeValidator(_day)] | None = None  # when it was recorded
+    date: _Day | None = None  # when it was recorded
     socket: list[SocketTable] = Field(default_factory=list)
     length: list[Length] = Field(default_factory=list)
     sphere: list[Sphere] = Field(default_factory=list)

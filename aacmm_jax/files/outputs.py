@@ -35,9 +35,9 @@ _asking: ContextVar[bool] = ContextVar("asking", default=False)
 
 def as_path(path: Any) -> Path:
     """The path of a file, or `InputError` for anything else: a number would name an open file."""
-    if isinstance(path, str | os.PathLike):
-        return Path(path)
-    raise InputError(f"a file is named by a {type(path).__name__}; give its path as text.")
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"a file is named by a {type(path).__name__}; give its path as text.")
+    return Path(path)
 
 
 def storable(text: str) -> str:
@@ -78,7 +78,14 @@ def write_atomically(
                 _remove_leftovers(file.target)
             file.create()
             yield file.temporary
-            file.finish()
+            with open(file.temporary, "rb+") as written:
+                os.fsync(written.fileno())
+            if file.target.exists():
+                replaced = file.target.stat()
+                if hasattr(os, "chown"):
+                    with contextlib.suppress(OSError):
+                        os.chown(file.temporary, replaced.st_uid, replaced.st_gid)
+                os.chmod(file.temporary, stat.S_IMODE(replaced.st_mode))
             file.check_replaced()
             if group is None:
                 _put_in_place([file])
@@ -110,7 +117,7 @@ class OutputFile:
             self.target = Path(os.path.realpath(self.named))
         self.temporary = _beside(self.target)
         self._lock: int | None = None
-        self._backup: Path | None = None
+        self.backup: Path | None = None
 
     @contextlib.contextmanager
     def refusing(self) -> Iterator[None]:
@@ -145,7 +152,7 @@ class OutputFile:
     def create(self) -> None:
         """Make the temporary file and lock it; whoever removes leftovers may have seen it before it was locked."""
         while True:
-            mode = 0o600 if self.target.exists() else 0o666  # `finish` gives it the permissions of what it replaces
+            mode = 0o600 if self.target.exists() else 0o666  # later it gets the permissions of what it replaces
             self._lock = os.open(self.temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode)
             if fcntl is None:
                 return
@@ -154,17 +161,6 @@ class OutputFile:
             if self.temporary.exists():
                 return
             self._unlock()
-
-    def finish(self) -> None:
-        """The content is complete: have it stored, with the permissions and the owner of the file it replaces."""
-        with open(self.temporary, "rb+") as written:
-            os.fsync(written.fileno())
-        if self.target.exists():
-            replaced = self.target.stat()
-            if hasattr(os, "chown"):
-                with contextlib.suppress(OSError):
-                    os.chown(self.temporary, replaced.st_uid, replaced.st_gid)
-            os.chmod(self.temporary, stat.S_IMODE(replaced.st_mode))
 
     def check_replaced(self) -> None:
         """Raise `InputError` where a file would replace one that somebody else wrote; of commands only.
@@ -196,30 +192,22 @@ class OutputFile:
             )
 
     def replace(self, keep: bool) -> None:
-        """Put the new file in place; with ``keep``, the old one can be put back by `undo`."""
+        """Put the new file in place; with ``keep``, the old one can be put back from its backup."""
         if keep and self.target.exists():
-            self._backup = _beside(self.target)
+            self.backup = _beside(self.target)
             try:
-                os.link(self.target, self._backup)
+                os.link(self.target, self.backup)
             except OSError:  # a file system without hard links
-                shutil.copy2(self.target, self._backup)
+                shutil.copy2(self.target, self.backup)
         self.check()
         if fcntl is None:
             self._unlock()
         os.replace(self.temporary, self.target)
 
-    def undo(self) -> None:
-        """As it was before `replace`."""
-        with contextlib.suppress(OSError):
-            if self._backup is None:
-                self.target.unlink()
-            else:
-                os.replace(self._backup, self.target)
-
     def discard(self) -> None:
         """Remove the temporary files that are left."""
         self._unlock()
-        for left in (self.temporary, self._backup):
+        for left in (self.temporary, self.backup):
             if left is not None:
                 with contextlib.suppress(OSError):
                     left.unlink()
@@ -244,7 +232,11 @@ def _put_in_place(files: list[OutputFile]) -> None:
             replaced.append(file)
     except BaseException:
         for file in reversed(replaced):
-            file.undo()
+            with contextlib.suppress(OSError):
+                if file.backup is None:
+                    file.target.unlink()
+                else:
+                    os.replace(file.backup, file.target)
         raise
     finally:
         for file in files:

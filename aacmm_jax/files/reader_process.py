@@ -47,7 +47,6 @@ def read_through(path: str | os.PathLike, source: Any, size: int, largest: int, 
     """Raise `InputError` where HDF5 cannot read a file, or what is in it is not what files of this package contain.
 
     ``source`` is its bytes, or the open file where they are too many for the memory: the child opens it by its name.
-    ``largest`` is the most bytes that may be read into memory.
     """
     if seal in _vouched_for:
         return
@@ -131,6 +130,7 @@ class _Reader:
                 raise
 
     def _ask(self, request: dict[str, Any], content: Any) -> str | None:
+        path = request["path"]
         try:
             self.start()
             if not self._started and self._process.stdout.readline() != _READY:
@@ -138,8 +138,8 @@ class _Reader:
         except (OSError, TypeError, ValueError) as error:  # an interpreter that is not there, has no name, or fails
             reason = (getattr(error, "strerror", None) or str(error)).lower()
             raise InputError(
-                f"{request['path']} cannot be read, as the process that opens HDF5 files first does not start: "
-                f"{reason}; see whether {sys.executable} -c 'import h5py' works."
+                f"{path} cannot be read, as the process that opens HDF5 files first does not start: {reason}; see "
+                f"whether {sys.executable} -c 'import h5py' works."
             ) from error
         self._started, answer = True, b""
         with contextlib.suppress(OSError):  # it has ended
@@ -147,16 +147,15 @@ class _Reader:
             self._process.stdin.write(content)
             self._process.stdin.flush()
             answer = self._process.stdout.readline()
-        if answer.endswith(b"\n"):
-            if answer != b'""\n':  # it ends
-                self.stop()
+        if answer == b'""\n':
+            return ""
+        status = None if answer.endswith(b"\n") else self._process.wait()
+        self.stop()  # it ends
+        if status is None:
             return json.loads(answer)
-        status = self._process.wait()
-        self.stop()
-        if status == -getattr(signal, "SIGKILL", 0):
-            path = request["path"]
-            return f"{path} cannot be read: the system ended the process that opens it; free some memory."
-        return None
+        killed = status == -getattr(signal, "SIGKILL", 0)
+        ended = f"{path} cannot be read: the system ended the process that opens it; free some memory."
+        return ended if killed else None
 
 
 def _after_fork() -> None:
@@ -183,7 +182,12 @@ def serve() -> None:
     os.dup2(2, 1)  # what a library prints is no answer
     from .hdf5_content import check
 
-    used = _memory_used()
+    used = 0  # bytes of address space of this process on Linux; elsewhere memory is not limited
+    with contextlib.suppress(OSError, ImportError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     if hasattr(signal, "SIGPROF"):
         signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends the process; the parent may have had it ignored
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGPROF])
@@ -203,16 +207,6 @@ def serve() -> None:
         answers.write(json.dumps(answer).encode() + b"\n")
         if answer != "":  # without memory, for one, HDF5 can no longer read what it could before
             break
-
-
-def _memory_used() -> int:
-    """Bytes of address space of this process on Linux; 0 elsewhere, where memory is not limited."""
-    with contextlib.suppress(OSError, ImportError):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    return 0
 
 
 @contextlib.contextmanager

@@ -35,14 +35,18 @@ _APART = 3.0  # standard errors by which two residuals differ
 
 
 def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.PathLike | None = None) -> str:
-    """The lines that make a manifest read the columns as an explanation has them.
+    """The lines that make a manifest read the columns as an explanation of its readings has them.
 
-    Args:
-        explanation: The explanation, of the readings as they were read.
-        unit: Unit that they were read in; None: as the manifest or the header of its tables says.
-        manifest: The manifest that they were read with, whose columns, signs and offsets are taken into account.
+    ``unit``, in which they were read; None: as the manifest or the header of its tables says. ``manifest``, with which
+    they were read, whose columns, signs and offsets are taken into account.
     """
     order, joints = list(explanation.order), len(explanation.order)
+
+    def reordered(stated: Any) -> list:
+        """Columns in this order: those that were stated one by one, or their numbers."""
+        columns = stated if isinstance(stated, list) and len(stated) == joints else numbers
+        return [columns[i] for i in order]
+
     exchanged, numbers, comments = order != sorted(order), list(range(1, joints + 1)), []
     as_read = Angles(unit=unit or "rad")  # pyright: ignore[reportArgumentType]
     if manifest is not None:
@@ -53,7 +57,7 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
             picked = columns.get("q") if isinstance(columns, dict) else columns
             # Columns that a table states for itself are not replaced by those of [angles].
             if exchanged and picked is not None:
-                line = _pick(table, _reordered(picked, numbers, order))
+                line = _pick(table, reordered(picked))
                 paths = table.get("files", [table.get("file")])
                 file = next(iter(paths.values() if isinstance(paths, dict) else paths))
                 comments.append(f"# and in [[{key}]] ({file}), instead of its columns:\n# {line}\n")
@@ -65,7 +69,7 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
         entries |= {"unit": "deg" if explanation.angle < 1 else "rad"}
         entries.pop("counts_per_turn", None)
     if exchanged or as_read.columns:
-        entries["columns"] = _reordered(as_read.columns, numbers, order)
+        entries["columns"] = reordered(as_read.columns)
     counts = entries.get("counts_per_turn")
     size = ANGLE_UNITS[entries["unit"]] if counts is None else 2 * np.pi / np.asarray(counts)
     # With the explanation's sign S and zero Z: S s (c - o) size + Z = S s (c - (o - Z / (S s size))) size.
@@ -77,12 +81,6 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
     if np.any(offset):
         entries["offset"] = [round(x) if x == round(x) else x for x in offset.tolist()]
     return tomlkit.dumps({"angles": entries}) + "".join(dict.fromkeys(comments))
-
-
-def _reordered(stated: Any, numbers: list[int], order: list[int]) -> list:
-    """Columns in another order: those that were stated one by one, or their numbers."""
-    columns = stated if isinstance(stated, list) and len(stated) == len(order) else numbers
-    return [columns[i] for i in order]
 
 
 def _tables(document: dict[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -143,6 +141,8 @@ def compare_reading_sets(manifest: str | os.PathLike, recording: Recording) -> l
     Each has the ``role``, the ``lines`` that make the manifest pick it, one for each kind of table, the RMS of all
     poses from their geometry (``rms_mm``), and whether it is ``taken`` by the manifest, which says ``recording``.
     """
+    from ..pipeline.single import calibrate, identify
+
     header, rows = readings_of_manifest(manifest).header, []
     for role, columns in reading_sets(header, recording.nominal.arm.joints).items():
         changed = InputFile(manifest)
@@ -151,11 +151,17 @@ def compare_reading_sets(manifest: str | os.PathLike, recording: Recording) -> l
         lines = [f"{_pick(table, names)} in [[{key}]]" for key, table in _tables(document)]
         changed.content = tomlkit.dumps(document).encode()
         try:
-            picked = read_manifest(changed)
-            rms = _rms(picked, recording)
+            capture, bounds = read_manifest(changed).capture, recording.nominal.bounds()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", IdentifiabilityWarning)
+                if capture.lengths or any(item.fixes_scale for item in capture.observations):
+                    options = {"shared_errors": False, "undetermined": "ignore"}
+                    rms = calibrate(bounds.space.base, capture, bounds, **options).observed.rms
+                else:
+                    rms = identify(bounds.space.base, capture, bounds).observed.rms
         except InputError:
             continue
-        taken = np.array_equal(np.asarray(picked.capture.readings), np.asarray(recording.capture.readings))
+        taken = np.array_equal(np.asarray(capture.readings), np.asarray(recording.capture.readings))
         rows.append({"role": role, "lines": list(dict.fromkeys(lines)), "rms_mm": rms, "taken": taken})
     return rows
 
@@ -177,16 +183,3 @@ def reading_sets_sentence(rows: Sequence[dict[str, Any]], poses: int) -> str:
     else:
         verdict = f": {figures}, so take the {best['role']} ones: {shorten(best['lines'], 3)}"
     return f"The tables have commanded and measured readings{verdict}."
-
-
-def _rms(recording: Recording, given: Recording) -> float:
-    """Distance of the tips from their geometry after a calibration of the same parameters, mm. Raises `InputError`."""
-    from ..pipeline.single import calibrate, identify
-
-    capture, bounds = recording.capture, given.nominal.bounds()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", IdentifiabilityWarning)
-        if capture.lengths or any(item.fixes_scale for item in capture.observations):
-            options = {"shared_errors": False, "undetermined": "ignore"}
-            return calibrate(bounds.space.base, capture, bounds, **options).observed.rms
-        return identify(bounds.space.base, capture, bounds).observed.rms

@@ -99,10 +99,8 @@ class ExportedUrdf(NamedTuple):
 def read_urdf(
     path: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
 ) -> ArmSpecification:
-    """The arm of a serial chain of a URDF, with the text of the file, for `save_urdf`; arguments as of `load_arm`.
-
-    The arm is in the first D-H frame, which is the base link's frame where the first axis is its z axis.
-    """
+    """The arm of a serial chain of a URDF, in the first D-H frame, with the text of the file; arguments as of
+    `load_arm`."""
     file = InputFile(path)
     with naming(path):
         try:
@@ -230,7 +228,18 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
         origins[chain.tip_joint.name] = _changed(new, chain.tip_joint.origin)
     name, added, notes = nominal.urdf.tip, "", ()
     if not same_transform(link, tip):
-        name, added = _added_link(chain.robot, nominal.urdf.tip, inverse(link) @ tip)
+        robot, end = chain.robot, nominal.urdf.tip
+        names = (f"{end}_probe{suffix}" for suffix in ("", *range(2, 1000)))
+        name = next(name for name in names if name not in robot.links and f"{name}_joint" not in robot.joints)
+        origin = " ".join(f'{key}="{text}"' for key, text in _attributes(inverse(link) @ tip).items())
+        added = (
+            f"  <link name={quoteattr(name)}/>\n"
+            f'  <joint name={quoteattr(name + "_joint")} type="fixed">\n'
+            f"    <parent link={quoteattr(end)}/>\n"
+            f"    <child link={quoteattr(name)}/>\n"
+            f"    <origin {origin}/>\n"
+            "  </joint>\n"
+        )
         notes = (f"the calibrated tip is the origin of the link {quoted(name)}, which was added.",)
     return ExportedUrdf(edited(nominal.urdf.text, origins, chain.robot, added), name, tuple(origins), notes)
 
@@ -257,38 +266,24 @@ def save_urdf(arm: Arm, path: str | os.PathLike, *, nominal: ArmSpecification) -
 
 def _changed(new: Transform, old: Transform) -> dict[str, str]:
     """xyz in m and rpy in rad with all digits, those of which the file's own text does not say the same."""
-    shifted, (xyz, rpy) = old.copy(), _attributes(new)
+    shifted, attributes = old.copy(), _attributes(new)
     shifted[:3, 3] = new[:3, 3]
-    changed = {} if same_transform(shifted, old) else {"xyz": xyz}
-    return changed if same_transform(shifted, new) else changed | {"rpy": rpy}
+    same = {"xyz": same_transform(shifted, old), "rpy": same_transform(shifted, new)}
+    return {key: text for key, text in attributes.items() if not same[key]}
 
 
-def _attributes(transform: Transform) -> tuple[str, str]:
-    values = transform[:3, 3] / 1000, roll_pitch_yaw(transform[:3, :3])
-    xyz, rpy = (" ".join(repr(float(value) + 0.0) for value in three) for three in values)  # -0.0 becomes 0.0
-    return xyz, rpy
-
-
-def _added_link(robot: Robot, tip: str, transform: Transform) -> tuple[str, str]:
-    names = (f"{tip}_probe{suffix}" for suffix in ("", *range(2, 1000)))
-    name = next(name for name in names if name not in robot.links and f"{name}_joint" not in robot.joints)
-    xyz, rpy = _attributes(transform)
-    return name, (
-        f"  <link name={quoteattr(name)}/>\n"
-        f'  <joint name={quoteattr(name + "_joint")} type="fixed">\n'
-        f"    <parent link={quoteattr(tip)}/>\n"
-        f"    <child link={quoteattr(name)}/>\n"
-        f'    <origin xyz="{xyz}" rpy="{rpy}"/>\n'
-        "  </joint>\n"
-    )
+def _attributes(transform: Transform) -> dict[str, str]:
+    values = {"xyz": transform[:3, 3] / 1000, "rpy": roll_pitch_yaw(transform[:3, :3])}
+    # 0.0 is added, as -0.0 becomes 0.0.
+    return {key: " ".join(repr(float(value) + 0.0) for value in three) for key, three in values.items()}
 
 
 def _check_moving(joint: UrdfJoint) -> None:
     """Refuse a joint that an arm does not have."""
     what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
     if joint.kind not in ("revolute", "continuous", "prismatic"):
-        known = joint.kind in ("floating", "planar")
-        kind = f"is {joint.kind}" if known else f"has the unknown type {quoted(joint.kind)}"
+        of_format = joint.kind in ("floating", "planar")
+        kind = f"is {joint.kind}" if of_format else f"has the unknown type {quoted(joint.kind)}"
         raise InputError(f"{what} {kind}, which is no joint of an arm; name links without it between them.")
     if joint.mimics is not None:
         raise InputError(

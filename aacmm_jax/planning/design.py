@@ -188,7 +188,7 @@ def _chosen(
     def possible(q: np.ndarray, owner: np.ndarray) -> Pool:
         """Those of the configurations that have an approach point."""
         if retract and region.cones is not None:
-            good = approaches(region, q, region.cones.normals[owner], retract).possible
+            _, good = approaches(region, q, region.cones.normals[owner], retract)
             q, owner = q[good], owner[good]
         return pool_of(problem, q, owner)
 

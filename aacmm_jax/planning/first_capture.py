@@ -36,41 +36,16 @@ _STILL_AT, _FEW = (0.5, 0.25, 0.75), 40  # of a joint's range; and poses that sa
 _POINTS = 240  # poses that a tracker sees
 
 
-class Determined(NamedTuple):
-    """What data of one kind determine of an arm."""
-
-    data: str  # in words
-    seen: Observability  # of all parameters
-    free: tuple[str, ...]  # a largest set that the data determine well; none where there are no such data
-
-
-class StillJoint(NamedTuple):
-    """What is not determined well any more where one joint does not move."""
-
-    joint: int  # from 1
-    lost: tuple[str, ...] | None  # parameters; None: without the joint the tip cannot stay in a socket
-
-
 class Expected(NamedTuple):
     """The standard uncertainty of lengths that the calibration adds, from random poses."""
 
     data: str  # in words
     sockets: int
-    lengths: int
     u: dict[int, float]  # number of poses -> median over the volume, mm; infinite where it is not determined
     enough: int | None  # the fewest poses that add no more than the noise of two readings; None: none of `COUNTS` do
 
 
-class FirstCapture(NamedTuple):
-    """How many poses the noise of one class of arms needs."""
-
-    arm_class: str
-    noise: Noise
-    u_reading: float  # of a length, by the noise of the readings at both ends, median over the volume, mm
-    expected: tuple[Expected, ...]
-
-
-def determined_by(arm: Arm) -> tuple[Determined, ...]:
+def determined_by(arm: Arm) -> dict[str, Observability]:
     """What sockets, sockets with a reference length, and a tracker determine, at their best.
 
     Args:
@@ -83,28 +58,19 @@ def determined_by(arm: Arm) -> tuple[Determined, ...]:
     sockets, length, points = _thorough(arm, None)
     # While coefficients are 0, gravity's direction changes nothing.
     every = Parameters(arm, tuple(name for name in parameter_names(arm) if not name.startswith("gravity_")))
-    target = [MeasuredPoints("tracker", one.q, one.points, station="tracker", target="target") for one in points]
+    target = [MeasuredPoints("tracker", seen.q, seen.points, station="tracker", target="target") for seen in points]
     kinds = {
         "sockets": Capture(sockets),
         "sockets and a reference length": Capture(sockets, length),
         "a tracker, of the probe": Capture({}, observations=points),
         "a tracker, of a target at an unknown place": Capture({}, observations=target),
     }
-    rows = []
-    for data, capture in kinds.items():
-        free: tuple[str, ...] = ()
-        if not capture.observations:
-            free = Parameters.independent(arm, capture).names
-        rows.append(Determined(data, observability(arm, capture, every), free))
-    return tuple(rows)
+    return {data: observability(arm, capture, every) for data, capture in kinds.items()}
 
 
-def still_joints(arm: Arm) -> tuple[StillJoint, ...]:
-    """What sockets with a reference length do not determine where one joint does not move; joint by joint.
-
-    Args:
-        arm: One arm.
-    """
+def still_joints(arm: Arm) -> list[tuple[str, ...] | None]:
+    """Of each joint the parameters that sockets with a reference length do not determine where it does not move; None:
+    without it the tip cannot stay in a socket."""
     arm = to_numpy(arm)
     names, limits, still = Parameters.independent(arm).names, np.asarray(joint_limits(arm, None)), []
     for joint in range(arm.joints):
@@ -118,20 +84,16 @@ def still_joints(arm: Arm) -> tuple[StillJoint, ...]:
             left = Parameters.independent(arm, Capture(sockets, length)).names
             lost = tuple(name for name in names if name not in left)
             break
-        still.append(StillJoint(joint + 1, lost))
-    return tuple(still)
+        still.append(lost)
+    return still
 
 
-def first_capture(arm: Arm, noise: Noise, arm_class: str = "") -> FirstCapture:
-    """The uncertainty of lengths that calibrations from random poses would add, by what is recorded and how much.
+def first_capture(arm: Arm, noise: Noise) -> tuple[float, list[Expected]]:
+    """The uncertainty of a length by the noise of the readings at both ends (median over the volume, mm), and what
+    calibrations from random poses would add to it, by what is recorded and how much.
 
     Sockets are in pairs, at the ends of reference lengths that are anywhere in the workspace; the numbers are medians
     over a few such placements.
-
-    Args:
-        arm: One arm that reaches a volume.
-        noise: Of its readings, and of the tip in its seat.
-        arm_class: What has such noise, in words.
 
     Raises:
         InputError: The noise is none, or no length fits into the workspace.
@@ -157,7 +119,7 @@ def first_capture(arm: Arm, noise: Noise, arm_class: str = "") -> FirstCapture:
         words = f"{sockets} sockets, {pluralise(sockets // 2, 'reference length')} of {length:.0f} mm"
         rows.append(_expected(words, sockets, placed, functions, u_reading))
     rows.append(_expected("a tracker", 0, [_seen(problem)], functions, u_reading))
-    return FirstCapture(arm_class, noise, u_reading, tuple(rows))
+    return u_reading, rows
 
 
 def _thorough(
@@ -209,4 +171,4 @@ def _expected(
         if sockets and count < 2 * sockets:
             u[count] = np.inf
     enough = next((count for count, value in u.items() if value <= u_reading), None)
-    return Expected(data, sockets, sockets // 2, u, enough)
+    return Expected(data, sockets, u, enough)

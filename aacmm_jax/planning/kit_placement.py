@@ -86,7 +86,7 @@ class Thing(NamedTuple):
         """Which poses can be taken by way of their approach points; all where it has none."""
         if not (retract and self.item.has_cone and seat.cones is not None):
             return np.ones(len(q), dtype=bool)
-        return approaches(seat, q, np.tile(seat.cones.normals, (len(q), 1)), retract).possible
+        return approaches(seat, q, np.tile(seat.cones.normals, (len(q), 1)), retract)[1]
 
 
 class _WithoutErrors(np.random.Generator):

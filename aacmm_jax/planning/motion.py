@@ -38,33 +38,23 @@ class Motion(NamedTuple):
     blocked: tuple[tuple[int, str, str], ...]  # moves to the pose of this index that hit something, and what touches
 
 
-class MovedPoses(NamedTuple):
-    """Approach configurations of poses, and which of them can be moved to and from there."""
-
-    q: Float[np.ndarray, "N n"]
-    possible: Bool[np.ndarray, " N"]
-
-
 def approaches(
     region: SearchRegion, q: Float[np.ndarray, "N n"], normals: Float[np.ndarray, "N 3"], retract: float
-) -> MovedPoses:
-    """Configurations with the tip ``retract`` (mm) along the normals, and the orientation kept where the joints allow.
-
-    Possible are those within the limits, above the table, and clear, as is the straight move of the joints there.
+) -> tuple[Float[np.ndarray, "N n"], Bool[np.ndarray, " N"]]:
+    """Configurations with the tip ``retract`` (mm) along the normals, and the orientation kept where the joints allow;
+    and which are possible: within the limits, above the table, and clear, as is the straight move of the joints there.
     """
     poses = np.asarray(region.arm.pose(q)).copy()
     poses[:, :3, 3] += retract * normals
     solution = readings_at_poses(region.arm, q, poses, region.limits.tolist())
-    above, whole = np.asarray(solution.q), np.asarray(solution.reached)
-    rows = np.flatnonzero(~whole)
-    good = whole.copy()
+    above, good = np.array(solution.q), np.array(solution.reached)
+    rows = np.flatnonzero(~good)
     if len(rows):
-        above = above.copy()
         above[rows], good[rows] = project_to_targets(region.arm, q[rows], poses[rows, :3, 3], region.limits)
     good &= lowest_point(region.arm, above) >= region.above
     rows = np.flatnonzero(good)
     good[rows] = [hit is None for hit in move_contacts(region, q[rows], above[rows])]
-    return MovedPoses(above, good)
+    return above, good
 
 
 def move_contacts(
@@ -98,7 +88,7 @@ def ordered_motion(
     where there is one.
     """
     weights = joint_weights(region.arm)
-    above = approaches(region, q, normals, retract).q if retract else None
+    above = approaches(region, q, normals, retract)[0] if retract else None
     through = q if above is None else above
     contacts: dict[tuple[int, int], tuple[str, str] | None] = {}
     order: list[int] = []
@@ -109,6 +99,7 @@ def ordered_motion(
             break
         first, last = np.array(new).T
         contacts |= dict(zip(new, move_contacts(region, through[first], through[last]), strict=True))
+    visits = q[:, None] if above is None else np.stack([above, q, above], axis=1)
     hits = ((place + 1, contacts.get(pair)) for place, pair in enumerate(_pairs(order)))
     given = np.argsort(owner, kind="stable")
     tool = cones_of([Cone()]) if region.cones is None else region.cones
@@ -116,8 +107,8 @@ def ordered_motion(
         approach=None if above is None else above[order],
         tilt=tilts(region.arm, q[order], tool._replace(normals=normals[order])),
         clearance=None if region.cell is None else np.asarray(clearances(region.cell, region.arm, q[order])),
-        travel=_whole_travel(q, above, order, weights),
-        unordered=_whole_travel(q, above, given.tolist(), weights),
+        travel=travel(visits[order].reshape(-1, q.shape[1]), weights),
+        unordered=travel(visits[given].reshape(-1, q.shape[1]), weights),
         blocked=tuple((place, *hit) for place, hit in hits if hit is not None),
     )
 
@@ -125,16 +116,6 @@ def ordered_motion(
 def _pairs(order: list[int]) -> list[tuple[int, int]]:
     """Neighbours in an order, the smaller number first: a move and the way back are the same."""
     return [(min(i, j), max(i, j)) for i, j in pairwise(order)]
-
-
-def _whole_travel(
-    q: Float[np.ndarray, "N n"], above: Float[np.ndarray, "N n"] | None, order: list[int], weights: np.ndarray
-) -> float:
-    """Travel by way of the approach points: in each socket from them, in between straight."""
-    if above is None:
-        return travel(q[order], weights)
-    visits = np.stack([above[order], q[order], above[order]], axis=1)
-    return travel(visits.reshape(-1, q.shape[1]), weights)
 
 
 def hardly_reached(name: str, point: Float[np.ndarray, " 3"]) -> str:
@@ -178,8 +159,6 @@ def short_order(
         blocked: Pairs between which the arm cannot move directly; they are avoided where possible.
     """
     given = np.argsort(groups, kind="stable")
-    if len(q) < 3:
-        return given.tolist()
     scaled = q * weights
     if len(q) > _MOST:
         return min(

@@ -121,11 +121,6 @@ def histogram(counts: np.ndarray, edges: np.ndarray, name: str = "") -> Marks:
     return Marks(name, (edges[:-1] + edges[1:]) / 2, counts, "boxes", "soft", words, box=(width, 0.0))
 
 
-def ordinates(marks: Sequence[Marks]) -> list[Numbers]:
-    """All that marks reach to along the vertical axis."""
-    return [ends for part in marks for ends in (part.y, part.low, part.high) if ends is not None]
-
-
 def linear(title: str, *values: Any, zero: bool = False, margin: float = 0.06) -> Axis:
     """An axis around values, with round numbers; ``zero``: it begins at 0, for numbers that are not negative."""
     low, high = _range(values)

@@ -13,12 +13,11 @@ from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.calibration import metrics_by_socket_and_length
 from ..summaries.tables import decimals_for, format_number
 from ..uncertainty.volume import VolumetricUncertainty
-from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, ordinates, runs, shades, thinned
+from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, runs, shades, thinned
 from .figures import draw
 
 _NAMED = 16  # most lengths or placements along an axis
 _LEAST = 1e-6  # mm: drawn for a limit of zero
-_TITLE = "measured − value [mm]"
 _ACROSS, _UP = "distance from the first axis [mm]", "height [mm]"
 _TIPS = 400  # most tips of the calibration that are drawn
 
@@ -48,7 +47,8 @@ def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, Axis, 
 
 
 def _errors_plot(axis: Axis, edges: np.ndarray, marks: Sequence[Marks]) -> Plot:
-    return Plot(axis, linear(_TITLE, *ordinates(marks), [0.0]), (*marks, borders(edges), level(0.0)))
+    ends = [end for part in marks for end in (part.y, part.low, part.high) if end is not None]
+    return Plot(axis, linear("measured − value [mm]", *ends, [0.0]), (*marks, borders(edges), level(0.0)))
 
 
 def length_chart(rows: Sequence[Mapping[str, Any]], earlier: Mapping[str, np.ndarray]) -> Chart:

@@ -113,7 +113,7 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
         from .studies import study_report
 
         return study_report(Results.of(source))
-    from ..files.compared_models import load_compared_models
+    from ..files.evaluations import load_compared_models
     from .studies import models_report
 
     return models_report(load_compared_models(source))

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..core.errors import InputError
 from ..core.units import ARCSEC, DEG
-from ..files.joint_options import masses_of, prior_of_text
+from ..files.arm_tables import masses_of, prior_of_text
 from ..kinematics.arm import DOWN, Arm, correction_names, is_length, parameter_unit, value_of, without_corrections
 from ..kinematics.corrected_arm import loads_of, with_corrections
 from ..kinematics.parameters import ArmSpecification, Parameters

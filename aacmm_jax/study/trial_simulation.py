@@ -70,13 +70,8 @@ class _Static(NamedTuple):
     eccentric: bool  # of any cell: sines are then computed for all
 
 
-class _Shared(NamedTuple):
-    """Arrays that all trials share."""
-
-    table: Any  # (rows, columns)
-    geometry: Geometry
-    nominal: Any  # (p,)
-    recorded_u: Any  # (l,)
+# Arrays that all trials share: the pool's table, the chain, and the nominal parameters and recorded u of lengths.
+_Shared = tuple[Any, Geometry, Any, Any]
 
 
 def draw(
@@ -113,7 +108,7 @@ def _prepared(study: Study, setting: Setting, device: Any) -> tuple[_Static, _Sh
         eccentric=bool(np.any(study.cell_values.eccentricity > 0)),
     )
     u = [float(length.u) for length in study.capture.lengths] if study.capture else [0.0] * len(static.lengths)
-    shared = _Shared(table, study.space.base.geometry, np.asarray(study.space.vector()), np.array(u))
+    shared = table, study.space.base.geometry, np.asarray(study.space.vector()), np.array(u)
     return static, jax.device_put(shared, device)
 
 
@@ -152,24 +147,25 @@ def _draw(
 
 def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w"], values: CellValues) -> DrawnTrials:
     """`_WIDTH` trials."""
-    n, p = shared.geometry.alpha.shape[-1], shared.nominal.shape[0]
+    table, plain, nominal, recorded_u = shared
+    n, p = plain.alpha.shape[-1], nominal.shape[0]
     parts = jax.vmap(lambda k: jax.random.split(k, 7))(keys)
     poses = sum(ends * taken for _, _, ends, _, taken in static.fixtures)
     normal = _normal(parts[:, 0], (p,))
     # One draw for both distributions: its rank among all normal draws is uniform.
     deviation = values.width * jnp.where(values.normal, normal, jax.scipy.special.erf(normal / math.sqrt(2)))
-    true = shared.nominal[None] + deviation
-    rows = shared.table.at[_chosen(static, parts[:, 1], trials)].get(mode="promise_in_bounds")
+    true = nominal[None] + deviation
+    rows = table.at[_chosen(static, parts[:, 1], trials)].get(mode="promise_in_bounds")
     columns = jax.lax.optimization_barrier(jnp.moveaxis(rows, -1, 0))  # (columns, w, N)
     q, cosine, sine = columns[:n], columns[n : 2 * n], columns[2 * n : 3 * n]
     inverse = columns[3 * n : 6 * n].reshape(n, 3, _WIDTH, poses)
     point = jnp.swapaxes(columns[6 * n :], 0, 1)  # (w, 3, N)
     target = point + values.seating[:, None, None] * _noise(parts[:, 2], (3, poses))
     # Functions of corrections are those of one nominal arm.
-    geometry, corrections = shared.geometry._replace(corrections=None), shared.geometry.corrections
+    geometry, corrections = plain._replace(corrections=None), plain.corrections
     geometry = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_WIDTH, *leaf.shape)), geometry)
     geometry = geometry._replace(**with_values(geometry, true, static.indices))
-    offsets = jnp.swapaxes(geometry.theta - shared.geometry.theta[None], 0, 1)[:, :, None]
+    offsets = jnp.swapaxes(geometry.theta - plain.theta[None], 0, 1)[:, :, None]
     joints = JointMotion(cosine, sine, None)
     if geometry.kinds is not None:  # the angle of a prismatic joint is that of the true arm
         prismatic, angle = geometry.kinds.mask(3), jnp.swapaxes(geometry.theta, 0, 1)[:, :, None]
@@ -180,9 +176,9 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
     q = q + _joint_changes(chain, joints, inverse, target) - offsets
     q = q if corrections is None else _read_where(geometry, corrections, q)
     reading = _readings(static, q, geometry.kinds, parts[:, 3:5], values)
-    u = jnp.where(jnp.isnan(values.u)[:, None], shared.recorded_u[None], values.u[:, None])
+    u = jnp.where(jnp.isnan(values.u)[:, None], recorded_u[None], values.u[:, None])
     value, u = _certified(static, point, parts[:, 5], u)
-    start = jnp.broadcast_to(shared.nominal, true.shape)
+    start = jnp.broadcast_to(nominal, true.shape)
     if static.random_start:
         fraction = jax.vmap(lambda k: jax.random.uniform(k, (p,), jnp.float64))(parts[:, 6])
         free = jnp.asarray(np.arange(p) != (-1 if static.anchor is None else static.anchor))[None]

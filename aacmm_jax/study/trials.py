@@ -124,41 +124,35 @@ def _identified(
 
     lengths = study.space.lengths
     angles = np.array([kind in ("alpha", "theta", "beta") for kind, _ in study.space.indices()])
-    none = np.full(len(drawn.true), np.nan)
+    true, none = np.where(lengths, drawn.true, 0.0), np.full(len(drawn.true), np.nan)
     identified, identified1 = of_all(many.parameters), of_all(stage1.parameters)
-    # Scale of the arm: the factor that best maps the true lengths onto the identified ones. Rows are contiguous, so
-    # that each is summed in the same order however many there are.
-    true = np.ascontiguousarray(np.where(lengths, drawn.true, 0.0))
-    scale, scale_after = (
-        np.ascontiguousarray(values * true).sum(axis=1) / np.maximum((true * true).sum(axis=1), 1e-300)
-        for values in (identified1, identified)
-    )
 
-    def largest_errors(values: np.ndarray) -> list[np.ndarray]:
-        return [np.abs((values - drawn.true)[:, which]).max(axis=1, initial=0.0) for which in (lengths, angles)]
+    def scale_of(values: np.ndarray) -> np.ndarray:
+        """The factor that best maps the true lengths onto those identified. Rows are contiguous, so that each is summed
+        in the same order however many there are."""
+        square = np.ascontiguousarray(true * true).sum(axis=1)
+        return np.ascontiguousarray(values * true).sum(axis=1) / np.maximum(square, 1e-300)
 
-    length_error, angle_error = largest_errors(identified) if scaled else (none, none)
-    length_error1, angle_error1 = largest_errors(identified1)
-    return {
+    results = {
         "converged": np.asarray(many.converged, dtype=np.int8),
         "reason": np.asarray(numbers_of(many.result), dtype=np.int8),
         "steps": many.steps.astype(np.int32),
         "k": none if many.k is None else many.k,
-        "scale": scale,
-        "scale_error": scale_after - 1 if scaled else none,
-        "de_stage1": stage1.de,
-        "deltam_stage1": stage1.deltam,
-        "length_error_stage1": length_error1,
-        "angle_error_stage1": angle_error1,
-        "de": many.de if scaled else none,
-        "deltam": many.deltam if scaled else none,
-        "length_error": length_error,
-        "angle_error": angle_error,
+        "scale": scale_of(identified1),
+        "scale_error": scale_of(identified) - 1,
         "truth_inside": np.all((drawn.true >= drawn.lower) & (drawn.true <= drawn.upper), axis=1).astype(np.int8),
         "active": of_all(many.active, np.zeros(len(fixed), np.int8)),
         "estimate": identified,
         "true": drawn.true,
     }
+    for suffix, stage, values in (("_stage1", stage1, identified1), ("", many, identified)):
+        error = np.abs(values - drawn.true)
+        results[f"de{suffix}"], results[f"deltam{suffix}"] = stage.de, stage.deltam
+        results[f"length_error{suffix}"] = error[:, lengths].max(axis=1, initial=0.0)
+        results[f"angle_error{suffix}"] = error[:, angles].max(axis=1, initial=0.0)
+    if not scaled:
+        results |= dict.fromkeys(("scale_error", "de", "deltam", "length_error", "angle_error"), none)
+    return results
 
 
 class _Recorded(NamedTuple):

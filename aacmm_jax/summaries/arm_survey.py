@@ -15,15 +15,8 @@ from ..kinematics.corrected_arm import function_values, loads_of
 from ..kinematics.corrections import terms_of
 from ..kinematics.parameters import ArmSpecification, Parameters
 from ..kinematics.workspace import arm_reach, closest_approach, total_link_length
-from ..planning.first_capture import (
-    U_LENGTH,
-    U_TRACKER,
-    Determined,
-    FirstCapture,
-    determined_by,
-    first_capture,
-    still_joints,
-)
+from ..planning.first_capture import U_LENGTH, U_TRACKER, Expected, determined_by, first_capture, still_joints
+from ..uncertainty.identifiability import Observability
 from .calibration import arm_summary
 from .tables import attributes, plain
 
@@ -75,21 +68,24 @@ def arm_survey(
         )
     try:
         best, chosen, still = determined_by(arm), Parameters.independent(arm), still_joints(arm)
-        seen = best[1].seen
+        seen = best["sockets and a reference length"]
         summary |= {
-            "parameters": len(best[0].seen.names),
+            "parameters": len(seen.names),
             # What no data on the tip can separate, whatever is recorded.
             "redundant": [text for text, always in zip(seen.undetermined, seen.structural, strict=True) if always],
             "weak": [trade_off.text for trade_off in seen.trade_offs],
             "parallel": list(seen.parallel),
             "free": list(chosen.names),
             "fixed": [name for name in chosen.held if not name.startswith("beta_")],
-            "determined": [_determined_row(data) for data in best],
-            "still": [{"joint": row.joint, "lost": None if row.lost is None else list(row.lost)} for row in still],
+            "determined": [_determined_row(data, row) for data, row in best.items()],
+            "still": [
+                {"joint": joint, "lost": None if lost is None else list(lost)} for joint, lost in enumerate(still, 1)
+            ],
         }
-        needed = first_capture(arm, usual.noise, usual.arm_class)
-        moving = [str(row.joint) for row in still if row.lost is None or row.lost]
-        summary |= {"needed": [_needed(needed, usual.source)], "advice": _advice(needed, moving, arm.joints)}
+        u_reading, expected = first_capture(arm, usual.noise)
+        moving = [str(joint) for joint, lost in enumerate(still, 1) if lost is None or lost]
+        needed = _needed(usual, u_reading, expected)
+        summary |= {"needed": [needed], "advice": _advice(expected, moving, arm.joints)}
     except InputError as error:
         summary["warnings"].append(f"What a calibration needs cannot be computed for this arm: {error}")
     return summary
@@ -113,10 +109,9 @@ def _left_out(arm: Arm, model: str | None) -> list[str]:
     return [reason.format(joint=joint, names=shorten(names)) for (joint, reason), names in why.items()]
 
 
-def _determined_row(data: Determined) -> dict[str, Any]:
-    seen = data.seen
+def _determined_row(data: str, seen: Observability) -> dict[str, Any]:
     return {
-        "data": data.data,
+        "data": data,
         "determined": seen.rank,
         "well_determined": seen.rank - len(seen.trade_offs),
         "scale": not any("the scale" in text for text in seen.undetermined),
@@ -126,27 +121,29 @@ def _determined_row(data: Determined) -> dict[str, Any]:
     }
 
 
-def _needed(capture: FirstCapture, source: str) -> dict[str, Any]:
+def _needed(usual: ArmNoise, u_reading: float, expected: list[Expected]) -> dict[str, Any]:
     return {
-        **attributes(capture, **{"class": "arm_class"}, u_reading_mm="u_reading"),
-        "noise_source": source,
+        "class": usual.arm_class,
+        "u_reading_mm": u_reading,
+        "noise_source": usual.source,
         "u_length_mm": U_LENGTH,
         "u_tracker_mm": U_TRACKER,
-        "encoder_arcsec": float(np.max(np.asarray(capture.noise.encoder))) / ARCSEC,
-        "seating_mm": float(capture.noise.seating),
+        "encoder_arcsec": float(np.max(np.asarray(usual.noise.encoder))) / ARCSEC,
+        "seating_mm": float(usual.noise.seating),
         "rows": [
             {
-                **attributes(row, "data", "sockets", "lengths", enough_poses="enough"),
+                **attributes(row, "data", "sockets", enough_poses="enough"),
+                "lengths": row.sockets // 2,
                 "u_mm": {str(count): plain(row.u[count]) for count in _SHOWN},
             }
-            for row in capture.expected
+            for row in expected
         ],
     }
 
 
-def _advice(needed: FirstCapture, moving: list[str], joints: int) -> str:
+def _advice(expected: list[Expected], moving: list[str], joints: int) -> str:
     """What to record, in a sentence or two: the fewest sockets of which some number of poses is enough."""
-    rows = [(row.enough, row.sockets, row) for row in needed.expected if row.sockets and row.enough is not None]
+    rows = [(row.enough, row.sockets, row) for row in expected if row.sockets and row.enough is not None]
     if not rows:
         return (
             "Random poses in sockets do not determine this arm well; use a tracker, or see what aacmm plan finds for "
@@ -157,7 +154,7 @@ def _advice(needed: FirstCapture, moving: list[str], joints: int) -> str:
     to_move = "Every joint must move." if len(moving) == joints else to_move
     tracked = "".join(
         f" With a tracker: {pluralise(2 * row.enough, 'pose')} all over its workspace."
-        for row in needed.expected
+        for row in expected
         if not row.sockets and row.enough is not None
     )
     return (

@@ -20,12 +20,74 @@ from ..core.linear_algebra import inverse_cholesky
 from ..core.numpy_or_jax import AnyArray, added_to, namespace
 from ..data.noise import Noise
 from ..data.observations.observation import Rows
+from ..kinematics.chain import ForwardPass, JointKinds
+from ..kinematics.jacobian import reading_columns, reading_rotations
 from ..model.elimination import arrow_of, followed, pseudo_inverse, sums_by_component, weighted
-from ..model.rows import PriorRows, RowBlock, Whitening
+from ..model.observed import Observed
+from ..model.rows import PointRows, PriorRows, RowBlock, Whitening
 from .covariance import inverse_information
-from .tip_errors import ArmErrors, matrix_products, products
 
+LEAST_SIGMA = 1e-9  # mm
 _LEAST_REDUNDANCY = 0.05  # determinant of a pose's part of the residuals' projector
+
+
+class ArmErrors(NamedTuple):
+    """How errors of a group's poses reach its rows."""
+
+    by_readings: Float[AnyArray, "r n m"]  # mm (or rad) a rad, or a mm of prismatic joints
+    by_seat: Float[AnyArray, "r c m"]  # of the tip's position, and of its orientation as far as the tip's lever goes
+    kinds: JointKinds | None
+
+
+def arm_errors(point: PointRows, observed: Observed) -> list[ArmErrors]:
+    """Of every group."""
+    forward = point.forward
+    assert isinstance(forward, ForwardPass)  # nobody asks for these where rows are those of a batch
+    xp = namespace(forward)
+    readings, rotations = reading_columns(forward), reading_rotations(forward)  # (n, 3, N)
+    # An arm whose tips err by s turns them by about s over its size.
+    size = xp.sqrt(xp.mean(xp.sum(forward.tip**2, axis=0)))
+    errors = []
+    for part, group in zip(point.rows, observed.layout.groups, strict=True):
+        by_tip, by_rotation, poses = part.by_tip, part.by_rotation, group.index
+        by_readings = products(by_tip, readings[..., poses])
+        by_seat = by_tip
+        if by_rotation is not None:
+            by_readings = by_readings + products(by_rotation, rotations[..., poses])
+            by_seat = xp.concatenate([by_tip, by_rotation / size], axis=1)
+        errors.append(ArmErrors(by_readings, by_seat, forward.kinds))
+    return errors
+
+
+def covariance_of_noise(errors: ArmErrors, noise: Noise) -> Float[AnyArray, "m r r"]:
+    """Of a group's rows by the noise of readings and seat."""
+    xp = namespace(errors, noise)
+    spread = xp.broadcast_to(noise.of_readings(errors.kinds), (errors.by_readings.shape[1],))
+    moved = errors.by_readings * spread[None, :, None]
+    tip = errors.by_seat[:, :3]
+    return squares(moved) + (noise.seating**2 + 1e-12) * squares(tip)
+
+
+def covariance_of_sigma(errors: ArmErrors, sigma: Float[AnyArray, ""]) -> Float[AnyArray, "m r r"]:
+    """Of a group's rows, where every coordinate of a tip scatters by ``sigma``, mm."""
+    return namespace(errors, sigma).maximum(sigma, LEAST_SIGMA) ** 2 * squares(errors.by_seat)
+
+
+def squares(rows: Float[AnyArray, "r c m"]) -> Float[AnyArray, "m r r"]:
+    """A matrix a pose times its own transpose."""
+    return namespace(rows).moveaxis(products(rows, rows), -1, 0)
+
+
+def products(left: Float[AnyArray, "r c m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r s m"]:
+    """A matrix a pose times the transpose of another, as sums: XLA computes many products of small matrices several
+    times as slowly."""
+    first, *others = (left[:, None, c] * right[None, :, c] for c in range(left.shape[1]))
+    return sum(others, first)
+
+
+def matrix_products(left: Float[AnyArray, "r s m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
+    """The product of two matrices a pose."""
+    return products(left, namespace(right).swapaxes(right, 0, 1))
 
 
 class UnknownsCovariance(NamedTuple):

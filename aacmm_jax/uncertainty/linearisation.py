@@ -20,8 +20,7 @@ from ..model.robust import Loss
 from ..model.rows import PointRows, PriorRows, RowBlock, Whitening, row_blocks, rows_at, whitening_of
 from ..solver.arrow import joined
 from .covariance import inverse_information
-from .linear_propagation import Influence
-from .tip_errors import ArmErrors, arm_errors, covariance_of_noise, covariance_of_sigma
+from .linear_propagation import ArmErrors, Influence, arm_errors, covariance_of_noise, covariance_of_sigma
 
 
 class ObservationRows(NamedTuple):

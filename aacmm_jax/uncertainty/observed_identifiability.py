@@ -29,9 +29,8 @@ from ..model.elimination import followed, pseudo_inverse, sums_by_component
 from ..model.observed import Observed, ends_of
 from ..model.rows import rows_at, whitening_of
 from ..solver.arrow import joined, split
-from .linear_propagation import Influence
+from .linear_propagation import Influence, arm_errors, covariance_of_noise, covariance_of_sigma
 from .linearisation import Linearisation
-from .tip_errors import arm_errors, covariance_of_noise, covariance_of_sigma
 
 _ROUNDS = 15
 _FITTED = 1e-8  # mm or rad, a step of the geometry

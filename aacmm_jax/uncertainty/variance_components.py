@@ -1,4 +1,4 @@
-"""Variances of readings and seat, estimated from the residuals by two moments.
+"""How far tips scatter by the residuals, and variances of readings and seat, estimated from these by two moments.
 
 The whitened residuals of poses follow their errors e as w = M e with M = I - U, U = (B^T D^-1 B + A^T G A) W: A and B
 are the derivatives by the head and by the private geometry, of which A has the latter eliminated (`model.elimination`),
@@ -16,17 +16,24 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.linear_algebra import inverse_positive_definite
-from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient
+from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient, while_loop
 from ..core.units import ARCSEC
 from ..data.noise import Noise, noise_of, one_arcsec
 from ..data.observations.observation import Rows
 from ..model.elimination import sums_by_component
-from ..model.robust import bounded_square
+from ..model.robust import bounded_square, median_square
 from ..model.rows import Whitening
-from .linear_propagation import Influence, row_errors
-from .tip_errors import ArmErrors, matrix_products, products, root_of_sum
+from .linear_propagation import (
+    LEAST_SIGMA,
+    ArmErrors,
+    Influence,
+    covariance_of_sigma,
+    matrix_products,
+    products,
+    row_errors,
+)
 
-_ROUNDS = 10
+_ROUNDS, _NEWTON_ROUNDS, _MEDIAN_ROUNDS = 10, 100, 20
 
 
 class Moments(NamedTuple):
@@ -164,3 +171,76 @@ def _outer(left: Float[AnyArray, "h r m"], right: Float[AnyArray, "h r m"]) -> F
 def noise_from(variances: Moments) -> Noise:
     """The noise of both variances, one encoder for all."""
     return noise_of(ARCSEC * root_of_sum(variances.encoder), root_of_sum(variances.seat))
+
+
+def _each(matrices: Float[AnyArray, "m r s"], vectors: Float[AnyArray, "s m"]) -> Float[AnyArray, "r m"]:
+    """A matrix a pose times its vector."""
+    return products(namespace(matrices).moveaxis(matrices, 0, -1), vectors[None])[:, 0]
+
+
+def scatter_of(
+    rows: list[Rows], errors: list[ArmErrors], degrees_of_freedom: Float[AnyArray, ""] | float
+) -> Float[AnyArray, ""]:
+    """Standard deviation of a tip coordinate, mm, with which the residuals are as large as they should be.
+
+    The sum of w.w over all rows equals its degrees of freedom (Paule and Mandel 1982); 0 where what was measured
+    explains more than all. Its derivative is that of the implicit equation.
+    """
+    xp = namespace([part.values for part in rows], errors, degrees_of_freedom)
+
+    def excess(log_sigma: Any, rows: list[Rows], errors: list[ArmErrors], expected: Any) -> tuple[Any, Any]:
+        """Of the weighted sum over its expectation, and its derivative by the logarithm of sigma."""
+        total, slope = -1.0 * expected, 0.0
+        for part, error in zip(rows, errors, strict=True):
+            of_arm = covariance_of_sigma(error, xp.exp(log_sigma))
+            inverse = inverse_positive_definite(part.measured + of_arm)
+            solved = _each(inverse, part.values)
+            total = total + xp.sum(solved * part.values)
+            slope = slope - 2 * xp.sum(solved * _each(of_arm, solved))
+        return total, xp.where(slope < 0, slope, -1.0)
+
+    constant = stop_gradient((rows, errors, degrees_of_freedom))
+
+    def refine(state: tuple[Any, Any]) -> tuple[Any, Any]:
+        count, log_sigma = state
+        total, slope = excess(log_sigma, *constant)
+        # Newton's step in the logarithm; far above the root, where the sum falls as a power of sigma, a longer one.
+        longer = xp.where(total > 0, (total + constant[2]) / constant[2], 1.0)
+        step = xp.clip(-total / slope * longer, -2.0, 2.0)
+        done = xp.abs(step) < 1e-12
+        return xp.where(done, _NEWTON_ROUNDS, count + 1), xp.maximum(log_sigma + step, np.log(LEAST_SIGMA))
+
+    values = xp.concatenate([xp.reshape(part.values, (-1,)) for part in constant[0]])
+    first = xp.log(xp.sqrt(xp.mean(values**2)) + LEAST_SIGMA)
+    _, root = while_loop(lambda state: state[0] < _NEWTON_ROUNDS, refine, (xp.asarray(0), first))
+    # One more step, which is nothing, but carries the derivatives of the implicit equation.
+    total, slope = excess(root, rows, errors, degrees_of_freedom)
+    step = xp.where(root > np.log(LEAST_SIGMA), -total / stop_gradient(slope), 0.0)
+    return xp.exp(root + xp.clip(step, -0.1, 0.1))
+
+
+def root_of_sum(value: Float[AnyArray, ""]) -> Float[AnyArray, ""]:
+    """The square root of a sum of squares; its derivative at 0, where it has none, is set to 0."""
+    xp, positive = namespace(value), value > 0
+    return xp.where(positive, xp.sqrt(xp.where(positive, value, 1.0)), 0.0)
+
+
+def robust_scatter_of(
+    rows: list[Rows], errors: list[ArmErrors], degrees_of_freedom: Float[AnyArray, ""] | float
+) -> Float[AnyArray, ""]:
+    """The same from the median of the poses' squared residuals, each over its median for normal errors: a few bad poses
+    do not change it much."""
+    xp = namespace([part.values for part in rows], errors)
+    constant, expected = stop_gradient((rows, errors)), stop_gradient(degrees_of_freedom)
+    count = sum(part.values.size for part in rows)
+
+    def rescale(log_sigma: Any, _: Any) -> tuple[Any, Any]:
+        squares = []
+        for part, error in zip(*constant, strict=True):
+            inverse = inverse_positive_definite(part.measured + covariance_of_sigma(error, xp.exp(log_sigma)))
+            square = xp.einsum("rm,mrs,sm->m", part.values, inverse, part.values)
+            squares.append(square / median_square(part.values.shape[0]))
+        ratio = xp.median(xp.concatenate(squares)) * count / expected
+        return xp.maximum(log_sigma + 0.5 * xp.log(ratio + 1e-300), np.log(LEAST_SIGMA)), xp.zeros(())
+
+    return xp.exp(scan(rescale, xp.log(scatter_of(rows, errors, degrees_of_freedom)), length=_MEDIAN_ROUNDS)[0])

@@ -9,7 +9,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.diagnostics import reading_check, reading_search
-from aacmm_jax.files.pose_tables import read_poses
+from aacmm_jax.files.table_columns import read_poses
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.planning import first_capture
 from aacmm_jax.summaries import arm_survey
@@ -50,7 +50,7 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
 
 @pytest.mark.slow
 def test_a_urdf_in_its_base_link(aacmm, monkeypatch):
-    monkeypatch.setattr(arm_survey, "still_joints", lambda arm: ())  # half of the time
+    monkeypatch.setattr(arm_survey, "still_joints", lambda arm: [])  # half of the time
     monkeypatch.setattr(first_capture, "_PLACEMENTS", 1)
     found = json.loads(aacmm("arm", URDF, "--tip", "tool0", "--encoder-arcsec", 5, "--json").stdout)
     chain = aj.files.urdf_chain(aj.files.load_specification(URDF, tip="tool0").urdf)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.files.compared_models import load_compared_models, save_compared_models
+from aacmm_jax.files.evaluations import load_compared_models, save_compared_models
 from aacmm_jax.report import write_report
 from tests.refusals import assert_refused
 

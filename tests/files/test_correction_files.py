@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
+from aacmm_jax.files.arm_tables import with_model
 from aacmm_jax.files.arms import load_specification, save_arm, specification_toml
 from aacmm_jax.files.controllers import python_program
-from aacmm_jax.files.joint_options import with_model
 from aacmm_jax.kinematics import with_corrections
 from aacmm_jax.kinematics.arm import correction_names
 from tests.prismatic_arms import SCARA

@@ -7,8 +7,8 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.core.units import DEG
+from aacmm_jax.files.arm_tables import prior_of_text
 from aacmm_jax.files.arms import specification_toml
-from aacmm_jax.files.joint_options import prior_of_text
 from aacmm_jax.kinematics import with_corrections
 
 ARM = """

@@ -11,7 +11,7 @@ from aacmm_jax.data.recording import Recording
 from aacmm_jax.files import controllers, plans
 from aacmm_jax.files.captures import load_capture, save_capture
 from aacmm_jax.files.manifest import read_manifest
-from aacmm_jax.files.pose_tables import corrected_csv, read_poses
+from aacmm_jax.files.table_columns import corrected_csv, read_poses
 from aacmm_jax.files.text_table import TextTable
 from aacmm_jax.kinematics.parameters import ArmSpecification, perturbed_arm
 from aacmm_jax.planning.kit import KitPlan

@@ -11,7 +11,7 @@ from aacmm_jax.cli import views
 from aacmm_jax.cli.display import display
 from aacmm_jax.diagnostics.model_errors import model_tests
 from aacmm_jax.diagnostics.shared_errors import missing_functions
-from aacmm_jax.files.joint_options import prior_of_text, with_model
+from aacmm_jax.files.arm_tables import prior_of_text, with_model
 from aacmm_jax.kinematics import corrections as kinds
 from aacmm_jax.kinematics import default_prior, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
