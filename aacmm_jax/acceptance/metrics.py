@@ -17,6 +17,8 @@ from .results import Measured, Metric, MetricValue, metric_value, percent
 
 ZONES = ((0.0, 0.2), (0.2, 0.8), (0.8, 1.0))  # near, middle and far of ASME B89.4.22: fractions of the reach
 SPAT_POSES = 10
+BARS = ((0.5, 0.75), (1.2, 1.5))  # of ASME B89.4.22: fractions of the reach
+LONGEST = 0.66  # least length of the longest bar of ISO 10360-12, as a part of the measuring range
 
 
 def half_range(points: Numbers) -> float:
@@ -210,6 +212,11 @@ def zone_of(measured: Measured, points: np.ndarray) -> tuple[float, float] | Non
         return None
     fraction = float(np.linalg.norm(points.mean(axis=0) - measured.reach.shoulder)) / (measured.size or 0.0) * 2
     return next((zone for zone in ZONES if fraction <= zone[1]), ZONES[-1])
+
+
+def bar_range(bar: tuple[float, float], radius: float) -> str:
+    """The lengths of a bar of ASME B89.4.22 in words."""
+    return f"{percent(bar)} of the reach ({bar[0] * radius:.0f} to {bar[1] * radius:.0f} mm)"
 
 
 def volumetric(measured: Measured, influences: Influences) -> list[Metric]:

@@ -18,8 +18,7 @@ from ..kinematics.parameters import ArmSpecification
 from ..kinematics.workspace import Reach, SearchRegion, arm_reach, configurations_at, lowest_point, search_region
 from ..uncertainty.volume import sample_lengths
 from .geometry import LEFT_OR_RIGHT, elbow_sides, touch_directions, unit_rows
-from .metrics import SPAT_POSES, ZONES
-from .requirements import BARS, LONGEST, bar_range
+from .metrics import BARS, LONGEST, SPAT_POSES, ZONES, bar_range
 from .results import percent
 from .standards import Planned
 

@@ -12,20 +12,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..data.recording import ProbedSphere, SphereTest
-from . import metrics
-from .geometry import (
-    EXACT_POINTS,
-    LEFT_OR_RIGHT,
-    BarPositions,
-    bar_positions,
-    covers_hemisphere,
-    fit_sphere,
-    least_turn,
-    separate,
-    unit_rows,
-)
+from . import geometry, metrics
 from .judgement import Influences
-from .metrics import SPAT_POSES, ZONES, articulated, spheres_for, zone_of
+from .metrics import BARS, LONGEST, SPAT_POSES, ZONES, articulated, bar_range, spheres_for, zone_of
 from .results import AcceptanceTest, Measured, Metric, percent
 from .standards import ASME_B89_4_22, EDITIONS, ISO_10360_12, JJF_1408
 
@@ -36,8 +25,6 @@ Confidence = Literal[
 ]
 Metrics = Callable[[Measured, Influences], Sequence[Metric]]
 Origin = tuple[str, Confidence]  # the source, and how certain it is
-BARS = ((0.5, 0.75), (1.2, 1.5))  # of ASME B89.4.22: fractions of the reach
-LONGEST = 0.66  # least length of the longest bar of ISO 10360-12, as a part of the measuring range
 _LEAST_APART = 0.1  # of two positions of a sphere, as a part of the measuring range
 _LEAST_SPREAD = 0.1  # of the places of bars, as a part of the measuring range
 _LEAST_RING_TURN, _LEAST_PROBE_TURN = math.radians(15), math.radians(10)
@@ -90,10 +77,19 @@ def _groups(
 
 
 def _sphere_positions(measured: Measured, test: SphereTest, positions: int) -> int:
-    groups = [group for sphere in spheres_for(measured, test) for group in sphere.groups if len(group) >= EXACT_POINTS]
+    groups = [
+        group
+        for sphere in spheres_for(measured, test)
+        for group in sphere.groups
+        if len(group) >= geometry.EXACT_POINTS
+    ]
     if not (measured.size and groups):
         return max(len(groups), 1)
-    return len(separate(np.array([fit_sphere(group).centre for group in groups]), _LEAST_APART * measured.size))
+    return len(
+        geometry.separate(
+            np.array([geometry.fit_sphere(group).centre for group in groups]), _LEAST_APART * measured.size
+        )
+    )
 
 
 def _orientations(measured: Measured) -> str | None:
@@ -101,7 +97,7 @@ def _orientations(measured: Measured) -> str | None:
         return "Points do not tell the orientations of the probe; record joint readings."
     for (name, test), groups in measured.postures.probes.items():
         if test == "articulation":
-            means = unit_rows(np.array([directions.mean(axis=0) for directions in groups]))
+            means = geometry.unit_rows(np.array([directions.mean(axis=0) for directions in groups]))
             if any(mean @ other > math.cos(_LEAST_PROBE_TURN) for mean, other in itertools.combinations(means, 2)):
                 return f"The orientations of the probe must differ; on sphere '{name}' two are nearly the same."
     return None
@@ -126,7 +122,10 @@ def _elbow(measured: Measured) -> str | None:
     bad = []
     for name in articulated(measured):
         sides = np.sin(measured.postures.elbows[name])
-        if min(np.sum(sides >= math.sin(LEFT_OR_RIGHT)), np.sum(sides <= -math.sin(LEFT_OR_RIGHT))) < _LEAST_ELBOW:
+        if (
+            min(np.sum(sides >= math.sin(geometry.LEFT_OR_RIGHT)), np.sum(sides <= -math.sin(geometry.LEFT_OR_RIGHT)))
+            < _LEAST_ELBOW
+        ):
             bad.append(name)
     few = f"{_LEAST_ELBOW} poses"
     sentence = f"The elbow must be on the left in {few} and on the right in {few} of every socket ({', '.join(bad)})."
@@ -139,11 +138,6 @@ def _two_bars(measured: Measured, positions: int) -> str | None:
         return f"Two bars are required, no fewer and no more ({len(bars)} given)."
     fewest = min(len(bar.lengths) for bar in bars)
     return None if fewest >= positions else f"Each bar is required in {positions} positions."
-
-
-def bar_range(bar: tuple[float, float], radius: float) -> str:
-    """The lengths of a bar of ASME B89.4.22 in words."""
-    return f"{percent(bar)} of the reach ({bar[0] * radius:.0f} to {bar[1] * radius:.0f} mm)"
 
 
 def _bar_lengths(measured: Measured) -> str | None:
@@ -163,9 +157,9 @@ def _longest(measured: Measured) -> str | None:
     return None if longest >= least else sentence
 
 
-def _bars(measured: Measured, by_bar: bool = True) -> list[BarPositions]:
+def _bars(measured: Measured, by_bar: bool = True) -> list[geometry.BarPositions]:
     """The positions of each bar, or of all together."""
-    positions = bar_positions(measured)
+    positions = geometry.bar_positions(measured)
     return positions.artefacts() if by_bar else [positions]
 
 
@@ -203,7 +197,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         "The touches must be spread over a hemisphere ({0}: they are not).",
         # Of groups that are too small, the number of touches speaks.
         lambda m, test, points: _groups(
-            m, test, lambda group: len(group) >= points and not covers_hemisphere(group, points)
+            m, test, lambda group: len(group) >= points and not geometry.covers_hemisphere(group, points)
         ),
     ),
     "groups": (
@@ -217,7 +211,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         "rings of touches turned against each other, by 22.5 deg or more (15 as touched by hand)",
         "The rings of touches must be turned by 22.5 deg or more against each other ({0}).",
         lambda m, test, points: _groups(
-            m, test, lambda group: len(group) >= points and least_turn(group) < _LEAST_RING_TURN, "repeat"
+            m, test, lambda group: len(group) >= points and geometry.least_turn(group) < _LEAST_RING_TURN, "repeat"
         ),
     ),
     "places of the sphere": (
@@ -247,7 +241,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     "readings": (
         "{1} readings of each length in each position",
         "{1} readings in each position are required (a position has {0}).",
-        lambda m, needed: min(bar_positions(m).readings.tolist(), default=0),
+        lambda m, needed: min(geometry.bar_positions(m).readings.tolist(), default=0),
     ),
     "positions": (
         "{1} positions of the bars, different by 10 degrees, or in place by 5 % of the range",

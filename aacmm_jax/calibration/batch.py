@@ -236,15 +236,15 @@ def _laid_out(
     sizes |= {leaf.shape[0] for leaf in jax.tree.leaves(arm) if leaf.ndim > 1}
     sizes |= {capture.q.shape[0]} if capture.q.ndim > 2 else set()
     sizes |= {np.shape(length.value)[0] for length in capture.lengths if np.ndim(length.value)}
-    numbers = " and ".join(map(str, sorted(sizes)))
-    for wrong, says in (
-        (not sizes, "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or "
-         "use identify."),
-        (sizes == {0}, "the batch is empty; give at least one problem."),
-        (len(sizes) > 1, f"batches of {numbers} problems do not fit together; give each the same number."),
-    ):  # fmt: skip
-        if wrong:
-            raise InputError(says)
+    if not sizes:
+        raise InputError(
+            "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use "
+            "identify."
+        )
+    if sizes == {0} or len(sizes) > 1:
+        numbers = " and ".join(map(str, sorted(sizes)))
+        several = f"batches of {numbers} problems do not fit together; give each the same number."
+        raise InputError(several if len(sizes) > 1 else "the batch is empty; give at least one problem.")
     for row, i in np.argwhere(~(np.atleast_2d(boxes["lower"]) <= np.atleast_2d(boxes["upper"]))):
         raise InputError(
             f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."

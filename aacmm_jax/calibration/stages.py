@@ -46,7 +46,9 @@ class Sensitivities(NamedTuple):
     lengths: Float[np.ndarray, "l 3 M"]  # of measured lengths by the tips, where positions of sockets are means
 
     @classmethod
-    def of(cls, linear: Linearisation, rows: Sequence[AnyArray], of_lengths: Sequence[AnyArray] | None = None) -> Any:
+    def of(
+        cls, linear: Linearisation, rows: Sequence[AnyArray], of_lengths: Sequence[AnyArray] | None = None
+    ) -> "Sensitivities":
         """Of parameters, and of lengths, that follow the whitened rows of every group so."""
         by_tips = [part.by_tip for part in linear.point.rows]
 

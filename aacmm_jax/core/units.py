@@ -17,25 +17,23 @@ def length_unit(size: float) -> str | None:
     return next((name for name, value in LENGTH_UNITS.items() if math.isclose(size, value)), None)
 
 
+# The unit in which people read a value, or a small change of one, and the factor to it.
+_VALUES = {"rad": (1 / DEG, "deg"), "1": (1.0, ""), "1/K": (1e6, "um/(m K)")}
+_CHANGES = _VALUES | {"rad": (1 / ARCSEC, "arcsec"), "1": (1e6, "ppm")}
+
+
 def people_read(unit: str) -> tuple[float, str]:
-    """The unit in which people read a value, and the factor to it: degrees for radians, um/(m K) for 1/K, others as
-    they are."""
-    return {"rad": (1 / DEG, "deg"), "1": (1.0, ""), "1/K": (1e6, "um/(m K)")}.get(unit, (1.0, unit))
+    """The factor to the unit in which people read a value, and that unit: degrees for radians, um/(m K) for 1/K."""
+    return _VALUES.get(unit, (1.0, unit))
+
+
+def people_read_change(unit: str) -> tuple[float, str]:
+    """The same of a small change of a value: um, arcsec, urad/m, ppm."""
+    if unit.startswith("mm"):
+        return 1 / UM, unit.replace("mm", "um", 1)
+    return _CHANGES.get(unit, (1e6, f"u{unit}") if unit.startswith("rad") else (1.0, unit))
 
 
 def error_unit(unit: str) -> tuple[float, str]:
     """The same of errors of parameters: mm, but arcsec, ppm and urad/m of others."""
     return (1.0, "mm") if unit == "mm" else people_read_change(unit)
-
-
-def people_read_change(unit: str) -> tuple[float, str]:
-    """The unit in which people read a small change of a value, and the factor to it: um, arcsec, urad/m, ppm."""
-    if unit == "rad":
-        return 1 / ARCSEC, "arcsec"
-    if unit == "1":
-        return 1e6, "ppm"
-    if unit == "1/K":
-        return people_read(unit)
-    if unit.startswith("mm"):
-        return 1 / UM, unit.replace("mm", "um", 1)
-    return (1e6, f"u{unit}") if unit.startswith("rad") else (1.0, unit)

@@ -1,12 +1,7 @@
 """What joints do besides their Denavit-Hartenberg motion: the kinds of corrections, and their coefficients by name.
 
-What a joint really does is its reading plus coefficients times known functions of all readings,
-
-    theta_i = q_i + theta_i0 + sum_b c_ib phi_b(q),
-
-so the derivative of the tip by a coefficient is the Jacobian column of the joint's theta (of a prismatic joint, of its
-d) times phi. Thermal expansion moves no joint: all lengths grow by 1 + c (T - 20 C). A new kind is one class in this
-file, or one that is made known by `register`: whatever else the package does with kinds, it asks them.
+Each coefficient multiplies a known function of the readings (`joint_functions`). A new kind is one class in this file,
+or one that is made known by `register`: whatever else the package does with kinds, it asks them.
 """
 
 import abc
@@ -339,10 +334,7 @@ KINDS: dict[str, AbstractCorrection] = {  # by what a model calls them, in the o
 
 
 def register(kind: AbstractCorrection) -> None:
-    """Make a kind known that is not of this file.
-
-    Raises `InputError` where what a model calls it, or a word of its coefficients, is another kind's.
-    """
+    """Make a kind known that is not of this file; `InputError` where a name of it is another kind's."""
     for name in (kind.model, *kind.words):
         taken = any(name in (other.model, *other.words) for other in KINDS.values())
         if taken or re.fullmatch("[a-z]+", name) is None or name in ("dh", *_SHORT_FORMS):
@@ -394,10 +386,8 @@ def model_with(kind: AbstractCorrection, option: str) -> str:
 
 
 def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
-    """The term that a coefficient belongs to, or None where this is no coefficient's name.
-
-    Raises `InputError` where it is one, but not of an arm with so many joints.
-    """
+    """The term that a coefficient belongs to, None where this is no coefficient's name; `InputError` where it is one,
+    but not of an arm with so many joints."""
     term = coefficient_of(name)
     if term is None:
         return None

@@ -170,10 +170,8 @@ def random_configurations(
     limits: Float[AnyArray, "n 2"],
     labels: Sequence[str] | None = None,
 ) -> Float[AnyArray, "m n"]:
-    """One random configuration for each target, within the limits, exact to 1e-9 mm.
-
-    Raises `InputError`, with the target's label, if none is found.
-    """
+    """One random configuration for each target, within the limits, exact to 1e-9 mm; `InputError`, with the target's
+    label, if none is found."""
     arm, targets, limits = to_numpy((arm, targets, limits))
     count = targets.shape[0]
     q, missing = np.zeros((count, arm.joints)), np.arange(count)

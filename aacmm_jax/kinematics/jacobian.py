@@ -220,14 +220,6 @@ def _plain_tip_position(geometry: Geometry, q: Float[AnyArray, "... n"]) -> Floa
 _tip_position = jax.custom_jvp(_plain_tip_position)
 
 
-def _errors_by_readings(
-    geometry: Geometry, q: Float[AnyArray, "... columns"], q_dot: Float[AnyArray, "... columns"]
-) -> tuple[Float[AnyArray, "n ... 1 N"], Float[AnyArray, "... 1 N"]]:
-    """How the corrections of each joint, and the scale of all lengths, change with the readings, by JAX."""
-    errors = lambda readings: joint_errors(geometry, joint_motion(geometry, readings))  # noqa: E731
-    return jax.jvp(errors, (q,), (jnp.broadcast_to(q_dot, q.shape),))[1]
-
-
 def _tip_position_jvp(primals, tangents):
     geometry, q = primals
     geometry_dot, q_dot = tangents
@@ -242,8 +234,9 @@ def _tip_position_jvp(primals, tangents):
             moved = moved + jnp.sum(_columns(forward, kind) * joints_first(tangent, rank), axis=0)
     if not isinstance(q_dot, SymbolicZero):
         moved = moved + jnp.sum(reading_columns(forward) * of_joints(geometry, joints_first(q_dot, rank)), axis=0)
-        if geometry.corrections is not None:
-            by_joints, by_scale = _errors_by_readings(geometry, q, q_dot)
+        if geometry.corrections is not None:  # which change with the readings, and so does the scale of all lengths
+            errors = lambda q: joint_errors(geometry, joint_motion(geometry, q))  # noqa: E731
+            _, (by_joints, by_scale) = jax.jvp(errors, (q,), (q_dot,))
             moved = moved + jnp.sum(reading_columns(forward) * by_joints, axis=0) + by_scale * _tip_by_scale(forward)
     return components_last(forward.tip, geometry, q), components_last(moved, geometry, q)
 
@@ -265,14 +258,12 @@ def tip_jacobian(geometry: Geometry, q: Float[AnyArray, "... n"], indices: Indic
     """Derivative of the tip by some parameters or readings."""
     forward = forward_pass(geometry, joint_motion(geometry, q))
     stacked, xp = stacked_jacobian_columns(forward, indices), namespace(geometry, q)
-    if geometry.corrections is not None and any(kind == "q" for kind, _ in indices):
-        units, columns, added = jnp.eye(q.shape[-1]), reading_columns(forward), []
-        for kind, i in indices:
-            added.append(jnp.zeros_like(forward.tip))
-            if kind == "q":
-                by_joints, _ = _errors_by_readings(geometry, jnp.asarray(q), units[i])
-                added[-1] = jnp.sum(columns * by_joints, axis=0)
-        stacked = stacked + xp.asarray(jnp.stack(added, axis=-3))
     columns = xp.moveaxis(stacked, -1, -3)
     batched = max(leaf.ndim for leaf in jax.tree.leaves((geometry, q))) > 1
-    return xp.moveaxis(columns if batched else columns[0], -2, -1)
+    columns = xp.moveaxis(columns if batched else columns[0], -2, -1)
+    for place, (kind, i) in enumerate(indices):
+        if kind == "q" and geometry.corrections is not None:  # which change with the reading as well
+            unit = jnp.broadcast_to(jnp.eye(q.shape[-1])[i], q.shape)
+            by_reading = jax.jvp(partial(_tip_position, geometry), (jnp.asarray(q),), (unit,))[1]
+            columns = set_at(columns, (..., place), xp.asarray(by_reading))
+    return columns

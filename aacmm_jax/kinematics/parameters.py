@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.arguments import NOT_EMPTY, NotNegative, Range, checked_arguments, checked_fields
-from ..core.arrays import Numbers, as_array, is_concrete, joined
+from ..core.arrays import Numbers, as_array, is_concrete
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, namespace
+from ..core.numpy_or_jax import AnyArray, namespace, to_jax
 from ..core.random_keys import random_key
 from .arm import (
     Arm,
@@ -160,11 +160,13 @@ class Parameters(eqx.Module):
                 f"the arm has {arm.joints} joints, but these are parameters of an arm with {self.base.joints}; "
                 "choose the free parameters of this arm (Parameters.free_of)."
             )
-        tools: Any = np if is_concrete(*jax.tree.leaves(arm.geometry)) else jnp  # see `joined`
+        # Where values are known by NumPy, since every operation of JAX outside jit is a program to compile.
+        tools: Any = np if is_concrete(*jax.tree.leaves(arm.geometry)) else jnp
         kinds = {kind: getattr(arm, kind) for kind, _ in self.indices()}
         values = {kind: tools.asarray(0.0 * arm.alpha if array is None else array) for kind, array in kinds.items()}
         rows = tools.broadcast_arrays(*(values[kind][..., i] for kind, i in self.indices()))
-        return np.stack(rows, axis=-1) if namespace(arm) is np else joined(rows, axis=-1, new=True)
+        vector = tools.stack(rows, axis=-1)
+        return vector if namespace(arm) is np else to_jax(vector)
 
     def arm(self, vector: Numbers) -> Arm:
         """The base arm with its free parameters taken from ``(..., p)`` values in the order of ``names``, mm and rad;

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..core.numpy_or_jax import AnyArray, namespace, set_at, to_numpy
-from ..core.pytree import pytree, static
+from ..core.numpy_or_jax import AnyArray, namespace, pytree, set_at, static, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.held import platform_frames, position_of
 from ..data.observations.observation import AbstractObservation, Tips, offset_of

@@ -14,7 +14,7 @@ from ..kinematics.corrections import Term
 from ..pipeline.model_ladder import ComparedModels
 from ..summaries.compared_models import compared_models_summary
 from ..summaries.result_tables import listed_apart
-from ..summaries.tables import decimals_for, format_number
+from ..summaries.tables import decimals_for, format_number, rows_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, names
@@ -71,17 +71,14 @@ def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any
     """
     if kind not in _UNITS:
         raise InputError(f"kind is '{kind}'; it must be length or angle.")
-    vectors, expanded = record.vectors(), uncertainty_of(record).expanded()
-    rows = [
-        {
-            "parameter": name,
-            "unit": parameter_unit(record.recording.nominal.arm, name),
-            "nominal": vectors["nominal"][i],
-            "calibrated": vectors["calibrated"][i],
-            "expanded": float(expanded[i]) if np.isfinite(expanded[i]) else None,
-        }
-        for i, name in enumerate(record.names)
-    ]
+    vectors, arm = record.vectors(), record.recording.nominal.arm
+    rows = rows_of(
+        parameter=record.names,
+        unit=[parameter_unit(arm, name) for name in record.names],
+        nominal=vectors["nominal"],
+        calibrated=vectors["calibrated"],
+        expanded=uncertainty_of(record).expanded(),
+    )
     chosen = [row for row in listed_apart(rows)[0] if row["unit"] == _UNITS[kind]]
     return draw(change_chart(_UNITS[kind], chosen).plots[0], axes)
 

@@ -21,6 +21,7 @@ from ..summaries.result_tables import (
     harmonics_table,
     listed_apart,
     parameter_table,
+    volume_table,
     weights_table,
     with_u_digits,
 )
@@ -35,7 +36,6 @@ from ..summaries.tables import (
     seat_in_words,
     tried_sentence,
     two_digits,
-    volume_rows,
 )
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.identifiability import Observability
@@ -143,10 +143,6 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
         f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
         f"expanded to 95 % ({factor_words(statistics)})."
     )
-    rows = volume_rows(statistics)
-    columns: dict[str, Any] = {"": [title for title, _ in rows]}
-    for i, which in enumerate(("median", "95th percentile", "largest")):
-        columns[which] = [with_u_digits(values[i]) for _, values in rows]
     positions = {f"{axis} [mm]": numbers(volume.start[:, k], 0) for k, axis in enumerate("xyz")}
     for name, u in (
         ("U of the tip [mm]", volume.expanded_tip),
@@ -169,7 +165,7 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     }
     blocks = [
         introduction,
-        by_columns("Expanded uncertainty over the working volume [mm]", columns),
+        volume_table("Expanded uncertainty over the working volume [mm]", statistics),
         volume_chart(volume)._replace(table=by_columns("All positions", positions)),
         noise[uncertainty["form"]],
     ]

@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...core.errors import InputError
-from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
-from ...core.pytree import register
+from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known, register
 from ...core.rotations import rotation_matrix, rotation_vector
 from .declared import Declared, declared
 
