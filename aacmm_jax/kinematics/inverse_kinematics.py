@@ -140,7 +140,7 @@ def weighted_inverse(forward: ForwardPass, damping: Float[AnyArray, "... N"]) ->
 
 
 def damped_inverse(columns: ByJoint, damping: Float[AnyArray, "... N"]) -> ByJoint:
-    """J^T (J J^T + damping)^-1 for each configuration, from ``columns``, the derivatives of the tip by the joints, mm."""
+    """J^T (J J^T + damping)^-1 for each configuration, from the derivatives of the tip by the joints, mm."""
     # Written out (adjugate over determinant): for matrices this small a library call costs ten times the arithmetic.
     x, y, z = columns[..., 0, :], columns[..., 1, :], columns[..., 2, :]
     xp = namespace(columns)
@@ -315,7 +315,7 @@ def readings_at_poses(
     scale, xp = length_scale(geometry, rows), namespace(geometry, rows, wanted)
     wanted = set_at(wanted, (slice(None), slice(3), 3), wanted[:, :3, 3] / scale[:, None])
 
-    solved = lambda rows: _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)  # noqa: E731
+    solved: Any = lambda rows: _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)  # noqa: E731
     both = xp.concatenate([rows[:, :n], wanted.reshape(count, 16)], axis=1)
     solution = in_chunks(solved, both, ROWS) if xp is np else solved(both)
     readings, distance, angle = solution[:, :-2], scale * solution[:, -2], solution[:, -1]
