@@ -14,20 +14,18 @@ from ..files.inputs import InputFile
 from ..files.outputs import together, write_text
 from ..summaries.tables import Styled, View, formatted, listed, number, warnings_of, written_of
 from . import options, views
-from .app import app, examples, show_summary, with_spinner
+from .app import command, show_summary, with_spinner
 from .options import argument, numbers_option, option
 from .plan_commands import assumed_noise
 
 _CAPTURES = (".toml", ".h5")  # others are tables
 
 
-@app.command(
-    epilog=examples(
-        "aacmm arm robot.urdf --tip tool0 --figure arm.png",
-        "aacmm arm --new my-arm.toml --joints 6",
-        "aacmm arm my-arm.toml --check poses.csv --unit deg",
-        "aacmm arm panda --check capture.toml",
-    )
+@command(
+    "aacmm arm robot.urdf --tip tool0 --figure arm.png",
+    "aacmm arm --new my-arm.toml --joints 6",
+    "aacmm arm my-arm.toml --check poses.csv --unit deg",
+    "aacmm arm panda --check capture.toml",
 )
 def arm(
     file: str | None = argument(

@@ -15,7 +15,7 @@ from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
 from ..files.schema import check_shown
 from . import options, views
-from .app import app, examples, prepare_jax, show_summary, with_spinner
+from .app import command, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame
 from .options import argument, option, output
 
@@ -29,11 +29,9 @@ _KINDS = {
 }
 
 
-@app.command(
-    epilog=examples(
-        "aacmm evaluate calibration.h5 capture.h5 --mpe Deltam=0.05 --mpe E_Uni=0.025+L/40000",
-        "aacmm evaluate points.toml",
-    )
+@command(
+    "aacmm evaluate calibration.h5 capture.h5 --mpe Deltam=0.05 --mpe E_Uni=0.025+L/40000",
+    "aacmm evaluate points.toml",
 )
 def evaluate(
     calibration: Path = argument(
@@ -173,7 +171,7 @@ def _evaluated_points(
     return summary
 
 
-@app.command(epilog=examples("aacmm report calibration.h5 -o report.html"))
+@command("aacmm report calibration.h5 -o report.html")
 def report(
     file: Path = argument("FILE.h5", "File to report: a calibration, evaluation, study or model comparison."),
     output: Path = output("FILE.html", "Report to write: one HTML file that needs no network connection."),
@@ -192,7 +190,7 @@ def report(
     show_summary(summary, as_json, views.report)
 
 
-@app.command(epilog=examples("aacmm show calibration.h5", "aacmm show panda"))
+@command("aacmm show calibration.h5", "aacmm show panda")
 def show(
     file: str = argument(
         "FILE",

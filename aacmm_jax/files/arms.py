@@ -101,7 +101,7 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
     """The noise that is usual for the arm of a file: that of its ``[noise]`` table, else that of its class.
 
     A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
-    ``kinematics.yaml`` (`data.arm_classes`). Plans assume this noise; a calibration estimates it from the data, and
+    ``kinematics.yaml`` (`data.noise`). Plans assume this noise; a calibration estimates it from the data, and
     compares it with that of a table. ``source`` is, like all arguments that are not named here, that of `load_arm`.
 
     Returns:
@@ -293,7 +293,15 @@ def specification_toml(specification: ArmSpecification, *, source: str = "", pro
         rows.append(row)
     document["joint"] = rows
     if arm.corrections is not None:
-        document["corrections"] = _corrections(arm)
+        nominal, loads = arm.corrections.nominal, loads_of(arm)
+        values = np.asarray(arm.coefficients).tolist()
+        document["corrections"] = _given(
+            gravity=np.asarray(arm.gravity).tolist(),
+            mass=None if loads is None else list(loads.mass),
+            centre=None if loads is None else [list(centre) for centre in loads.centre],
+            coefficients=dict(zip(correction_names(arm)[: len(values)], values, strict=True)),
+            nominal=_given(**{kind: getattr(nominal, kind) for kind in GEOMETRY}),
+        )
     if proposed:
         document["identification"] = _given(
             held=None if specification.held is None else list(specification.held),
@@ -310,20 +318,6 @@ def specification_toml(specification: ArmSpecification, *, source: str = "", pro
             learn=[group for group, learned in zip(prior.groups, prior.learned, strict=True) if learned] or None,
         )
     return document.as_string()
-
-
-def _corrections(arm: Arm) -> dict[str, object]:
-    """The table ``[corrections]`` of an arm that has some, mm and rad."""
-    assert arm.corrections is not None
-    nominal, loads = arm.corrections.nominal, loads_of(arm)
-    values = np.asarray(arm.coefficients).tolist()
-    return _given(
-        gravity=np.asarray(arm.gravity).tolist(),
-        mass=None if loads is None else list(loads.mass),
-        centre=None if loads is None else [list(centre) for centre in loads.centre],
-        coefficients=dict(zip(correction_names(arm)[: len(values)], values, strict=True)),
-        nominal=_given(**{kind: getattr(nominal, kind) for kind in GEOMETRY}),
-    )
 
 
 def _given(**entries: Any) -> dict[str, Any]:

@@ -28,10 +28,11 @@ def fields_of(text: str) -> set[str]:
 
 def check_fields(text: str) -> None:
     """Refuse fields without a name, more of them than a path has folders, and fields with nothing between them."""
-    for name in _FIELD.findall(text):
+    names = _FIELD.findall(text)
+    for name in names:
         if not name[0].isalpha():
             raise InputError(f"the field {{{name}}} in {quoted(text)} has no name; begin it with a letter.")
-    if len(_FIELD.findall(text)) > _MOST_FIELDS:
+    if len(names) > _MOST_FIELDS:
         raise InputError(f"{quoted(text)} has more than {_MOST_FIELDS} fields; write more of it out.")
     if re.search(r"\{\w+\}\{\w+\}", text):
         raise InputError(f"{quoted(text)} has two fields with nothing between them; write what divides them.")

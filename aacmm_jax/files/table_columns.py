@@ -174,8 +174,7 @@ def position_columns(table: TextTable) -> tuple[list[int], str | None] | None:
 
 def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str | None) -> tuple[str | None, str | None]:
     """The units that the header states for readings of revolute and of prismatic joints, or None; ``stated``: that of
-    the former in the manifest.
-    """
+    the former in the manifest. Raises `InputError` where it states units of something else."""
     slides = [picked[i - 1] for i in arm.prismatic]
     turns = [i for i in picked if i not in slides]
     kinds = (("revolute", turns, ANGLE_UNITS, stated), ("prismatic", slides, LENGTH_UNITS, None))

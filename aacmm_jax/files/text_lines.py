@@ -126,10 +126,8 @@ def _nearly_unit(text: str) -> bool:
 
 
 def are_units(cells: list[str], alone: bool) -> bool:
-    """Whether cells are a row of units: all of them, or most by whole words, or one misspelt unit for all.
-
-    ``alone``: there are no names, so that one must be of lengths or angles, as the names of columns may be letters.
-    """
+    """Whether cells are a row of units: all of them, or most by whole words, or one misspelt unit for all; ``alone``,
+    without names, one must be of lengths or angles, as the names of columns may be letters."""
     texts = [_inside(cell) for cell in cells if cell]
     if texts and all(map(_is_unit, texts)):
         return not alone or any(text in _UNITS for text in texts)

@@ -64,7 +64,7 @@ class TextTable:
         rows: list[Line] = []
         for line_number, line in enumerate(lines[skip:], start=skip + 1):
             cells = cells_of(line, delimiter)
-            if not any(cell.strip('"') for cell in cells):
+            if not any(cell.strip(' \t"') for cell in cells):
                 continue
             text, above = line.strip(' \t"'), (rows or words)[-1:]
             # A line that begins with "#" is a row only where it is as wide as what is above it, and has numbers.
@@ -186,7 +186,7 @@ class TextTable:
     def numbers(self, picked: Sequence[int], *, measured: bool = False, stated: bool = False) -> np.ndarray:
         """The numbers of columns, counted from 0, ``(rows, columns)``; ``measured``: they are not numbers of columns,
         and no two of them are the same unless somebody ``stated`` the columns."""
-        hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip('"').startswith("#")), None)
+        hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip(' \t"').startswith("#")), None)
         if hashed is not None and not self._hashes:
             raise InputError(
                 f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; leave it "

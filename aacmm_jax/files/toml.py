@@ -4,6 +4,7 @@ import math
 import os
 import re
 import tomllib
+import typing
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
@@ -126,7 +127,14 @@ def _explain(error: Any, model: Any, content: Any) -> str:
         named = quoted(str(step))[1:-1]  # in short
         place += f" {step + 1}" if isinstance(step, int) else f".{named}" if place else named
     if kind == "extra_forbidden":
-        return f"unknown key '{place}'{nearest(str(steps[-1]), _known_keys(model, steps[:-1]))}"
+        # Field names of the model that the key belongs to.
+        for step in [step for step in steps[:-1] if not isinstance(step, int)]:
+            fields = getattr(model, "model_fields", {})
+            model = fields[step].annotation if step in fields else None
+            while model is not None and not hasattr(model, "model_fields"):
+                model = next((part for part in typing.get_args(model) if part is not type(None)), None)
+        names = [field.alias or name for name, field in getattr(model, "model_fields", {}).items()]
+        return f"unknown key '{place}'{nearest(str(steps[-1]), names)}"
     if kind == "missing":
         return f"'{place}' is missing; add it."
     if kind == "value_error":
@@ -142,20 +150,3 @@ def _explain(error: Any, model: Any, content: Any) -> str:
     if context.get("class_name") == "Distribution":
         wanted = "must be a number, { uniform = ... } or { normal = ... }"
     return f"'{place}' {wanted}, not {shown}{advice}."
-
-
-def _known_keys(model: Any, steps: Sequence[Any]) -> list[str]:
-    """Field names of the model that an unknown key belongs to."""
-    import typing
-
-    for step in steps:
-        if isinstance(step, int):
-            continue
-        annotation = model.model_fields[step].annotation if step in model.model_fields else None
-        while annotation is not None and not hasattr(annotation, "model_fields"):
-            inner = [item for item in typing.get_args(annotation) if item is not type(None)]
-            annotation = inner[0] if inner else None
-        if annotation is None:
-            return []
-        model = annotation
-    return [field.alias or name for name, field in model.model_fields.items()]

@@ -99,10 +99,8 @@ class ExportedUrdf(NamedTuple):
 def read_urdf(
     path: str | os.PathLike, *, base: str | None = None, tip: str | None = None, probe: Numbers | None = None
 ) -> ArmSpecification:
-    """The arm of a serial chain of a URDF, with the text of the file, for `save_urdf`; arguments as of `load_arm`.
-
-    The arm is in the first D-H frame, which is the base link's frame where the first axis is its z axis.
-    """
+    """The arm of a serial chain of a URDF, in the first D-H frame, with the text of the file; arguments as of
+    `load_arm`."""
     file = InputFile(path)
     with naming(path):
         try:
@@ -284,8 +282,8 @@ def _check_moving(joint: UrdfJoint) -> None:
     """Refuse a joint that an arm does not have."""
     what, slides = f"joint {quoted(joint.name)}", joint.kind == "prismatic"
     if joint.kind not in ("revolute", "continuous", "prismatic"):
-        known = joint.kind in ("floating", "planar")
-        kind = f"is {joint.kind}" if known else f"has the unknown type {quoted(joint.kind)}"
+        of_format = joint.kind in ("floating", "planar")
+        kind = f"is {joint.kind}" if of_format else f"has the unknown type {quoted(joint.kind)}"
         raise InputError(f"{what} {kind}, which is no joint of an arm; name links without it between them.")
     if joint.mimics is not None:
         raise InputError(

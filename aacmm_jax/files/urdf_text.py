@@ -123,11 +123,20 @@ class Element(NamedTuple):
             transform[:3, 3] = _METRE * origin.numbers("xyz", _ZERO)
         return transform
 
-    def check_name(self, what: str, name: str, known: list[str]) -> None:
-        """Refuse the name of an attribute or element in it that is misspelt, or not one of those ``known``."""
-        if not _NAMES[self.name].others or difflib.get_close_matches(name.casefold(), known, n=1, cutoff=_ALIKE):
+    def check_attributes(self) -> None:
+        """Refuse attributes that `check_name` does."""
+        names = _NAMES[self.name].attributes.split()
+        for key in self.attributes:
+            if key == "quat_xyzw":
+                raise InputError(f"{self.where} has a quaternion, quat_xyzw; write its angles as rpy.")
+            if key not in names and ":" not in key and key != "xmlns":
+                self.check_name("attribute", key, names)
+
+    def check_name(self, what: str, name: str, names: list[str]) -> None:
+        """Refuse the name of an attribute or element in it that is misspelt, or none of ``names``."""
+        if not _NAMES[self.name].others or difflib.get_close_matches(name.casefold(), names, n=1, cutoff=_ALIKE):
             shape = "<{}>" if what == "element" else "{}"
-            meant = nearest(shape.format(name.casefold()), map(shape.format, known)) if known else "; take it out."
+            meant = nearest(shape.format(name.casefold()), map(shape.format, names)) if names else "; take it out."
             shown = f"<{quoted(name)[1:-1]}>" if what == "element" else quoted(name)
             raise InputError(f"{self.where} has an unknown {what} {shown}{meant}")
 
@@ -335,12 +344,7 @@ def _parsed(text: str) -> tuple[Element, int]:
         tag = re.compile(rb"""<(?:[^"'>]++|"[^"]*+"|'[^']*+')*+>""").match(content, begin)
         place = (begin, len(content) if tag is None else tag.end())  # None of no XML, which the parser refuses
         element = Element(name, attributes, words, line, place, [])
-        known = _NAMES[name].attributes.split()
-        for key in attributes:
-            if key == "quat_xyzw":
-                raise InputError(f"{element.where} has a quaternion, quat_xyzw; write its angles as rpy.")
-            if key not in known and ":" not in key and key != "xmlns":
-                element.check_name("attribute", key, known)
+        element.check_attributes()
         (root if parent is None else parent.children).append(element)
         stack.append(element)
 

@@ -226,9 +226,7 @@ def checked_limits(limits: Limits, joints: int, prismatic: tuple[int, ...] = ())
 
 def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
     """Lowest and highest reading of each joint: those given, else the arm's own, else -pi to pi; rad, or mm.
-
-    Raises `InputError` where a prismatic joint has neither.
-    """
+    `InputError` where a prismatic joint has neither."""
     rows = limits if limits is not None else arm.limits
     if rows is None:
         if arm.prismatic:

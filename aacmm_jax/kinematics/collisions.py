@@ -291,8 +291,7 @@ def checked_cell(arm: Arm, cell: Cell, limits: JointLimits) -> Cell:
 
     A body touches itself at its joints, and its foot touches what it stands on. Pairs of capsules that touch in half of
     random configurations, more than any arm does, and capsules that touch an obstacle in all of them, are left out.
-
-    Raises `InputError` for an obstacle without extent, or two of one name.
+    `InputError` for an obstacle without extent, or two of one name.
     """
     names = [obstacle.name for obstacle in cell.obstacles]
     for obstacle in cell.obstacles:

@@ -141,10 +141,8 @@ def lowest_point(arm: Arm, q: Configurations) -> Float[np.ndarray, " c"]:
 
 
 def total_link_length(arm: Arm) -> float:
-    """Sum of the lengths of the links and the probe, without the base's height d_1, mm.
-
-    A prismatic joint adds its longest slide by its limits, or 1 m where it has none.
-    """
+    """Sum of the lengths of the links and the probe, without the base's height d_1, mm; a prismatic joint adds its
+    longest slide by its limits, or 1 m where it has none."""
     slides = [1000.0 if arm.limits is None else max(map(abs, arm.limits[i - 1])) for i in arm.prismatic]
     links = np.abs(arm.a).sum() + np.abs(np.asarray(arm.d)[1:]).sum() + np.linalg.norm(np.asarray(arm.probe))
     return float(links + sum(slides))
@@ -197,10 +195,8 @@ def cones_of(cones: list[Cone], tool_axis: tuple[float, float, float] = TOOL_AXI
 
 
 def tilts(arm: Arm, q: Configurations, cones: Cones) -> Float[np.ndarray, " c"]:
-    """Angle between a tool and the normal of its socket, rad: 0 where it comes straight from above the socket.
-
-    ``cones`` has a row for each configuration.
-    """
+    """Angle between a tool and the normal of its socket, rad, 0 where it comes straight from above the socket; with a
+    cone for each configuration."""
     rotations = np.asarray(to_numpy(arm).pose(q))[..., :3, :3]
     return _angle(rotations @ cones.tool_axis, cones.normals)
 

@@ -127,11 +127,11 @@ def relaxed_value(candidates: Candidates, count: int, objective: Objective, iter
     of Silvey, Titterington and Torsney 1978): at a hundredth of the cost this ranks sets of candidates as exchange
     does. Without iterations it is the value for random poses.
     """
-    p, (_, each, unknowns) = candidates.parameters, candidates.rows.shape
+    p, (_, rows, unknowns) = candidates.parameters, candidates.rows.shape
     flat = candidates.rows.reshape(-1, unknowns)
     times = np.full(len(candidates.rows), count / len(candidates.rows))
     for iteration in range(iterations + 1):
-        covariance = np.linalg.inv(candidates.base + (flat * np.repeat(times, each)[:, None]).T @ flat)
+        covariance = np.linalg.inv(candidates.base + (flat * np.repeat(times, rows)[:, None]).T @ flat)
         if iteration < iterations:
             gradient = objective.gradient(covariance[:p, :p])
             try:

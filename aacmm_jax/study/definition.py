@@ -160,7 +160,7 @@ class Study:
     @property
     def plain_arm(self) -> Arm:
         """The nominal arm whose joints do what they read: of configurations that trials begin with."""
-        return without_corrections(self.nominal.arm) if self.nominal.arm.corrections is not None else self.nominal.arm
+        return without_corrections(self.nominal.arm)
 
     @cached_property
     def joints(self) -> Arm:

@@ -156,15 +156,17 @@ def cell_summary(results: Results, cell: int) -> dict[str, Any]:
 
 def distribution(values: Float[np.ndarray, " t"], groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
     """Mean, standard deviation (key "spread") and percentiles, each with its standard error."""
-    order = np.argsort(values)
-    values, groups = values[order], groups[order]
-    figures = {"mean": statistic(np.mean, values, groups)}
-    if len(values) > 1:
-        figures["spread"] = statistic(lambda x: np.std(x, ddof=1 if len(x) > 1 else 0), values, groups)
-    percentiles = statistic(_percentiles, values, groups)
-    for i, percentile in enumerate(PERCENTILES):
-        figures[f"p{percentile}"] = {key: value[i] for key, value in percentiles.items()}
-    return figures
+    order, names = np.argsort(values), ("mean", "spread", *(f"p{percentile}" for percentile in PERCENTILES))
+    columns = statistic(_figures, values[order], groups[order])
+    figures = {name: {key: column[i] for key, column in columns.items()} for i, name in enumerate(names)}
+    return {name: figure for name, figure in figures.items() if len(values) > 1 or name != "spread"}
+
+
+def _figures(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " f"]:
+    """Those of sorted values; percentiles are linear between neighbours as in `numpy.percentile`, which would sort."""
+    places = np.array(PERCENTILES) / 100 * (len(ordered) - 1)
+    percentiles = np.interp(places, np.arange(len(ordered)), ordered)
+    return np.array([ordered.mean(), np.std(ordered, ddof=min(len(ordered) - 1, 1)), *percentiles])
 
 
 def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " t"]) -> dict[str, Any]:
@@ -188,11 +190,6 @@ def statistic(function: Callable, values: np.ndarray, groups: Int[np.ndarray, " 
 def _jackknife(rest: np.ndarray) -> np.ndarray:
     """The standard error of a statistic from its values with one group left out each (Efron and Stein 1981)."""
     return np.asarray(np.sqrt((len(rest) - 1) / len(rest) * np.sum((rest - rest.mean(axis=0)) ** 2, axis=0)))
-
-
-def _percentiles(ordered: Float[np.ndarray, " t"]) -> Float[np.ndarray, " q"]:
-    """Percentiles of sorted values, linear between neighbours as in `numpy.percentile` (which would sort again)."""
-    return np.interp(np.array(PERCENTILES) / 100 * (len(ordered) - 1), np.arange(len(ordered)), ordered)
 
 
 def _parameters(results: Results, cell: int) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from ..core.jax_setup import set_up
 from ..files.outputs import OutputFile
 from .blocks import Block, check_same, computed_with
 from .configuration_pool import check_reach
-from .definition import Study, equal_study
+from .definition import Setting, Study, equal_study
 from .store import Results, check_owners, parts_of, read, write_block
 from .trials import run_block
 
@@ -113,7 +113,13 @@ def run_study(
         kept = {block for block in results.finished_blocks() if results.is_readable(block)}
         missing = [block for block in results.blocks if block not in kept]
         done = before = total - sum(block.size for block in missing)
-        first, others = _in_order(study, missing)
+        # The first block of every setting compiles its program. Blocks of one setting run consecutively, so that few
+        # pools are needed at a time.
+        by_setting: dict[Setting, list[Block]] = {}
+        for block in missing:
+            by_setting.setdefault(study.settings[block.first_cell], []).append(block)
+        first = [blocks[0] for blocks in by_setting.values()]
+        others = [block for blocks in by_setting.values() for block in blocks[1:]]
         progress = StudyProgress(done, total, len(first), len(first))
         tell(progress)
         with _stop_on_interrupt() as stopped:
@@ -266,18 +272,6 @@ def _pool(executor: Executor | None, workers: int | None) -> Iterator[tuple[Exec
         yield threads, count, itertools.cycle(devices)
     finally:  # where a block is running still, an interrupt does not wait for it
         threads.shutdown(wait=False, cancel_futures=True)
-
-
-def _in_order(study: Study, missing: list[Block]) -> tuple[list[Block], list[Block]]:
-    """The first block of every setting, each of which compiles its program; and the others.
-
-    Blocks of one setting run consecutively, so that few pools are needed at a time.
-    """
-    by_setting = {setting: [] for setting in study.settings}
-    for block in missing:
-        by_setting[study.settings[block.first_cell]].append(block)
-    groups = [blocks for blocks in by_setting.values() if blocks]
-    return [blocks[0] for blocks in groups], [block for blocks in groups for block in blocks[1:]]
 
 
 def _completed(

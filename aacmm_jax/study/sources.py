@@ -22,7 +22,6 @@ from .definition import Study
 from .specification import Specification, checked
 
 _SHIPPED = resources.files("aacmm_jax.study") / "shipped_studies"
-_TABLES = ("deviation", "noise", "bounds", "reference", "identification")
 
 
 def make_study(
@@ -63,9 +62,6 @@ def make_study(
         >>> print(len(made.cells), made.factors)
         6 {'capture.poses': [20.0, 70.0], 'noise.encoder_arcsec': [1.0, 2.0, 5.0]}
     """
-    for key in tables:
-        if key not in _TABLES:
-            raise InputError(f"a study has no table '{key}'{nearest(key, _TABLES)}")
     if isinstance(capture, Capture):
         nominal = _nominal(arm, capture)
         recording, capture = Recording(capture, nominal), {"file": "(in memory)"}

@@ -193,10 +193,10 @@ def _read_where(geometry: Geometry, corrections: Corrections, q: Float[Array, "n
     The errors of joints change so little with the readings (their slope is their amplitude times the order of the
     harmonic) that a few substitutions are exact to rounding.
     """
-    each = jax.tree.map(lambda leaf: leaf[:, None, :], geometry)._replace(corrections=corrections)
+    corrected = jax.tree.map(lambda leaf: leaf[:, None, :], geometry)._replace(corrections=corrections)
 
     def closer(_: Array, reading: Float[Array, "n w N"]) -> Float[Array, "n w N"]:
-        return q - joint_errors(each, joint_motion_of_rows(each, reading[:, :, None]))[0][:, :, 0]
+        return q - joint_errors(corrected, joint_motion_of_rows(corrected, reading[:, :, None]))[0][:, :, 0]
 
     return jax.lax.fori_loop(0, _SUBSTITUTIONS, closer, q)
 

@@ -58,7 +58,6 @@ class Table(NamedTuple):
     title: str
     headings: Sequence[str]
     rows: Sequence[Sequence[Any]]
-    keys: int = 1  # columns that a terminal repeats where it is too narrow for all
     folded: bool = False  # a page shows it on demand only, and does not print it
 
     @property
@@ -70,21 +69,19 @@ class Table(NamedTuple):
 View = Iterator[Line | Table]  # what people see of a summary
 
 
-def listed(
-    title: str, rows: Iterable[Any], columns: Columns | Sequence[str], *, folded: bool = False, keys: int = 1
-) -> Table:
+def listed(title: str, rows: Iterable[Any], columns: Columns | Sequence[str]) -> Table:
     """A table of rows: each column is a key of the row, or a function of the row; None: there is no such column.
 
     With headings alone, each row is its cells.
     """
     if not isinstance(columns, Mapping):
-        return Table(title, columns, list(rows), keys, folded)
+        return Table(title, columns, list(rows))
     getters = {heading: getter for heading, getter in columns.items() if getter is not None}
     cells = [
         [getter(row) if callable(getter) else row.get(getter) for getter in getters.values()]
         for row in rows
     ]  # fmt: skip
-    return Table(title, list(getters), cells, keys, folded)
+    return Table(title, list(getters), cells)
 
 
 def by_columns(title: str, columns: Mapping[str, Iterable[Any]]) -> Table:

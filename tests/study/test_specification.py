@@ -81,7 +81,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        ({"nois": {}}, "a study has no table 'nois'; did you mean 'noise'"),
+        ({"nois": {}}, "the study: unknown key 'nois'; did you mean 'noise'"),
         ({"noise": {"encoder_arcse": 1}}, "unknown key 'noise.encoder_arcse'; did you mean 'encoder_arcsec'"),
         ({"noise": {"encoder_arcsec": -1}}, "'noise.encoder_arcsec' must be greater than or equal to 0, not -1"),
         ({"noise": {"encoder_arcsec": [1, -2]}}, "'noise.encoder_arcsec 2' must be greater than or equal to 0, not -2"),
