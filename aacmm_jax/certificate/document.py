@@ -96,7 +96,6 @@ def dcc_xml(
 def _check_evaluation(
     record: CalibrationRecord, administrative_data: AdministrativeData, evaluation: EvaluationRecord | None
 ) -> None:
-    """Refuse an evaluation of another arm, and a conformity without results that it rests on."""
     simulated = record.recording.true is not None
     if evaluation is None:
         check_conformity(administrative_data, simulated=simulated)
@@ -259,7 +258,6 @@ def _influences(record: EvaluationRecord) -> str:
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:
-    """One test; ``judged``: with the conformity of values with limits, which no simulated arm has."""
     lacking = f"Not the full procedure. {' '.join(test.missing)}" if test.missing else "The full procedure."
     lists = (
         named(
