@@ -175,7 +175,6 @@ def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[S
 
 
 def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
-    """The readings of each joint within its limits."""
     arm = record.calibrated.arm
     slides = [joint + 1 in arm.prismatic for joint in range(arm.joints)]
     units = np.where(slides, 1.0, DEG)
