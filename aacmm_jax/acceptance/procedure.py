@@ -158,7 +158,6 @@ def plan_procedure(
 
 
 def _unsuitable_bars(standard: Planned, size: float, lengths: Sequence[float]) -> list[str]:
-    """Sentences on bars outside the standard's ranges, for a measuring range in mm."""
     if standard == "iso":
         least = LONGEST * size
         sentence = f"The longest bar, {lengths[-1]:g} mm, is under 66 % of the range ({least:.0f} mm)."

@@ -60,7 +60,6 @@ class StandardTest(NamedTuple):
 
 
 def _wrong(measured: Measured, test: SphereTest, wrong: Callable[[ProbedSphere], list[str]]) -> str | None:
-    """What is wrong of the spheres of a test, in one list."""
     named = [text for sphere in spheres_for(measured, test) for text in wrong(sphere)]
     return ", ".join(named) if named else None
 
@@ -158,7 +157,6 @@ def _longest(measured: Measured) -> str | None:
 
 
 def _bars(measured: Measured, by_bar: bool = True) -> list[geometry.BarPositions]:
-    """The positions of each bar, or of all together."""
     positions = geometry.bar_positions(measured)
     return positions.artefacts() if by_bar else [positions]
 

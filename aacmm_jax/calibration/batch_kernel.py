@@ -233,7 +233,7 @@ def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task
         covariances = [sigma**2 * matrices for matrices in own_covariances(task.observed, state.point, whitening)]
         k = scale_and_weights(ends_between(task.observed, z[len(free) :], covariances, problem.capture))[0].value
     tips = repeatability_of(state, task.observed)
-    side = Bounds(begun.space, *(side[: len(free)] for side in begun.sides)).active(z[: len(free)])
+    side = Bounds(begun.space, *(side[: len(free)] for side in begun.box[:2])).active(z[: len(free)])
     fields = {
         "parameters": set_at(task.start, free, z[: len(free)]),
         "de": tips.de,

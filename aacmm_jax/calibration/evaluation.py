@@ -155,7 +155,10 @@ def _evaluated(
     if lengths:
         ends = [(position_of(length.start), position_of(length.end)) for length in lengths]
         measured, pull = observed.distances(geometry, ends)
-        scatter = fitted.variances_of(pull) if fitted.redundant or noise is not None else np.nan
+        # By an arm without errors but the noise of its readings, where anything shows that.
+        influence = linear.influence(np.concatenate([[True], ~fitted.free]))
+        scatter = variances_of_functions(influence, *observed.by_unknowns(pull, 1))
+        scatter = scatter if fitted.redundant or noise is not None else np.nan
         u = xp.sqrt(scatter + xp.stack([length.u for length in lengths]) ** 2)
     described = None
     if whole:
@@ -192,11 +195,6 @@ class GeometryFit(NamedTuple):
     def geometry(self) -> Float[AnyArray, " g"]:
         """The numbers of the geometry."""
         return self.linear.z[1:]
-
-    def variances_of(self, derivatives: Float[AnyArray, "q g"]) -> Float[AnyArray, " q"]:
-        """Variances of functions of the geometry, by an arm without errors but the noise of its readings."""
-        influence = self.linear.influence(np.concatenate([[True], ~self.free]))
-        return variances_of_functions(influence, *self.linear.observed.by_unknowns(derivatives, 1))
 
 
 def fit_geometry(arm: Arm, observed: Observed, kept: Mapping[str, AnyArray], noise: Noise | None) -> GeometryFit:

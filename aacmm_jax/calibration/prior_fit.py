@@ -97,6 +97,11 @@ class PriorProblem(NamedTuple):
         return np.array(self.prior.learned)
 
     @property
+    def steps(self) -> Any:
+        """Natural steps of the unknowns."""
+        return self.begun.box[2]
+
+    @property
     def groups(self) -> Groups:
         """The groups, with what is known of them."""
         prior = self.prior
@@ -106,7 +111,7 @@ class PriorProblem(NamedTuple):
         """The scales before anything is learned; those that are given keep these values."""
         xp, prior = namespace(self.reference.sigma, self.prior), self.prior
         first = np.array([members[0] for members in prior.members])
-        variances = 2 * xp.log(xp.maximum((prior.sd / self.begun.steps[: prior.sd.shape[0]])[first], _LEAST_GIVEN))
+        variances = 2 * xp.log(xp.maximum((prior.sd / self.steps[: prior.sd.shape[0]])[first], _LEAST_GIVEN))
         return xp.concatenate([_log_sigma(self.reference.sigma), variances])
 
     def sd(self, scales: Float[AnyArray, " s"]) -> Float[AnyArray, " k"]:
@@ -116,7 +121,7 @@ class PriorProblem(NamedTuple):
     def rows(self, scales: Float[AnyArray, " s"]) -> PriorRows:
         """The rows of the prior with these scales."""
         xp, index = namespace(scales, self.prior), self.prior.index
-        weight = 1 / (self.sd(scales) * self.begun.steps[index])
+        weight = 1 / (self.sd(scales) * self.steps[index])
         return PriorRows(self.prior.mean, set_at(xp.zeros_like(self.prior.mean), index, weight))
 
     def args(self, scales: Float[AnyArray, " s"], prior: PriorRows | None) -> Args:
@@ -127,14 +132,16 @@ class PriorProblem(NamedTuple):
 
     def fit(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"], *, differentiable: bool) -> Fit:
         """The unknowns with these scales."""
-        index, steps = self.prior.index, self.begun.steps
+        index, steps = self.prior.index, self.steps
         tight = namespace(scales, z).clip(stop_gradient(self.sd(scales)), _LEAST_SCALE, 1.0)
-        begun = self.begun._replace(steps=set_at(steps, index, steps[index] * tight))
-        return fit(self.task, self.args(scales, self.rows(scales)), z, begun, NEAR, differentiable)
+        box = (*self.begun.box[:2], set_at(steps, index, steps[index] * tight))
+        return fit(
+            self.task, self.args(scales, self.rows(scales)), z, self.begun._replace(box=box), NEAR, differentiable
+        )
 
     def model(self, scales: Float[AnyArray, " s"], z: Float[AnyArray, " z"]) -> PriorModel:
         """The model of the parameters that have a prior, linear at a point."""
-        xp, index, (lower, upper), steps = namespace(scales, z), self.prior.index, self.begun.sides, self.begun.steps
+        xp, index, (lower, upper, steps) = namespace(scales, z), self.prior.index, self.begun.box
         data: Any = observed_model(z, self.args(scales, None), curved=False)
         pinned = (z <= lower) | (z >= upper)
         deviation = (z[: self.prior.mean.shape[0]] - self.prior.mean)[index] / steps[index]
@@ -213,7 +220,7 @@ class PriorProblem(NamedTuple):
             learned=prior.learned,
             units=prior.units,
             parameters=tuple(len(members) for members in prior.members),
-            sd=xp.where(in_units, of_groups * self.begun.steps[first], of_groups),
+            sd=xp.where(in_units, of_groups * self.steps[first], of_groups),
             effective=xp.asarray(prior.membership) @ effective,
             supported=~xp.asarray(self.learned) | self.moving(scales),
             names=self.begun.space.names,

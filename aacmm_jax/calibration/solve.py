@@ -98,7 +98,7 @@ def concluded(
     """The identification whose unknowns are ``z``; ``last`` is the last least squares, with the evaluations of all."""
     xp, names, free, observed = namespace(task, z), task.bounds.space.names, task.free, task.observed
     p, count = len(free), z.shape[0] - len(free)
-    active = Bounds(begun.space, *(side[:p] for side in begun.sides)).active(z[:p])
+    active = Bounds(begun.space, *(side[:p] for side in begun.box[:2])).active(z[:p])
     whitening = whitening_at(task, state, of_prior and of_prior.rows)
     linear = Linearisation.of(observed, begun.space, z, state.point, state.errors, whitening, task.loss)
     # A parameter on a bound follows no row; `stages` adds the chance that it is not on its bound.

@@ -250,6 +250,10 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
         )
 
 
+# Lower and upper bounds of the unknowns, and their natural steps.
+Bounded = tuple[Float[AnyArray, " z"], Float[AnyArray, " z"], Float[AnyArray, " z"]]
+
+
 class State(NamedTuple):
     """Everything at one point of a solve."""
 
@@ -262,8 +266,7 @@ class Begun(NamedTuple):
     """Where a solve begins."""
 
     space: Parameters
-    sides: tuple[Float[AnyArray, " z"], Float[AnyArray, " z"]]  # bounds of all unknowns
-    steps: Float[AnyArray, " z"]  # natural steps
+    box: Bounded
     before: State  # at the start
     z: Float[AnyArray, " z"]  # where it begins: there, or near the solution
     state: State  # there
@@ -295,12 +298,11 @@ def begin(task: Task, near: Float[AnyArray, " p"] | None = None) -> Begun:
     if near is not None:
         z = unknowns(xp.clip(near, task.bounds.lower, task.bounds.upper)[task.free])
         state = state_at(task, space, z)
-    lower, upper, steps = box_of(task)
-    return Begun(space, (lower, upper), steps, before, z, state)
+    return Begun(space, box_of(task), before, z, state)
 
 
-def box_of(task: Task) -> tuple[Float[AnyArray, " z"], Float[AnyArray, " z"], Float[AnyArray, " z"]]:
-    """Lower and upper bounds of all unknowns, of which the geometry has none unless it is kept; natural steps."""
+def box_of(task: Task) -> Bounded:
+    """Of all unknowns, of which the geometry has no bounds unless it is kept."""
     xp, kept, sides = namespace(task), task.kept or {}, []
     for side, endless in ((task.bounds.lower, -np.inf), (task.bounds.upper, np.inf)):
         geometry = [kept.get(name, np.full(len(units), endless)) for name, units in task.observed.blocks.items()]
@@ -385,16 +387,16 @@ def args_of(task: Task, whitening: Whitening, loss: Loss | None, z: Float[AnyArr
 def fit(task: Task, args: Args, z: Float[AnyArray, " n"], begun: Begun, rules: Rules, differentiable: bool) -> Fit:
     """A least squares within bounds: differentiable for arrays of JAX, unless no derivative is needed. The steps of
     what is begun scale the unknowns."""
-    xp, count = namespace(z, args, begun.sides), z.shape[0]
+    xp, count = namespace(z, args, begun.box), z.shape[0]
     if not task.fitted[:count].any():
         return Fit(z, xp.zeros((), dtype=int), reasons(xp.asarray(GRADIENT)), xp.zeros(()))
-    (lower, upper), scale = (side[:count] for side in begun.sides), begun.steps[:count]
+    box = Box(*(side[:count] for side in begun.box))
     if xp is np or not differentiable:
-        last = minimise(observed_model, z, args, Box(lower, upper, scale), rules, task.max_steps)
+        last = minimise(observed_model, z, args, box, rules, task.max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     # Optimistix takes 0.2 s to import, and NumPy needs none of it.
     from ..solver.bounded import least_squares
 
-    box: dict[str, Any] = {"lower": lower, "upper": upper, "scale": scale, "max_steps": task.max_steps}
-    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=rules, throw=False, **box)
+    within: dict[str, Any] = {**box._asdict(), "max_steps": task.max_steps}
+    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=rules, throw=False, **within)
     return Fit(solution.value, *(solution.stats[name] for name in ("num_steps", "reason", "optimality")))

@@ -10,10 +10,9 @@ from ..acceptance.record import EvaluationRecord, same_arm
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..core.errors import InputError
-from ..data.observations.observation import certified_quantities
 from ..diagnostics.contradictions import LEFT_OUT
 from ..diagnostics.findings import findings_of
-from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity, held_by_xml
+from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
 from ..summaries.observations import scale_sources
 from . import xml_elements as xml
 from .measurement_results import results_of, uncertainty_statement
@@ -70,8 +69,6 @@ def dcc_xml(
             "calibrate again."
         )
     _check_evaluation(record, administrative_data, evaluation)
-    for what, words in _given_texts(record, evaluation, sources, command):
-        held_by_xml(words, what if what == "the command" else f"the name of {what} {words!r}")
     try:
         day = datetime.datetime.fromisoformat(record.recording.measured or created).date()
     except ValueError as error:
@@ -99,7 +96,6 @@ def dcc_xml(
 def _check_evaluation(
     record: CalibrationRecord, administrative_data: AdministrativeData, evaluation: EvaluationRecord | None
 ) -> None:
-    """Refuse an evaluation of another arm, and a conformity without results that it rests on."""
     simulated = record.recording.true is not None
     if evaluation is None:
         check_conformity(administrative_data, simulated=simulated)
@@ -117,31 +113,13 @@ def _check_evaluation(
     check_conformity(administrative_data, simulated=simulated, decision=decision, tested=True)
 
 
-def _given_texts(
-    record: CalibrationRecord, evaluation: EvaluationRecord | None, sources: Sequence[str], command: str
-) -> Iterator[tuple[str, str]]:
-    """Every text that people gave besides the administrative data, and what it is the name of."""
-    recordings = [record.recording] + ([] if evaluation is None else [evaluation.recording])
-    for recording in recordings:
-        yield from (("socket", name) for name in recording.capture.names)
-        yield from (("sphere", sphere.name) for sphere in recording.spheres)
-    for observation in record.recording.capture.observations:
-        yield from (("observation", observation.name), ("target", observation.target))
-        yield from (("a certified value,", quantity.says) for quantity in certified_quantities(observation))
-    for removed in record.removed:
-        yield from (("what was left out,", name) for name in (removed.group, *removed.members))
-    yield "arm", record.recording.nominal.name
-    yield from (("file", source) for source in sources)
-    yield "the command", command
-
-
 def _administrative(
     record: CalibrationRecord, given: AdministrativeData, day: datetime.date, sources: Sequence[str]
 ) -> Element:
     """The administrative data, with the unique identifier still empty."""
     name = given.item.name or record.recording.nominal.name or "articulated-arm coordinate measuring machine"
-    maker = given.item.manufacturer
     serial = ("manufacturer", given.item.serial_number or NOT_STATED, "Serial number")
+    customers = ("customer", given.item.customer_number, "Customer's number")
     persons = [
         element(
             "respPerson",
@@ -155,16 +133,7 @@ def _administrative(
         "administrativeData",
         xml.software("dccSoftware"),
         _core(given, day),
-        element(
-            "items",
-            element(
-                "item",
-                text("name", name),
-                None if maker is None else element("manufacturer", text("name", maker)),
-                optional("model", given.item.model),
-                xml.identifications(serial, ("customer", given.item.customer_number, "Customer's number")),
-            ),
-        ),
+        element("items", xml.item("item", name, given.item, serial, customers)),
         element(
             "calibrationLaboratory",
             optional("calibrationLaboratoryCode", given.laboratory.code),
@@ -289,7 +258,6 @@ def _influences(record: EvaluationRecord) -> str:
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:
-    """One test; ``judged``: with the conformity of values with limits, which no simulated arm has."""
     lacking = f"Not the full procedure. {' '.join(test.missing)}" if test.missing else "The full procedure."
     lists = (
         named(

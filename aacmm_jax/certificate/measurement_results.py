@@ -19,7 +19,7 @@ from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.degrees_of_freedom import LEVEL
 from . import xml_elements as xml
-from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, optional, real, text
+from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
 _METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
 _METRICS = {
@@ -128,26 +128,16 @@ def _equipment(
     """The reference artefacts, the reference lengths, and the artefacts and instruments behind observations, with
     certified values and uncertainties as they were given."""
     for reference in references:
-        maker = reference.manufacturer
-        yield element(
-            "measuringEquipment",
-            text("name", reference.name),
-            None if maker is None else element("manufacturer", text("name", maker)),
-            optional("model", reference.model),
-            xml.identifications(
-                ("manufacturer", reference.serial_number, "Serial number"),
-                ("other", reference.certificate_number, "Number of its calibration certificate"),
-            ),
-        )
-    lengths = record.recording.capture.lengths
-    if lengths:
-        named_lengths = ((_length_name(i, length), length) for i, length in enumerate(lengths, start=1))
+        serial = ("manufacturer", reference.serial_number, "Serial number")
+        certificate = ("other", reference.certificate_number, "Number of its calibration certificate")
+        yield xml.item("measuringEquipment", reference.name, reference, serial, certificate)
+    if lengths := record.recording.capture.lengths:
         quantities = (
-            xml.equipment_quantity(name, float(length.value), MILLIMETRE, float(length.u))
-            for name, length in named_lengths
+            xml.equipment_quantity(_length_name(i, length), float(length.value), MILLIMETRE, float(length.u))
+            for i, length in enumerate(lengths, start=1)
         )
-        quantities = element("measuringEquipmentQuantities", quantities)
         unknown = "" if references else f"Artefact: {NOT_STATED}"
+        quantities = element("measuringEquipmentQuantities", quantities)
         yield named("measuringEquipment", "Reference lengths", quantities, says=unknown)
     # Observations with the same certified values are of one artefact in several placements, which is named once.
     equipment: dict[tuple, tuple[list[str], str, list[Quantity]]] = {}

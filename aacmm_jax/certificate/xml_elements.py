@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 from ..core.errors import InputError
 from ..core.text import number, quoted
-from ..files.administrative_data import NOT_STATED, Contact
+from ..files.administrative_data import NOT_STATED, CalibratedItem, Contact, Reference, held_by_xml
 from ..uncertainty.degrees_of_freedom import LEVEL
 
 DCC, SI, XSI = "https://ptb.de/dcc", "https://ptb.de/si", "http://www.w3.org/2001/XMLSchema-instance"
@@ -35,6 +35,9 @@ def element(tag: str, *children: Child, ref_type: str | None = None, prefix: str
 
 def _put(parent: Element, child: Child) -> None:
     if isinstance(child, str):
+        # Names that people gave stand in many texts: that which XML cannot hold is refused by name.
+        for word in child.split(" "):
+            held_by_xml(word, f"{word!r} in the certificate")
         parent.text = child
     elif isinstance(child, Element):
         parent.append(child)
@@ -121,14 +124,20 @@ def si(tag: str, *children: Child) -> Element:
     return element(tag, *children, prefix="si")
 
 
-def identifications(*entries: tuple[str, str | None, str]) -> Element | None:
-    """Identifications (issuer, value, name); those without a value are left out."""
-    given = [
-        element("identification", element("issuer", issuer), element("value", value), english("name", name))
-        for issuer, value, name in entries
+def item(tag: str, name: str, given: CalibratedItem | Reference, *numbers: tuple[str, str | None, str]) -> Element:
+    """A thing with its maker, model and numbers (issuer, value, name), those that were stated."""
+    identifications = [
+        element("identification", element("issuer", issuer), element("value", value), english("name", words))
+        for issuer, value, words in numbers
         if value is not None
     ]
-    return element("identifications", given) if given else None
+    return element(
+        tag,
+        text("name", name),
+        None if given.manufacturer is None else element("manufacturer", text("name", given.manufacturer)),
+        optional("model", given.model),
+        element("identifications", identifications) if identifications else None,
+    )
 
 
 def contact(tag: str, who: Contact) -> Element:

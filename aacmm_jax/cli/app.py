@@ -100,6 +100,11 @@ def examples(*commands: str) -> str:
     return "\n".join(["\b", f"{word}:", *(f"  {line}" for line in lines)])
 
 
+def command(*typed: str, name: str | None = None) -> Callable[[Any], Any]:
+    """A command, named as its function or ``name``, with examples as they are typed."""
+    return app.command(name, epilog=examples(*typed))
+
+
 def prepare_jax() -> None:
     """Before a command computes: on the CPU where JAX cannot start on what it is told to use, with a warning."""
     warning = prepare_command()
@@ -114,6 +119,18 @@ def with_spinner(what: str, work: Callable[[], Any]) -> Any:
     console = Console(stderr=True)
     with console.status(f"{what} ...") if console.is_terminal else contextlib.nullcontext():
         return work()
+
+
+@contextlib.contextmanager
+def progress_bar(*columns: Any, transient: bool = False) -> Iterator[Any]:
+    """A bar of rich with these columns on standard error, where that is a terminal; None elsewhere."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    bars = Progress(*columns, console=console, transient=transient)
+    with bars if console.is_terminal else contextlib.nullcontext() as bar:
+        yield bar
 
 
 def show_summary(summary: dict[str, Any], as_json: bool, view: Callable[[dict[str, Any]], Iterable]) -> None:

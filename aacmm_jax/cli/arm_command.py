@@ -14,20 +14,18 @@ from ..files.inputs import InputFile
 from ..files.outputs import together, write_text
 from ..summaries.tables import Styled, View, formatted, listed, number, warnings_of, written_of
 from . import options, views
-from .app import app, examples, show_summary, with_spinner
+from .app import command, show_summary, with_spinner
 from .options import argument, numbers_option, option
 from .plan_commands import assumed_noise
 
 _CAPTURES = (".toml", ".h5")  # others are tables
 
 
-@app.command(
-    epilog=examples(
-        "aacmm arm robot.urdf --tip tool0 --figure arm.png",
-        "aacmm arm --new my-arm.toml --joints 6",
-        "aacmm arm my-arm.toml --check poses.csv --unit deg",
-        "aacmm arm panda --check capture.toml",
-    )
+@command(
+    "aacmm arm robot.urdf --tip tool0 --figure arm.png",
+    "aacmm arm --new my-arm.toml --joints 6",
+    "aacmm arm my-arm.toml --check poses.csv --unit deg",
+    "aacmm arm panda --check capture.toml",
 )
 def arm(
     file: str | None = argument(
@@ -64,6 +62,8 @@ def arm(
     table [angles] that a manifest then needs. Positions of a table are in the base frame (of a URDF: in its base link),
     those of a manifest's tracker in a frame that is found. Exit code 1 where nothing makes them fit.
     """
+    from ..files.arm_tables import with_model
+
     if new is not None:
         if file is not None or check is not None or figure is not None:
             raise InputError("--new writes a template and reads no arm; leave out the arm, --check and --figure.")
@@ -89,10 +89,7 @@ def arm(
         return
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
-    if model is not None:
-        from ..files.arm_tables import with_model
-
-        specification = with_model(specification, model)
+    specification = specification if model is None else with_model(specification, model)
     frame = first_frame(specification)
     with together(figure):
         usual = assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)

@@ -9,24 +9,21 @@ import typer
 
 from .. import data, files, kinematics, pipeline, plot, summaries
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..core.text import number as number_of
 from ..core.units import DEG
 from ..files.hdf5 import read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
 from . import options, views
-from .app import app, examples, show_summary, with_spinner
-from .options import argument, bad_option, flag, names_option, option, output, seed
+from .app import command, show_summary, with_spinner
+from .options import argument, flag, names_option, option, output, seed
 
 
-@app.command(
-    epilog=examples(
-        "aacmm calibrate capture.h5 -o calibration.h5",
-        "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
-        "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
-        "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
-    )
+@command(
+    "aacmm calibrate capture.h5 -o calibration.h5",
+    "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
+    "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
+    "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
 )
 def calibrate(
     capture: list[Path] = argument("CAPTURE.h5 ...", "Capture, or captures of one arm in several sessions."),
@@ -164,21 +161,13 @@ def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bou
     """The arm with the bounds of its parameters, as its file or the command line says."""
     from ..kinematics.arm import is_length
 
-    widths: dict[str, float] = {}
-    for text in bounds:
-        name, _, width = text.partition("=")
-        if name in widths:
-            raise InputError(f"--bound gives {name} two half-widths; give it one.")
-        try:
-            value = number_of(width.strip())
-        except ValueError:
-            bad_option("--bound", text, "NAME=WIDTH, in mm or deg")
-        widths[name] = value if is_length(name) else value * DEG
+    widths = options.numbers_by_name("--bound", bounds, "NAME=WIDTH, in mm or deg", 1)
+    of_bounds = {name: width if is_length(name) else width * DEG for name, (width,) in widths.items()}
     identified = nominal.space().names
     return nominal._replace(
         length=nominal.length if length_mm is None else length_mm,
         angle=nominal.angle if angle_deg is None else angle_deg * DEG,
-        override={name: width for name, width in nominal.override.items() if name in identified} | widths,
+        override={name: width for name, width in nominal.override.items() if name in identified} | of_bounds,
     )
 
 
@@ -202,13 +191,11 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
     return data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
 
 
-@app.command(
-    "compare-models",
-    epilog=examples(
-        "aacmm compare-models capture.h5",
-        'aacmm compare-models capture.h5 --models "dh;gravity;gravity,harmonics=1" --leave-out "monday/*" '
-        '--leave-out "tuesday/*"',
-    ),
+@command(
+    "aacmm compare-models capture.h5",
+    'aacmm compare-models capture.h5 --models "dh;gravity;gravity,harmonics=1" --leave-out "monday/*" '
+    '--leave-out "tuesday/*"',
+    name="compare-models",
 )
 def compare_models(
     capture: Path = argument("CAPTURE.h5", "Capture, written by import or simulate."),
@@ -266,11 +253,9 @@ def compare_models(
         raise typer.Exit(1)
 
 
-@app.command(
-    epilog=examples(
-        "aacmm compare march.h5 september.h5",
-        "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05",
-    )
+@command(
+    "aacmm compare march.h5 september.h5",
+    "aacmm compare 2023.h5 2024.h5 2025.h5 --figure trend.png --max-length-change-mm 0.05",
 )
 def compare(
     paths: list[Path] = argument(

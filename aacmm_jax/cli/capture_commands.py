@@ -13,7 +13,7 @@ from ..core.text import quoted
 from ..core.units import DEG
 from ..files.outputs import together
 from . import options, views
-from .app import app, examples, show_summary, with_spinner
+from .app import command, show_summary, with_spinner
 from .arm_command import checked_recording, reading_check
 from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
 
@@ -22,7 +22,7 @@ _POSES = 70  # in each socket
 _DIGITS = 9
 
 
-@app.command(epilog=examples("aacmm demo my-demo --seed 7"))
+@command("aacmm demo my-demo --seed 7")
 def demo(
     folder: Path = typer.Argument(Path("aacmm-demo"), help="Folder for the files; made if it does not exist."),
     seed: int = seed("the noise"),
@@ -38,12 +38,10 @@ def demo(
     show_summary(summary, as_json, views.demo)
 
 
-@app.command(
-    epilog=examples(
-        "aacmm simulate cheng2018-simulation -o capture.h5 --poses 70 \\\n"
-        "  --socket A=400,200,300 --socket B=600,200,300 --length A,B,0.002 \\\n"
-        "  --encoder-arcsec 2 --seating-mm 0.005"
-    )
+@command(
+    "aacmm simulate cheng2018-simulation -o capture.h5 --poses 70 \\\n"
+    "  --socket A=400,200,300 --socket B=600,200,300 --length A,B,0.002 \\\n"
+    "  --encoder-arcsec 2 --seating-mm 0.005"
 )
 def simulate(
     arm: str = options.NOMINAL_ARM,
@@ -149,9 +147,7 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, in
     return counts
 
 
-@app.command(
-    name="import", epilog=examples("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check")
-)
+@command("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check", name="import")
 def import_(
     manifest: Path = argument(
         "MANIFEST.toml", "Which files hold which poses and measured values, in which columns and units."

@@ -14,7 +14,7 @@ from ..core.text import printable, shorten
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import check_kept, together, write_text
 from . import options
-from .app import app, examples, show_summary, warn_of_unusable
+from .app import command, show_summary, warn_of_unusable
 from .arm_command import first_frame
 from .options import argument, names_option, numbers_option, option, output
 
@@ -22,13 +22,11 @@ _FORMATS = {".urdf": "urdf", ".json": "json", ".csv": "csv", ".yaml": "ur", ".ym
 _OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
 
 
-@app.command(
-    epilog=examples(
-        "aacmm export calibration.h5 --format toml -o arm.toml",
-        "aacmm export calibration.h5 -o robot.urdf",
-        "aacmm export calibration.h5 --format table --convention craig --units m-rad",
-        "aacmm export calibration.h5 --format dcc --evaluation tests.h5 --about laboratory.toml -o certificate.xml",
-    )
+@command(
+    "aacmm export calibration.h5 --format toml -o arm.toml",
+    "aacmm export calibration.h5 -o robot.urdf",
+    "aacmm export calibration.h5 --format table --convention craig --units m-rad",
+    "aacmm export calibration.h5 --format dcc --evaluation tests.h5 --about laboratory.toml -o certificate.xml",
 )
 def export(
     calibration: Path = options.CALIBRATION_FILE,
@@ -168,11 +166,9 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
     )
 
 
-@app.command(
-    epilog=examples(
-        "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
-        "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
-    )
+@command(
+    "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg",
+    "aacmm correct calibration.h5 poses.csv -o corrected.csv --unit deg --near 0,-90,90,0,90,0 --probe 0,0,150",
 )
 def correct(
     calibration: Path = options.CALIBRATION_FILE,

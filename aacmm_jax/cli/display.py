@@ -40,7 +40,7 @@ def print_table(console: Console, table: Table) -> None:
     """Print a table so that nothing in it is cut off.
 
     Cells wrap between words where the console is narrow. Where even that is not enough, the columns are printed in
-    several blocks, each of which begins with the first ``keys`` columns.
+    several blocks, each of which begins with the first column.
     """
     cells, columns = table.cells, range(len(table.headings))
     rows = [[Text(cell.text.translate(_PLAIN).strip(), STYLES.get(cell.mark, "")) for cell in row] for row in cells]
@@ -48,11 +48,11 @@ def print_table(console: Console, table: Table) -> None:
     natural = [max(cell_len(line) for text in column for line in text.split("\n")) for column in texts]
     words = [max((cell_len(word) for text in column for word in text.split()), default=0) for column in texts]
     least = [min(word, _LONGEST_WORD) for word in words]
-    blocks = [list(range(table.keys))]
-    for i in columns[table.keys :]:
+    blocks = [[0]]
+    for i in columns[1:]:
         width = sum(least[j] + _GAP for j in (*blocks[-1], i)) - _GAP
-        if width > console.width and len(blocks[-1]) > table.keys:
-            blocks.append(list(range(table.keys)))
+        if width > console.width and len(blocks[-1]) > 1:
+            blocks.append([0])
         blocks[-1].append(i)
     for block in blocks:
         widths = {i: natural[i] for i in block}

@@ -86,63 +86,51 @@ def names_option(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def numbers_option(name: str, text: str, form: str, count: int | None = None) -> tuple[float, ...]:
+def numbers_option(option: str, text: str, form: str, count: int | None = None) -> tuple[float, ...]:
     """Finite numbers that an option lists, separated by commas."""
-    values = _numbers(name, text, text, form)
-    if count not in (None, len(values)):
-        bad_option(name, text, form)
+    values = _numbers(option, text, text, form, count)
     if not all(map(math.isfinite, values)):
-        raise InputError(f"{name} '{text}' holds a value that is not finite; give finite numbers.")
+        raise InputError(f"{option} '{text}' holds a value that is not finite; give finite numbers.")
     return values
 
 
-def _numbers(option: str, text: str, values: str, form: str) -> tuple[float, ...]:
-    """The numbers in a part (``values``) of what is given for an option."""
+def _numbers(option: str, text: str, part: str, form: str, count: int | None) -> tuple[float, ...]:
+    """The numbers in a part of what is given for an option."""
     try:
-        return tuple(number(part.strip()) for part in values.split(","))
+        values = tuple(number(word.strip()) for word in part.split(","))
     except ValueError:
         bad_option(option, text, form)
+    if count not in (None, len(values)):
+        bad_option(option, text, form)
+    return values
 
 
-def numbers_by_socket(
-    option: str, texts: Sequence[str] | None, count: int, form: str
-) -> dict[str | None, tuple[float, ...]]:
-    """So many numbers by the name of a socket, None for all: ``NAME=1,2,3`` or ``1,2,3``."""
-    by_name: dict[str | None, tuple[float, ...]] = {}
+def numbers_by_name(
+    option: str, texts: Sequence[str] | None, form: str, count: int, *, named: bool = True
+) -> dict[str, tuple[float, ...]]:
+    """So many numbers by name: ``NAME=1,2,3``; unless all are ``named`` also ``1,2,3``, by the name ""."""
+    by_name: dict[str, tuple[float, ...]] = {}
     for text in texts or ():
         name, equals, values = text.rpartition("=")
-        key = name if equals else None
-        numbers = _numbers(option, text, values, form)
-        if len(numbers) != count:
+        if named and not equals:
             bad_option(option, text, form)
-        if key in by_name:
-            raise InputError(f"{option} is given twice for {'all sockets' if key is None else repr(key)}; give one.")
-        by_name[key] = numbers
+        if any(is_control(character) for character in name):
+            raise InputError(f"{option} {quoted(text)} has a control character in its name; leave it out.")
+        if name in by_name:
+            raise InputError(f"{option} is given twice for {repr(name) if name else 'all sockets'}; give one.")
+        by_name[name] = _numbers(option, text, values, form, count)
     return by_name
 
 
 def sockets_option(texts: Sequence[str] | None) -> dict[str, tuple[float, ...]]:
     """Sockets from ``NAME=X,Y,Z``, mm."""
-    points: dict[str, tuple[float, ...]] = {}
-    for text in texts or ():
-        name, _, point = text.rpartition("=")
-        form = "NAME=X,Y,Z in mm, for example A=400,200,300"
-        coordinates = _numbers("--socket", text, point, form)
-        if len(coordinates) != 3:
-            bad_option("--socket", text, form)
-        if any(is_control(character) for character in name):
-            raise InputError(f"--socket {quoted(text)} has a control character in its name; leave it out.")
-        if name in points:
-            raise InputError(f"socket '{name}' is given twice in --socket; give each its own name.")
-        points[name] = coordinates
-    return points
+    return numbers_by_name("--socket", texts, "NAME=X,Y,Z in mm, for example A=400,200,300", 3)
 
 
 def length_option(text: str) -> tuple:
     """A reference length from ``A,B`` or ``A,B,U``, mm; a name with a comma in it is put in double quotes."""
     form = "A,B or A,B,U with u in mm"
-    start, end, *rest = [*next(csv.reader([text]), []), "", ""]
-    u = _numbers("--length", text, ",".join(rest[:-2]), form) if rest[:-2] else ()
-    if not start or not end or len(u) > 1:
+    names = next(csv.reader([text]), [])
+    if len(names) not in (2, 3) or not all(names[:2]):
         bad_option("--length", text, form)
-    return (start, end, *u)
+    return (*names[:2], *(_numbers("--length", text, u, form, 1)[0] for u in names[2:]))

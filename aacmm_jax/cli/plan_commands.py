@@ -2,8 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,18 +15,8 @@ from ..core.text import listed, number
 from ..core.units import DEG
 from ..files.outputs import together, write_text
 from . import options
-from .app import app, examples, show_summary, with_spinner
-from .options import (
-    bad_option,
-    flag,
-    length_option,
-    names_option,
-    numbers_by_socket,
-    option,
-    output,
-    seed,
-    sockets_option,
-)
+from .app import command, progress_bar, show_summary, with_spinner
+from .options import bad_option, flag, option, output, seed
 
 _CONTEXT: Any = typer.Context.__base__  # what Typer passes: its own class is a subclass that nothing is of
 _SOCKETS, _FARTHEST = 4, 0.95
@@ -45,16 +34,14 @@ _OF_SOCKETS = {"sockets", "socket", "length", "length_mm", "u_mm", "cone_deg", "
 _OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
 
 
-@app.command(
-    epilog=examples(
-        "aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv --manifest capture.toml",
-        "aacmm plan my-arm.toml --acceptance iso -o acceptance.csv --manifest acceptance.toml",
-        "aacmm plan my-arm.toml -o plan.csv --poses 25 \\\n"
-        "  --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002",
-        "aacmm plan my-arm.toml --kit kit.toml --poses 60 -o plan.csv --manifest capture.toml",
-        "aacmm plan robot.urdf --tip tool0 -o plan.csv --poses 40 --cone-deg 55 --collisions --cell cell.toml",
-        "aacmm plan panda -o plan.csv --poses 40 --cone-deg 55 --link-radius-mm 60 --angles rad --unconstrained",
-    )
+@command(
+    "aacmm plan my-arm.toml --sockets 4 --poses 30 -o plan.csv --manifest capture.toml",
+    "aacmm plan my-arm.toml --acceptance iso -o acceptance.csv --manifest acceptance.toml",
+    "aacmm plan my-arm.toml -o plan.csv --poses 25 \\\n"
+    "  --socket A=400,200,300 --socket B=700,500,500 --length A,B,0.002",
+    "aacmm plan my-arm.toml --kit kit.toml --poses 60 -o plan.csv --manifest capture.toml",
+    "aacmm plan robot.urdf --tip tool0 -o plan.csv --poses 40 --cone-deg 55 --collisions --cell cell.toml",
+    "aacmm plan panda -o plan.csv --poses 40 --cone-deg 55 --link-radius-mm 60 --angles rad --unconstrained",
 )
 def plan(
     context: _CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
@@ -163,6 +150,7 @@ def plan(
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
+    from ..files.arm_tables import with_model
     from ..files.plans import plan_csv, plan_manifest
 
     given = dict(locals())  # all options by name
@@ -170,13 +158,10 @@ def plan(
     with together(output, manifest):  # refuses outputs that are inputs or cannot be written, before the work
         specification = files.load_specification(arm, base=base, tip=tip)
         if held is not None:
-            fixed = names_option(held)
+            fixed = options.names_option(held)
             others = tuple(name for name in specification.free if name not in fixed)
             specification = specification._replace(held=fixed, free=others)
-        if model is not None:
-            from ..files.arm_tables import with_model
-
-            specification = with_model(specification, model)
+        specification = specification if model is None else with_model(specification, model)
     _check_options(context, kit is not None, acceptance is not None)
     planned: Any
     if acceptance is not None:
@@ -228,7 +213,7 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         )
     if given["region"] and given["socket"]:
         raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
-    points, count = sockets_option(given["socket"]), given["sockets"] or _SOCKETS
+    points, count = options.sockets_option(given["socket"]), given["sockets"] or _SOCKETS
     names = list(points) or [chr(ord("A") + i) for i in range(min(count, 26))]
     cell, radius, axis = given["cell"], given["link_radius_mm"], given["tool_axis"]
     with together(given["output"], given["manifest"]):
@@ -257,12 +242,19 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
     )
     stated = {"noise_source": noise.source, "notes": [] if loaded is None else list(loaded.notes)}
     stated |= {"angles": given["angles"], "model": given["model"]}
-    with _progress() as progress:
-        settings = {"poses": given["poses"], **chosen._replace(progress=progress)._asdict()}
+    with progress_bar(transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def progress(stage: str, fraction: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=1.0)
+            bar.update(tasks[stage], completed=fraction)
+
+        settings = {"poses": given["poses"], **chosen._replace(progress=None if bar is None else progress)._asdict()}
         if things is not None:
             return planning.plan_kit(specification.arm, things, **settings), stated
         placed = {"sockets": points or count, "length": _range(given["length_mm"]), "u": given["u_mm"]}
-        placed |= {"lengths": [length_option(text) for text in given["length"] or ()], "cone": cones}
+        placed |= {"lengths": [options.length_option(text) for text in given["length"] or ()], "cone": cones}
         return planning.plan(specification.arm, **placed, **settings), stated
 
 
@@ -282,16 +274,15 @@ def assumed_noise(
 
 def _cones(given: Mapping[str, Any], default: float, sockets: list[str]) -> Any:
     """One cone for all sockets, or one for each where some are named."""
-    tilts = numbers_by_socket("--cone-deg", given["cone_deg"], 1, "DEG or NAME=DEG")
-    normals = numbers_by_socket("--normal", given["normal"], 3, "X,Y,Z or NAME=X,Y,Z")
+    tilts = options.numbers_by_name("--cone-deg", given["cone_deg"], "DEG or NAME=DEG", 1, named=False)
+    normals = options.numbers_by_name("--normal", given["normal"], "X,Y,Z or NAME=X,Y,Z", 3, named=False)
 
-    def cone(name: str | None) -> Any:
-        tilt, normal = tilts.get(name, tilts.get(None)), normals.get(name, normals.get(None, (0.0, 0.0, 1.0)))
-        x, y, z = normal
+    def cone(name: str) -> Any:
+        tilt, (x, y, z) = tilts.get(name, tilts.get("")), normals.get(name, normals.get("", (0.0, 0.0, 1.0)))
         return kinematics.Cone(default if tilt is None else math.radians(tilt[0]), (x, y, z))
 
-    named = [name for name in (*tilts, *normals) if name is not None]
-    return {name: cone(name) for name in dict.fromkeys([*sockets, *sorted(named)])} if named else cone(None)
+    named = sorted(filter(None, (*tilts, *normals)))
+    return {name: cone(name) for name in dict.fromkeys([*sockets, *named])} if named else cone("")
 
 
 def arm_for(manifest: Path, arm: str) -> str:
@@ -327,24 +318,3 @@ def _region(texts: list[str] | None) -> dict[str, tuple[float, float]] | None:
         except ValueError:
             bad_option("--region", text, "AXIS=LOW:HIGH, in mm; for example z=0:800")
     return region or None
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, float], None]]:
-    """A bar on standard error, where that is a terminal; yields the callback that moves it."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda what, fraction: None
-        return
-    with Progress(console=console, transient=True) as bar:
-        tasks: dict[str, Any] = {}
-
-        def report(what: str, fraction: float) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=1.0)
-            bar.update(tasks[what], completed=fraction)
-
-        yield report

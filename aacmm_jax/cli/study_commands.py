@@ -6,7 +6,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +14,14 @@ from ..core.errors import InputError
 from ..files.outputs import together
 from ..summaries.tables import Styled, View
 from . import INTERRUPTED, INTERRUPTED_SENTENCE, options
-from .app import Stopped, app, examples, show_summary, with_spinner
+from .app import Stopped, command, progress_bar, show_summary, with_spinner
 from .options import argument, flag, option, output
 
 
-@app.command(
-    epilog=examples(
-        "aacmm study bound-sensitivity -o study.h5",
-        "aacmm study my-study.toml -o study.h5 --dask tls://scheduler:8786",
-        "aacmm study --resume -o study.h5",
-    )
+@command(
+    "aacmm study bound-sensitivity -o study.h5",
+    "aacmm study my-study.toml -o study.h5 --dask tls://scheduler:8786",
+    "aacmm study --resume -o study.h5",
 )
 def study(
     output: Path = output("FILE.h5", "Study to write, or to continue (HDF5)."),
@@ -118,37 +115,24 @@ def _leaving_threads() -> Iterator[None]:
 
 @contextmanager
 def _progress_display() -> Iterator[Any]:
-    """A progress bar with rate and time left, on standard error, where that is a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    """A progress bar with the time left, on standard error, where that is a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield None
-        return
-    columns = (
-        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("trials")),
-        *(TimeElapsedColumn(), TextColumn("{task.fields[left]}")),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("Compiling ...", total=None, left="")
+    counts = (BarColumn(), MofNCompleteColumn(), TextColumn("trials"))
+    with progress_bar(TextColumn("{task.description}"), *counts, TimeElapsedColumn(), TimeRemainingColumn()) as bar:
+        if bar is None:
+            yield None
+            return
+        task = bar.add_task("Compiling ...", total=None)
 
         def show(state: Any) -> None:
-            """Rate and time left are of the time after compiling."""
+            description = "Calibrating"
             if state.compiling:
                 number = state.programs - state.compiling + 1
                 description = f"Compiling program {number} of {state.programs} ..."
-                bar.update(task, description=description, total=state.total, completed=state.done)
             elif state.stopping:
                 description = "Stopping: running blocks are kept; Ctrl-C again drops them"
-                bar.update(task, description=description, left="")
-            elif bar.tasks[0].description.startswith("Compiling"):
-                bar.reset(task, description="Calibrating", total=state.total, completed=state.done)
-            else:
-                bar.update(task, completed=state.done)
-                speed, seconds = bar.tasks[0].speed, bar.tasks[0].time_remaining
-                if speed and seconds is not None:
-                    bar.update(task, left=f"{speed:,.0f}/s, {timedelta(seconds=int(seconds))} left")
+            bar.update(task, description=description, total=state.total, completed=state.done)
 
         yield show
 

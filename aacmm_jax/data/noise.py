@@ -220,12 +220,12 @@ def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEAT
         InputError: The repeatability is not above 0.
     """
     if not (math.isfinite(repeatability) and repeatability > 0):
-        raise InputError(f"a repeatability of {repeatability:g} mm is none; give a number above 0.")
+        raise InputError(f"a repeatability of {repeatability:g} mm is given; it must be positive.")
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
     geometry = to_numpy(arm.geometry)
-    one = noise_of(np.asarray(1.0), np.asarray(0.0)).of_readings(geometry.kinds)
-    scattered = np.asarray(encoder_covariances(geometry, joint_motion(geometry, q), one))
+    unit = noise_of(np.asarray(1.0), np.asarray(0.0)).of_readings(geometry.kinds)
+    scattered = np.asarray(encoder_covariances(geometry, joint_motion(geometry, q), unit))
     lever = math.sqrt(float(np.mean(np.trace(scattered))) / 3)
     if lever == 0:
         raise InputError("no joint moves the tip of this arm, so its repeatability says nothing of the readings.")

@@ -128,11 +128,7 @@ def case_of(
     capture: Capture | None = None,
     class_noise: Noise | None = None,
 ) -> Case:
-    """The case of a result, or the same one again for the same record: what it has computed is kept.
-
-    Raises:
-        InputError: The result is no record, and its capture is not given.
-    """
+    """The case of a result, or the same one again for the same record: what it has computed is kept."""
     if not isinstance(result, CalibrationRecord):
         if capture is None:
             raise InputError("the result does not hold its capture; give the capture that it was calibrated from.")

@@ -74,13 +74,8 @@ def standing_joints(arm: Arm, q: Float[AnyArray, "N n"]) -> tuple[StandingJoint,
 
 
 def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None = None) -> list[dict[str, Any]]:
-    """Joints that (nearly) stand still over all poses, with what they leave open, in one sentence each.
-
-    Args:
-        arm: One arm, nominal.
-        capture: Poses of it.
-        nominal: The arm with the free parameters that a calibration of the capture would take; None: there is none.
-    """
+    """Joints that (nearly) stand still over all poses, with what they leave open, in one sentence each; ``nominal`` has
+    the free parameters that a calibration of the capture would take, where there is one."""
     still = standing_joints(arm, np.asarray(capture.readings))
     joints = [standing.joint for standing in still]
     remedy = "move it" if len(still) == 1 else "move them"
@@ -176,19 +171,9 @@ def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
     """How far poses are from those of a calibration, and these from one another.
 
     What a model lacks depends on the readings, so a calibration has seen such errors only near its own poses. Elsewhere
-    an uncertainty that follows from the model alone says nothing of them.
-
-    Args:
-        arm: The arm.
-        calibrated: Readings that it was calibrated with, ``(N, n)``, rad (slides: mm). A temperature after
-            them is left out.
-        q: Readings of other poses, ``(v, n)``.
-
-    Returns:
-        The distances.
-
-    Raises:
-        InputError: Fewer than two poses were calibrated with.
+    an uncertainty that follows from the model alone says nothing of them. ``calibrated`` are the readings that the arm
+    was calibrated with, ``(N, n)``, and ``q`` those of other poses, rad (slides: mm); a temperature after them is left
+    out. Raises `InputError` for fewer than two poses.
     """
     units = np.asarray(reading_units(arm.geometry))
     poses, others = (np.asarray(values, dtype=float)[:, : arm.joints] / units for values in (calibrated, q))

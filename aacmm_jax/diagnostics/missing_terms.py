@@ -150,9 +150,7 @@ def columns_of(terms: Sequence[MissingTerm], rows: Sequence[Rows]) -> list[Float
 def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
     """Everything that is looked for. Masses are not known, so each link that bends a joint has its own coefficient.
 
-    Args:
-        arm: The calibrated arm.
-        q: All readings in their order, rad; with a thermometer, the temperature last, C.
+    ``q`` are all readings in their order, rad; with a thermometer, the temperature last, C.
     """
     arm = to_numpy(arm)
     order = np.linspace(-1.0, 1.0, len(q))[:, None]
@@ -186,14 +184,8 @@ def missing_terms(arm: Arm, q: Float[np.ndarray, "N n"]) -> list[MissingTerm]:
 def found_terms(
     arm: Arm, q: Float[np.ndarray, "N n"], rows: Sequence[Rows], relations: Sequence[Block]
 ) -> tuple[FoundTerm, ...]:
-    """Terms that the model lacks, the one that explains most first.
-
-    Args:
-        arm: The calibrated arm.
-        q: All readings in their order, rad.
-        rows: Equations of the poses.
-        relations: Equations of lengths, certified values and priors.
-    """
+    """Terms that the model of a calibrated arm lacks, the one that explains most first; ``q`` are all readings in their
+    order, ``rows`` the equations of the poses, and ``relations`` those of lengths, certified values and priors."""
     left = Residuals.of([*(part.block("") for part in rows), *relations])
     candidates, others_rows = missing_terms(arm, q), sum(len(block.residual) for block in relations)
     columns = [np.pad(values, ((0, others_rows), (0, 0))) for values in columns_of(candidates, rows)]

@@ -1,7 +1,7 @@
 """Tests of a calibration's model and noise by its own residuals: their size, by observation, and pose after pose.
 
 Each of the five families of tests of model and noise (`missing_terms`, `noisy_encoders`,
-`length_consistency`, and two here) raises a false alarm in at most `LEVEL` of the calibrations in which nothing
+`scale`, and two here) raises a false alarm in at most `LEVEL` of the calibrations in which nothing
 is wrong, so all of them together in at most 5 % (Bonferroni). Within a family, that level is divided among its tests
 (Holm 1979, Scandinavian Journal of Statistics 6: the most significant one first, each at the level over the number of
 those left). All of them take the parameters, the unknown geometry and the correlations between residuals into account.
@@ -20,10 +20,10 @@ from ..data.capture import Capture
 from ..data.noise import Noise
 from ..uncertainty.shared_kinds import SUCCESSIVE, VISITS
 from .findings import Case, Finding, case_of, chance_text
-from .length_consistency import Lengths, lengths_of
 from .missing_terms import FoundTerm, explained, missing
 from .noisy_encoders import NoisyJoint, noisiest_joint
 from .residual_tests import LEVEL, Residuals, alike, form_test, in_succession
+from .scale import Lengths, lengths_of
 
 ORDER, NEEDS = 62, "fit"
 # Of the noise of a class: its members differ by a quarter or so, which is what 8 degrees of freedom say (JCGM 100,

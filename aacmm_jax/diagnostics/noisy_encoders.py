@@ -160,11 +160,8 @@ class _Equations(NamedTuple):
         return self._replace(rows=weighted, variances=new)
 
     def estimated(self, groups: Sequence[Sequence[int]]) -> tuple["_Equations", Float[np.ndarray, " k"]]:
-        """With one variance for each group of joints, the seat being the last group, by restricted maximum likelihood.
-
-        Returns:
-            The equations whitened by them, and the standard uncertainty of the log of each variance.
-        """
+        """With one variance for each group of joints, the seat being the last group, by restricted maximum likelihood;
+        and the standard uncertainty of the log of each variance."""
         now, u = self, np.zeros(len(groups))
         log = np.array([np.log(max(np.mean(self.variances[list(group)]), 1e-6)) for group in groups])
         if len(self.unit) in groups[-1]:  # from nothing it would not rise
@@ -289,13 +286,8 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
 
 
 def amend(result: Result, case: Case, again: Callable[[Noise], Result]) -> Result:
-    """A result, or where it has noisy encoders that which their noise leads to.
-
-    Args:
-        result: Of `calibrate` or `identify`.
-        case: Its case.
-        again: The same calibration with a noise that is given.
-    """
+    """A result, or where it has noisy encoders that which their noise leads to; ``again`` calibrates likewise with a
+    noise that is given."""
     replaced = case.once(noise_by_joint)
     if replaced is None:
         return result

@@ -61,12 +61,6 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
 
     Arm, geometry and the standard deviations of the rows are those of its last solve, so that the root mean square of
     ``normalised`` over an observation is its ``reduced_chi``.
-
-    Args:
-        record: The calibration.
-
-    Returns:
-        One for each observation.
     """
     residuals = []
     for part in linearisation_of(record, record.names, noise=record.given_noise).parts():
@@ -118,9 +112,6 @@ def signed_residuals(record: CalibrationRecord) -> SignedResiduals | None:
 
     A joint whose angle is wrong moves the tip along its own direction alone, so that what the model lacks in one joint
     shows in ``along_joint`` against the reading of that joint.
-
-    Args:
-        record: The calibration.
     """
     rows, joints, parts = equations_of(record).rows, record.calibrated.arm.joints, []
     if not rows:

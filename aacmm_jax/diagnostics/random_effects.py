@@ -17,8 +17,8 @@ from ..calibration.record import CalibrationRecord
 from ..calibration.stages import Sensitivities
 from ..uncertainty.evidence import Groups, PriorModel, covariance_of_log_variances, learned_log_variances
 from .equations import LEAST_U, PRIOR, Block, Rows, lengths_in_solve
-from .length_consistency import lengths_of_sockets
 from .residual_tests import Residuals
+from .scale import lengths_of_sockets
 
 _ROUNDS = 40  # of the variance of independent errors; usually 5
 _TOLERANCE = 1e-6

@@ -169,11 +169,7 @@ def _checked(fit: ReadingFit, free_tip: bool) -> ReadingCheck:
 
 
 def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
-    """`check_readings` of what was recorded in sockets, or as one station of an instrument saw it.
-
-    Raises:
-        InputError: There is neither a socket of two poses nor a measured point.
-    """
+    """`check_readings` of what was recorded in sockets, or as one station of an instrument saw it."""
     if any(size > 1 for size in capture.sizes):
         return check_readings(arm, np.asarray(capture.q)[:, : arm.joints], sockets=capture.owner)
     measured = [observation for observation in capture.observations if isinstance(observation, MeasuredPoints)]
@@ -272,14 +268,8 @@ _QUARTERS = 1e-9  # rad
 def reading_check_summary(
     check: ReadingCheck, arm: str, *, unit: str | None = None, positions: str = "mm"
 ) -> dict[str, Any]:
-    """Plain values for JSON and display.
-
-    Args:
-        check: What the comparison found.
-        arm: Name of the arm.
-        unit: Unit of the readings that was stated, or taken; None where the file says it for itself.
-        positions: Unit that positions were taken to be in.
-    """
+    """Plain values for JSON and display; ``unit`` is that of the readings, stated or taken, None where the file says it
+    for itself, and ``positions`` that which positions were taken to be in."""
     given, best, tip = check.given, check.best, ""
     improved = f"from {given.rms:.3g} to {best.rms:.3g} mm RMS ({best.rms_fitted:.3g} mm"
     words = explanation_words(best, positions)

@@ -25,21 +25,13 @@ _EIGHTH = math.pi / 4  # of zeros: Gauss and Newton find the right one from an e
 
 
 class Evidence(NamedTuple):
-    """What recorded poses must agree with.
+    """What recorded poses must agree with."""
 
-    Args:
-        q: Readings, a column each for as many joints as the arm has, rad.
-        owner: Number of the socket that each pose was held in, from 0 and not decreasing; of points all 0.
-        points: Where the tip was, mm; None: the tips of a socket coincide, wherever it is.
-        rotations: Orientation of the last frame, in the base frame.
-        own_frame: Whether the points are in an instrument's frame, which is unknown, and not in the base frame.
-    """
-
-    q: Float[np.ndarray, "m n"]
-    owner: Int[np.ndarray, " m"]  # not decreasing
-    points: Float[np.ndarray, "m 3"] | None = None
-    rotations: Float[np.ndarray, "m 3 3"] | None = None
-    own_frame: bool = False
+    q: Float[np.ndarray, "m n"]  # readings, a column each for as many joints as the arm has, rad
+    owner: Int[np.ndarray, " m"]  # the socket that each pose was held in, from 0 and not decreasing; of points all 0
+    points: Float[np.ndarray, "m 3"] | None = None  # of the tip, mm; None: those of a socket coincide, wherever it is
+    rotations: Float[np.ndarray, "m 3 3"] | None = None  # of the last frame, in the base frame
+    own_frame: bool = False  # whether points are in an instrument's frame, which is unknown, not in the base frame
 
     @property
     def in_base(self) -> bool:

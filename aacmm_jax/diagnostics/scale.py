@@ -1,16 +1,30 @@
-"""What fixes the scale of a calibrated arm, and whether k may be the scale of an arm."""
+"""What fixes the scale of a calibrated arm, whether k may be the scale of an arm, and whether reference lengths agree:
+with each other, and with the arm that the poses determine."""
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
 
 from ..calibration.record import REPEATABILITY, CalibrationRecord
+from ..calibration.redrawn import covariance_of_lengths
 from ..calibration.results import PLAUSIBLE_SCALE, plausible
 from ..calibration.scale_anchor import scale_set_by_clause
+from ..calibration.stages import ends_between, positions_at_ends
+from ..core.distributions import chi_square_tail, f_tail
+from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..core.units import INCH, M
-from .findings import Case, Finding
+from ..model.observed import Observed
+from ..uncertainty.shared_kinds import PLACES
+from .equations import EXACT, LEAST_U, PRIOR, Block, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
+from .findings import Case, Finding, chance_text
+from .residual_tests import LEVEL, consistency
 from .usability import on_bounds
 
-ORDER, NEEDS = 70, "nothing"
+ORDER, NEEDS = 66, "nothing"
 _SUSPICIOUS = 0.005  # of a fixed link: beyond it the nominal value or a reference length is wrong
 # By k, which is a length measured by the nominal arm over its reference value: one in m, read as mm, makes k = 1000.
 _MISTAKEN_UNITS = {
@@ -21,12 +35,26 @@ _MISTAKEN_UNITS = {
     1 / 10.0: "Is the arm in cm by mistake?",
     1 / INCH: "Is the arm in inches by mistake?",
 }
+# A length is named where chi-square falls below a ninth without it, to what chance exceeds in over 5 % of cases.
+_CLEAR, _AGREE = 9.0, 0.05
+
+
+class Lengths(NamedTuple):
+    """Reference lengths and certified values against each other, by the arm that the poses determine."""
+
+    birge_ratio: float
+    degrees_of_freedom: int
+    probability: float
+    number: int
+    odd: str = ""  # the one without which the others agree
+    difference: float = 0.0  # of that one from what the others say, mm
 
 
 def test(case: Case) -> list[Finding]:
-    """At most one finding on k, and one where the arm could not be divided by it."""
+    """Lengths that disagree, at most one finding on k, and one where the arm could not be divided by it."""
     record = case.record
-    findings = [finding] if (finding := _of_k(record)) is not None else []
+    fits = record.plausible_scale and not record.implausible_residual
+    findings = [finding for finding in (_of_lengths(case) if fits else None, _of_k(record)) if finding is not None]
     if record.against_division and record.plausible_scale:
         findings.append(
             Finding(
@@ -88,3 +116,126 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
             concerns=(record.hold,),
         )
     return None
+
+
+def _of_lengths(case: Case) -> Finding | None:
+    lengths = case.once(lengths_of)
+    if lengths is None or lengths.probability >= LEVEL:
+        return None
+    kinds = set() if case.record.shared is None else set(case.record.shared.kinds)
+    odd = f"; without {lengths.odd} ({lengths.difference:+.3g} mm) the others agree" if lengths.odd else ""
+    predicted = "u, the poses and the errors that these share" if kinds and not odd else "u and the poses"
+    # Errors of places take the part of what u(k) had for lengths that disagree.
+    enlarged = case.record.final_method == "two-stage" and PLACES not in kinds
+    return Finding(
+        "lengths-disagree",
+        f"Reference lengths that disagree with the arm: the {lengths.number} err {lengths.birge_ratio:.2g} times "
+        f"as much as their {predicted} predict (Birge ratio, {chance_text(lengths.probability)}){odd}.",
+        "u(k) allows for it." if enlarged else "",
+        "Look for a wrong length, or for errors outside the D-H model.",
+        severity="doubt",
+        probability=lengths.probability,
+        concerns=(lengths.odd,) if lengths.odd else (),
+    )
+
+
+class Related(NamedTuple):
+    """Lengths and certified values, and the equations of the poses that say what they should be."""
+
+    units: Float[np.ndarray, " l"]  # of their residuals, mm
+    poses: list[Block]
+    relations: Block
+    covariance: Float[np.ndarray, "l l"]
+    scale: tuple[Float[np.ndarray, " R"], Float[np.ndarray, " l"]] | None  # derivatives by the scale anchor
+
+
+def lengths_of(case: Case) -> Lengths | None:
+    """Lengths and certified values against the arm as the poses alone determine it, but for its scale; None where there
+    are too few to contradict each other.
+
+    Errors that poses share, where the calibration has found them, are part of what is expected, unless a single length
+    is what all others contradict.
+    """
+    if not case.testable:
+        return None
+    record, (rows, relations), freedom = case.record, case.chunks, case.left.degrees_of_freedom
+    capture = record.recording.capture
+    afterwards = bool(capture.lengths) and not lengths_in_solve(record)
+    related = lengths_of_sockets(record, rows) if afterwards else _of_observations(record, rows, relations)
+    if related is None:
+        return None
+    names, covariance = [f"{length.start} - {length.end}" for length in capture.lengths], related.covariance
+    if not afterwards:
+        certified = Observed.of(capture, None).certified()
+        names += [part for part, (value, _) in certified.items() for _ in np.asarray(value)]
+    plain = _tested(record, related, covariance, freedom, names)
+    if plain is None or plain.odd or record.shared is None or not capture.lengths:
+        return plain
+    by_shared = covariance_of_lengths(record.shared, to_numpy(record.calibrated.arm), record.names, capture)
+    number = len(by_shared)  # they come before certified values
+    by_shared = by_shared / (related.units[:number, None] * related.units[:number])
+    return _tested(record, related, covariance + np.pad(by_shared, (0, len(names) - number)), freedom, names)
+
+
+def _tested(
+    record: CalibrationRecord, related: Related, covariance: Float[np.ndarray, "l l"], freedom: int, names: list[str]
+) -> Lengths | None:
+    tested = consistency(related.poses, related.relations, covariance, related.scale)
+    number, square = tested.degrees_of_freedom, max(tested.square, 0.0)
+    if number < 1:
+        return None
+
+    def probability(square: float, number: int) -> float:
+        if record.given_noise is not None:
+            return chi_square_tail(square, number)
+        return f_tail(square / number, number, freedom)
+
+    worst = int(np.argmax(tested.gains))
+    rest = max(square - tested.gains[worst], 0.0)
+    lengths = Lengths(float(np.sqrt(square / number)), number, probability(square, number), len(names))
+    if number > 1 and probability(rest, number - 1) > _AGREE and _CLEAR * rest < square:
+        return lengths._replace(odd=names[worst], difference=float(tested.shifts[worst] * related.units[worst]))
+    return lengths
+
+
+def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Related | None:
+    """The positions of sockets are eliminated: a length has the scatter of its ends besides its own u."""
+    capture, anchor = record.recording.capture, scale_anchor_of(record)
+    kept, p = np.array([name != anchor for name in record.names]), len(record.names)
+    linear = linearisation_of(record, record.names, noise=record.noise, lengths=False)
+    influence, observed = linear.influence(), linear.observed
+    ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.own, capture)
+    error = np.asarray(ends.measured - ends.nominal)
+    if np.max(np.abs(error)) < EXACT:
+        return None
+    # Positions follow the arm as the means of their tips do.
+    followers = []
+    for name in positions_at_ends(capture):
+        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        followers.append(-influence.follow[of][component, first : first + 3])
+    slopes = np.einsum("lec,ech->lh", ends.by_positions, np.stack(followers))[:, :p]
+    scale = None
+    if anchor is not None:
+        by_anchor = np.asarray(record.calibrated.arm.jacobian(capture.readings, (anchor,)))
+        scale = np.concatenate([(p.by_tip @ by_anchor[p.poses]).ravel() for p in rows]), slopes[:, ~kept][:, 0]
+    further = rows[0].shared.shape[2] - int(kept.sum())  # unknowns of sockets with very many poses
+    relations = Block("", None, error, np.pad(slopes[:, kept], ((0, 0), (0, further))), np.zeros((len(error), 0)))
+    poses, covariance = [part.block("") for part in rows], np.asarray(ends.covariance(np.ones(())))
+    return Related(np.ones(len(error)), poses, relations, covariance, scale)
+
+
+def _of_observations(record: CalibrationRecord, rows: Sequence[Rows], relations: Sequence[Block]) -> Related | None:
+    lengths = [block for block in relations if block.fixture != PRIOR]
+    if not lengths:
+        return None
+    capture, anchor, (related,), scale = record.recording.capture, scale_anchor_of(record), lengths, None
+    stated = [np.asarray(u) for _, u in Observed.of(capture, None).certified().values()]
+    units = np.maximum(np.concatenate([[float(length.u) for length in capture.lengths], *stated]), LEAST_U)
+    # What a prior says counts as the poses do: lengths are compared with all else.
+    poses = [*(part.block("") for part in rows), *(block for block in relations if block.fixture == PRIOR)]
+    measured = any(o.fixes_scale and not o.certified for o in capture.observations)
+    if anchor is not None and (record.hold is None or lengths_in_solve(record)) and not measured:
+        column = record.names.index(anchor)
+        scale = np.concatenate([block.shared[:, column] for block in poses]), related.shared[:, column]
+        *poses, related = (b._replace(shared=np.delete(b.shared, column, axis=1)) for b in (*poses, related))
+    return Related(units, poses, related, np.eye(len(units)), scale)

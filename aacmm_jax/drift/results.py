@@ -138,7 +138,6 @@ def _of_all(drift: Drift) -> str:
 
 
 def _of_probe(drift: Drift, probe: ProbeTest) -> str:
-    """Whether the probe was remounted, or the arm has changed."""
     share = 100 * (1 - probe.statistic / drift.joint_test.statistic)
     change = ", ".join(f"{name} by {in_words('mm', value)}" for name, value in probe.change)
     if not probe.remounted:
@@ -168,7 +167,6 @@ def _of_each(drift: Drift) -> str:
 
 
 def _of_lengths(lengths: LengthChange, level: float) -> Iterator[str]:
-    """The change of lengths, and that of the scale, where it has an uncertainty."""
     start = f"Lengths of {lengths.length:g} mm"
     if np.all(np.isfinite(lengths.u)):
         percent = 100 * float(np.mean(lengths.moved))

@@ -142,7 +142,6 @@ def joint_test(
 
 
 def _steps(names: Sequence[str]) -> Float[np.ndarray, " p"]:
-    """Changes of parameters that are comparable: 1 mm and 1 mrad."""
     return np.where([is_length(name) for name in names], 1.0, 1e-3)
 
 

@@ -101,7 +101,7 @@ def load_noise(source: str | os.PathLike, *, base: str | None = None, tip: str |
     """The noise that is usual for the arm of a file: that of its ``[noise]`` table, else that of its class.
 
     A file without the table is that of a measuring arm, or of a robot where it is a URDF, names one, or is a
-    ``kinematics.yaml`` (`data.arm_classes`). Plans assume this noise; a calibration estimates it from the data, and
+    ``kinematics.yaml`` (`data.noise`). Plans assume this noise; a calibration estimates it from the data, and
     compares it with that of a table. ``source`` is, like all arguments that are not named here, that of `load_arm`.
 
     Returns:

@@ -1,7 +1,7 @@
 """What joints do besides their Denavit-Hartenberg motion: the kinds of corrections, and their coefficients by name.
 
-Each coefficient multiplies a known function of the readings (`joint_functions`). A new kind is one class in this file,
-or one that is made known by `register`: whatever else the package does with kinds, it asks them.
+Each coefficient multiplies a known function of the readings (`joint_functions`). A new kind is one class here, added to
+`KINDS`: whatever else the package does with kinds, it asks them.
 """
 
 import abc
@@ -90,11 +90,8 @@ class AbstractCorrection(abc.ABC):
 
     @abc.abstractmethod
     def values(self, terms: Sequence["Term"], q: Readings, forward: ForwardPass) -> Rows:
-        """The functions of terms of this kind at N configurations, one after the other: `rows` of each.
-
-        ``q`` are the readings, rad (mm of prismatic joints), joints first, that of a thermometer (C) last; ``forward``
-        are the frames of the nominal arm there, mm.
-        """
+        """The functions of terms of this kind, one after the other, `rows` of each: at readings, rad (mm of prismatic
+        joints; joints first, that of a thermometer, C, last), where the nominal arm has the frames ``forward``, mm."""
 
 
 class Term(NamedTuple):
@@ -127,8 +124,7 @@ class Harmonics(AbstractCorrection):
     """cos hq and sin hq of every joint; of orders 1 and 2 by default, or of an option's: ``harmonics=1-3+8``.
 
     An encoder that is eccentric by e at the radius R errs by e / R times a sine of its reading (10 um at 50 mm: 41
-    arcsec); one that is oval or tilted errs by the second harmonic, and N evenly spaced read heads leave multiples of N
-    only.
+    arcsec), one that is oval or tilted by the second harmonic; N evenly spaced read heads leave multiples of N only.
     """
 
     model = "harmonics"
@@ -212,10 +208,8 @@ class GearRatio(AbstractCorrection):
 
 
 class Coupling(AbstractCorrection):
-    """The reading of another joint: a motor or a belt that turns one joint moves another a little, too.
-
-    ``coupled=2-3`` lets the reading of joint 2 move joint 3; by default each joint moves the next.
-    """
+    """The reading of another joint, whose motor or belt moves this one a little, too: by default each joint moves the
+    next, with ``coupled=2-3`` joint 2 moves joint 3."""
 
     model = "coupled"
     words = ("coupled",)
@@ -267,15 +261,13 @@ class Gravity(AbstractCorrection):
     shared = ""
 
     def terms(self, joints: int, option: str, loads: Loads | None) -> tuple[Term, ...]:
-        numbers, word = range(1, joints + 1), self.words[0]
-        if loads is not None:
-            return tuple(Term(self, word, 0, joint, loads) for joint in numbers)
-        return tuple(Term(self, word, link, joint) for joint in numbers for link in range(joint, joints + 1))
+        numbers = range(1, joints + 1)
+        links = [(0, joint) for joint in numbers] if loads else [(j, i) for i in numbers for j in numbers[i - 1 :]]
+        return tuple(Term(self, "compliance", link, joint, loads) for link, joint in links)
 
     def wrong(self, term: Term, joints: int) -> str:
-        if term.number and not term.joint <= term.number <= joints:
-            return f"is of a link from {term.joint} to {joints}, as compliance{term.joint}_{term.joint} is"
-        return ""
+        i, beyond = term.joint, term.number and not term.joint <= term.number <= joints
+        return f"is of a link from {i} to {joints}, as compliance{i}_{i} is" if beyond else ""
 
     def usual(self, terms: Sequence[Term]) -> dict[str, float]:
         # With masses, 1 mrad for 100 N m.
@@ -303,11 +295,8 @@ class Gravity(AbstractCorrection):
 
 
 class Expansion(AbstractCorrection):
-    """Thermal expansion: the difference of the thermometer from 20 C; 0 for readings without one.
-
-    One coefficient for the whole arm: a, d and the probe, and the travel of carriages, whose scales expand with them.
-    Typical are 11.5e-6 / K for steel, 23e-6 for aluminium and about 1e-6 for carbon fibre along its fibres.
-    """
+    """The difference of the thermometer from 20 C, 0 for readings without one: all lengths, and the travel of
+    carriages, grow by it times one coefficient (steel 11.5e-6 / K, aluminium 23e-6, carbon fibre along it 1e-6)."""
 
     model = "expansion"
     words = ("expansion",)
@@ -331,20 +320,6 @@ class Expansion(AbstractCorrection):
 KINDS: dict[str, AbstractCorrection] = {  # by what a model calls them, in the order of these names
     kind.model: kind for kind in (Coupling(), Expansion(), GearRatio(), Gravity(), Harmonics())
 }
-
-
-def register(kind: AbstractCorrection) -> None:
-    """Make a kind known that is not of this file; `InputError` where a name of it is another kind's."""
-    for name in (kind.model, *kind.words):
-        taken = any(name in (other.model, *other.words) for other in KINDS.values())
-        if taken or re.fullmatch("[a-z]+", name) is None or name in ("dh", *_SHORT_FORMS):
-            raise InputError(
-                f"'{name}' of {type(kind).__name__} is no name for a kind of joint correction; name it by lowercase "
-                "letters that no other kind has."
-            )
-    KINDS[kind.model] = kind
-    coefficient_of.cache_clear()
-    terms_of.cache_clear()
 
 
 @lru_cache(_KEPT)
@@ -400,8 +375,8 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
 def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term, ...]:
     """The terms of a model: kinds with their options, separated by commas, such as "dh,gravity,harmonics=1".
 
-    Raises `InputError` where a kind is unknown or there twice, or an option means nothing. "dh" stands for the arm
-    itself, "functions" for harmonics=1-31; ``loads`` are the masses of the arm, where known.
+    "dh" stands for the arm itself, "functions" for harmonics=1-31. `InputError` where a kind is unknown or there twice,
+    or an option means nothing.
     """
     terms: dict[Term, None] = {}
     seen: set[str] = set()

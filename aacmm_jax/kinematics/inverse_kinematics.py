@@ -3,8 +3,7 @@
 With the Jacobian J of the tip by the readings and the gap g to the target, the smallest change of the readings that
 closes the gap to first order is J^T (J J^T)^-1 g. It is damped by what vanishes with the gap, so that the last steps
 are Newton's: dq = J^T (J J^T + 0.01 |g|^2)^-1 g (Levenberg's method; Chan and Lawrence 1988), at most 0.5 rad a joint,
-within the limits. `readings_at_poses`, with which a controller that knows the nominal arm only can be corrected, and
-`workspace.into_cones` add the orientation to it; all use `repeated`.
+within the limits. `readings_at_poses` and `workspace.into_cones` add the orientation to it; all use `repeated`.
 """
 
 import math
@@ -91,8 +90,9 @@ def solve_to_targets(
 ) -> tuple[Float[AnyArray, "c n"], Float[AnyArray, " c"]]:
     """Damped least-norm steps to the targets, within the limits, of at most 0.5 rad a joint; for any jit, vmap or loop.
 
-    A slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). In NumPy a row does not depend on the others;
-    in JAX all go on until the last has arrived.
+    Returned are the joint readings ``(c, n)``, rad or mm, and the final distances from the targets ``(c,)``, mm. A
+    slide of 1 mm counts as a rotation of 1 mrad (`JointKinds.units`). In NumPy a row does not depend on the others; in
+    JAX all go on until the last has arrived.
 
     Args:
         geometry: The arm's ``geometry``.
@@ -100,9 +100,6 @@ def solve_to_targets(
         targets: Positions of the tip, one each ``(c, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm.
         steps: Most steps.
-
-    Returns:
-        The joint readings ``(c, n)``, rad or mm, and the final distances from the targets ``(c,)``, mm.
 
     Example:
         >>> limits = np.tile([-np.pi, np.pi], (6, 1))
@@ -143,11 +140,8 @@ def weighted_inverse(forward: ForwardPass, damping: Float[AnyArray, "... N"]) ->
 
 
 def damped_inverse(columns: ByJoint, damping: Float[AnyArray, "... N"]) -> ByJoint:
-    """J^T (J J^T + damping)^-1 for each configuration, from ``columns``, the derivatives of the tip by the joints, mm.
-
-    The inverse is written out (adjugate over determinant): for matrices this small a library call costs ten times the
-    arithmetic.
-    """
+    """J^T (J J^T + damping)^-1 for each configuration, from the derivatives of the tip by the joints, mm."""
+    # Written out (adjugate over determinant): for matrices this small a library call costs ten times the arithmetic.
     x, y, z = columns[..., 0, :], columns[..., 1, :], columns[..., 2, :]
     xp = namespace(columns)
     xx, yy, zz = (xp.sum(c * c, axis=0) + damping for c in (x, y, z))
@@ -204,7 +198,7 @@ def project_to_targets(
     limits: JointLimits | None = None,
     steps: int = _STEPS,
 ) -> tuple[Float[np.ndarray, "N columns"], Bool[np.ndarray, " N"]]:
-    """Configurations moved by least-norm steps until the tip is at its target.
+    """Configurations ``(N, n)`` moved by least-norm steps until the tip is at its target, and whether it arrived.
 
     Args:
         arm: The arm.
@@ -212,9 +206,6 @@ def project_to_targets(
         targets: Positions of the tip, one each ``(N, 3)``, mm.
         limits: Lowest and highest reading of each joint ``(n, 2)``, rad or mm; by default none.
         steps: Most steps of each configuration.
-
-    Returns:
-        The joint readings ``(N, n)``, rad or mm, and whether the tip arrived ``(N,)``.
 
     Example:
         >>> readings, arrived = aj.kinematics.project_to_targets(true, q[None], np.array([[100.0, 150.0, -100.0]]))
@@ -236,9 +227,8 @@ def project_to_targets(
 def project_to_centroids(arm: Arm, capture: SocketPoses, targets_of: Arm | None = None) -> Float[np.ndarray, "N n"]:
     """The configurations of a capture moved by least-norm steps until each tip is at its socket's centroid.
 
-    ``targets_of`` is the arm that the centroids come from; by default the same. With a nominal arm that is some mm
-    wrong the tips scatter, and scattered tips make directions look determined that are not, such as a rotation about
-    the base.
+    ``targets_of`` is the arm that the centroids come from; by default the same. Tips of a nominal arm that is some mm
+    wrong scatter, which makes directions look determined that are not, such as a rotation about the base.
     """
     q, source = np.asarray(capture.q), arm if targets_of is None else targets_of
     tips = in_chunks(lambda rows: np.asarray(source.position(rows)), q)
@@ -260,7 +250,8 @@ def corrected_readings(nominal: Arm, calibrated: Arm, q: Numbers, limits: Limits
     """Readings that put the calibrated arm where a controller with the nominal arm believes it to be at ``q``.
 
     What the controller means by the readings ``q`` is the pose ``nominal.pose(q)``; the readings found make
-    ``calibrated.pose`` equal to it, in the base frame that both arms have in common. See `readings_at_poses`.
+    ``calibrated.pose`` equal to it, in the base frame that both arms have in common (`readings_at_poses`). `InputError`
+    where the arms have other numbers of joints, or one of them is a batch.
 
     Args:
         nominal: The arm that the controller has.
@@ -268,9 +259,6 @@ def corrected_readings(nominal: Arm, calibrated: Arm, q: Numbers, limits: Limits
         q: Commanded joint readings ``(..., n)``, rad; ``(..., n + 1)`` with the temperature of an arm that has a
             thermometer, C, of which a controller knows nothing.
         limits: Lowest and highest reading of each joint, n pairs, rad; by default those of the nominal arm, if any.
-
-    Raises:
-        InputError: The arms have other numbers of joints, or one of them is a batch.
 
     Example:
         >>> ur10e = aj.load_arm("ur10e")
@@ -294,7 +282,7 @@ def readings_at_poses(
 
     Six joints reach a pose exactly, on the branch of the start. More joints take the least-norm steps, which change
     the readings least; fewer reach the position alone, and ``angle`` says what remains. Works under jit, vmap and
-    jacfwd.
+    jacfwd. `InputError` where the arm is a batch, the limits are no pairs, or the shapes differ.
 
     Args:
         arm: One arm.
@@ -302,9 +290,6 @@ def readings_at_poses(
             thermometer, C.
         poses: The pose wanted for each, with the tip (mm) as its origin, in the arm's base frame ``(..., 4, 4)``.
         limits: Lowest and highest reading of each joint, n pairs, rad; by default none.
-
-    Raises:
-        InputError: The arm is a batch, the limits are no pairs, or the shapes differ.
 
     Example:
         >>> ur10e = aj.load_arm("ur10e")
@@ -324,16 +309,14 @@ def readings_at_poses(
     allowed = np.tile([-np.inf, np.inf], (n, 1))
     if limits is not None:
         allowed = np.asarray(checked_limits(limits, n, arm.prismatic))
-    shape, geometry = q.shape[:-1], arm.geometry
-    rows, wanted = q.reshape(math.prod(shape), q.shape[-1]), poses.reshape(math.prod(shape), 4, 4)
+    shape, geometry, count = q.shape[:-1], arm.geometry, math.prod(q.shape[:-1])
+    rows, wanted = q.reshape(count, q.shape[-1]), poses.reshape(count, 4, 4)
     # An arm that has expanded reaches a position where the arm at 20 C reaches it divided by the scale of lengths.
     scale, xp = length_scale(geometry, rows), namespace(geometry, rows, wanted)
     wanted = set_at(wanted, (slice(None), slice(3), 3), wanted[:, :3, 3] / scale[:, None])
 
-    def solved(rows: Any) -> Any:
-        return _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)
-
-    both = xp.concatenate([rows[:, :n], wanted.reshape(len(wanted), 16)], axis=1)
+    solved: Any = lambda rows: _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)  # noqa: E731
+    both = xp.concatenate([rows[:, :n], wanted.reshape(count, 16)], axis=1)
     solution = in_chunks(solved, both, ROWS) if xp is np else solved(both)
     readings, distance, angle = solution[:, :-2], scale * solution[:, -2], solution[:, -1]
     reached = (distance <= ARRIVED) & ((angle <= _ALIGNED) | (n < FULL_POSE))
@@ -403,8 +386,8 @@ def least_motion(arm: Arm, q: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " N
     """The smallest movement of an arm whose readings change by 1 rad (1 m of a prismatic joint) in all, mm.
 
     A rotation of the last frame counts as what it moves at 500 mm, with six joints or more. It is 0 in a singular
-    configuration, where two axes of a wrist align or an arm is stretched: readings of a pose are not unique there, or
-    poses near it have none.
+    configuration, as where two axes of a wrist align: readings of a pose are not unique there, or poses near it have
+    none.
     """
     geometry = to_numpy(arm.geometry)
     forward = forward_pass(geometry, joint_motion(geometry, q))

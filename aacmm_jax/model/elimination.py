@@ -151,7 +151,7 @@ def arrow_of(
     if prior is not None:
         diagonal = np.arange(prior.weight.shape[0])
         head = added_to(head, (diagonal, diagonal), prior.weight**2)
-    crossed, own, slopes = [], [], []
+    crossed, squares, slopes = [], [], []
     for number, (count, size) in enumerate(classes):
         # C = B A^T, D = B B^T and the gradient B w, summed over the blocks with components of this class.
         c, d, g = xp.zeros((count, size, height)), xp.zeros((count, size, size)), xp.zeros((count, size))
@@ -172,9 +172,9 @@ def arrow_of(
             sums = sums_by_component(block.by_own, both, block.sizes)
             d, g = d + sums[..., :-1], g + sums[..., -1]
         crossed.append(c)
-        own.append(d)
+        squares.append(d)
         slopes.append(g)
-    return Arrow(head, tuple(crossed), tuple(own)), slopes
+    return Arrow(head, tuple(crossed), tuple(squares)), slopes
 
 
 def _shifts(block: RowBlock) -> Float[AnyArray, "h _"]:
@@ -303,8 +303,8 @@ def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArr
     xp = namespace(arrow, gradient)
     # A A^T - C^T D^-1 C, and the slope of the cost where the components follow the head.
     head, (slope, parts) = arrow.head, arrow.split(gradient)
-    for crossed, own, part in zip(arrow.crossed, arrow.own, parts, strict=True):
-        follow = pseudo_inverse(own) @ crossed
+    for crossed, information, part in zip(arrow.crossed, arrow.own, parts, strict=True):
+        follow = pseudo_inverse(information) @ crossed
         head = head - xp.einsum("Kkh,Kkg->hg", crossed, follow)
         slope = slope - xp.einsum("Kkh,Kk->h", follow, part)
     return head, slope

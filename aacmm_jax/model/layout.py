@@ -114,12 +114,12 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
     half = {name for pair in ends if (pair[0] in alone) != (pair[1] in alone) for name in pair}
     alone = {name: number for name, number in alone.items() if name not in half}
     # The first observation of the component of each: a length makes one component of those that it joins.
-    of_each = np.arange(len(observations))
+    component = np.arange(len(observations))
     for pair in ends:
         if pair[0] in alone:
-            low, high = sorted(of_each[alone[name]] for name in pair)
-            of_each[of_each == high] = low
-    first = of_each.tolist()
+            low, high = sorted(component[alone[name]] for name in pair)
+            component[component == high] = low
+    first = component.tolist()
     sizes = Counter[int]()  # numbers of each component
     for name, number in alone.items():
         sizes[first[number]] += len(units[name])
@@ -202,7 +202,7 @@ def _group(members: Sequence[_Member], layout: Layout, of: int, places: dict[int
     if of >= 0:
         components = [places[member.first] for member in members]
         sizes = tuple(np.bincount(components, weights=counts, minlength=layout.classes[of][0]).astype(int).tolist())
-        own = next(role for role in roles if role.private)
-        start = tuple(layout.component_of(index)[2] for index in own.first)
+        private = next(role for role in roles if role.private)
+        start = tuple(layout.component_of(index)[2] for index in private.first)
     numbers, targeted = tuple(member.number for member in members), bool(members[0].observation.target)
     return Group(numbers, poses, tuple(roles), targeted, of, sizes, start)

@@ -161,8 +161,8 @@ class Observed:
         forward = forward_pass(arm, self.motion)
         tips = [tips_of(forward, rows) for rows in self.slices]
         parts: dict[str, Any] = {}
-        for observation, own in zip(self.observations, tips, strict=True):
-            new = observation.start(own, arm.probe)
+        for observation, tips_seen in zip(self.observations, tips, strict=True):
+            new = observation.start(tips_seen, arm.probe)
             if observation.target:
                 new = {offset_of(observation.target): arm.probe} | new
             parts = new | parts  # what another observation says stays

@@ -161,14 +161,14 @@ def _by_head(
 def _by_own(by_roles: list[Float[AnyArray, "_ _ _"]], group: Group, size: int) -> Float[AnyArray, "k r m"]:
     """Derivatives by the numbers of the component of each pose, in their order."""
     xp = namespace(by_roles)
-    own = xp.concatenate([by for by, role in zip(by_roles, group.roles, strict=True) if role.private])
-    if own.shape[0] == size:
-        return own
+    private = xp.concatenate([by for by, role in zip(by_roles, group.roles, strict=True) if role.private])
+    if private.shape[0] == size:
+        return private
     start = np.repeat(np.asarray(group.start), group.counts)
-    whole = xp.zeros((size, *own.shape[1:]))
+    whole = xp.zeros((size, *private.shape[1:]))
     for first in np.unique(start):
-        piece = xp.where(start == first, own, 0.0)
-        whole = set_at(whole, slice(first, first + own.shape[0]), whole[first : first + own.shape[0]] + piece)
+        piece = xp.where(start == first, private, 0.0)
+        whole = set_at(whole, slice(first, first + private.shape[0]), whole[first : first + private.shape[0]] + piece)
     return whole
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..core.arguments import NOT_EMPTY, NotNegative, Range, check_finite, checked_arguments
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
+from ..core.numpy_or_jax import AnyArray, namespace, to_jax, to_numpy
 from ..core.text import shorten
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..kinematics.arm import Arm, is_length, is_single, parameter_names
@@ -132,16 +132,12 @@ def fix_scale(
             "make a capture without them."
         )
     check_readings(capture, arm)
-    scatter = None if sigma is None else namespace(sigma).asarray(sigma, dtype=float)
-    return to_jax(_fixed(*to_numpy((arm, capture, scatter))))
-
-
-@compiled(jit=eqx.filter_jit)
-def _fixed(arm: Arm, capture: Capture, sigma: Float[AnyArray, ""] | None) -> ScaleFix:
+    arm, capture = to_numpy((arm, capture))
     tips = arm.position(capture.q)
-    scatter = repeatability(tips, capture.sizes).sigma if sigma is None else sigma
-    scale, _ = scale_and_weights(ends_of_sockets(tips, capture, scatter))
-    return ScaleFix(divided_arm(arm, scale.value), scale)
+    with np.errstate(all="ignore"):
+        scatter = repeatability(tips, capture.sizes).sigma if sigma is None else namespace(tips).asarray(sigma)
+        scale, _ = scale_and_weights(ends_of_sockets(tips, capture, scatter))
+    return to_jax(ScaleFix(divided_arm(arm, scale.value), scale))
 
 
 class MeasuredEnds(NamedTuple):

@@ -134,8 +134,8 @@ def repeatability(
         InputError: Sizes and tips do not fit, or sizes are traced.
 
     Example:
-        >>> found = aj.model.repeatability(result.arm.position(two_bars.q), two_bars.sizes)
-        >>> print(f"DE {found.de:.4f} mm, Deltam {found.deltam:.4f} mm")
+        >>> metrics = aj.model.repeatability(result.arm.position(two_bars.q), two_bars.sizes)
+        >>> print(f"DE {metrics.de:.4f} mm, Deltam {metrics.deltam:.4f} mm")
         DE 0.0127 mm, Deltam 0.0199 mm
     """
     sizes = tuple(sizes)

@@ -133,7 +133,6 @@ def _label_space(axes: Any) -> None:
 
 
 def _axes_in_space(axes: Any) -> Any:
-    """The given axes, or new ones, in three dimensions."""
     if axes is None:
         return new_figure((6, 5.4)).add_subplot(projection="3d")
     if getattr(axes, "name", "") != "3d":

@@ -138,7 +138,6 @@ def _changes_of_two(drift: Drift) -> Plot:
 
 
 def _lengths_of_two(drift: Drift) -> Plot:
-    """Histogram of the changes of lengths between two calibrations, and what the uncertainties alone predict."""
     lengths = drift.lengths
     counts, edges = np.histogram(1e3 * lengths.change, bins=40)
     marks = [histogram(counts, edges)]
@@ -168,7 +167,6 @@ def _ratio_axis(ratio: np.ndarray) -> Axis:
 
 
 def _within(x: Axis) -> Marks:
-    """The band of changes within their expanded uncertainty."""
     return Marks("", [x.low, x.high], [0.0, 0.0], "band", "soft", low=[-1.0, -1.0], high=[1.0, 1.0])
 
 

@@ -89,7 +89,6 @@ def save_figure(figure: Any, path: Path) -> None:
 
 
 def _columns(labels: list[str]) -> int:
-    """How many entries of a legend stand side by side."""
     return max(1, min(len(labels), _ROOM // (max(map(len, labels)) + 5)))
 
 
@@ -145,7 +144,6 @@ def _draw_marks(axes: Any, marks: Marks) -> None:
 
 
 def _draw_table(axes: Any, marks: Marks, x: np.ndarray, y: np.ndarray) -> None:
-    """Boxes about their places, in their shades."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 

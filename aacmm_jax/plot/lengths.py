@@ -157,19 +157,22 @@ def acceptance_metrics(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any
     return draw(metrics_chart(tests).plots[0], axes)
 
 
+def _section(start: np.ndarray, shaded: tuple[np.ndarray, Any], said: Sequence[str], name: str = "", **style) -> Marks:
+    """Points of half a section through the volume, mm, with their shades, those of the last shade on top."""
+    shade, limits = shaded
+    order = np.argsort(shade, kind="stable")
+    words = [f"({', '.join(f'{x:.0f}' for x in start[i])}) mm: {said[i]}" for i in order]
+    radius = np.hypot(start[:, 0], start[:, 1])
+    return Marks(name, radius[order], start[order, 2], words=words, shade=shade[order], limits=limits, **style)
+
+
 def volume_chart(volume: VolumetricUncertainty) -> Chart:
     """U of lengths over the working volume: half a section through it."""
     finite = np.isfinite(volume.expanded_length)
-    expanded, start = volume.expanded_length[finite], volume.start[finite]
+    expanded, name = volume.expanded_length[finite], f"U of a {volume.length:g} mm length"
     shade, limits = shades(expanded)
-    order = np.argsort(shade, kind="stable")
-    words = [
-        f"({', '.join(f'{x:.0f}' for x in point)}) mm: U = {format_number(u, decimals_for(u))} mm"
-        for point, u in zip(start[order], expanded[order].tolist(), strict=True)
-    ]
-    name, radius = f"U of a {volume.length:g} mm length", np.hypot(start[:, 0], start[:, 1])
-    limits = limits if np.any(finite) else ()
-    marks = Marks(name, radius[order], start[order, 2], words=words, shade=shade[order], limits=limits, unit="mm")
+    said = [f"U = {format_number(u, decimals_for(u))} mm" for u in expanded.tolist()]
+    marks = _section(volume.start[finite], (shade, limits if np.any(finite) else ()), said, name, unit="mm")
     axes = linear(_ACROSS, np.hypot(volume.start[:, 0], volume.start[:, 1]), [0.0]), linear(_UP, volume.start[:, 2])
     description = "The larger the mark, the more uncertain; height against distance from the first axis."
     return Chart("volume", f"{name} over the volume", description, (Plot(*axes, (marks,), height=380),))
@@ -197,21 +200,16 @@ def tried_chart(volume: VolumetricUncertainty, tips: np.ndarray, poses: TriedPos
     """Half a section through the volume: random poses by their distance from the nearest calibrated one, and the tips
     of the calibration, mm."""
     ratio = poses.distance / max(poses.spacing, 1e-12)
-    shade, limits = tried_shades(ratio)
-    order = np.argsort(shade, kind="stable")
-    radius, height = np.hypot(volume.start[:, 0], volume.start[:, 1]), volume.start[:, 2]
-    words = [
-        f"({', '.join(f'{x:.0f}' for x in volume.start[i])}) mm: {poses.distance[i] / DEG:.0f} deg from the nearest "
-        f"pose, {ratio[i]:.1f} times their spacing"
-        for i in order
+    said = [
+        f"{distance / DEG:.0f} deg from the nearest pose, {times:.1f} times their spacing"
+        for distance, times in zip(poses.distance.tolist(), ratio.tolist(), strict=True)
     ]
     tips = tips[thinned(len(tips), _TIPS)]
     across = np.hypot(tips[:, 0], tips[:, 1])
-    marks = (
-        Marks("", radius[order], height[order], words=words, shade=shade[order], limits=limits, size=5),
-        Marks("tips of the calibration", across, tips[:, 2], "square", "accent", size=4),
-    )
-    plot = Plot(linear(_ACROSS, radius, across, [0.0]), linear(_UP, height, tips[:, 2]), marks, height=380)
+    random = _section(volume.start, tried_shades(ratio), said, size=5)
+    marks = random, Marks("tips of the calibration", across, tips[:, 2], "square", "accent", size=4)
+    axes = linear(_ACROSS, random.x, across, [0.0]), linear(_UP, volume.start[:, 2], tips[:, 2])
+    plot = Plot(*axes, marks, height=380)
     description = (
         "Random poses all over the volume by their distance in joint space from the nearest pose of the calibration, "
         "in multiples of the spacing of its own poses: up to 1 it was tried there; the larger the mark, the less."

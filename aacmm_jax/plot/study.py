@@ -272,7 +272,6 @@ def _runs(results: Results, factor: str, most: int) -> dict[str, list[list[int]]
 
 
 def _cell_label(results: Results, cell: int, without: str = "") -> str:
-    """The levels of a cell's factors in words."""
     factors = results.study.factors
     levels = {name: factors[name][at[cell]] for name, at in _index(results).items() if name != without}
     return ", ".join(level_title(name, level) for name, level in levels.items())

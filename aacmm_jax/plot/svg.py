@@ -79,7 +79,6 @@ def _path(d: Iterable[str], kind: str, width: float | None = None) -> str:
 
 
 def _grid(plot: Plot) -> Iterator[str]:
-    """Frame and grid; a table of boxes has no grid."""
     x, y = (1000 * axis.at([tick for tick, _ in axis.ticks]) for axis in (plot.x, plot.y))
     if not any(marks.symbol == "boxes" and marks.box[1] for marks in plot.marks):
         across = [] if plot.x.named else [f"M{_number(at)} 0V1000" for at in x]
@@ -129,7 +128,6 @@ def _by_shade(marks: Marks, among: np.ndarray) -> Iterator[tuple[int, np.ndarray
 
 
 def _spans(plot: Plot, marks: Marks) -> str:
-    """Bars, or a band, from the lower to the upper ends."""
     x, low = _positions(plot, marks.x, marks.low)
     high = _positions(plot, marks.x, marks.high)[1]
     finite = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)

@@ -167,7 +167,6 @@ def _acceptance(
 
 
 def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSphere]) -> list[Table]:
-    """Bars and spheres that were measured."""
     bars = Counter((float(length.value), float(length.u)) for length in lengths)
     rows = [("length", value, u, f"in {pluralise(count, 'position')}") for (value, u), count in sorted(bars.items())]
     for sphere in spheres:

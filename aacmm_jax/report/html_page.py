@@ -96,7 +96,6 @@ def write_report(
 
 
 def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any]) -> Report:
-    """The report of a file; what it takes is imported for its kind alone."""
     if kind == "calibration":
         from ..files.calibrations import load_calibration
         from .calibration import calibration_report

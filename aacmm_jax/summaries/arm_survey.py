@@ -31,11 +31,8 @@ def arm_survey(
 ) -> dict[str, Any]:
     """Plain values for JSON and display.
 
-    Args:
-        specification: The arm, with the identification that its file proposes.
-        usual: Class of the arm, and the noise of its readings and of the seat.
-        base: The first frame in a robot's base link, mm; frames are in the base link then.
-        model: The model that the arm's corrections are of, where one was named.
+    ``base``: the first frame in a robot's base link, mm; frames are in the base link then. ``model``: that the arm's
+    corrections are of, where one was named.
     """
     arm: Arm = to_numpy(specification.arm)
     plain_arm, links = without_corrections(arm), total_link_length(arm)

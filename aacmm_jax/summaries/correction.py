@@ -27,14 +27,9 @@ def correction_summary(
 ) -> dict[str, Any]:
     """Plain values for JSON and display; rows are counted from 1.
 
-    Args:
-        nominal: The arm that the controller has.
-        calibrated: The calibrated arm.
-        q: Commanded readings, or those that the search for a pose began with, rad and mm; perhaps with temperatures.
-        corrected: The corrected readings.
-        unit: Of readings in the tables, deg or rad.
-        of_readings: Whether readings were commanded; of positions with orientations nothing is known of the arm
-            without a correction.
+    ``q``: commanded readings, or those that the search for a pose began with, rad and mm; perhaps with temperatures.
+    ``unit``: of readings in the tables. ``of_readings``: whether readings were commanded; of positions with
+    orientations nothing is known of the arm without a correction.
     """
     reached, after = np.asarray(corrected.reached), np.asarray(corrected.q)
     commanded, distance, angle = q[:, : nominal.joints], np.asarray(corrected.distance), np.asarray(corrected.angle)

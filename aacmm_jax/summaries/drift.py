@@ -8,21 +8,9 @@ from ..core.text import csv_text
 from ..core.units import people_read, people_read_change
 from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange
+from . import tables
 from .result_tables import listed_apart
-from .tables import (
-    Cell,
-    Styled,
-    View,
-    attributes,
-    decimals_for,
-    limits_of,
-    listed,
-    number,
-    plain,
-    rows_of,
-    warnings_of,
-    written_of,
-)
+from .tables import Cell, Styled, View, attributes, decimals_for, listed, number, plain, rows_of
 
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
@@ -118,7 +106,7 @@ def comparison(summary: dict[str, Any]) -> View:
     """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
     new, old = (f"{summary[which]} ({summary[f'{which}_created'][:10]})" for which in ("new", "old"))
     yield [Styled(summary["arm"]), f": {new} against {old}"]
-    yield from warnings_of(summary)
+    yield from tables.warnings_of(summary)
     yield from summary["findings"]
     yield from _parameters(summary)
     lengths = summary["lengths"]
@@ -141,8 +129,8 @@ def comparison(summary: dict[str, Any]) -> View:
         title = "Each calibration against the first (whose own error is in all of them)"
         yield listed(title, rows, (*headings, "mean [um/m]"))
         yield "The change of every parameter from the first calibration: --csv, --json, --figure."
-    yield from limits_of(summary)
-    yield from written_of(summary)
+    yield from tables.limits_of(summary)
+    yield from tables.written_of(summary)
 
 
 def _parameters(summary: dict[str, Any]) -> View:

@@ -6,19 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.units import DEG, people_read
-from .tables import (
-    METRICS,
-    Cell,
-    Columns,
-    Table,
-    decimals_for,
-    expanded_words,
-    listed,
-    number,
-    quantity_words,
-    rms_difference,
-    volume_rows,
-)
+from . import tables
+from .tables import METRICS, Cell, Columns, Table, decimals_for, listed, number
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
@@ -91,11 +80,11 @@ def validation_tables(summary: Row) -> list[Table]:
     ]
     cells = [(title, summary[value], summary[u]) for title, value, u in pooled if summary[value] is not None]
     caption = f"Cross-validated: each of {summary['groups']} groups held out once [mm]"
-    tables = [listed(caption, cells, ("", "residual", "predicted by u"))]
+    shown = [listed(caption, cells, ("", "residual", "predicted by u"))]
     rows = summary.get("left_out") or []
     if rows:
         lengths = any(row["lengths"] for row in rows)
-        tables.append(listed("Groups held out [mm]", rows, {
+        shown.append(listed("Groups held out [mm]", rows, {
             "group held out": "group",
             "poses": "poses",
             "RMS distance": "rms_mm",
@@ -107,7 +96,7 @@ def validation_tables(summary: Row) -> list[Table]:
                 "disagrees" if row["disagrees"] else "" if row["converged"] else "did not converge", "bad"
             ),
         }))  # fmt: skip
-    return tables
+    return shown
 
 
 def prior_table(rows: Rows) -> Table:
@@ -206,10 +195,16 @@ def harmonics_table(rows: Rows) -> Table:
 
 def volume_table(caption: str, volume: Row) -> Table:
     """Expanded uncertainty of tips and lengths over the working volume."""
-    rows = [
-        [title, *("not determined" if u is None else with_u_digits(u) for u in values)]
-        for title, values in volume_rows(volume)
-    ]
+    length = f"{volume['length_mm']:g} mm length"
+    titles = {
+        "expanded_tip": "tip position (worst direction): from the calibration",
+        "expanded_length": f"{length}: from the calibration",
+        "expanded_length_reading": f"{length}: with the noise of both readings",
+    }
+    rows = []
+    for key, title in titles.items():
+        values = [volume[f"{key}_{statistic}_mm"] for statistic in ("median", "95", "largest")]
+        rows.append([title, *("not determined" if u is None else with_u_digits(u) for u in values)])
     return listed(caption, rows, ("", "median", "95th percentile", "largest"))
 
 
@@ -264,8 +259,8 @@ def geometry_table(parts: Rows, coverage: float) -> Table:
     return listed("Geometry found", rows, {
         "part": "part",
         "quantity": "quantity",
-        "value": lambda row: quantity_words(row, u=False, coverage=coverage),
-        "U (95 %)": lambda row: expanded_words(row, coverage),
+        "value": lambda row: tables.quantity_words(row, u=False, coverage=coverage),
+        "U (95 %)": lambda row: tables.expanded_words(row, coverage),
         "largest difference from the certified values [mm]": "difference" if certified else None,
     })  # fmt: skip
 
@@ -333,7 +328,7 @@ def model_tables(summary: Row) -> tuple[Table, Table]:
     def to_best(row: Row) -> tuple[float | None, float | None]:
         """Nothing of the best model itself, and where the regions say nothing."""
         compared = row["difference"] is not None and row["u_difference"] is not None
-        return rms_difference(row, least) if compared and row["rms_outside"] > least else (None, None)
+        return tables.rms_difference(row, least) if compared and row["rms_outside"] > least else (None, None)
 
     by_name = listed("Models", models, {
         "model": lambda row: (

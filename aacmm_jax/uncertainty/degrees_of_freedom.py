@@ -122,13 +122,8 @@ def effective_degrees_of_freedom(
 
 
 def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
-    """The factor of U over u for quantities with these variances of their parts.
-
-    Args:
-        level: Coverage probability.
-        variances: Of the parts, whose sum is u^2.
-        law: How well each is known.
-    """
+    """The factor of U over u, for a coverage probability, of quantities with these variances of their parts, whose sum
+    is u^2; ``law`` says how well each is known."""
     if not 0 < level < 1:
         raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
     law, variances = law.in_numpy, np.asarray(variances, dtype=float)

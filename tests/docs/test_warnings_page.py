@@ -22,7 +22,6 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "drift/comparison.py": ("_warnings",),
     "data/capture_data.py": ("sentences",),
     "uncertainty/identifiability.py": ("sentences", "by_more_sockets"),
-    "calibration/scale_anchor.py": ("warn_of_known_scale",),
     "acceptance/record.py": ("evaluation_of", "unstated_uncertainty_warning", "SIMULATED"),
     "acceptance/procedure.py": ("_socket_in_zone",),
     "report/studies.py": ("_warnings",),

@@ -15,7 +15,8 @@ from scipy import stats
 from typer.testing import CliRunner
 
 import aacmm_jax as aj
-from aacmm_jax.cli.calibration_commands import app
+from aacmm_jax.cli import calibration_commands  # noqa: F401 - registers its commands
+from aacmm_jax.cli.app import app
 from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.drift.comparison import compare, trend

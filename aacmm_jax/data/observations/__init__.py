@@ -8,7 +8,7 @@
 >>> sphere = aj.data.observations.Sphere("sphere", q, diameter=25.0, u=0.0005, stylus=6.0)
 >>> bar = aj.data.observations.Artefact("bar", {"a": (0, 0, 0), "b": (300, 0, 0)}, {"a": q[:5], "b": q[5:]}, u=0.001)
 >>> capture = aj.Capture({}, observations=[tracker, sphere, bar])
->>> [list(one.unknowns) for one in capture.observations]
+>>> [list(observation.unknowns) for observation in capture.observations]
 [['frame of tracker'], ['centre of sphere', 'radius of sphere'], ['placement bar', 'coordinates of bar']]
 
 ``aj.calibrate(arm, capture, bounds)`` finds these unknowns together with the arm; ``Simulated...`` of each kind is what

@@ -53,7 +53,7 @@ class Entry(NamedTuple):
     def described(self) -> str:
         """Its line in the docstring of the class."""
         alternatives = (self.annotation, *get_args(self.annotation))
-        names = next((one.dim_str for one in alternatives if getattr(one, "dim_str", "")), "").split()
+        names = next((kind.dim_str for kind in alternatives if getattr(kind, "dim_str", "")), "").split()
         shape = f" ``({', '.join(names)}{',' * (len(names) == 1)})``" if names else ""
         unit = f", {self.unit}" if self.unit not in ("", "1") else ""
         return f"{self.name}: {self.says[:1].upper()}{self.says[1:]}{shape}{unit}{self.more and '; '}{self.more}."
@@ -126,8 +126,8 @@ class Declared(abc.ABC):
         parameters = list(cls._parameters.parameters.values())
         if "__init__" in vars(cls):
             _, *stated = inspect.signature(vars(cls)["__init__"]).parameters.values()
-            parameters = [one for one in parameters if one.default is not REQUIRED]
-            parameters = [*(one for one in stated if one.kind is not one.VAR_KEYWORD), *parameters]
+            others = [parameter for parameter in parameters if parameter.default is not REQUIRED]
+            parameters = [*(parameter for parameter in stated if parameter.kind is not parameter.VAR_KEYWORD), *others]
         cls.__signature__ = inspect.Signature(parameters)
         if cls.__doc__:
             cls.__doc__ = _documented(cls.__doc__, cls.entries)

@@ -8,6 +8,7 @@ for all kinds. Beside it stands what simulates it: the true geometry, where the 
 import abc
 import functools
 import importlib
+import inspect
 import itertools
 import pkgutil
 from collections.abc import Hashable, Mapping, Sequence
@@ -244,8 +245,7 @@ def quantities_by_unit(units: Sequence[str], values: Float[np.ndarray, " k"]) ->
             return (Quantity("normal", turned[:, 2], "1"), Quantity("distance from the origin", values[2:], "mm"))
         point = turned[:, :2] @ values[2:]
         return (Quantity("direction of the axis", turned[:, 2], "1"), Quantity("point of the axis", point, "mm"))
-    kinds = dict.fromkeys(units)
-    return tuple(Quantity("value", values[[one == unit for one in units]], unit) for unit in kinds)
+    return tuple(Quantity("value", values[np.array(units) == unit], unit) for unit in dict.fromkeys(units))
 
 
 def certified_quantities(observation: AbstractObservation) -> tuple[Quantity, ...]:
@@ -334,13 +334,13 @@ OTHER_KINDS: list[type[Declared]] = []  # observations and what simulates them, 
 @functools.cache
 def _classes_of_files() -> list[type[Declared]]:
     names = [f"{__package__}.{module.name}" for module in pkgutil.iter_modules([str(Path(__file__).parent)])]
-    members = [one for name in names for one in vars(importlib.import_module(name)).values() if isinstance(one, type)]
-    return [one for one in dict.fromkeys(members) if issubclass(one, Declared)]
+    members = itertools.chain(*(vars(importlib.import_module(name)).values() for name in names))
+    return [kind for kind in dict.fromkeys(filter(inspect.isclass, members)) if issubclass(kind, Declared)]
 
 
 def _classes_by(base: type, label: str) -> dict[str, Any]:
-    classes = [one for one in (*_classes_of_files(), *OTHER_KINDS) if issubclass(one, base) and hasattr(one, label)]
-    return {getattr(one, label): one for one in sorted(classes, key=lambda one: one.__name__)}
+    classes = sorted((*_classes_of_files(), *OTHER_KINDS), key=lambda kind: kind.__name__)
+    return {getattr(kind, label): kind for kind in classes if issubclass(kind, base) and hasattr(kind, label)}
 
 
 def kinds() -> dict[str, type[AbstractObservation]]:
