@@ -62,6 +62,8 @@ def arm(
     table [angles] that a manifest then needs. Positions of a table are in the base frame (of a URDF: in its base link),
     those of a manifest's tracker in a frame that is found. Exit code 1 where nothing makes them fit.
     """
+    from ..files.arm_tables import with_model
+
     if new is not None:
         if file is not None or check is not None or figure is not None:
             raise InputError("--new writes a template and reads no arm; leave out the arm, --check and --figure.")
@@ -87,10 +89,7 @@ def arm(
         return
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
-    if model is not None:
-        from ..files.arm_tables import with_model
-
-        specification = with_model(specification, model)
+    specification = specification if model is None else with_model(specification, model)
     frame = first_frame(specification)
     with together(figure):
         usual = assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)

@@ -150,6 +150,7 @@ def plan(
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
+    from ..files.arm_tables import with_model
     from ..files.plans import plan_csv, plan_manifest
 
     given = dict(locals())  # all options by name
@@ -160,10 +161,7 @@ def plan(
             fixed = options.names_option(held)
             others = tuple(name for name in specification.free if name not in fixed)
             specification = specification._replace(held=fixed, free=others)
-        if model is not None:
-            from ..files.arm_tables import with_model
-
-            specification = with_model(specification, model)
+        specification = specification if model is None else with_model(specification, model)
     _check_options(context, kit is not None, acceptance is not None)
     planned: Any
     if acceptance is not None:

@@ -98,63 +98,49 @@ def evaluate(
         )
     with together(output):
         if capture is None:
-            summary = _evaluated_points(calibration, output, acceptance, range_mm, of_test)
+            record, summarise = _points(calibration, acceptance, range_mm, of_test), summaries.evaluation.points_summary
         else:
-            of_test |= {"maxima": maxima, "standards": acceptance}
             paths, choice = (InputFile(calibration), InputFile(capture)), (only or None, without or ())
-            summary = _evaluated(paths, output, choice, range_mm, of_test)
-    summary |= {} if output is None else {"written": str(output)}
+            of_test |= {"maxima": maxima, "standards": acceptance}
+            record, summarise = _evaluation(paths, choice, range_mm, of_test), summaries.evaluation.evaluation_summary
+        summary = with_spinner("Evaluating", lambda: summarise(record))
+        given = {
+            "--rule": rule is not None,
+            "--test-u-mm": u_test.fixed > 0 or 1 / u_test.divisor > 0,
+            "--expansion": bool(expansion),
+            "--range-mm": range_mm is not None,
+        }
+        if capture is not None and not summary["acceptance"] and any(given.values()):
+            raise InputError(
+                f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only; this "
+                "capture supports none, or none was requested: name them with --acceptance, or leave the option out."
+            )
+        if output is not None:
+            files.save_evaluation(output, record, summary)
+            summary["written"] = str(output)
     show_summary(summary, as_json, views.points if capture is None else views.evaluation)
     if summary["failed"] or any(test["decision"] in ("fails", "undecided") for test in summary["acceptance"]):
         raise typer.Exit(1)
 
 
-def _evaluated(
-    paths: tuple[InputFile, InputFile],
-    output: Path | None,
-    choice: tuple,
-    measuring_range: float | None,
-    of_test: dict[str, Any],
-) -> dict[str, Any]:
-    """Evaluate a calibration on a part of a capture; the summary."""
+def _evaluation(paths: tuple[InputFile, InputFile], choice: tuple, stated_range: float | None, of_test: dict) -> Any:
+    """The record of a calibration evaluated on a part of a capture."""
     from ..diagnostics.findings import findings_of, sentences
 
     record, recording = files.load_calibration(paths[0]), files.load_capture(paths[1])
     recording = recording._replace(
         capture=recording.capture.select(*choice),
         sources=(*map(fingerprint, paths), *recording.sources),
-        measuring_range=measuring_range or recording.measuring_range,
+        measuring_range=stated_range or recording.measuring_range,
     )
     stored = read_summary(paths[0], ("calibration",))[1]
     warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
     evaluation = acceptance_tests.evaluation_of(record, recording, **of_test)
-    evaluation = evaluation._replace(calibration_warnings=tuple(warnings))
-    summary = with_spinner("Evaluating", lambda: summaries.evaluation.evaluation_summary(evaluation))
-    influences = of_test["influences"]
-    given = {
-        "--rule": of_test["rule"] is not None,
-        "--test-u-mm": of_test["u_test"] > 0 or influences.u_relative > 0,
-        "--expansion": influences.artefact is not None or influences.arm is not None,
-        "--range-mm": measuring_range is not None,
-    }
-    if not summary["acceptance"] and any(given.values()):
-        raise InputError(
-            f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only; this "
-            "capture supports none, or none was requested: name them with --acceptance, or leave the option out."
-        )
-    if output is not None:
-        files.save_evaluation(output, evaluation, summary)
-    return summary
+    return evaluation._replace(calibration_warnings=tuple(warnings))
 
 
-def _evaluated_points(
-    manifest: Path,
-    output: Path | None,
-    standards: list[str] | None,
-    measuring_range: float | None,
-    of_test: dict[str, Any],
-) -> dict[str, Any]:
-    """Run the acceptance tests of a manifest of points; the summary."""
+def _points(manifest: Path, standards: list[str] | None, stated_range: float | None, of_test: dict) -> Any:
+    """The record of a manifest of points, with the acceptance tests that they allow."""
     from ..acceptance.standards import STANDARDS, checked_standards
 
     if manifest.suffix != ".toml":
@@ -163,12 +149,8 @@ def _evaluated_points(
         )
     chosen = checked_standards(STANDARDS if standards is None else standards)
     measured = files.read_points(manifest)
-    measured = measured._replace(measuring_range=measuring_range or measured.measuring_range)
-    record = acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
-    summary = summaries.evaluation.points_summary(record)
-    if output is not None:
-        files.save_evaluation(output, record, summary)
-    return summary
+    measured = measured._replace(measuring_range=stated_range or measured.measuring_range)
+    return acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
 
 
 @command("aacmm report calibration.h5 -o report.html")

@@ -49,14 +49,8 @@ def rotation_matrix(w: Vectors) -> Matrices:
     return _polynomial(w, sine, cosine)
 
 
-def rotation_derivative(w: Vectors) -> Matrices:
-    """J with exp(w + dw) = exp(J dw) exp(w) to first order: the left Jacobian of the rotation group."""
-    _, cosine, cubic = _coefficients(w)
-    return _polynomial(w, cosine, cubic)
-
-
 def rotation_and_derivative(w: Vectors) -> tuple[Matrices, Matrices]:
-    """`rotation_matrix` and `rotation_derivative`, from the same sines and cosines."""
+    """`rotation_matrix`, and J with exp(w + dw) = exp(J dw) exp(w) to first order: the group's left Jacobian."""
     sine, cosine, cubic = _coefficients(w)
     return _polynomial(w, sine, cosine), _polynomial(w, cosine, cubic)
 
@@ -73,7 +67,7 @@ def inverse_frame(frame: Float[AnyArray, " 6"]) -> tuple[Float[AnyArray, " 6"], 
     """The outer frame as seen in the given one, and the derivatives of its six numbers by those of the given one."""
     xp, rotation, origin = namespace(frame), rotation_matrix(frame[:3]).T, frame[3:]
     identity, none = xp.asarray(np.eye(3)), xp.zeros((3, 3))
-    by_rotation = -rotation @ cross_matrix(origin) @ rotation_derivative(frame[:3])
+    by_rotation = -rotation @ cross_matrix(origin) @ rotation_and_derivative(frame[:3])[1]
     derivative = xp.concatenate(
         [xp.concatenate([-identity, none], axis=1), xp.concatenate([by_rotation, -rotation], axis=1)]
     )

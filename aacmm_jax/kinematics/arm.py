@@ -34,7 +34,8 @@ class Arm(eqx.Module):
 
     A prismatic joint slides along its axis: T = Rz(theta) Tz(q + d) Tx(a) Rx(alpha) [Ry(beta)], with readings in mm.
     Every parameter is ``(..., n)`` for n joints; leading shapes are a batch of arms and broadcast against those of q.
-    Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1.
+    Source: Denavit and Hartenberg 1955; Cheng et al. 2018, eq. 1. `InputError` where shapes do not fit together, a
+    value is not finite, or there is no joint of such a number.
 
     Args:
         alpha: Link twists ``(..., n)``, rad.
@@ -51,9 +52,6 @@ class Arm(eqx.Module):
         corrections: What joints do besides their readings; `kinematics.with_corrections` makes them.
         thermometer: Whether readings have one more, last column: the temperature of the arm, C, of which only thermal
             expansion makes use. Where it is missing, the arm is taken to be at 20 C.
-
-    Raises:
-        InputError: Shapes do not fit together, a value is not finite, or there is no joint of such a number.
 
     Example:
         >>> two_joints = aj.Arm(alpha=[0.0, 0.0], a=[300.0, 200.0], d=[0.0, 0.0], probe=(0.0, 0.0, 50.0))

@@ -122,15 +122,12 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     That is the body of an arm whose links are where its table's frames are; of a robot with links beside its axes, its
     URDF's shapes are nearer to the truth (`files.load_cell`). The tool's capsule ends two radii before the tip, so that
     it clears a surface that the tip is in up to a tilt of 60 deg. Capsules that little of the arm joins touch at their
-    joint, and are no pair.
+    joint, and are no pair. `InputError` where a radius is not positive, or not one for each joint.
 
     Args:
         arm: One arm.
         radius: Radius of every link, or one for each joint, mm.
         tool_radius: Radius of the probe, mm; by default a quarter of the last link's, 8 at most.
-
-    Raises:
-        InputError: A radius is not positive, or not one for each joint.
 
     Example:
         >>> body = aj.kinematics.body_along_links(arm, 40.0, tool_radius=5.0)

@@ -32,7 +32,8 @@ def with_corrections(
 
     The functions are evaluated on the frames of this arm, also when its parameters change later. A model leaves out
     functions that are constant, or combinations of others of the same joint, within the limits of the joints: gravity
-    about a vertical axis, for instance.
+    about a vertical axis, for instance. `InputError` where something in the model is unknown, or numbers do not fit the
+    arm.
 
     Args:
         arm: The nominal arm; corrections that it has are replaced.
@@ -41,9 +42,6 @@ def with_corrections(
         mass: Mass of each link ``(n,)``, kg, for compliances alone; by default unknown.
         centre: Centre of mass of each link in its D-H frame ``(n, 3)``, mm.
         gravity: Direction of gravity in the base frame ``(3,)``.
-
-    Raises:
-        InputError: Something in the model is unknown, or numbers do not fit the arm.
 
     Example:
         >>> eccentric = aj.kinematics.with_corrections(arm, "harmonics=1")

@@ -71,16 +71,14 @@ class Parameters(eqx.Module):
         probe), ``probe_x`` and ``probe_y``. Of a prismatic joint i only the direction matters, since neighbouring links
         do not rotate against each other: three of the lengths about it say where the next axis is, and a_i and d_(i+1)
         are fixed too (``theta_n`` and ``probe_z`` for the last joint). Each prismatic joint leaves two parameters less
-        (Everett and Hollerbach 1988).
+        (Everett and Hollerbach 1988). `InputError` where the arm has no such parameter, or one is named as held and as
+        free.
 
         Args:
             arm: The arm; it supplies the values of the fixed parameters.
             held: Names of the fixed parameters, instead of those above; beta and the direction of
                 gravity are fixed unless in ``free``.
             free: Names that are free in addition, beta and gravity included.
-
-        Raises:
-            InputError: The arm has no such parameter, or one is named as held and as free.
         """
         n, free = arm.joints, _unique_names(arm, free, "free")
         if held is None:
@@ -104,19 +102,17 @@ class Parameters(eqx.Module):
     def independent(cls, arm: Arm, capture: SocketPoses | None = None) -> "Parameters":
         """A largest set of parameters that a capture determines well; redundant ones are fixed at their nominal values.
 
-        Fixed too is one parameter of every near-degenerate combination (`independence`). For the paper's arm with
-        a reference length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are
+        Fixed too is one parameter of every near-degenerate combination (`independence`). For the paper's arm with a
+        reference length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are
         nearly parallel, d of the first is fixed and Hayati's beta is free instead. Observations besides sockets count
         as positions of the tip in an unknown frame, which is the most that spheres, planes and distances may say;
-        `observability` knows what each kind determines.
+        `observability` knows what each kind determines. `InputError` where the capture has another number of joints, or
+        determines nothing.
 
         Args:
             arm: The nominal arm.
             capture: The poses, reference lengths and other observations; by default poses over the whole workspace with
                 one reference length.
-
-        Raises:
-            InputError: The capture has another number of joints, or determines nothing.
         """
         base, names = independent_names(arm, generic_poses(arm) if capture is None else capture)
         if not names:
@@ -252,15 +248,14 @@ class Bounds(eqx.Module):
     ) -> "Bounds":
         """A box centred on an arm; the default half-widths are the paper's, 10 mm and about 1 degree.
 
+        `InputError` where a half-width is negative, a name is not free, or the arm does not fit the parameters.
+
         Args:
             arm: The arm in the middle of the box, with as many joints as the space's.
             space: The free parameters.
             length: Half-width for lengths, mm.
             angle: Half-width for angles, rad.
             override: Half-widths of single parameters by name, mm or rad.
-
-        Raises:
-            InputError: A half-width is negative, a name is not free, or the arm does not fit the parameters.
         """
         widths = np.where(space.lengths, float(length), float(angle))
         for name, width in (override or {}).items():
@@ -279,14 +274,13 @@ class Bounds(eqx.Module):
 def perturbed_arm(space: Parameters, *, length: NotNegative, angle: NotNegative, seed: int = 0) -> Arm:
     """The space's base arm with random errors of its free parameters, uniform and independent, as of manufacture.
 
+    `InputError` where a largest error is negative or not finite.
+
     Args:
         space: The free parameters and their base arm.
         length: Largest error of a length, mm.
         angle: Largest error of an angle, rad.
         seed: Seed of the errors.
-
-    Raises:
-        InputError: A largest error is negative or not finite.
 
     Example:
         >>> as_built = aj.perturbed_arm(space, length=1.0, angle=0.001, seed=1)

@@ -36,7 +36,8 @@ class Prior(eqx.Module):
     1992; Bishop 2006, section 3.5), one for each group. A group in which the data support no deviation from its mean
     gets the least, 0.1 um or 0.1 urad, with which it stays there. Where ``sd`` names a learned group, its standard
     deviation is *expected* to be about that, to a factor of 4.5 (the log of the variance has the standard deviation 3):
-    this keeps groups apart of which the data hardly tell which one acts.
+    this keeps groups apart of which the data hardly tell which one acts. `InputError` where no group is given, or a
+    standard deviation or mean is no such number.
 
     Args:
         sd: standard deviation by group, mm or rad, positive; infinite where nothing is known; of a learned group, what
@@ -44,9 +45,6 @@ class Prior(eqx.Module):
         mean: mean by parameter or group, mm or rad; by default the nominal arm's value.
         learn: groups whose standard deviation is learned, whether or not ``sd`` names them; True for all that ``sd``
             names, or, without ``sd``, for lengths and angles.
-
-    Raises:
-        InputError: no group is given, or a standard deviation or mean is no such number.
 
     Example:
         >>> tolerances = aj.Prior({"lengths": 0.5, "angles": 0.001, "d_3": 0.1})

@@ -13,7 +13,6 @@ from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known
 from ...core.rotations import (
     fitted_frame,
     rotation_and_derivative,
-    rotation_derivative,
     rotation_matrix,
     rotation_vector,
 )
@@ -166,7 +165,7 @@ class MeasuredTransforms(MeasuredPoints):
         predicted = products_by_column(target.swapaxes(0, 1), axes)
         seen = products_by_column(rotation_matrix(turn), xp.moveaxis(self.rotations, 0, -1))
         angle, left, right = rotation_logarithm(products_by_column(predicted.swapaxes(0, 1), seen.swapaxes(0, 1)))
-        by_station = -products_by_column(rotation_derivative(turn).swapaxes(0, 1), right.swapaxes(0, 1))
+        by_station = -products_by_column(rotation_and_derivative(turn)[1].swapaxes(0, 1), right.swapaxes(0, 1))
         inside = products_by_column(by_target.swapaxes(0, 1), axes)
         by_orientation = products_by_column(left, inside.swapaxes(0, 1)).swapaxes(0, 1)
         none, square = xp.zeros((3, 3, m)), xp.zeros((m, 3, 3))
