@@ -35,44 +35,43 @@ _KINDS = {
 )
 def evaluate(
     calibration: Path = argument(
-        "CALIBRATION.h5", "Calibration, written by calibrate; or, alone, a manifest of points (TOML)."
+        "Calibration, written by calibrate; or, alone, a manifest of points (TOML).", "CALIBRATION.h5"
     ),
-    capture: Path | None = argument("CAPTURE.h5", "Capture, written by import or simulate.", None),
-    output: Path | None = output("FILE.h5", "Evaluation to write (HDF5), for aacmm report.", None),
+    capture: Path | None = argument("Capture, written by import or simulate.", "CAPTURE.h5", None),
+    output: Path | None = output("Evaluation to write (HDF5), for aacmm report.", "FILE.h5", None),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     mpe: list[str] | None = option(
-        "NAME=A[+L/K]",
         "Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where one is not "
         "met by the decision rule.",
+        "NAME=A[+L/K]",
     ),
     acceptance: list[str] | None = option(
-        "[jjf|asme|iso]",
         "Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; repeatable. Default: those of the "
         "standard that the capture was made for, of --mpe, and of all for a manifest of points.",
+        "[jjf|asme|iso]",
     ),
     test_u_mm: str = option(
-        "A[+L/K]",
         "Standard uncertainty that seat and fixture add to every test value (L: the length).",
+        "A[+L/K]",
         default="0",
     ),
     expansion: list[str] | None = option(
-        "OF=C,U,T,U",
         "Thermal expansion of the artefact or the arm in an acceptance test: coefficient in 1e-6/K, temperature in C, "
         "each with its standard uncertainty; 'artefact=11.5,1,20.8,0.2'. Lengths are corrected. Give it for the arm "
         "only where the arm does not compensate its own expansion.",
+        "OF=C,U,T,U",
     ),
     rule: Literal["iso-2017", "iso-2013", "simple"] | None = option(
-        None,
         "Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance "
-        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017.",
+        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017."
     ),
     range_mm: float | None = option(
-        "MM", "Measuring range that the maker states, a diameter. Default: that of the files.", min=0
+        "Measuring range that the maker states, a diameter. Default: that of the files.", min=0
     ),
-    max_rms_mm: float | None = option("MM", "Exit code 1 where the RMS distance is larger.", min=0),
-    max_deltam_mm: float | None = option("MM", "Exit code 1 where Deltam is larger.", min=0),
-    max_length_error_mm: float | None = option("MM", "Exit code 1 where the error of any length is larger.", min=0),
+    max_rms_mm: float | None = option("Exit code 1 where the RMS distance is larger.", min=0),
+    max_deltam_mm: float | None = option("Exit code 1 where Deltam is larger.", min=0),
+    max_length_error_mm: float | None = option("Exit code 1 where the error of any length is larger.", min=0),
     as_json: bool = options.JSON,
 ) -> None:
     """Test a calibration on a capture that it has not seen.
@@ -155,8 +154,8 @@ def _points(manifest: Path, standards: list[str] | None, stated_range: float | N
 
 @command("aacmm report calibration.h5 -o report.html")
 def report(
-    file: Path = argument("FILE.h5", "File to report: a calibration, evaluation, study or model comparison."),
-    output: Path = output("FILE.html", "Report to write: one HTML file that needs no network connection."),
+    file: Path = argument("File to report: a calibration, evaluation, study or model comparison.", "FILE.h5"),
+    output: Path = output("Report to write: one HTML file that needs no network connection.", "FILE.html"),
     about: Path | None = options.ABOUT,
     as_json: bool = options.JSON,
 ) -> None:
@@ -175,12 +174,12 @@ def report(
 @command("aacmm show calibration.h5", "aacmm show panda")
 def show(
     file: str = argument(
-        "FILE",
         "File to show: a capture, calibration, evaluation, study or model comparison (HDF5), or an arm: a TOML file, a "
         "URDF, a kinematics.yaml or a shipped name.",
+        "FILE",
     ),
-    cell: int | None = option("N", "Show this cell of a study in full.", min=1),
-    figures: Path | None = option("FOLDER", "Write the figures of a study (PNG) to this folder."),
+    cell: int | None = option("Show this cell of a study in full.", "N", min=1),
+    figures: Path | None = option("Write the figures of a study (PNG) to this folder.", "FOLDER"),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
     as_json: bool = options.JSON,

@@ -14,7 +14,7 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 from ..core.text import pluralise
-from ..core.units import DEG, people_read_change
+from ..core.units import DEG, people_read, people_read_change
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 _MOST_DECIMALS = 6  # of a quantity that was found
@@ -198,32 +198,27 @@ def observed_words(sockets: int, others: int, lengths: int | None = None) -> str
 def quantity_words(row: Mapping[str, Any], u: bool = True, coverage: float | None = None) -> str:
     """A quantity of an observation as a person reads it, angles in deg; with its standard uncertainty where one is
     stated and ``u`` is true. With a coverage factor, what was found is rounded to its expanded uncertainty."""
-    factor, unit = _quantity_unit(row)
+    factor, unit = people_read(row["unit"])
     uncertainties = [None] * len(row["values"]) if coverage is None else row["u_found"]
     expanded = [None if value is None else (coverage or 0.0) * factor * value for value in uncertainties]
     decimals = [min(decimals_for(u, 4 if unit else 6), _MOST_DECIMALS) for u in expanded]
     pairs = zip(row["values"], decimals, strict=True)
-    words = _in_brackets([f"{factor * value:z.{digits}f}" for value, digits in pairs]) + unit
+    words = _in_brackets([f"{factor * value:z.{digits}f}" for value, digits in pairs], unit)
     if not u or row["u"] is None:
         return words
-    return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g}{unit or ' 1'})"
+    return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g} {unit or 1})"
 
 
 def expanded_words(row: Mapping[str, Any], coverage: float) -> str:
     """The expanded uncertainties of a quantity that was found, two digits each, angles in deg."""
-    factor, unit = _quantity_unit(row)
+    factor, unit = people_read(row["unit"])
     if any(u is None for u in row["u_found"]):
         return "not determined"
-    return _in_brackets([two_digits(coverage * factor * u) if u > 0 else "0" for u in row["u_found"]]) + unit
+    return _in_brackets([two_digits(coverage * factor * u) if u > 0 else "0" for u in row["u_found"]], unit)
 
 
-def _quantity_unit(row: Mapping[str, Any]) -> tuple[float, str]:
-    units = {"rad": (1 / DEG, " deg"), "1": (1.0, "")}
-    return units.get(row["unit"], (1.0, f" {row['unit']}"))
-
-
-def _in_brackets(words: Sequence[str]) -> str:
-    return f"({', '.join(words)})" if len(words) > 1 else words[0]
+def _in_brackets(words: Sequence[str], unit: str) -> str:
+    return (f"({', '.join(words)})" if len(words) > 1 else words[0]) + (f" {unit}" if unit else "")
 
 
 def factor_words(volume: Mapping[str, Any]) -> str:
@@ -287,9 +282,9 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
         sd = float(f"{row['sd'] * scale:.3g}")
         return f"{words.get(row['kind'], row['kind'])} {sd:g} {unit}"
 
-    tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
     functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
-    parts = [*tips, *(["functions that the model lacks: " + ", ".join(functions)] if functions else [])]
+    parts = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
+    parts += [f"functions that the model lacks: {', '.join(functions)}"] if functions else []
     return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
 
 
