@@ -7,6 +7,7 @@ every residual that replaces the errors of the capture by others. No kind has to
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from jaxtyping import Float, Int
 from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture, ReferenceLength, visits_of
+from ..data.capture import Capture, ReferenceLength, names_in, visits_of
 from ..data.noise import Noise
 from ..data.observations.observation import AbstractObservation
 from ..kinematics.arm import Arm, by_joint
@@ -27,7 +28,7 @@ from ..kinematics.corrections import term_of
 from ..kinematics.inverse_kinematics import project_to_centroids
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
-from ..model.sockets import membership
+from ..model.sockets import membership, starts
 from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
@@ -133,9 +134,8 @@ def variances_in_places(shared: SharedErrors | None, capture: Capture) -> Float[
 
 def _by_name(capture: Capture) -> tuple[list[str], Float[np.ndarray, "k M"]]:
     """Names of sockets and observations, and 1 where a pose belongs to each."""
-    others = capture.observations
-    names = [*capture.names, *(observation.name for observation in others)]
-    return names, membership((*capture.sizes, *(observation.q.shape[0] for observation in others)))
+    sizes = (*capture.sizes, *(observation.q.shape[0] for observation in capture.observations))
+    return list(names_in(capture)), membership(sizes)
 
 
 def _roots(shared: SharedErrors, capture: Capture) -> list[Float[np.ndarray, "M c"]]:
@@ -178,6 +178,7 @@ class SocketTruth(NamedTuple):
     exact: Float[np.ndarray, "M n"]
     moves: Float[np.ndarray, "M n 3"]  # the least change of the joints for each mm that the tip shall move
     lengths: Float[np.ndarray, " l"]  # between the tips, mm
+    shared: DrawShared | None = None  # errors that poses share
 
     @classmethod
     def of(cls, arm: Arm, capture: Capture) -> "SocketTruth":
@@ -185,8 +186,7 @@ class SocketTruth(NamedTuple):
         exact, units = project_to_centroids(arm, capture), reading_units(arm.geometry)
         by_joints = np.asarray(arm.jacobian(exact, [f"q_{i}" for i in range(1, arm.joints + 1)]))
         moves = units[:, None] * np.linalg.pinv(by_joints * units, rcond=1e-8)
-        first = np.concatenate([[0], np.cumsum(capture.sizes)[:-1]])
-        ends = np.asarray(arm.position(exact))[first[capture.ends()]]
+        ends = np.asarray(arm.position(exact))[starts(capture.sizes)[capture.ends()]]
         return cls(arm, capture, exact, moves, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
     @property
@@ -195,12 +195,12 @@ class SocketTruth(NamedTuple):
         return self.exact.size
 
     def drawn(
-        self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0, shared: DrawShared | None = None
+        self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0
     ) -> tuple[Capture, DrawnErrors | None]:
         """As `ObservedTruth.drawn`."""
         arm, exact = self.arm, self.exact
         seats = float(noise.seating) * level * random.normal(size=(count, len(exact), 3))
-        alike = None if shared is None else shared(count, random)
+        alike = None if self.shared is None else self.shared(count, random)
         seats = seats if alike is None else seats + alike.tips
         read = noise.of_columns(arm.geometry.kinds, arm.joints, exact.shape[1])
         readings = exact + read * level * random.normal(size=(count, *exact.shape))
@@ -210,13 +210,11 @@ class SocketTruth(NamedTuple):
 
     def resampled(self, count: int, random: np.random.Generator) -> Capture:
         """As `ObservedTruth.resampled`, of each socket."""
-        first, q = 0, np.asarray(self.capture.q)
-        rows = []
-        for size in self.capture.sizes:
-            rows.append(first + random.integers(size, size=(count, size)))
-            first += size
+        q, sizes = np.asarray(self.capture.q), self.capture.sizes
+        pairs = zip(starts(sizes), sizes, strict=True)
+        rows = np.concatenate([first + random.integers(size, size=(count, size)) for first, size in pairs], axis=1)
         nominal = np.array([float(length.value) for length in self.capture.lengths])
-        return self._batch(q[np.concatenate(rows, axis=1)], nominal, random)
+        return self._batch(q[rows], nominal, random)
 
     def _batch(self, q: Float[np.ndarray, "t M n"], centre: np.ndarray, random: np.random.Generator) -> Capture:
         u = np.array([float(length.u) for length in self.capture.lengths])
@@ -232,6 +230,7 @@ class ObservedTruth(NamedTuple):
     roots: list[Float[np.ndarray, "m r r"]]  # of the covariance of what was measured
     geometry: dict[str, Float[np.ndarray, " k"]]
     reading: Int[np.ndarray, " M"]  # number of the reading of each pose; equal ones were read at once
+    shared: DrawShared | None = None
 
     @classmethod
     def at(cls, capture: Capture, space: Parameters, vector: Any, geometry: Mapping[str, Any]) -> "ObservedTruth":
@@ -249,11 +248,11 @@ class ObservedTruth(NamedTuple):
         return sum(part.observation.q.size + part.values.size for part in self.parts)
 
     def drawn(
-        self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0, shared: DrawShared | None = None
+        self, count: int, noise: Noise, random: np.random.Generator, level: Any = 1.0
     ) -> tuple[Capture, DrawnErrors | None]:
-        """A batch of captures with new errors; ``level`` (t, 1, 1) multiplies the noise of readings and seat. Also the
-        errors that poses share, as ``shared`` draws them."""
-        alike, q = None if shared is None else shared(count, random), np.asarray(self.observed.q)
+        """A batch of captures with new errors, and those of them that poses share; ``level`` (t, 1, 1) multiplies the
+        noise of readings and seat."""
+        alike, q = None if self.shared is None else self.shared(count, random), np.asarray(self.observed.q)
         encoder = noise.of_columns(self.kinds, self.parts[0].by_readings.shape[1], q.shape[1])
         read = encoder * level * random.normal(size=(count, self.reading.max() + 1, q.shape[1]))
         values = self.values(count, random)
@@ -347,15 +346,15 @@ class ObservedTruth(NamedTuple):
 
 def truth_of(result: Calibration, capture: Capture) -> SocketTruth | ObservedTruth:
     """The arm and the geometry of a calibration. Raises `InputError` where it is of another capture."""
+    shared = partial(draw_shared, to_numpy(result.shared), result.arm, capture)
     if result.method != "joint":
-        return SocketTruth.of(result.arm, capture)
+        return SocketTruth.of(result.arm, capture)._replace(shared=shared)
     geometry = result.observed.geometry
-    missing = [name for name in Observed.of(capture, None).blocks if name not in geometry]
-    if missing:
-        raise InputError(
-            f"the calibration does not have the {missing[0]}; give the capture that it was identified from."
-        )
-    return ObservedTruth.at(capture, Parameters(result.arm, result.space.names), result.parameters, geometry)
+    for name in Observed.of(capture, None).blocks:
+        if name not in geometry:
+            raise InputError(f"the calibration does not have the {name}; give the capture that it was identified from.")
+    space = Parameters(result.arm, result.space.names)
+    return ObservedTruth.at(capture, space, result.parameters, geometry)._replace(shared=shared)
 
 
 def shifted(

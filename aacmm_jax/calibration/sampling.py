@@ -1,7 +1,6 @@
 """Uncertainty without linearisation: Monte Carlo after JCGM 101, and the bootstrap over poses."""
 
 import math
-from functools import partial
 from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..core.arguments import OneOf, Range, checked_arguments
 from ..core.errors import InputError
-from ..core.numpy_or_jax import AnyArray, to_numpy
+from ..core.numpy_or_jax import AnyArray
 from ..core.random_keys import random_generator
 from ..data.capture import Capture
 from ..data.noise import Noise
@@ -23,7 +22,7 @@ from ..model.loss_names import LossName
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
 from .record import uncertainty_of
-from .redrawn import draw_shared, truth_of
+from .redrawn import truth_of
 from .results import Calibration
 
 Level = Annotated[float, Range(above=0, most=0.9999)]  # coverage probability
@@ -144,7 +143,7 @@ def monte_carlo(
     if most < block:
         raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
     repeated, truth = Repeated.of(result, capture, lengths), truth_of(result, capture)
-    freedom, shared = result.degrees_of_freedom, partial(draw_shared, to_numpy(result.shared), result.arm, capture)
+    freedom = result.degrees_of_freedom
     values, failed, blocks, stable = [], 0, [], False
     while sum(map(len, values)) + failed < most and not stable:
         random, parts = np.random.default_rng([seed, len(values)]), []
@@ -154,7 +153,7 @@ def monte_carlo(
             # Noise estimated with few degrees of freedom is itself uncertain: its scale is drawn too, which gives
             # Student's t (JCGM 101, 6.4.9).
             scale = 1.0 if math.isinf(freedom) else np.sqrt(freedom / random.chisquare(freedom, size=(count, 1, 1)))
-            captures, errors = truth.drawn(count, noise, random, scale, shared)
+            captures, errors = truth.drawn(count, noise, random, scale)
             means = repeated.prior_means(count, random)
             solved, lost = repeated.solved(captures, means, errors and errors.coefficients)
             parts.append(solved)

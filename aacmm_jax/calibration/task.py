@@ -250,10 +250,6 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
         )
 
 
-# Lower and upper bounds of the unknowns, and their natural steps.
-Bounded = tuple[Float[AnyArray, " z"], Float[AnyArray, " z"], Float[AnyArray, " z"]]
-
-
 class State(NamedTuple):
     """Everything at one point of a solve."""
 
@@ -266,7 +262,7 @@ class Begun(NamedTuple):
     """Where a solve begins."""
 
     space: Parameters
-    box: Bounded
+    box: tuple[AnyArray, AnyArray, AnyArray]  # bounds of the unknowns, and natural steps
     before: State  # at the start
     z: Float[AnyArray, " z"]  # where it begins: there, or near the solution
     state: State  # there
@@ -301,8 +297,8 @@ def begin(task: Task, near: Float[AnyArray, " p"] | None = None) -> Begun:
     return Begun(space, box_of(task), before, z, state)
 
 
-def box_of(task: Task) -> Bounded:
-    """Of all unknowns, of which the geometry has no bounds unless it is kept."""
+def box_of(task: Task) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Lower and upper bounds of the unknowns, of which the geometry has none unless it is kept; natural steps."""
     xp, kept, sides = namespace(task), task.kept or {}, []
     for side, endless in ((task.bounds.lower, -np.inf), (task.bounds.upper, np.inf)):
         geometry = [kept.get(name, np.full(len(units), endless)) for name, units in task.observed.blocks.items()]

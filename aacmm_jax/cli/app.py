@@ -102,7 +102,15 @@ def examples(*commands: str) -> str:
 
 def command(*typed: str, name: str | None = None) -> Callable[[Any], Any]:
     """A command, named as its function or ``name``, with examples as they are typed."""
-    return app.command(name, epilog=examples(*typed))
+
+    def register(function: Any) -> Any:
+        for parameter, value in inspect.signature(function).parameters.items():
+            unit = parameter.rpartition("_")[2]
+            if unit in ("mm", "deg", "arcsec") and value.default.metavar is None:
+                value.default.metavar = unit.upper()
+        return app.command(name, epilog=examples(*typed))(function)
+
+    return register
 
 
 def prepare_jax() -> None:

@@ -29,28 +29,28 @@ _CAPTURES = (".toml", ".h5")  # others are tables
 )
 def arm(
     file: str | None = argument(
-        "ARM", "A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", None
+        "A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM", None
     ),
     new: Path | None = option(
-        "FILE.toml", "Write a template of an arm file, with every key explained. Overwrites nothing."
+        "Write a template of an arm file, with every key explained. Overwrites nothing.", "FILE.toml"
     ),
-    joints: int | None = option("N", "Number of joints of the template. Default: 6.", min=1, max=20),
+    joints: int | None = option("Number of joints of the template. Default: 6.", "N", min=1, max=20),
     check: Path | None = option(
-        "POSES",
         "Compare readings with the arm: a manifest (TOML), a capture (HDF5), or a table (CSV) with columns q_1, q_2, "
         "... and, where the tip was, x, y, z (mm, or as the header says) with or without qw, qx, qy, qz or rx, ry, rz; "
         "without positions its poses are of one socket, or of those that a column socket names.",
+        "POSES",
     ),
     unit: Literal["deg", "rad"] | None = option(
-        None, "Unit of the readings in a table. Default: as its header says, else by their size."
+        "Unit of the readings in a table. Default: as its header says, else by their size."
     ),
-    figure: Path | None = option("FILE.png", "Draw the arm at zero readings, and its reach (.png, .svg, .pdf)."),
+    figure: Path | None = option("Draw the arm at zero readings, and its reach (.png, .svg, .pdf).", "FILE.png"),
     encoder_arcsec: float | None = options.USUAL_ENCODER_NOISE,
     seating_mm: float | None = options.USUAL_SEATING_NOISE,
-    model: str | None = option("MODEL", "Model of the joints, as for calibrate: gravity,harmonics=1."),
+    model: str | None = option("Model of the joints, as for calibrate: gravity,harmonics=1.", "MODEL"),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
-    probe: str | None = option("X,Y,Z", "Tip of a tool in the last link of a URDF or kinematics.yaml, mm."),
+    probe: str | None = option("Tip of a tool in the last link of a URDF or kinematics.yaml, mm.", "X,Y,Z"),
     as_json: bool = options.JSON,
 ) -> None:
     """Look at an arm before its first calibration.
@@ -62,6 +62,8 @@ def arm(
     table [angles] that a manifest then needs. Positions of a table are in the base frame (of a URDF: in its base link),
     those of a manifest's tracker in a frame that is found. Exit code 1 where nothing makes them fit.
     """
+    from ..files.arm_tables import with_model
+
     if new is not None:
         if file is not None or check is not None or figure is not None:
             raise InputError("--new writes a template and reads no arm; leave out the arm, --check and --figure.")
@@ -87,10 +89,7 @@ def arm(
         return
     if unit is not None:
         raise InputError("--unit is for the table of --check; leave it out.")
-    if model is not None:
-        from ..files.arm_tables import with_model
-
-        specification = with_model(specification, model)
+    specification = specification if model is None else with_model(specification, model)
     frame = first_frame(specification)
     with together(figure):
         usual = assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)

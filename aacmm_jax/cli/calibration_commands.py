@@ -26,51 +26,49 @@ from .options import argument, flag, names_option, option, output, seed
     "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
 )
 def calibrate(
-    capture: list[Path] = argument("CAPTURE.h5 ...", "Capture, or captures of one arm in several sessions."),
-    output: Path = output("FILE.h5", "Calibration to write (HDF5)."),
+    capture: list[Path] = argument("Capture, or captures of one arm in several sessions.", "CAPTURE.h5 ..."),
+    output: Path = output("Calibration to write (HDF5).", "FILE.h5"),
     method: Literal["two-stage", "joint"] | None = option(
-        None,
         "two-stage: repeatability, then the scale by the reference lengths; joint: one least squares of all. "
-        "Default: two-stage, but joint with observations besides sockets, a robust loss or a prior.",
+        "Default: two-stage, but joint with observations besides sockets, a robust loss or a prior."
     ),
     robust: LossName | None = option(
-        None, "Robust loss: down-weights outlying poses and lists them. Turns off the search for noisy encoders."
+        "Robust loss: down-weights outlying poses and lists them. Turns off the search for noisy encoders."
     ),
     model: str | None = option(
-        "KINDS",
         "Model non-geometric errors of the joints: dh,gravity,harmonics=1+2,gear,coupled=2-3. Default: the arm file's; "
         "dh alone for none.",
+        "KINDS",
     ),
     prior: str | None = option(
-        "GROUP=SD,...",
         "Standard deviations of parameters about their nominal values: 'length=0.5mm,angle=0.05deg', "
         "'d_3=750.2+-0.1mm', 'alpha=learn' from the data; 'learn' for all, 'none'. Default: the arm file's.",
+        "GROUP=SD,...",
     ),
     scale: Literal["measured", "nominal"] = option(
-        None,
         "nominal: stage 1 alone, with the scale of the nominal arm, where nothing in the capture fixes it.",
         default="measured",
     ),
     same_probe: bool = flag("--same-probe", "The probe was not remounted between sessions."),
     only_poses: int | None = option(
-        "N", "Calibrate with N poses drawn at random, and test the result on the others.", min=1
+        "Calibrate with N poses drawn at random, and test the result on the others.", "N", min=1
     ),
     seed: int = seed("--only-poses"),
     hold: str = option(
-        "NAME",
         "Length that anchors the scale in stage 1: a parameter, 'longest', or 'none' as in the paper.",
+        "NAME",
         default="longest",
     ),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     held: str | None = option(
-        "NAMES", "Fix these parameters, separated by commas. Default: the list in the arm's file."
+        "Fix these parameters, separated by commas. Default: the list in the arm's file.", "NAMES"
     ),
-    free: str | None = option("NAMES", "Identify further parameters, separated by commas (beta_2: Hayati's angle)."),
-    length_bound_mm: float | None = option("MM", "Half-width of the bounds of length parameters.", min=0),
-    angle_bound_deg: float | None = option("DEG", "Half-width of the bounds of angle parameters.", min=0),
+    free: str | None = option("Identify further parameters, separated by commas (beta_2: Hayati's angle).", "NAMES"),
+    length_bound_mm: float | None = option("Half-width of the bounds of length parameters.", min=0),
+    angle_bound_deg: float | None = option("Half-width of the bounds of angle parameters.", min=0),
     bound: list[str] | None = option(
-        "NAME=WIDTH", "Half-width of the bounds of one parameter, in mm or deg; repeatable."
+        "Half-width of the bounds of one parameter, in mm or deg; repeatable.", "NAME=WIDTH"
     ),
     encoder_arcsec: float | None = options.KNOWN_ENCODER_NOISE,
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
@@ -79,17 +77,16 @@ def calibrate(
         "--keep-noise", "Do not re-estimate the noise of an encoder found to be noisier than stated."
     ),
     shared_errors: bool = option(
-        None, "Look for errors that poses share, and add what they do to the uncertainties.", default=True
+        "Look for errors that poses share, and add what they do to the uncertainties.", default=True
     ),
     cross_validate: bool | None = option(
-        None,
         "Calibrate once without each placement, station or other group of what was observed, or each region of joint "
         "space where all is one group, and test the result there. Default: yes, for a recorded capture with several "
-        "placements of the reference length, where neither --model, --prior nor --robust is given.",
+        "placements of the reference length, where neither --model, --prior nor --robust is given."
     ),
     leave_out: list[str] | None = option(
-        "PATTERN",
         "With --cross-validate: leave out, as one group, everything whose name matches ('monday/*'); repeatable.",
+        "PATTERN",
     ),
     monte_carlo: bool = flag(
         "--monte-carlo", "Check the uncertainties by Monte Carlo (JCGM 101); takes a minute or two."
@@ -99,8 +96,8 @@ def calibrate(
         "--remove-contradicting",
         "Leave out a socket, placement or station that contradicts all others, and say what that changed.",
     ),
-    figure: Path | None = option("FILE", "Plot the residual of every pose: PNG, SVG or PDF by the name."),
-    max_steps: int = option("N", "Largest number of steps of each solve.", default=300, min=1, max=1_000_000),
+    figure: Path | None = option("Plot the residual of every pose: PNG, SVG or PDF by the name.", "FILE"),
+    max_steps: int = option("Largest number of steps of each solve.", "N", default=300, min=1, max=1_000_000),
     as_json: bool = options.JSON,
 ) -> None:
     """Identify the parameters of an arm from captures.
@@ -198,26 +195,26 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
     name="compare-models",
 )
 def compare_models(
-    capture: Path = argument("CAPTURE.h5", "Capture, written by import or simulate."),
+    capture: Path = argument("Capture, written by import or simulate.", "CAPTURE.h5"),
     models: str | None = option(
-        "MODELS",
         "Models from simple to rich, separated by semicolons, as for calibrate --model. Default: dh; gravity; "
         "harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); gravity,functions; of a capture with "
         "temperatures each of these also with expansion.",
+        "MODELS",
     ),
     leave_out: list[str] | None = option(
-        "PATTERN",
         "Leave out, as one group, everything whose name matches ('monday/*'); repeatable. Default: each placement, "
         "station or other group where there are at least three, else either half of each joint's travel.",
+        "PATTERN",
     ),
-    only_poses: int | None = option("N", "Use N poses drawn at random, to save time.", min=1),
+    only_poses: int | None = option("Use N poses drawn at random, to save time.", "N", min=1),
     seed: int = seed("--only-poses"),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     encoder_arcsec: float | None = options.KNOWN_ENCODER_NOISE,
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     seating_mm: float | None = options.KNOWN_SEATING_NOISE,
-    output: Path | None = output("FILE.h5", "Comparison to write (HDF5), for show and report.", None),
+    output: Path | None = output("Comparison to write (HDF5), for show and report.", "FILE.h5", None),
     as_json: bool = options.JSON,
 ) -> None:
     """Compare models of the joints by unseen regions.
@@ -259,20 +256,19 @@ def compare_models(
 )
 def compare(
     paths: list[Path] = argument(
-        "OLD.h5 NEW.h5 [MORE.h5 ...]",
         "Calibrations of one arm, written by calibrate: two in this order; more than two are ordered by date.",
+        "OLD.h5 NEW.h5 [MORE.h5 ...]",
     ),
-    level: float = option("P", "Coverage probability of the expanded uncertainties.", default=0.95),
+    level: float = option("Coverage probability of the expanded uncertainties.", "P", default=0.95),
     length_mm: float | None = option(
-        "MM",
-        "Compute the change of this length all over the volume. Default: 300, or half a small arm's reach.",
+        "Compute the change of this length all over the volume. Default: 300, or half a small arm's reach."
     ),
     figure: Path | None = option(
-        "FILE", "Plot the changes, over time for three calibrations or more: PNG, SVG or PDF by the name."
+        "Plot the changes, over time for three calibrations or more: PNG, SVG or PDF by the name.", "FILE"
     ),
-    csv: Path | None = option("FILE", "Write every parameter of every calibration."),
+    csv: Path | None = option("Write every parameter of every calibration.", "FILE"),
     max_length_change_mm: float | None = option(
-        "MM", "Exit code 1 where a length changes by more than this from the first to the last.", min=0
+        "Exit code 1 where a length changes by more than this from the first to the last.", min=0
     ),
     as_json: bool = options.JSON,
 ) -> None:

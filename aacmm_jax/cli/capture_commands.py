@@ -45,35 +45,34 @@ def demo(
 )
 def simulate(
     arm: str = options.NOMINAL_ARM,
-    output: Path = output("FILE.h5", "Capture to write (HDF5)."),
-    socket: list[str] | None = option("NAME=X,Y,Z", "Simulate a socket at this position, mm; repeatable."),
+    output: Path = output("Capture to write (HDF5).", "FILE.h5"),
+    socket: list[str] | None = option("Simulate a socket at this position, mm; repeatable.", "NAME=X,Y,Z"),
     poses: list[str] | None = option(
-        "[NAME=]N", f"Number of poses in each socket, or in the named one; repeatable. Default: {_POSES}."
+        f"Number of poses in each socket, or in the named one; repeatable. Default: {_POSES}.", "[NAME=]N"
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     encoder_arcsec: float = options.ENCODER_NOISE,
-    resolution_arcsec: float = option("ARCSEC", "Round joint readings to multiples of this.", default=0.0, min=0),
+    resolution_arcsec: float = option("Round joint readings to multiples of this.", default=0.0, min=0),
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     linear_resolution_mm: float = option(
-        "MM", "Round readings of prismatic joints to multiples of this.", default=0.0, min=0
+        "Round readings of prismatic joints to multiples of this.", default=0.0, min=0
     ),
     seating_mm: float = options.SEATING_NOISE,
     temperature_c: str | None = option(
-        "LOWEST[,HIGHEST]", "Temperature of an arm with a thermometer, or limits to draw it between, C. Default: 20."
+        "Temperature of an arm with a thermometer, or limits to draw it between, C. Default: 20.", "LOWEST[,HIGHEST]"
     ),
     true_arm: str | None = option(
-        "ARM", "Simulate with this true arm: a TOML file, a URDF or a name. Default: the nominal arm."
+        "Simulate with this true arm: a TOML file, a URDF or a name. Default: the nominal arm.", "ARM"
     ),
     deviate_length_mm: float = option(
-        "MM", "Simulate with a random true arm whose lengths differ by at most this.", default=0.0, min=0
+        "Simulate with a random true arm whose lengths differ by at most this.", default=0.0, min=0
     ),
     deviate_angle_deg: float = option(
-        "DEG", "Simulate with a random true arm whose angles differ by at most this.", default=0.0, min=0
+        "Simulate with a random true arm whose angles differ by at most this.", default=0.0, min=0
     ),
     acceptance: Literal["asme", "iso"] | None = option(
-        None,
         "Simulate the acceptance test that 'aacmm plan --acceptance' plans, by ASME B89.4.22 or ISO 10360-12, in place "
-        "of sockets; artefacts have u = 0.001 mm.",
+        "of sockets; artefacts have u = 0.001 mm."
     ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
@@ -150,9 +149,9 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, in
 @command("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check", name="import")
 def import_(
     manifest: Path = argument(
-        "MANIFEST.toml", "Which files hold which poses and measured values, in which columns and units."
+        "Which files hold which poses and measured values, in which columns and units.", "MANIFEST.toml"
     ),
-    output: Path | None = output("FILE.h5", "Capture to write (HDF5).", None),
+    output: Path | None = output("Capture to write (HDF5).", "FILE.h5", None),
     check: bool = flag(
         "--check",
         "Compare the readings with the arm: order, signs, zeros and units of the columns; joints that stand still; "

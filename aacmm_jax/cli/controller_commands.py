@@ -31,25 +31,24 @@ _OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
 def export(
     calibration: Path = options.CALIBRATION_FILE,
     form: Literal["toml", "json", "csv", "dcc", "urdf", "table", "offsets", "ur", "python"] | None = option(
-        None,
         "toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf: "
         "the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: zero offsets of the "
         "joints alone, refitted; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy. "
         "Default: by the name of the output (.urdf, .json, .csv, .yaml, .py), else toml.",
+        None,
         "--format",
     ),
     which: Literal["calibrated", "nominal", "true"] | None = option(
-        None,
         "Arm to write with --format toml, urdf, table, ur or python; a simulation has a true one. Default: calibrated.",
+        None,
         "--arm",
     ),
-    convention: Literal["standard", "craig"] | None = option(None, "Convention of --format table. Default: standard."),
-    units: Literal["mm-deg", "m-rad"] | None = option(None, "Units of --format table. Default: mm-deg."),
-    output: Path | None = output("FILE", "File to write. Default: standard output.", None),
+    convention: Literal["standard", "craig"] | None = option("Convention of --format table. Default: standard."),
+    units: Literal["mm-deg", "m-rad"] | None = option("Units of --format table. Default: mm-deg."),
+    output: Path | None = output("File to write. Default: standard output.", "FILE", None),
     about: Path | None = options.ABOUT,
     evaluation: Path | None = option(
-        "FILE.h5",
-        "Add the acceptance tests of this evaluation (aacmm evaluate -o) of the calibration to --format dcc.",
+        "Add the acceptance tests of this evaluation (aacmm evaluate -o) of the calibration to --format dcc.", "FILE.h5"
     ),
 ) -> None:
     """Write a calibration for other programs or controllers."""
@@ -173,35 +172,34 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
 def correct(
     calibration: Path = options.CALIBRATION_FILE,
     poses: Path = argument(
-        "POSES.csv",
         "A row for each commanded pose: the joint readings (columns q_1, q_2, ..., or no others); or position x, y, z "
         "(mm) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector).",
+        "POSES.csv",
     ),
-    output: Path = output("FILE.csv", "Table with corrected readings to write."),
+    output: Path = output("Table with corrected readings to write.", "FILE.csv"),
     unit: Literal["deg", "rad"] | None = option(
-        None,
         "Unit of joint readings and rotation vectors when the header states none (q_1_deg). Readings of prismatic "
-        "joints are in mm.",
+        "joints are in mm."
     ),
     columns: str | None = option(
-        "NAMES",
         "Columns of the joint readings where they are not named q_1, q_2, ...: names, a pattern, or numbers from 1, "
         "separated by commas. Default: all columns of a table with one for each joint.",
+        "NAMES",
     ),
     length_unit: Literal["mm", "m", "um", "inch"] | None = option(
-        None, "Unit of positions when the column header has none (e.g. x_m). Default: mm."
+        "Unit of positions when the column header has none (e.g. x_m). Default: mm."
     ),
     near: str | None = option(
-        "Q1,Q2,...",
         "Search near these readings, for positions with orientations. Default: columns q_1, q_2, ... of the table.",
+        "Q1,Q2,...",
     ),
     probe: str | None = option(
-        "X,Y,Z",
         "Use this tip of the tool in the last frame for both arms, mm. Default: the nominal and the calibrated probe, "
         "whose difference is corrected too.",
+        "X,Y,Z",
     ),
     temperature: float | None = option(
-        "C", "Temperature of an arm that was calibrated with its thermal expansion. Default: column temperature_C."
+        "Temperature of an arm that was calibrated with its thermal expansion. Default: column temperature_C.", "C"
     ),
     as_json: bool = options.JSON,
 ) -> None:

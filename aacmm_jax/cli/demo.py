@@ -1,5 +1,6 @@
 """The demonstration: the paper's arm with realistic noise, both stages, compared with the truth."""
 
+import contextlib
 import math
 from pathlib import Path
 from typing import Any
@@ -84,18 +85,17 @@ def _prepare(folder: Path, true_name: str) -> None:
     """Make the folder, or make sure that all that is in it was left by an earlier demonstration."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        there = {item.name for item in folder.iterdir() if not item.name.endswith(".part")}
+        there = sorted(item.name for item in folder.iterdir() if not item.name.endswith(".part"))
     except OSError as error:
-        raise InputError(
-            f"{folder} cannot be used as a folder: {(error.strerror or str(error)).lower()}; name another."
-        ) from error
-    foreign = sorted(there - set(_FILES))
-    if not foreign and there:
-        try:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{folder} cannot be used as a folder: {reason}; name another.") from error
+    foreign = [name for name in there if name not in _FILES]
+    if there and not foreign:
+        with contextlib.suppress(InputError):
             true = files.load_capture(folder / _CAPTURE).true
-        except InputError:
-            true = None
-        foreign = [] if true is not None and true.name == true_name else sorted(there)
+            if true is not None and true.name == true_name:
+                return
+        foreign = there
     if foreign:
         raise InputError(
             f"{folder} holds files that are not of a demonstration ({shorten(foreign)}); name a new or an empty folder."

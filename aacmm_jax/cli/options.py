@@ -13,13 +13,14 @@ from ..core.jax_setup import LARGEST_INTEGER
 from ..core.text import is_control, number, quoted
 
 
-def argument(metavar: str, help: str, default: Any = ...) -> Any:
+def argument(help: str, metavar: str, default: Any = ...) -> Any:
     """An argument of a command, as the default of the function's parameter."""
     return typer.Argument(default, metavar=metavar, help=help)
 
 
-def option(metavar: str | None, help: str, *names: str, default: Any = None, **limits: Any) -> Any:
-    """An option: the word for its value (None: its choices), what it does, and its names if not the parameter's."""
+def option(help: str, metavar: str | None = None, *names: str, default: Any = None, **limits: Any) -> Any:
+    """An option: what it does, the word for its value (None: its choices, or the unit that the parameter's name ends
+    in), and its names if not the parameter's."""
     return typer.Option(default, *names, metavar=metavar, help=help, **limits)
 
 
@@ -28,42 +29,42 @@ def flag(name: str, help: str) -> Any:
     return typer.Option(False, name, help=help)
 
 
-def output(metavar: str, help: str, default: Any = ...) -> Any:
+def output(help: str, metavar: str, default: Any = ...) -> Any:
     """The option -o."""
     kept = " An existing file that aacmm did not write is kept unless --overwrite."
-    return option(metavar, help + kept, "--output", "-o", default=default)
+    return option(help + kept, metavar, "--output", "-o", default=default)
 
 
 def seed(of: str) -> Any:
     """The option --seed."""
-    return option("N", f"Seed of {of}.", default=0, min=0, max=LARGEST_INTEGER)
+    return option(f"Seed of {of}.", "N", default=0, min=0, max=LARGEST_INTEGER)
 
 
 JSON = flag("--json", "Print one JSON object on standard output, and nothing else.")
-ONLY = option("PATTERN", "Use only the sockets that match this shell pattern; repeatable.")
-WITHOUT = option("PATTERN", "Leave out the sockets that match this shell pattern; repeatable.")
-CALIBRATION_FILE = argument("CALIBRATION.h5", "Calibration, written by calibrate.")
+ONLY = option("Use only the sockets that match this shell pattern; repeatable.", "PATTERN")
+WITHOUT = option("Leave out the sockets that match this shell pattern; repeatable.", "PATTERN")
+CALIBRATION_FILE = argument("Calibration, written by calibrate.", "CALIBRATION.h5")
 NOMINAL_ARM = argument(
-    "ARM", "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm."
+    "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM"
 )
-ABOUT = option("FILE.toml", "Administrative data of a certificate: laboratory, customer, item, persons, dates.")
-BASE_LINK = option("LINK", "Link of a URDF that does not move. Default: its root.", "--base")
-TIP_LINK = option("LINK", "Link at the end of a URDF. Default: the only one with no link after it.", "--tip")
+ABOUT = option("Administrative data of a certificate: laboratory, customer, item, persons, dates.", "FILE.toml")
+BASE_LINK = option("Link of a URDF that does not move. Default: its root.", "LINK", "--base")
+TIP_LINK = option("Link at the end of a URDF. Default: the only one with no link after it.", "LINK", "--tip")
 _ENCODER = "the standard deviation of a joint reading"
 _SEATING = "the standard deviation of the tip in its socket, for each coordinate"
 _ESTIMATED, _OF_CLASS = "Default: estimated.", "Default: the arm file's [noise], or that of the arm's class."
-ENCODER_NOISE = option("ARCSEC", f"Set {_ENCODER}.", default=0.0, min=0)
-SEATING_NOISE = option("MM", f"Set {_SEATING}.", default=0.0, min=0)
-KNOWN_ENCODER_NOISE = option("ARCSEC", f"State {_ENCODER}, for the weights. {_ESTIMATED}", min=0)
-KNOWN_SEATING_NOISE = option("MM", f"State {_SEATING}. {_ESTIMATED}", min=0)
-USUAL_ENCODER_NOISE = option("ARCSEC", f"Assume {_ENCODER}. {_OF_CLASS}", min=0)
-USUAL_SEATING_NOISE = option("MM", f"Assume {_SEATING}. {_OF_CLASS}", min=0)
+ENCODER_NOISE = option(f"Set {_ENCODER}.", default=0.0, min=0)
+SEATING_NOISE = option(f"Set {_SEATING}.", default=0.0, min=0)
+KNOWN_ENCODER_NOISE = option(f"State {_ENCODER}, for the weights. {_ESTIMATED}", min=0)
+KNOWN_SEATING_NOISE = option(f"State {_SEATING}. {_ESTIMATED}", min=0)
+USUAL_ENCODER_NOISE = option(f"Assume {_ENCODER}. {_OF_CLASS}", min=0)
+USUAL_SEATING_NOISE = option(f"Assume {_SEATING}. {_OF_CLASS}", min=0)
 LINEAR_ENCODER_NOISE = option(
-    "MM", "Do the same for prismatic joints. Default: what the other encoders are at a distance of 1 m.", min=0
+    "Do the same for prismatic joints. Default: what the other encoders are at a distance of 1 m.", min=0
 )
 REFERENCE_LENGTHS = option(
-    "A,B[,U]",
     "Reference length between two sockets, u in mm; repeatable. Quote a name with a comma: '\"a, b\",C'.",
+    "A,B[,U]",
     "--length",
 )
 

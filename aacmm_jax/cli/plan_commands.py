@@ -46,100 +46,90 @@ _OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
 def plan(
     context: _CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
     arm: str = options.NOMINAL_ARM,
-    output: Path = output("FILE.csv", "Plan to write: one row a pose, in the order to take them."),
-    poses: int = option("N", "Number of poses, all sockets together.", default=30, min=2, max=10_000),
+    output: Path = output("Plan to write: one row a pose, in the order to take them.", "FILE.csv"),
+    poses: int = option("Number of poses, all sockets together.", "N", default=30, min=2, max=10_000),
     sockets: int | None = option(
-        "N",
         f"Position this many sockets, in pairs at the ends of the reference length. Default: {_SOCKETS}.",
+        "N",
         min=1,
         max=1000,
     ),
-    socket: list[str] | None = option("NAME=X,Y,Z", "Use a socket at this given position instead, mm; repeatable."),
+    socket: list[str] | None = option("Use a socket at this given position instead, mm; repeatable.", "NAME=X,Y,Z"),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     length_mm: str = option(
-        "L[:M]", "Reference length to position; of a range, the best length is chosen.", default="500"
+        "Reference length to position; of a range, the best length is chosen.", "L[:M]", default="500"
     ),
-    u_mm: float = option("MM", "Standard uncertainty of the reference length to position.", default=0.002),
+    u_mm: float = option("Standard uncertainty of the reference length to position.", default=0.002),
     model: str | None = option(
-        "MODEL", "Model of the joints, as for calibrate: the poses determine its coefficients too."
+        "Model of the joints, as for calibrate: the poses determine its coefficients too.", "MODEL"
     ),
     held: str | None = option(
-        "NAMES",
-        "Fix these parameters, as for calibrate, separated by commas. Default: the list in the arm's file.",
+        "Fix these parameters, as for calibrate, separated by commas. Default: the list in the arm's file.", "NAMES"
     ),
     encoder_arcsec: float | None = options.USUAL_ENCODER_NOISE,
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     seating_mm: float | None = options.USUAL_SEATING_NOISE,
     cone_deg: list[str] | None = option(
-        "[NAME=]DEG",
         "Largest tilt of the tool from the normal of a socket (of all, or of one by name); 180 for any direction. "
         "Default: 60 for robots, any for measuring arms. With --kit: half_angle_deg in its tables.",
+        "[NAME=]DEG",
     ),
     normal: list[str] | None = option(
-        "[NAME=]X,Y,Z", "Direction out of a socket (of all, or of one by name). Default: 0,0,1."
+        "Direction out of a socket (of all, or of one by name). Default: 0,0,1.", "[NAME=]X,Y,Z"
     ),
     tool_axis: str = option(
-        "AXIS",
         "Axis of the last frame that points from the tool into a socket: x, y, z, -x, -y or -z.",
+        "AXIS",
         default="z",
     ),
     retract_mm: float | None = option(
-        "MM",
         "Distance of the approach point of each pose along the socket's normal; 0 for none. Default: 50 for robots, 0 "
         "for measuring arms.",
         min=0,
     ),
-    cell: Path | None = option("FILE.toml", "Keep the arm clear of the boxes, walls and posts in this file."),
+    cell: Path | None = option("Keep the arm clear of the boxes, walls and posts in this file.", "FILE.toml"),
     collisions: bool = flag(
         "--collisions",
         "Keep the arm's body (collision shapes of its URDF, else capsules along its links) clear of itself and of the "
         "table. Implied by --cell and --link-radius-mm.",
     ),
-    link_radius_mm: float | None = option("MM", "Take capsules of this radius as the arm's body.", min=0),
+    link_radius_mm: float | None = option("Take capsules of this radius as the arm's body.", min=0),
     unconstrained: bool = flag("--unconstrained", "Predict also without cones, obstacles and approach points."),
-    angles: Literal["deg", "rad"] = option(
-        None, "Unit of the joint readings in the plan and its manifest.", default="deg"
-    ),
+    angles: Literal["deg", "rad"] = option("Unit of the joint readings in the plan and its manifest.", default="deg"),
     criterion: Literal["length", "A", "D", "E"] = option(
-        None,
         "Minimise the largest uncertainty of a length in the volume, or A, D or E of the parameters.",
         default="length",
     ),
     region: list[str] | None = option(
-        "AXIS=LOW:HIGH",
         "Place sockets in this range of x, y, z or distance from the base, mm; repeatable. Default: z=0:.",
+        "AXIS=LOW:HIGH",
     ),
-    margin_deg: float = option("DEG", "Keep joints at least this far from their limits.", default=5.0, min=0),
-    above_mm: float = option(
-        "MM", "Height of the table in the base frame: every joint and tip stays above it.", default=0.0
-    ),
-    candidates: int = option("N", "Number of poses to choose from.", default=3000, min=100, max=1_000_000),
+    margin_deg: float = option("Keep joints at least this far from their limits.", default=5.0, min=0),
+    above_mm: float = option("Height of the table in the base frame: every joint and tip stays above it.", default=0.0),
+    candidates: int = option("Number of poses to choose from.", "N", default=3000, min=100, max=1_000_000),
     check_length_mm: float | None = option(
-        "MM",
-        "Predict the uncertainty of this length all over the volume. Default: 300, or half a small arm's reach.",
+        "Predict the uncertainty of this length all over the volume. Default: 300, or half a small arm's reach."
     ),
     farthest: float | None = option(
-        "PART",
-        f"Largest distance of what is placed from the shoulder, part of the reach. Default: {_FARTHEST}.",
+        f"Largest distance of what is placed from the shoulder, part of the reach. Default: {_FARTHEST}.", "PART"
     ),
     kit: Path | None = option(
-        "FILE.toml", "Place these artefacts and use these instruments, with their uncertainties, instead of sockets."
+        "Place these artefacts and use these instruments, with their uncertainties, instead of sockets.", "FILE.toml"
     ),
     acceptance: Literal["asme", "iso"] | None = option(
-        None, "Plan the poses of an acceptance test instead, by ASME B89.4.22 or ISO 10360-12."
+        "Plan the poses of an acceptance test instead, by ASME B89.4.22 or ISO 10360-12."
     ),
-    sphere_mm: float = option("MM", "Diameter of the sphere of an acceptance test.", default=25.0),
-    stylus_mm: float = option("MM", "Diameter of the probe's ball in an acceptance test.", default=6.0, min=0),
+    sphere_mm: float = option("Diameter of the sphere of an acceptance test.", default=25.0),
+    stylus_mm: float = option("Diameter of the probe's ball in an acceptance test.", default=6.0, min=0),
     bar_mm: list[float] | None = option(
-        "MM", "Length of an available bar for an acceptance test; twice for asme, five times for iso."
+        "Length of an available bar for an acceptance test; twice for asme, five times for iso."
     ),
     range_mm: float | None = option(
-        "MM",
         "Measuring range that the maker states, a diameter, for an acceptance test. Default: twice the reach.",
         min=0,
     ),
     manifest: Path | None = option(
-        "FILE.toml", "Write a manifest, for the import of the readings once they are recorded."
+        "Write a manifest, for the import of the readings once they are recorded.", "FILE.toml"
     ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
@@ -150,6 +140,7 @@ def plan(
 
     For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
     """
+    from ..files.arm_tables import with_model
     from ..files.plans import plan_csv, plan_manifest
 
     given = dict(locals())  # all options by name
@@ -160,10 +151,7 @@ def plan(
             fixed = options.names_option(held)
             others = tuple(name for name in specification.free if name not in fixed)
             specification = specification._replace(held=fixed, free=others)
-        if model is not None:
-            from ..files.arm_tables import with_model
-
-            specification = with_model(specification, model)
+        specification = specification if model is None else with_model(specification, model)
     _check_options(context, kit is not None, acceptance is not None)
     planned: Any
     if acceptance is not None:

@@ -35,44 +35,43 @@ _KINDS = {
 )
 def evaluate(
     calibration: Path = argument(
-        "CALIBRATION.h5", "Calibration, written by calibrate; or, alone, a manifest of points (TOML)."
+        "Calibration, written by calibrate; or, alone, a manifest of points (TOML).", "CALIBRATION.h5"
     ),
-    capture: Path | None = argument("CAPTURE.h5", "Capture, written by import or simulate.", None),
-    output: Path | None = output("FILE.h5", "Evaluation to write (HDF5), for aacmm report.", None),
+    capture: Path | None = argument("Capture, written by import or simulate.", "CAPTURE.h5", None),
+    output: Path | None = output("Evaluation to write (HDF5), for aacmm report.", "FILE.h5", None),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     mpe: list[str] | None = option(
-        "NAME=A[+L/K]",
         "Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where one is not "
         "met by the decision rule.",
+        "NAME=A[+L/K]",
     ),
     acceptance: list[str] | None = option(
-        "[jjf|asme|iso]",
         "Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; repeatable. Default: those of the "
         "standard that the capture was made for, of --mpe, and of all for a manifest of points.",
+        "[jjf|asme|iso]",
     ),
     test_u_mm: str = option(
-        "A[+L/K]",
         "Standard uncertainty that seat and fixture add to every test value (L: the length).",
+        "A[+L/K]",
         default="0",
     ),
     expansion: list[str] | None = option(
-        "OF=C,U,T,U",
         "Thermal expansion of the artefact or the arm in an acceptance test: coefficient in 1e-6/K, temperature in C, "
         "each with its standard uncertainty; 'artefact=11.5,1,20.8,0.2'. Lengths are corrected. Give it for the arm "
         "only where the arm does not compensate its own expansion.",
+        "OF=C,U,T,U",
     ),
     rule: Literal["iso-2017", "iso-2013", "simple"] | None = option(
-        None,
         "Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance "
-        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017.",
+        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017."
     ),
     range_mm: float | None = option(
-        "MM", "Measuring range that the maker states, a diameter. Default: that of the files.", min=0
+        "Measuring range that the maker states, a diameter. Default: that of the files.", min=0
     ),
-    max_rms_mm: float | None = option("MM", "Exit code 1 where the RMS distance is larger.", min=0),
-    max_deltam_mm: float | None = option("MM", "Exit code 1 where Deltam is larger.", min=0),
-    max_length_error_mm: float | None = option("MM", "Exit code 1 where the error of any length is larger.", min=0),
+    max_rms_mm: float | None = option("Exit code 1 where the RMS distance is larger.", min=0),
+    max_deltam_mm: float | None = option("Exit code 1 where Deltam is larger.", min=0),
+    max_length_error_mm: float | None = option("Exit code 1 where the error of any length is larger.", min=0),
     as_json: bool = options.JSON,
 ) -> None:
     """Test a calibration on a capture that it has not seen.
@@ -98,63 +97,49 @@ def evaluate(
         )
     with together(output):
         if capture is None:
-            summary = _evaluated_points(calibration, output, acceptance, range_mm, of_test)
+            record, summarise = _points(calibration, acceptance, range_mm, of_test), summaries.evaluation.points_summary
         else:
-            of_test |= {"maxima": maxima, "standards": acceptance}
             paths, choice = (InputFile(calibration), InputFile(capture)), (only or None, without or ())
-            summary = _evaluated(paths, output, choice, range_mm, of_test)
-    summary |= {} if output is None else {"written": str(output)}
+            of_test |= {"maxima": maxima, "standards": acceptance}
+            record, summarise = _evaluation(paths, choice, range_mm, of_test), summaries.evaluation.evaluation_summary
+        summary = with_spinner("Evaluating", lambda: summarise(record))
+        given = {
+            "--rule": rule is not None,
+            "--test-u-mm": u_test.fixed > 0 or 1 / u_test.divisor > 0,
+            "--expansion": bool(expansion),
+            "--range-mm": range_mm is not None,
+        }
+        if capture is not None and not summary["acceptance"] and any(given.values()):
+            raise InputError(
+                f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only; this "
+                "capture supports none, or none was requested: name them with --acceptance, or leave the option out."
+            )
+        if output is not None:
+            files.save_evaluation(output, record, summary)
+            summary["written"] = str(output)
     show_summary(summary, as_json, views.points if capture is None else views.evaluation)
     if summary["failed"] or any(test["decision"] in ("fails", "undecided") for test in summary["acceptance"]):
         raise typer.Exit(1)
 
 
-def _evaluated(
-    paths: tuple[InputFile, InputFile],
-    output: Path | None,
-    choice: tuple,
-    measuring_range: float | None,
-    of_test: dict[str, Any],
-) -> dict[str, Any]:
-    """Evaluate a calibration on a part of a capture; the summary."""
+def _evaluation(paths: tuple[InputFile, InputFile], choice: tuple, stated_range: float | None, of_test: dict) -> Any:
+    """The record of a calibration evaluated on a part of a capture."""
     from ..diagnostics.findings import findings_of, sentences
 
     record, recording = files.load_calibration(paths[0]), files.load_capture(paths[1])
     recording = recording._replace(
         capture=recording.capture.select(*choice),
         sources=(*map(fingerprint, paths), *recording.sources),
-        measuring_range=measuring_range or recording.measuring_range,
+        measuring_range=stated_range or recording.measuring_range,
     )
     stored = read_summary(paths[0], ("calibration",))[1]
     warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
     evaluation = acceptance_tests.evaluation_of(record, recording, **of_test)
-    evaluation = evaluation._replace(calibration_warnings=tuple(warnings))
-    summary = with_spinner("Evaluating", lambda: summaries.evaluation.evaluation_summary(evaluation))
-    influences = of_test["influences"]
-    given = {
-        "--rule": of_test["rule"] is not None,
-        "--test-u-mm": of_test["u_test"] > 0 or influences.u_relative > 0,
-        "--expansion": influences.artefact is not None or influences.arm is not None,
-        "--range-mm": measuring_range is not None,
-    }
-    if not summary["acceptance"] and any(given.values()):
-        raise InputError(
-            f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only; this "
-            "capture supports none, or none was requested: name them with --acceptance, or leave the option out."
-        )
-    if output is not None:
-        files.save_evaluation(output, evaluation, summary)
-    return summary
+    return evaluation._replace(calibration_warnings=tuple(warnings))
 
 
-def _evaluated_points(
-    manifest: Path,
-    output: Path | None,
-    standards: list[str] | None,
-    measuring_range: float | None,
-    of_test: dict[str, Any],
-) -> dict[str, Any]:
-    """Run the acceptance tests of a manifest of points; the summary."""
+def _points(manifest: Path, standards: list[str] | None, stated_range: float | None, of_test: dict) -> Any:
+    """The record of a manifest of points, with the acceptance tests that they allow."""
     from ..acceptance.standards import STANDARDS, checked_standards
 
     if manifest.suffix != ".toml":
@@ -163,18 +148,14 @@ def _evaluated_points(
         )
     chosen = checked_standards(STANDARDS if standards is None else standards)
     measured = files.read_points(manifest)
-    measured = measured._replace(measuring_range=measuring_range or measured.measuring_range)
-    record = acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
-    summary = summaries.evaluation.points_summary(record)
-    if output is not None:
-        files.save_evaluation(output, record, summary)
-    return summary
+    measured = measured._replace(measuring_range=stated_range or measured.measuring_range)
+    return acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
 
 
 @command("aacmm report calibration.h5 -o report.html")
 def report(
-    file: Path = argument("FILE.h5", "File to report: a calibration, evaluation, study or model comparison."),
-    output: Path = output("FILE.html", "Report to write: one HTML file that needs no network connection."),
+    file: Path = argument("File to report: a calibration, evaluation, study or model comparison.", "FILE.h5"),
+    output: Path = output("Report to write: one HTML file that needs no network connection.", "FILE.html"),
     about: Path | None = options.ABOUT,
     as_json: bool = options.JSON,
 ) -> None:
@@ -193,12 +174,12 @@ def report(
 @command("aacmm show calibration.h5", "aacmm show panda")
 def show(
     file: str = argument(
-        "FILE",
         "File to show: a capture, calibration, evaluation, study or model comparison (HDF5), or an arm: a TOML file, a "
         "URDF, a kinematics.yaml or a shipped name.",
+        "FILE",
     ),
-    cell: int | None = option("N", "Show this cell of a study in full.", min=1),
-    figures: Path | None = option("FOLDER", "Write the figures of a study (PNG) to this folder."),
+    cell: int | None = option("Show this cell of a study in full.", "N", min=1),
+    figures: Path | None = option("Write the figures of a study (PNG) to this folder.", "FOLDER"),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
     as_json: bool = options.JSON,

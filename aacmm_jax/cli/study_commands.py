@@ -24,20 +24,20 @@ from .options import argument, flag, option, output
     "aacmm study --resume -o study.h5",
 )
 def study(
-    output: Path = output("FILE.h5", "Study to write, or to continue (HDF5)."),
+    output: Path = output("Study to write, or to continue (HDF5).", "FILE.h5"),
     specification: str | None = argument(
-        "SPEC.toml", "Specification: a TOML file, or the name of a study that ships with aacmm.", None
+        "Specification: a TOML file, or the name of a study that ships with aacmm.", "SPEC.toml", None
     ),
     resume: bool = flag("--resume", "Continue the study in the output file."),
-    trials: int | None = option("N", "Trials in each cell. Default: as the specification says.", min=1),
-    seed: int | None = option("N", "Seed. Default: as the specification says.", min=0),
-    chunk: int | None = option("N", "Trials computed at a time; no result depends on it. Default: 1000.", min=1),
+    trials: int | None = option("Trials in each cell. Default: as the specification says.", "N", min=1),
+    seed: int | None = option("Seed. Default: as the specification says.", "N", min=0),
+    chunk: int | None = option("Trials computed at a time; no result depends on it. Default: 1000.", "N", min=1),
     dask: str | None = option(
-        "ADDRESS",
         "Run on a Dask cluster: the address of its scheduler. tcp:// trusts everybody who can reach its port, who can "
         "run programs with your rights; tls:// asks for certificates (see docs/scaling.md).",
+        "ADDRESS",
     ),
-    workers: int | None = option("N", "Threads of this process. Default: one a core.", min=1),
+    workers: int | None = option("Threads of this process. Default: one a core.", "N", min=1),
     shards: bool = flag(
         "--shards", "Dask workers write their trials themselves, to the output's folder, which they share."
     ),

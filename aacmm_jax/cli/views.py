@@ -206,18 +206,8 @@ def _uncertainty(summary: dict[str, Any]) -> View:
     yield "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
     if part.get("tried"):
         yield words.tried_sentence(part["tried"])
-    seating = 1e3 * part["seating_mm"]
-    noise = f"{words.encoders_in_words(part)}, {words.seat_in_words(summary)} {seating:.3g} um"
-    joints = ", ".join(str(row["joint"]) for row in part.get("noisy_encoders", ()))
-    replaced = f", but for joint {joints}" if joints else ""
-    source = {
-        "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times what it predicts.",
-        "estimated": f"Noise estimated from the residuals: {noise} (only their combination is well determined).",
-        "common": f"One variance for all poses: {seating:.3g} um a coordinate.",
-        "robust": "The variance of each pose is taken from its own residual (robust noise model).",
-    }[part["form"]]
     pairs = [f"{row['one']} with {row['other']} ({row['r']:+.3f})" for row in part["correlated"][:6]]
-    yield source + (f" Strongly correlated: {', '.join(pairs)}." if pairs else "")
+    yield words.noise_sentence(summary) + (f" Strongly correlated: {', '.join(pairs)}." if pairs else "")
     rest = " (the priors determine the rest)" if summary.get("prior") and part["rank"] < part["parameters"] else ""
     indices = ", ".join(f"{name} = {value:.3g}" for name, value in part["indices"].items())
     yield (

@@ -113,9 +113,14 @@ def first_capture(arm: Arm, noise: Noise) -> tuple[float, list[Expected]]:
     )
     rows = []
     for sockets in _SOCKETS:
+        pairs = tuple((i, i + 1) for i in range(0, sockets, 2))
         starts, ends = sample_lengths(arm, _PLACEMENTS * sockets // 2, length=length, seed=2)
         points = np.stack([np.asarray(arm.position(starts)), np.asarray(arm.position(ends))], axis=1)
-        placed = [_in_sockets(problem, part.reshape(-1, 3)) for part in np.split(points, _PLACEMENTS)]
+        placed = []
+        for part in np.split(points, _PLACEMENTS):
+            places = FixturePlacement(part.reshape(-1, 3), pairs, (U_LENGTH,) * len(pairs))
+            pool = pool_of(problem, *configurations_at(problem.region, places.points, _STARTS))
+            placed.append((candidates_of(problem, places, pool), len(pool.q)))
         words = f"{sockets} sockets, {pluralise(sockets // 2, 'reference length')} of {length:.0f} mm"
         rows.append(_expected(words, sockets, placed, functions, u_reading))
     rows.append(_expected("a tracker", 0, [_seen(problem)], functions, u_reading))
@@ -132,13 +137,6 @@ def _thorough(
     sockets = {f"S{i}": q[end - size : end] for i, (size, end) in enumerate(zip(sizes, ends, strict=True))}
     length = ReferenceLength("S0", "S1", float(np.linalg.norm(tips[0] - tips[sizes[0]])), U_LENGTH)
     return sockets, [length], [MeasuredPoints("tracker", q, tips, u=U_TRACKER)]
-
-
-def _in_sockets(problem: DesignProblem, points: Float[np.ndarray, "s 3"]) -> tuple[Candidates, int]:
-    """Random poses in sockets, two by two at the ends of reference lengths, and how many there are."""
-    pairs = tuple((i, i + 1) for i in range(0, len(points), 2))
-    pool = pool_of(problem, *configurations_at(problem.region, points, _STARTS))
-    return candidates_of(problem, FixturePlacement(points, pairs, (U_LENGTH,) * len(pairs)), pool), len(pool.q)
 
 
 def _seen(problem: DesignProblem) -> tuple[Candidates, int]:

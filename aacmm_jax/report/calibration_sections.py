@@ -28,12 +28,11 @@ from ..summaries.result_tables import (
 from ..summaries.tables import (
     Cell,
     by_columns,
-    encoders_in_words,
     factor_words,
     listed,
+    noise_sentence,
     number,
     numbers,
-    seat_in_words,
     tried_sentence,
     two_digits,
 )
@@ -150,24 +149,11 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
         ("with readings [mm]", volume.expanded_length_reading),
     ):
         positions[name] = [with_u_digits(float(value)) for value in u]
-    uncertainty = summary["uncertainty"]
-    seating = 1e3 * uncertainty["seating_mm"]
-    words = f"{encoders_in_words(uncertainty)}, {seat_in_words(summary)} {seating:.3g} µm"
-    basis = "All uncertainties are based on"
-    joints = ", ".join(str(row["joint"]) for row in uncertainty.get("noisy_encoders", ()))
-    replaced = f", but for joint {joints}, whose noise was estimated" if joints else ""
-    noise = {
-        "given": f"{basis} the given noise{replaced}: {words}. Residuals are {uncertainty['misfit'] or 0:.2f} times "
-        "its prediction.",
-        "estimated": f"{basis} the noise estimated from the residuals: {words}.",
-        "common": f"{basis} one variance for all poses: {seating:.3g} µm in each coordinate.",
-        "robust": "Each pose's own residual is taken as its error (robust covariance).",
-    }
     blocks = [
         introduction,
         volume_table("Expanded uncertainty over the working volume [mm]", statistics),
         volume_chart(volume)._replace(table=by_columns("All positions", positions)),
-        noise[uncertainty["form"]],
+        noise_sentence(summary),
     ]
     return Section("volume", "Uncertainty over the working volume", blocks)
 

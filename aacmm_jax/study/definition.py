@@ -335,22 +335,18 @@ class Study:
             if setting.method != "stage1" and capture is not None and not capture.lengths:
                 raise InputError("the capture file has no reference length; use method = 'stage1', or another file.")
             for fixture in () if capture is not None else setting.fixtures:
-                self._check_pool(fixture)
+                pool, (placements, poses) = self.specification.capture.pool, self.pool_capacity(fixture)
+                if fixture.points is None and placements < 2:
+                    raise InputError(
+                        f"a capture.pool of {pool} poses holds fewer than two placements of {fixture.poses} poses in "
+                        f"each of its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
+                    )
+                if fixture.poses > poses:
+                    raise InputError(
+                        f"{fixture.poses} poses are more than the pool has for a socket ({poses}); give a larger "
+                        f"capture.pool than {pool}."
+                    )
         _ = self.cell_values  # its checks
-
-    def _check_pool(self, fixture: Fixture) -> None:
-        """Raise `InputError` where the pool is too small for a fixture."""
-        pool, (placements, poses) = self.specification.capture.pool, self.pool_capacity(fixture)
-        if fixture.points is None and placements < 2:
-            raise InputError(
-                f"a capture.pool of {pool} poses holds fewer than two placements of {fixture.poses} poses in each of "
-                f"its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
-            )
-        if fixture.poses > poses:
-            raise InputError(
-                f"{fixture.poses} poses are more than the pool has for a socket ({poses}); give a larger capture.pool "
-                f"than {pool}."
-            )
 
 
 @lru_cache(maxsize=4)

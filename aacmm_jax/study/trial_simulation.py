@@ -177,7 +177,11 @@ def _chunk(static: _Static, shared: _Shared, keys: Array, trials: Int[Array, " w
     q = q if corrections is None else _read_where(geometry, corrections, q)
     reading = _readings(static, q, geometry.kinds, parts[:, 3:5], values)
     u = jnp.where(jnp.isnan(values.u)[:, None], recorded_u[None], values.u[:, None])
-    value, u = _certified(static, point, parts[:, 5], u)
+    value = u = jnp.zeros((_WIDTH, 0)) if not static.lengths else u
+    if static.lengths:
+        between = jnp.stack([point[:, :, b] - point[:, :, a] for a, b in static.lengths], axis=1)
+        u = jnp.broadcast_to(u, between.shape[:2])
+        value = jnp.linalg.norm(between, axis=-1) + u * _normal(parts[:, 5], between.shape[1:2])
     start = jnp.broadcast_to(nominal, true.shape)
     if static.random_start:
         fraction = jax.vmap(lambda k: jax.random.uniform(k, (p,), jnp.float64))(parts[:, 6])
@@ -199,17 +203,6 @@ def _read_where(geometry: Geometry, corrections: Corrections, q: Float[Array, "n
         return q - joint_errors(corrected, joint_motion_of_rows(corrected, reading[:, :, None]))[0][:, :, 0]
 
     return jax.lax.fori_loop(0, _SUBSTITUTIONS, closer, q)
-
-
-def _certified(
-    static: _Static, point: Float[Array, "w 3 N"], keys: Array, u: Float[Array, "w l"]
-) -> tuple[Array, Array]:
-    """Certified values of the reference lengths, with an error of standard deviation u."""
-    if not static.lengths:
-        return jnp.zeros((_WIDTH, 0)), jnp.zeros((_WIDTH, 0))
-    between = jnp.stack([point[:, :, b] - point[:, :, a] for a, b in static.lengths], axis=1)
-    u = jnp.broadcast_to(u, between.shape[:2])
-    return jnp.linalg.norm(between, axis=-1) + u * _normal(keys, between.shape[1:2]), u
 
 
 def _normal(keys: Array, shape: tuple[int, ...], dtype: Any = jnp.float64) -> Float[Array, "w ..."]:

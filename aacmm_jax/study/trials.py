@@ -181,13 +181,24 @@ def _draw_observed(
 ) -> tuple[DrawnTrials, Capture]:
     """Trials ``trials`` of cells ``cells``, and their captures as a batch. Each has random numbers of its own."""
     recorded = _recorded(study)
-    seed = study.specification.seed
-    rows = []
+    truth, nominal = recorded.truth, np.asarray(recorded.space.vector())
+    fixed = np.array([name == setting.hold for name in study.space.names])
+    true, start, q, shifts, certified, lengths = [], [], [], [], [], []
     for cell, trial in zip(cells.tolist(), trials.tolist(), strict=True):
         values = CellValues(*(column[cell] for column in study.cell_values))
-        rows.append(_trial(study, setting, recorded, values, np.random.default_rng([seed, cell, trial])))
-    true, start, q, shifts, certified, lengths = zip(*rows, strict=True)
-    truth = recorded.truth
+        random = np.random.default_rng([study.specification.seed, cell, trial])
+        normal, fraction = random.normal(size=len(nominal)), random.uniform(size=len(nominal))
+        true.append(nominal + values.width * np.where(values.normal, normal, erf(normal / np.sqrt(2))))
+        bounded = np.isfinite(values.lower) & np.isfinite(values.upper)  # coefficients of corrections are not
+        lower, upper = (np.where(bounded, side, nominal) for side in (values.lower, values.upper))
+        at_random = setting.random_start & ~fixed
+        start.append(np.where(at_random, lower + fraction * (upper - lower), nominal))
+        taken, left = _taken(recorded, true[-1])
+        q.append(_read(recorded.space.base, taken, truth.reading, values, random))
+        errors = truth.errors_of_rows(1, float(values.seating), random)
+        shifts.append([error[0] - rows for error, rows in zip(errors, left, strict=True)])
+        certified.append({name: drawn[0] for name, drawn in truth.values(1, random).items()})
+        lengths.append(truth.lengths(1, random)[0])
     readings, value = np.stack(q), np.stack(lengths)
     stacked = {name: np.stack([values[name] for values in certified]) for name in certified[0]}
     observations = [
@@ -196,30 +207,8 @@ def _draw_observed(
     ]
     u = np.broadcast_to(np.asarray(truth.observed.u), value.shape)
     captures = truth.batch(observations, value)
-    lower, upper = study.cell_values.lower[cells], study.cell_values.upper[cells]
-    return DrawnTrials(readings, np.stack(true), lower, upper, np.stack(start), value, u), captures
-
-
-def _trial(
-    study: Study, setting: Setting, recorded: _Recorded, values: CellValues, random: np.random.Generator
-) -> tuple[Any, ...]:
-    """True parameters, start, readings, shifts of the residuals, certified values and reference lengths."""
-    truth, nominal = recorded.truth, np.asarray(recorded.space.vector())
-    normal = random.normal(size=len(nominal))
-    true = nominal + values.width * np.where(values.normal, normal, erf(normal / np.sqrt(2)))
-    start = nominal
-    fraction = random.uniform(size=len(nominal))
-    if setting.random_start:
-        fixed = np.array([name == setting.hold for name in study.space.names])
-        bounded = np.isfinite(values.lower) & np.isfinite(values.upper)  # coefficients of corrections are not
-        lower, upper = (np.where(bounded, side, nominal) for side in (values.lower, values.upper))
-        start = np.where(fixed, nominal, lower + fraction * (upper - lower))
-    q, left = _taken(recorded, true)
-    read = _read(recorded.space.base, q, truth.reading, values, random)
-    errors = truth.errors_of_rows(1, float(values.seating), random)
-    shifts = [error[0] - rows for error, rows in zip(errors, left, strict=True)]
-    certified = {name: drawn[0] for name, drawn in truth.values(1, random).items()}
-    return true, start, read, shifts, certified, truth.lengths(1, random)[0]
+    bounds = study.cell_values.lower[cells], study.cell_values.upper[cells]
+    return DrawnTrials(readings, np.stack(true), *bounds, np.stack(start), value, u), captures
 
 
 def _taken(

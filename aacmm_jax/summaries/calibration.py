@@ -208,6 +208,7 @@ def _uncertainty_summary(record: CalibrationRecord, volume: VolumetricUncertaint
     if len(readings) > 1:  # a single pose has no distance from another
         poses = tried_poses(record.calibrated.arm, readings, volume.q)
         nearby = {"poses": len(poses.distance), "tried": int(poses.tried.sum()), "spacing_rad": poses.spacing}
+    pairs = uncertainty.correlated(_CORRELATED)
     for encoder in record.noisy_encoders:
         unit, size = ("mm", 1.0) if encoder.joint in record.calibrated.arm.prismatic else ("arcsec", ARCSEC)
         values = {name: getattr(encoder, name) / size for name in ("expected", "found", "u")}
@@ -221,7 +222,7 @@ def _uncertainty_summary(record: CalibrationRecord, volume: VolumetricUncertaint
         # Of the unknown geometry, whose uncertainty follows from the scatter of single poses.
         "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(1), np.zeros(1))[0]),
         "volume": plain(volume.summary),
-        "correlated": [{"one": one, "other": other, "r": r} for one, other, r in uncertainty.correlated(_CORRELATED)],
+        "correlated": [{"one": first, "other": second, "r": r} for first, second, r in pairs],
         **attributes(observability, "rank", "condition", "indices"),
         "parameters": len(observability.names),
         "tried": nearby,

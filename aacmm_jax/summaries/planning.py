@@ -73,9 +73,9 @@ def _stated(
     if cell is not None:
         starts = np.cumsum([0, *(len(motion.tilt) for motion in motions)]).tolist()
         hits = [
-            (start + index, [one, other])
+            (start + index, [part, touched])
             for start, motion in zip(starts, motions, strict=False)
-            for index, one, other in motion.blocked
+            for index, part, touched in motion.blocked
         ]
         clearances = [motion.clearance.min() for motion in motions if motion.clearance is not None]
         collisions = {

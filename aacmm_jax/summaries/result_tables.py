@@ -195,10 +195,16 @@ def harmonics_table(rows: Rows) -> Table:
 
 def volume_table(caption: str, volume: Row) -> Table:
     """Expanded uncertainty of tips and lengths over the working volume."""
-    rows = [
-        [title, *("not determined" if u is None else with_u_digits(u) for u in values)]
-        for title, values in tables.volume_rows(volume)
-    ]
+    length = f"{volume['length_mm']:g} mm length"
+    titles = {
+        "expanded_tip": "tip position (worst direction): from the calibration",
+        "expanded_length": f"{length}: from the calibration",
+        "expanded_length_reading": f"{length}: with the noise of both readings",
+    }
+    rows = []
+    for key, title in titles.items():
+        values = [volume[f"{key}_{statistic}_mm"] for statistic in ("median", "95", "largest")]
+        rows.append([title, *("not determined" if u is None else with_u_digits(u) for u in values)])
     return listed(caption, rows, ("", "median", "95th percentile", "largest"))
 
 

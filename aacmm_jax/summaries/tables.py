@@ -14,7 +14,7 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 from ..core.text import pluralise
-from ..core.units import DEG, people_read_change
+from ..core.units import DEG, people_read, people_read_change
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 _MOST_DECIMALS = 6  # of a quantity that was found
@@ -198,32 +198,27 @@ def observed_words(sockets: int, others: int, lengths: int | None = None) -> str
 def quantity_words(row: Mapping[str, Any], u: bool = True, coverage: float | None = None) -> str:
     """A quantity of an observation as a person reads it, angles in deg; with its standard uncertainty where one is
     stated and ``u`` is true. With a coverage factor, what was found is rounded to its expanded uncertainty."""
-    factor, unit = _quantity_unit(row)
+    factor, unit = people_read(row["unit"])
     uncertainties = [None] * len(row["values"]) if coverage is None else row["u_found"]
     expanded = [None if value is None else (coverage or 0.0) * factor * value for value in uncertainties]
     decimals = [min(decimals_for(u, 4 if unit else 6), _MOST_DECIMALS) for u in expanded]
     pairs = zip(row["values"], decimals, strict=True)
-    words = _in_brackets([f"{factor * value:z.{digits}f}" for value, digits in pairs]) + unit
+    words = _in_brackets([f"{factor * value:z.{digits}f}" for value, digits in pairs], unit)
     if not u or row["u"] is None:
         return words
-    return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g}{unit or ' 1'})"
+    return f"{words} (exact)" if row["u"] == 0 else f"{words} (u = {factor * row['u']:.4g} {unit or 1})"
 
 
 def expanded_words(row: Mapping[str, Any], coverage: float) -> str:
     """The expanded uncertainties of a quantity that was found, two digits each, angles in deg."""
-    factor, unit = _quantity_unit(row)
+    factor, unit = people_read(row["unit"])
     if any(u is None for u in row["u_found"]):
         return "not determined"
-    return _in_brackets([two_digits(coverage * factor * u) if u > 0 else "0" for u in row["u_found"]]) + unit
+    return _in_brackets([two_digits(coverage * factor * u) if u > 0 else "0" for u in row["u_found"]], unit)
 
 
-def _quantity_unit(row: Mapping[str, Any]) -> tuple[float, str]:
-    units = {"rad": (1 / DEG, " deg"), "1": (1.0, "")}
-    return units.get(row["unit"], (1.0, f" {row['unit']}"))
-
-
-def _in_brackets(words: Sequence[str]) -> str:
-    return f"({', '.join(words)})" if len(words) > 1 else words[0]
+def _in_brackets(words: Sequence[str], unit: str) -> str:
+    return (f"({', '.join(words)})" if len(words) > 1 else words[0]) + (f" {unit}" if unit else "")
 
 
 def factor_words(volume: Mapping[str, Any]) -> str:
@@ -234,31 +229,26 @@ def factor_words(volume: Mapping[str, Any]) -> str:
     return f"coverage factor {low:.2f}" + (f" to {high:.2f}" if f"{low:.2f}" != f"{high:.2f}" else "")
 
 
-def volume_rows(volume: Mapping[str, Any]) -> list[tuple[str, list[float | None]]]:
-    """U over the working volume: what it is of, and its median, 95th percentile and largest value, mm."""
-    length = f"{volume['length_mm']:g} mm length"
-    titles = {
-        "expanded_tip": "tip position (worst direction): from the calibration",
-        "expanded_length": f"{length}: from the calibration",
-        "expanded_length_reading": f"{length}: with the noise of both readings",
-    }
-    which = ("median", "95", "largest")
-    return [(title, [volume[f"{key}_{statistic}_mm"] for statistic in which]) for key, title in titles.items()]
-
-
-def encoders_in_words(noise: Mapping[str, Any]) -> str:
-    """The noise of the encoders of a summary: "encoders 2 arcsec, linear encoders 5 um"."""
+def noise_sentence(summary: Mapping[str, Any]) -> str:
+    """The noise that the uncertainties of a calibration rest on."""
 
     def joined(values: float | list[float], factor: float) -> str:
         return ", ".join(f"{factor * x:.3g}" for x in (values if isinstance(values, list) else [values]))
 
-    words, linear = f"encoders {joined(noise['encoder_arcsec'], 1.0)} arcsec", noise["linear_encoder_mm"]
-    return words if linear is None else f"{words}, linear encoders {joined(linear, 1e3)} um"
-
-
-def seat_in_words(summary: Mapping[str, Any]) -> str:
-    """What the noise is of that does not come from the joints: of the seat in a socket, or of the tip itself."""
-    return "seat" if summary["sockets_used"] else "each coordinate of the tip"
+    part = summary["uncertainty"]
+    linear, seating = part["linear_encoder_mm"], f"{1e3 * part['seating_mm']:.3g} um"
+    slides = "" if linear is None else f", linear encoders {joined(linear, 1e3)} um"
+    # What does not come from the joints is of the seat in a socket, or of the tip itself.
+    seat = "seat" if summary["sockets_used"] else "each coordinate of the tip"
+    noise = f"encoders {joined(part['encoder_arcsec'], 1.0)} arcsec{slides}, {seat} {seating}"
+    joints = ", ".join(str(row["joint"]) for row in part.get("noisy_encoders", ()))
+    replaced = f", but for joint {joints}" if joints else ""
+    return {
+        "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times what it predicts.",
+        "estimated": f"Noise estimated from the residuals: {noise} (only their combination is well determined).",
+        "common": f"One variance for all poses: {seating} a coordinate.",
+        "robust": "The variance of each pose is taken from its own residual (robust noise model).",
+    }[part["form"]]
 
 
 def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:
@@ -268,18 +258,18 @@ def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, floa
     return row["difference"] / total, row["u_difference"] / total
 
 
-def lengths_sentence(found: Mapping[str, Any]) -> str:
+def lengths_sentence(row: Mapping[str, Any]) -> str:
     """What a calibration says of the lengths that it was tried on (`verdicts.checked_lengths`), in words."""
-    low, high = (f"{found[key]:.4g}" for key in ("shortest_mm", "longest_mm"))
+    low, high = (f"{row[key]:.4g}" for key in ("shortest_mm", "longest_mm"))
     size = f"{low} mm" if low == high else f"{low} to {high} mm"
     untested = f"Lengths over {high} mm are untested."
-    if found["rms_mm"] is None:
+    if row["rms_mm"] is None:
         return f"Lengths tested: none, as the only one ({size}) fixed the scale. {untested}"
-    held = f"{found['held_out']} of them" if found["held_out"] else "none"
-    predicted = "" if found["predicted_mm"] is None else f", predicted {two_digits(found['predicted_mm'])} mm"
+    held = f"{row['held_out']} of them" if row["held_out"] else "none"
+    predicted = "" if row["predicted_mm"] is None else f", predicted {two_digits(row['predicted_mm'])} mm"
     return (
-        f"Lengths tested: {found['lengths']} ({size}), {held} held out; RMS error "
-        f"{two_digits(found['rms_mm'])} mm{predicted}. {untested}"
+        f"Lengths tested: {row['lengths']} ({size}), {held} held out; RMS error "
+        f"{two_digits(row['rms_mm'])} mm{predicted}. {untested}"
     )
 
 
@@ -292,16 +282,16 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
         sd = float(f"{row['sd'] * scale:.3g}")
         return f"{words.get(row['kind'], row['kind'])} {sd:g} {unit}"
 
-    tips = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
     functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
-    parts = [*tips, *(["functions that the model lacks: " + ", ".join(functions)] if functions else [])]
+    parts = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
+    parts += [f"functions that the model lacks: {', '.join(functions)}"] if functions else []
     return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
 
 
-def tried_sentence(found: Mapping[str, Any]) -> str:
+def tried_sentence(row: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
-        f"{100 * found['tried'] / found['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
-        f"one as these are to one another ({found['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
+        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
+        f"one as these are to one another ({row['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
         "poses U is an extrapolation by the model."
     )

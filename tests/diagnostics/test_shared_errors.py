@@ -1,7 +1,6 @@
 """Errors that poses share are found, and widen the uncertainty; clean calibrations stay as they are."""
 
 import dataclasses
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -9,10 +8,9 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.redrawn import draw_shared, truth_of
+from aacmm_jax.calibration.redrawn import truth_of
 from aacmm_jax.calibration.sampling import Repeated
 from aacmm_jax.core.distributions import student_quantile
-from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data.noise import ArmNoise
 from aacmm_jax.diagnostics.equations import Block
 from aacmm_jax.diagnostics.findings import amendable
@@ -188,8 +186,7 @@ def test_monte_carlo_agrees_with_the_covariance(poses, made):
     result = calibrated(poses, capture, "two-stage")
     assert result.shared is not None
     task = Repeated.of(result, capture, tuple(q[:20] for q in volume(poses)))
-    shared = partial(draw_shared, to_numpy(result.shared), result.arm, capture)
-    captures, errors = truth_of(result, capture).drawn(500, result.noise, np.random.default_rng(0), shared=shared)
+    captures, errors = truth_of(result, capture).drawn(500, result.noise, np.random.default_rng(0))
     values, failed = task.solved(captures, coefficients=errors.coefficients)
     assert failed == 0
     linear = aj.uncertainty_of(result).expanded_length(*task.ends)

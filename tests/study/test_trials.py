@@ -280,7 +280,7 @@ def test_pools_are_the_same_in_every_study_of_a_seed(pools_built_once, monkeypat
     monkeypatch.setattr(configuration_pool, "_fixture_table", pools_built_once)
     one_socket = {"capture": CAPTURE | {"positions_mm": [[400, 200, 300]]}, "reference": None}
     one, two, other = (
-        configuration_pool.pool_of(study, study.settings[0]).table
+        configuration_pool.pool_of(study, study.settings[0])[0]
         for study in (made(**one_socket, noise={}), made(**one_socket, noise=NOISE), made(**one_socket, seed=4))
     )
     np.testing.assert_array_equal(one, two)
