@@ -119,8 +119,8 @@ def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geom
 
 
 def _first_frame(direction: Vector, point: Vector) -> Transform:
-    """The frame with z along the first axis that is rotated least (after pi about x, for an axis that points down), with
-    its origin nearest to that of the base."""
+    """The frame with z along the first axis that is rotated least (after pi about x, for an axis that points down),
+    with its origin nearest to that of the base."""
     frame, down = np.eye(4), direction[2] < 0
     x, y, z = (direction[0], -direction[1], -direction[2]) if down else direction
     # Rodrigues' formula about z cross the axis, whose sine is the length of (x, y) and whose cosine is z.
