@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import NoReturn
 
 INTERRUPTED = 130
-INTERRUPTED_SENTENCE = "Interrupted; nothing was written that is not whole."
+INTERRUPTED_SENTENCE = "Interrupted; no file was left half-written."
 _CLOSED_PIPE = 141  # as a shell reports of a program whose output is closed (128 + SIGPIPE)
 # Modules of commands, in the order in which ``--help`` lists them.
 _FAMILIES = (
@@ -82,8 +82,16 @@ def main() -> None:
         _fail_without_jax()
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             _discard_output()
-            _fail("standard output cannot be written: no space left on the device; free some, or write elsewhere.", 1)
-        _fail(f"aacmm failed unexpectedly ({type(error).__name__}: {error}); report what it says with --debug.", 1)
+            _fail(
+                "standard output cannot be written: no space left on the device; free some space, or write to "
+                "another device.",
+                1,
+            )
+        _fail(
+            f"aacmm failed unexpectedly ({type(error).__name__}: {error}); repeat the command with --debug and "
+            "report what it prints.",
+            1,
+        )
     finally:
         gc.freeze()
 

@@ -53,8 +53,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"max_content_width": 120},
     help="Calibrate articulated-arm coordinate measuring machines and other serial arms.",
-    epilog="Every command has --help, --debug for the traceback of a failure, and --overwrite to replace a file that "
-    "aacmm did not write. Start with: aacmm demo",
+    epilog="Every command accepts --help, --debug (shows the traceback of a failure) and --overwrite (replaces files "
+    "that aacmm did not write). Start with: aacmm demo",
 )
 
 
@@ -163,5 +163,5 @@ def _printable(item: Any) -> Any:
 def warn_of_unusable(calibration: Path, record: Any) -> None:
     """Say on standard error that a calibration did not converge, or ended with a residual that no arm has."""
     if not record.converged or record.implausible_residual:
-        reason = "the residual is that of no arm; see aacmm show." if record.converged else record.reason
-        typer.echo(f"Warning: {calibration} is not a calibration that can be used: {reason}", err=True)
+        reason = "its residuals are too large for this arm; see aacmm show." if record.converged else record.reason
+        typer.echo(f"Warning: the calibration in {calibration} is not usable: {reason}", err=True)

@@ -32,74 +32,88 @@ def arm(
         "A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM", None
     ),
     new: Path | None = option(
-        "Write a template of an arm file, with every key explained. Overwrites nothing.", "FILE.toml"
+        "Write a template of an arm file that explains every key. No existing file is replaced.", "FILE.toml"
     ),
     joints: int | None = option("Number of joints of the template. Default: 6.", "N", min=1, max=20),
     check: Path | None = option(
-        "Compare readings with the arm: a manifest (TOML), a capture (HDF5), or a table (CSV) with columns q_1, q_2, "
-        "... and, where the tip was, x, y, z (mm, or as the header says) with or without qw, qx, qy, qz or rx, ry, rz; "
-        "without positions its poses are of one socket, or of those that a column socket names.",
+        "Compare recorded readings with the arm. The file is a manifest (TOML), a capture (HDF5) or a table (CSV). A "
+        "table has the readings in columns q_1, q_2, ... If the tip positions are known, they are in columns x, y, z "
+        "(mm, unless the header states another unit), and orientations in qw, qx, qy, qz or rx, ry, rz. If they are "
+        "not known, a column socket names the socket of each pose; without this column, all poses are of one socket.",
         "POSES",
     ),
     unit: Literal["deg", "rad"] | None = option(
-        "Unit of the readings in a table. Default: as its header says, else by their size."
+        "Unit of the readings in a table. Default: the unit in the header; without one, the unit follows from the "
+        "size of the readings."
     ),
-    figure: Path | None = option("Draw the arm at zero readings, and its reach (.png, .svg, .pdf).", "FILE.png"),
+    figure: Path | None = option(
+        "Draw the arm at zero readings, and its reach, to this file (.png, .svg or .pdf).", "FILE.png"
+    ),
     encoder_arcsec: float | None = options.USUAL_ENCODER_NOISE,
     seating_mm: float | None = options.USUAL_SEATING_NOISE,
-    model: str | None = option("Model of the joints, as for calibrate: gravity,harmonics=1.", "MODEL"),
+    model: str | None = option(
+        "Model of the joints, as for calibrate --model; for example gravity,harmonics=1.", "MODEL"
+    ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
-    probe: str | None = option("Tip of a tool in the last link of a URDF or kinematics.yaml, mm.", "X,Y,Z"),
+    probe: str | None = option(
+        "Position (mm) of the tip of a tool in the last link of a URDF or kinematics.yaml.", "X,Y,Z"
+    ),
     as_json: bool = options.JSON,
 ) -> None:
-    """Look at an arm before its first calibration.
+    """Analyse an arm before its first calibration.
 
-    Prints its axes at zero readings, its reach, which parameters are redundant and with what, what sockets, reference
-    lengths and a tracker determine of it, and how many poses a first capture needs.
+    The command prints the axes at zero readings and the reach of the arm; which parameters are redundant, and with
+    which others; how many parameters sockets, reference lengths and a tracker determine; and how many poses a first
+    capture needs.
 
-    --check finds which order, signs, zeros and units of the columns make recorded readings fit the arm, and prints the
-    table [angles] that a manifest then needs. Positions of a table are in the base frame (of a URDF: in its base link),
-    those of a manifest's tracker in a frame that is found. Exit code 1 where nothing makes them fit.
+    --check finds the order, signs, zeros and units of the columns with which recorded readings fit the arm, and prints
+    the table [angles] that a manifest then needs. Positions in a table are in the base frame (for a URDF: in its base
+    link). The frame of a tracker in a manifest is found from the data. The exit code is 1 if the readings cannot be
+    made to fit the arm.
     """
     from ..files.arm_tables import arm_template, with_model
 
     if new is not None:
         if file is not None or check is not None or figure is not None:
-            raise InputError("--new writes a template and reads no arm; leave out the arm, --check and --figure.")
+            raise InputError(
+                "--new writes a template and does not read an arm; leave out the arm, --check and --figure."
+            )
         with together(new):
             if os.path.lexists(new):
-                raise InputError(f"{new} exists; give another name, or remove it.")
+                raise InputError(f"{new} already exists; give another name, or remove the file.")
             write_text(new, arm_template(joints or 6))
         summary = {"kind": "arm template", "joints": joints or 6, "written": str(new)}
         show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. Look at it: aacmm arm {new}"])
         return
     if file is None:
-        raise InputError("name an arm: a file or a shipped arm; or write a template with --new my-arm.toml.")
+        raise InputError(
+            "no arm is named; name an arm file or a shipped arm, or write a template with --new my-arm.toml."
+        )
     if joints is not None:
-        raise InputError("--joints is for a template; give it with --new.")
+        raise InputError("--joints applies to a template only; give --new too.")
     options.check_figure(figure)
     with together(figure):
         tool = None if probe is None else numbers_option("--probe", probe, "X,Y,Z in mm", 3)
         specification = files.load_specification(file, base=base, tip=tip, probe=tool)
     if check is not None:
         if figure is not None or encoder_arcsec is not None or seating_mm is not None:
-            raise InputError("--check compares readings alone; leave out --figure, --encoder-arcsec and --seating-mm.")
+            raise InputError("--check only compares readings; leave out --figure, --encoder-arcsec and --seating-mm.")
         if model is not None:
-            raise InputError("--check compares readings alone; leave out --model.")
+            raise InputError("--check only compares readings; leave out --model.")
         summary = _checked(specification, check, unit)
         show_summary(summary, as_json, reading_check)
         if not summary["explained"]:
             raise typer.Exit(1)
         return
     if unit is not None:
-        raise InputError("--unit is for the table of --check; leave it out.")
+        raise InputError("--unit applies to the table of --check only; leave it out.")
     specification = specification if model is None else with_model(specification, model)
     frame = first_frame(specification)
     with together(figure):
         usual = assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)
         look = summaries.arm_survey.arm_survey
-        summary = with_spinner("Looking at the arm", lambda: look(specification, usual, base=frame, model=model))
+        summary = with_spinner("Analysing the arm", lambda: look(specification, usual, base=frame, model=model))
         if frame is not None:
             summary["urdf"]["first_frame_in_base_mm"] = frame.tolist()
         if figure is not None:
@@ -119,12 +133,15 @@ def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]
     if suffix not in _CAPTURES:
         return _checked_table(specification, path, unit)
     if unit is not None:
-        raise InputError(f"--unit is for a table, but {path} says the unit of its readings; leave it out.")
+        raise InputError(
+            f"--unit applies to tables only, and {path} states the unit of its readings; leave --unit out."
+        )
     recording = files.read_manifest(path) if suffix == ".toml" else files.load_capture(InputFile(path))
     joints = recording.nominal.arm.joints
     if joints != specification.arm.joints:
         raise InputError(
-            f"{path} has readings of {joints} joints, but the arm has {specification.arm.joints}; name its arm."
+            f"{path} has readings of {joints} joints, but the arm has {specification.arm.joints} joints; name the arm "
+            "of these readings."
         )
     return checked_recording(specification, recording, path if suffix == ".toml" else None)
 
@@ -197,16 +214,19 @@ def reading_check(summary: dict[str, Any]) -> View:
     outside = (summary["found"] or summary["given"])["readings_outside_limits"]
     yield from filter(None, (
         summary["tip"],
-        summary["unit"] and f"Readings were taken to be in {summary['unit']}.",
-        outside and f"{pluralise(outside, 'reading')} are outside the joint limits.",
+        summary["unit"] and f"The readings are taken to be in {summary['unit']}.",
+        outside and f"Outside the joint limits: {pluralise(outside, 'reading')}.",
         alternatives_sentence(summary["alternatives"], summary["known_positions"]),
         *(Styled(row["says"], "yellow") for row in summary["standing"]),
         summary["reading_sets_sentence"],
     ))  # fmt: skip
     for key, where in (("units", ", in the table of the measured positions"), ("angles", "")):
         if summary[key] is not None:
-            yield f"\nIn the manifest{where}:\n{summary[key]}".rstrip("\n")
-    yield f"\n{pluralise(summary['poses'], 'pose')}, {summary['hypotheses']:,} possibilities tried."
+            yield f"\nWrite in the manifest{where}:\n{summary[key]}".rstrip("\n")
+    yield (
+        f"\n{pluralise(summary['poses'], 'pose')}; {summary['hypotheses']:,} combinations of order, signs, zeros and "
+        "units were tried."
+    )
 
 
 def survey(summary: dict[str, Any]) -> View:
@@ -225,9 +245,9 @@ def survey(summary: dict[str, Any]) -> View:
     yield listed("Axes at zero readings", rows, headings)
     reach = summary["reach_mm"]
     yield (
-        f"\nReach: {reach['nearest']:.0f} to {reach['farthest']:.0f} mm from the shoulder, on the first axis at "
-        f"({', '.join(f'{x:.0f}' for x in reach['shoulder'])}) mm (self-collision is not considered). "
-        f"The links together measure {reach['links']:.0f} mm."
+        f"\nReach: {reach['nearest']:.0f} to {reach['farthest']:.0f} mm from the shoulder, which is on the first axis "
+        f"at ({', '.join(f'{x:.0f}' for x in reach['shoulder'])}) mm (self-collision is not considered). The total "
+        f"length of the links is {reach['links']:.0f} mm."
     )
     if summary["determined"]:
         yield from _determined(summary)
@@ -239,33 +259,36 @@ def survey(summary: dict[str, Any]) -> View:
 
 def _determined(summary: dict[str, Any]) -> View:
     """What data can and cannot determine of the arm."""
-    yield ["\n", Styled("Redundant"), f", whatever is recorded ({summary['parameters']} parameters in all):"]
+    yield ["\n", Styled("Redundant"), f", whatever data are recorded ({summary['parameters']} parameters in total):"]
     yield from (f"  {text}" for text in summary["redundant"])
     if summary["weak"]:
-        yield [Styled("Hardly determined"), ", even by poses all over the workspace:"]
+        yield [Styled("Poorly determined"), ", even by poses all over the workspace:"]
         yield from (f"  {text}" for text in summary["weak"])
     why = [text for row in summary["determined"][1:2] for text in row["corrections"]]
     if summary["corrections_left_out"] or why:
         yield [Styled("Joint corrections"), ":"]
         yield from (f"  {text}" for text in (*summary["corrections_left_out"], *why))
     for i in summary["parallel"]:
-        yield f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} takes the place of d_{i}."
+        yield f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} is used instead of d_{i}."
     columns = {"data": "data", "parameters": "determined", "well": "well_determined", "scale": "scale"}
-    yield listed("What data determine at their best", summary["determined"], columns)
-    yield f"To be freed, of sockets with a length: {len(summary['free'])}: {', '.join(summary['free'])}."
-    yield ["\n", Styled("Where a joint stays still in all poses")]
+    yield listed("Number of parameters that each kind of data can determine", summary["determined"], columns)
+    yield (
+        f"Parameters to identify from sockets and a reference length ({len(summary['free'])}): "
+        f"{', '.join(summary['free'])}."
+    )
+    yield ["\n", Styled("If one joint does not move in any pose")]
 
     def lost(row: dict[str, Any]) -> str:
         if row["lost"] is None:
-            return "(the tip can hardly stay in a socket then)"
+            return "(the tip can then hardly stay in a socket)"
         return ", ".join(row["lost"]) or "-"
 
-    yield listed("", summary["still"], {"joint": "joint", "no longer determined well": lost})
+    yield listed("", summary["still"], {"joint": "joint", "no longer well determined": lost})
 
 
 def _needed(arm_class: dict[str, Any]) -> View:
     """What a first capture with so many poses reaches."""
-    title = "U of a length that a calibration from random poses adds"
+    title = "U that a calibration from random poses adds to a measured length"
     yield ["\n", Styled(title), f" [mm, k = 2]: {arm_class['class']}"]
     columns: dict[str, Any] = {"data": "data"}
     for count in arm_class["rows"][0]["u_mm"]:
@@ -273,12 +296,12 @@ def _needed(arm_class: dict[str, Any]) -> View:
     columns["enough"] = lambda row: row["enough_poses"] or None
     yield listed("", arm_class["rows"], columns)
     yield (
-        f"Medians over the volume, of encoders of {arm_class['encoder_arcsec']:.3g} arcsec and a seat of "
-        f"{arm_class['seating_mm']:.3g} mm ({arm_class['noise_source']}), reference lengths of "
-        f"u = {arm_class['u_length_mm']:g} mm, and a tracker of u = {arm_class['u_tracker_mm']:g} mm in each "
-        "coordinate. Two sockets and a reference length are as good as a ball bar in one place."
+        f"Medians over the volume, for encoders with {arm_class['encoder_arcsec']:.3g} arcsec and a seat with "
+        f"{arm_class['seating_mm']:.3g} mm ({arm_class['noise_source']}), reference lengths with u = "
+        f"{arm_class['u_length_mm']:g} mm, and a tracker with u = {arm_class['u_tracker_mm']:g} mm per coordinate. "
+        "Two sockets with a reference length are equivalent to a ball bar in one placement."
     )
     yield (
-        "Enough: poses from which on this is less than the noise of the readings themselves, "
+        "Enough: the number of poses from which on this U is less than that of the noise of the readings themselves, "
         f"{formatted(2 * arm_class['u_reading_mm'])} mm."
     )

@@ -29,24 +29,28 @@ def calibrate(
     capture: list[Path] = argument("Capture, or captures of one arm in several sessions.", "CAPTURE.h5 ..."),
     output: Path = output("Calibration to write (HDF5).", "FILE.h5"),
     method: Literal["two-stage", "joint"] | None = option(
-        "two-stage: repeatability, then the scale by the reference lengths; joint: one least squares of all. "
-        "Default: two-stage, but joint with observations besides sockets, a robust loss or a prior."
+        "two-stage: identify from repeatability, then set the scale by the reference lengths; joint: one "
+        "least-squares fit of all data. Default: joint if there are observations other than sockets, a robust loss or "
+        "a prior; otherwise two-stage."
     ),
     robust: LossName | None = option(
-        "Robust loss: down-weights outlying poses and lists them. Turns off the search for noisy encoders."
+        "Use this robust loss, which down-weights outlying poses and lists them. It turns off the search for noisy "
+        "encoders."
     ),
     model: str | None = option(
-        "Model non-geometric errors of the joints: dh,gravity,harmonics=1+2,gear,coupled=2-3. Default: the arm file's; "
-        "dh alone for none.",
+        "Model these non-geometric errors of the joints, for example dh,gravity,harmonics=1+2,gear,coupled=2-3; dh "
+        "alone models none. Default: the model of the arm file.",
         "KINDS",
     ),
     prior: str | None = option(
-        "Standard deviations of parameters about their nominal values: 'length=0.5mm,angle=0.05deg', "
-        "'d_3=750.2+-0.1mm', 'alpha=learn' from the data; 'learn' for all, 'none'. Default: the arm file's.",
+        "Prior standard deviations of parameters about their nominal values, for example 'length=0.5mm,angle=0.05deg' "
+        "or 'd_3=750.2+-0.1mm'. 'alpha=learn' estimates the standard deviation of a group from the data, and 'learn' "
+        "those of all groups; 'none' uses no prior. Default: the prior of the arm file.",
         "GROUP=SD,...",
     ),
     scale: Literal["measured", "nominal"] = option(
-        "nominal: stage 1 alone, with the scale of the nominal arm, where nothing in the capture fixes it.",
+        "nominal: solve stage 1 only and keep the scale of the nominal arm, for a capture in which nothing fixes the "
+        "scale.",
         default="measured",
     ),
     same_probe: bool = flag("--same-probe", "The probe was not remounted between sessions."),
@@ -55,7 +59,8 @@ def calibrate(
     ),
     seed: int = seed("--only-poses"),
     hold: str = option(
-        "Length that anchors the scale in stage 1: a parameter, 'longest', or 'none' as in the paper.",
+        "Scale anchor of stage 1, which is held constant: the name of a length parameter, 'longest', or 'none' as in "
+        "the paper.",
         "NAME",
         default="longest",
     ),
@@ -68,7 +73,7 @@ def calibrate(
     length_bound_mm: float | None = option("Half-width of the bounds of length parameters.", min=0),
     angle_bound_deg: float | None = option("Half-width of the bounds of angle parameters.", min=0),
     bound: list[str] | None = option(
-        "Half-width of the bounds of one parameter, in mm or deg; repeatable.", "NAME=WIDTH"
+        "Half-width of the bounds of one parameter, in mm or deg; may be given several times.", "NAME=WIDTH"
     ),
     encoder_arcsec: float | None = options.KNOWN_ENCODER_NOISE,
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
@@ -77,34 +82,36 @@ def calibrate(
         "--keep-noise", "Do not re-estimate the noise of an encoder found to be noisier than stated."
     ),
     shared_errors: bool = option(
-        "Look for errors that poses share, and add what they do to the uncertainties.", default=True
+        "Look for errors that several poses have in common, and include them in the uncertainties.", default=True
     ),
     cross_validate: bool | None = option(
-        "Calibrate once without each placement, station or other group of what was observed, or each region of joint "
-        "space where all is one group, and test the result there. Default: yes, for a recorded capture with several "
-        "placements of the reference length, where neither --model, --prior nor --robust is given."
+        "Hold out each placement, station or other group of observations in turn, calibrate with the others, and test "
+        "the result on the group held out. If all observations are one group, regions of joint space are held out "
+        "instead. Default: yes for a recorded capture with several placements of the reference length, unless "
+        "--model, --prior or --robust is given."
     ),
     leave_out: list[str] | None = option(
-        "With --cross-validate: leave out, as one group, everything whose name matches ('monday/*'); repeatable.",
+        "With --cross-validate: hold out, as one group, everything whose name matches ('monday/*'); may be given "
+        "several times.",
         "PATTERN",
     ),
     monte_carlo: bool = flag(
         "--monte-carlo", "Check the uncertainties by Monte Carlo (JCGM 101); takes a minute or two."
     ),
-    strict: bool = flag("--strict", "Refuse free parameters that such data could not determine even without noise."),
+    strict: bool = flag("--strict", "Reject free parameters that these data could not determine even without noise."),
     remove_contradicting: bool = flag(
         "--remove-contradicting",
-        "Leave out a socket, placement or station that contradicts all others, and say what that changed.",
+        "Leave out a socket, placement or station that contradicts all others, and report the effect on the result.",
     ),
-    figure: Path | None = option("Plot the residual of every pose: PNG, SVG or PDF by the name.", "FILE"),
-    max_steps: int = option("Largest number of steps of each solve.", "N", default=300, min=1, max=1_000_000),
+    figure: Path | None = option("Plot the residual of every pose to this file (.png, .svg or .pdf).", "FILE"),
+    max_steps: int = option("Largest number of steps per solve.", "N", default=300, min=1, max=1_000_000),
     as_json: bool = options.JSON,
 ) -> None:
     """Identify the parameters of an arm from captures.
 
     Stage 1 makes the tips of each socket coincide; the reference lengths then fix the scale. Observations of other
-    kinds (measured points, spheres, planes, artefacts) are solved with all else at once. Several captures are sessions
-    of one arm.
+    kinds (measured points, spheres, planes, artefacts) are fitted together with all other data. Several captures are
+    sessions of one arm.
     """
     from ..diagnostics.usability import does_not_fit
     from ..files.arm_tables import with_model
@@ -144,12 +151,15 @@ def calibrate(
 def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
     """The recording of a file, or of several as the sessions of one arm, with the digests of the files."""
     if same_probe and len(paths) == 1:
-        raise InputError("--same-probe is for several captures; name them, or leave it out.")
+        raise InputError("--same-probe applies to several captures only; name all captures, or leave the option out.")
     sessions = {}
     for path in paths:
         recording = files.load_capture(read := InputFile(path))
         if path.stem in sessions:
-            raise InputError(f"two captures have the name '{path.stem}', which names their session; rename one.")
+            raise InputError(
+                f"two captures have the file name '{path.stem}', which becomes the name of the session; rename "
+                "one of the files."
+            )
         sessions[path.stem] = recording._replace(sources=(fingerprint(read), *recording.sources))
     return pipeline.join_recordings(sessions, same_probe=same_probe)
 
@@ -197,14 +207,15 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
 def compare_models(
     capture: Path = argument("Capture, written by import or simulate.", "CAPTURE.h5"),
     models: str | None = option(
-        "Models from simple to rich, separated by semicolons, as for calibrate --model. Default: dh; gravity; "
-        "harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); gravity,functions; of a capture with "
-        "temperatures each of these also with expansion.",
+        "Models from simple to rich, separated by semicolons, each as for calibrate --model. Default: dh; gravity; "
+        "harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); gravity,functions; for a capture with "
+        "temperatures, each of these models with expansion too.",
         "MODELS",
     ),
     leave_out: list[str] | None = option(
-        "Leave out, as one group, everything whose name matches ('monday/*'); repeatable. Default: each placement, "
-        "station or other group where there are at least three, else either half of each joint's travel.",
+        "Hold out, as one group, everything whose name matches ('monday/*'); may be given several times. Default: "
+        "each placement, station or other group in turn if there are at least three; otherwise each half of every "
+        "joint's travel.",
         "PATTERN",
     ),
     only_poses: int | None = option("Use N poses drawn at random, to save time.", "N", min=1),
@@ -217,9 +228,10 @@ def compare_models(
     output: Path | None = output("Comparison to write (HDF5), for show and report.", "FILE.h5", None),
     as_json: bool = options.JSON,
 ) -> None:
-    """Compare models of the joints by unseen regions.
+    """Compare models of the joints on held-out regions.
 
-    Each model is calibrated with all poses, its prior learned from them, and predicts every region from the others.
+    Each model is calibrated with all poses, from which its prior is learned. It then predicts each region from all
+    other regions.
     """
     from ..data.capture import draw_poses
     from ..files.arm_tables import masses_of
@@ -230,7 +242,9 @@ def compare_models(
         recording = files.load_capture(read := InputFile(capture))
     chosen = None if models is None else tuple(model.strip() for model in models.split(";"))
     if chosen is not None and not all(chosen):
-        raise InputError(f"--models '{models}' names an empty model; separate models by one semicolon each.")
+        raise InputError(
+            f"--models '{models}' contains an empty model; write exactly one semicolon between two models."
+        )
     part, nominal = recording.capture.select(only or None, without or ()), recording.nominal
     if only_poses is not None:
         part = draw_poses(part, only_poses, seed)[0]
@@ -256,25 +270,27 @@ def compare_models(
 )
 def compare(
     paths: list[Path] = argument(
-        "Calibrations of one arm, written by calibrate: two in this order; more than two are ordered by date.",
+        "Calibrations of one arm, written by calibrate. Two are compared in the order given; three or more are "
+        "ordered by date.",
         "OLD.h5 NEW.h5 [MORE.h5 ...]",
     ),
     level: float = option("Coverage probability of the expanded uncertainties.", "P", default=0.95),
     length_mm: float | None = option(
-        "Compute the change of this length all over the volume. Default: 300, or half a small arm's reach."
+        "Compute the change of lengths of this size all over the volume. Default: 300, or half the reach of a small "
+        "arm."
     ),
     figure: Path | None = option(
-        "Plot the changes, over time for three calibrations or more: PNG, SVG or PDF by the name.", "FILE"
+        "Plot the changes, for three or more calibrations over time, to this file (.png, .svg or .pdf).", "FILE"
     ),
-    csv: Path | None = option("Write every parameter of every calibration.", "FILE"),
+    csv: Path | None = option("Write every parameter of every calibration to this file (CSV).", "FILE"),
     max_length_change_mm: float | None = option(
-        "Exit code 1 where a length changes by more than this from the first to the last.", min=0
+        "Exit with code 1 if a length changes by more than this from the first calibration to the last.", min=0
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Compare calibrations of one arm.
 
-    Reports which parameters changed beyond their uncertainty, and what that does to lengths.
+    The command reports which parameters changed beyond their uncertainty, and how measured lengths change.
     """
     if len(paths) < 2:
         raise InputError(f"{paths[0]} alone cannot be compared; name at least two calibrations.")
@@ -311,8 +327,7 @@ def _compared(records: list, created: list[str], settings: dict[str, Any]) -> An
     if len(records) == 2:
         drift, (old, new) = compare(*records, **settings), map(moment, created)
         warning = (
-            f"{labels[1]} was made before {labels[0]} ({new:%Y-%m-%d %H:%M} and {old:%Y-%m-%d %H:%M}): is the order "
-            "right?"
+            f"{labels[1]} ({new:%Y-%m-%d %H:%M}) was made before {labels[0]} ({old:%Y-%m-%d %H:%M}); check the order."
         )
         warnings = (*drift.warnings, warning) if new < old else drift.warnings
         return Trend((old, new), (0, 1), (drift._replace(warnings=warnings),))
@@ -320,8 +335,8 @@ def _compared(records: list, created: list[str], settings: dict[str, Any]) -> An
     if list(by_date.order) == sorted(by_date.order):
         return by_date
     warning = (
-        f"Ordered by date, not as named: {', '.join(labels[i] for i in by_date.order)}. The date is when the poses "
-        "were measured, where the manifest states it, and otherwise when the file was made."
+        f"The calibrations are ordered by date, not as named: {', '.join(labels[i] for i in by_date.order)}. The date "
+        "is that of the measurement if the manifest states it, otherwise that of the file."
     )
     first, *others = by_date.drifts
     return by_date._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *others))

@@ -24,13 +24,13 @@ _DIGITS = 9
 
 @command("aacmm demo my-demo --seed 7")
 def demo(
-    folder: Path = typer.Argument(Path("aacmm-demo"), help="Folder for the files; made if it does not exist."),
+    folder: Path = typer.Argument(Path("aacmm-demo"), help="Folder for the files; created if it does not exist."),
     seed: int = seed("the noise"),
     as_json: bool = options.JSON,
 ) -> None:
     """Calibrate a simulated arm and compare it with the truth.
 
-    The arm of Cheng et al. 2018, with realistic noise.
+    The simulated arm is that of Cheng et al. 2018, with realistic noise.
     """
     from .demo import run
 
@@ -46,9 +46,12 @@ def demo(
 def simulate(
     arm: str = options.NOMINAL_ARM,
     output: Path = output("Capture to write (HDF5).", "FILE.h5"),
-    socket: list[str] | None = option("Simulate a socket at this position, mm; repeatable.", "NAME=X,Y,Z"),
+    socket: list[str] | None = option(
+        "Simulate a socket at this position (mm); may be given several times.", "NAME=X,Y,Z"
+    ),
     poses: list[str] | None = option(
-        f"Number of poses in each socket, or in the named one; repeatable. Default: {_POSES}.", "[NAME=]N"
+        f"Number of poses in each socket, or in the named socket; may be given several times. Default: {_POSES}.",
+        "[NAME=]N",
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     encoder_arcsec: float = options.ENCODER_NOISE,
@@ -59,20 +62,24 @@ def simulate(
     ),
     seating_mm: float = options.SEATING_NOISE,
     temperature_c: str | None = option(
-        "Temperature of an arm with a thermometer, or limits to draw it between, C. Default: 20.", "LOWEST[,HIGHEST]"
+        "Temperature (C) of an arm with a thermometer; with two values, the temperatures are drawn between them. "
+        "Default: 20.",
+        "LOWEST[,HIGHEST]",
     ),
     true_arm: str | None = option(
         "Simulate with this true arm: a TOML file, a URDF or a name. Default: the nominal arm.", "ARM"
     ),
     deviate_length_mm: float = option(
-        "Simulate with a random true arm whose lengths differ by at most this.", default=0.0, min=0
+        "Simulate with a random true arm whose lengths differ from the nominal ones by at most this.",
+        default=0.0,
+        min=0,
     ),
     deviate_angle_deg: float = option(
-        "Simulate with a random true arm whose angles differ by at most this.", default=0.0, min=0
+        "Simulate with a random true arm whose angles differ from the nominal ones by at most this.", default=0.0, min=0
     ),
     acceptance: Literal["asme", "iso"] | None = option(
-        "Simulate the acceptance test that 'aacmm plan --acceptance' plans, by ASME B89.4.22 or ISO 10360-12, in place "
-        "of sockets; artefacts have u = 0.001 mm."
+        "Instead of sockets, simulate the acceptance test to ASME B89.4.22 or ISO 10360-12 that 'aacmm plan "
+        "--acceptance' plans; artefacts have u = 0.001 mm."
     ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
@@ -88,8 +95,8 @@ def simulate(
             true = files.load_specification(true_arm, base=true_base, tip=true_tip)
         if true.arm.joints != nominal.arm.joints:
             raise InputError(
-                f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints}; choose a "
-                "true arm with as many."
+                f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints} joints; "
+                "choose a true arm with as many joints."
             )
         if deviate_length_mm or deviate_angle_deg:
             deviation = {"length": deviate_length_mm, "angle": deviate_angle_deg * DEG}
@@ -99,7 +106,7 @@ def simulate(
         if acceptance is not None:
             if socket or poses or length or resolution_arcsec or linear_resolution_mm or temperature_c:
                 raise InputError(
-                    "--acceptance brings its own sockets, poses and lengths, at 20 C; leave out --socket, --poses, "
+                    "--acceptance sets the sockets, poses and lengths itself, at 20 C; leave out --socket, --poses, "
                     "--length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
                 )
             u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
@@ -107,10 +114,10 @@ def simulate(
                 acceptance_tests.plan_procedure(nominal.arm, acceptance), nominal, true, noise=noise, **u, seed=seed
             ))  # fmt: skip
         else:
-            points, form = sockets_option(socket), "one number or two, LOWEST,HIGHEST in C"
+            points, form = sockets_option(socket), "T or LOWEST,HIGHEST, in C"
             warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)
             if not points:
-                raise InputError("there is no socket; give --socket NAME=X,Y,Z, or --acceptance.")
+                raise InputError("no socket is given; give --socket NAME=X,Y,Z, or --acceptance.")
             capture = with_spinner("Simulating", lambda: data.simulate(
                 true.arm,
                 points,
@@ -140,7 +147,7 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, in
         if not equals:
             counts = dict.fromkeys(counts, int(count))
         elif name not in counts:
-            raise InputError(f"--poses {text} names the unknown socket '{name}'; known are {', '.join(counts)}.")
+            raise InputError(f"--poses {text} names an unknown socket, '{name}'; the sockets are {', '.join(counts)}.")
         else:
             counts[name] = int(count)
     return counts
@@ -149,19 +156,23 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, in
 @command("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check", name="import")
 def import_(
     manifest: Path = argument(
-        "Which files hold which poses and measured values, in which columns and units.", "MANIFEST.toml"
+        "Manifest, which states which files contain the poses and measured values, in which columns and units.",
+        "MANIFEST.toml",
     ),
     output: Path | None = output("Capture to write (HDF5).", "FILE.h5", None),
     check: bool = flag(
         "--check",
-        "Compare the readings with the arm: order, signs, zeros and units of the columns; joints that stand still; "
-        "commanded against measured readings where the tables have both. Exit code 1 where nothing fits.",
+        "Compare the readings with the arm: find the order, signs, zeros and units of the columns, and joints that do "
+        "not move, and compare commanded with measured readings if the tables contain both. Exit with code 1 if the "
+        "readings cannot be made to fit the arm.",
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Read recorded joint readings into a capture."""
     if output is None and not check:
-        raise InputError("name the capture to write with -o FILE.h5, or look at the readings with --check.")
+        raise InputError(
+            "no output is named; name the capture to write with -o FILE.h5, or check the readings with --check."
+        )
     with together(output):
         recording = files.read_manifest(manifest)
         summary = summaries.calibration.capture_summary(recording)

@@ -33,13 +33,14 @@ def export(
     form: Literal["toml", "json", "csv", "dcc", "urdf", "table", "offsets", "ur", "python"] | None = option(
         "toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf: "
         "the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: zero offsets of the "
-        "joints alone, refitted; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy. "
-        "Default: by the name of the output (.urdf, .json, .csv, .yaml, .py), else toml.",
+        "joints only, refitted; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy. "
+        "Default: as the extension of the output says (.urdf, .json, .csv, .yaml, .py), otherwise toml.",
         None,
         "--format",
     ),
     which: Literal["calibrated", "nominal", "true"] | None = option(
-        "Arm to write with --format toml, urdf, table, ur or python; a simulation has a true one. Default: calibrated.",
+        "Arm to write with --format toml, urdf, table, ur or python. Only a simulation has a true arm. Default: "
+        "calibrated.",
         None,
         "--arm",
     ),
@@ -48,19 +49,21 @@ def export(
     output: Path | None = output("File to write. Default: standard output.", "FILE", None),
     about: Path | None = options.ABOUT,
     evaluation: Path | None = option(
-        "Add the acceptance tests of this evaluation (aacmm evaluate -o) of the calibration to --format dcc.", "FILE.h5"
+        "Evaluation of this calibration, written by aacmm evaluate -o; its acceptance tests are added to the "
+        "certificate (--format dcc).",
+        "FILE.h5",
     ),
 ) -> None:
     """Write a calibration for other programs or controllers."""
     written_as: str = form or _FORMATS.get("" if output is None else output.suffix.lower(), "toml")
     if (about is not None or evaluation is not None) and written_as != "dcc":
-        raise InputError("--about and --evaluation are for certificates; give them with --format dcc.")
+        raise InputError("--about and --evaluation apply to certificates only; give --format dcc too.")
     if which is not None and written_as not in _OF_ONE_ARM:
         raise InputError(
-            f"--arm is for --format {', '.join(_OF_ONE_ARM)}; leave it out, as {written_as} holds what it needs."
+            f"--arm applies to --format {', '.join(_OF_ONE_ARM)} only; leave it out with --format {written_as}."
         )
     if (convention is not None or units is not None) and written_as != "table":
-        raise InputError("--convention and --units are for tables; give them with --format table.")
+        raise InputError("--convention and --units apply to tables only; give --format table too.")
     notes: list[str] = []
     with together(output):
         record = files.load_calibration(read := InputFile(calibration))
@@ -68,7 +71,9 @@ def export(
         arms = {"calibrated": record.calibrated, "nominal": nominal, "true": record.recording.true}
         specification = arms[which or "calibrated"]
         if specification is None:
-            raise InputError(f"{calibration} is not of a simulation, so it has no true arm; choose another --arm.")
+            raise InputError(
+                f"{calibration} is not a calibration of simulated data, so it has no true arm; choose another --arm."
+            )
         warn_of_unusable(calibration, record)
         if written_as == "dcc":
             text = _certificate(read, record, about, evaluation)
@@ -124,8 +129,9 @@ def _left_out_of_table(record: Any, arm: Any) -> list[str]:
     q = np.asarray(record.recording.capture.readings)
     moved = np.linalg.norm(np.asarray(arm.position(q)) - np.asarray(without_corrections(arm).position(q)), axis=1)
     return [
-        f"The {np.count_nonzero(arm.coefficients)} coefficients of joint corrections stand in comments: by the table "
-        f"alone the tip is elsewhere by up to {moved.max():.3g} mm over the poses of the calibration."
+        f"The table contains the {np.count_nonzero(arm.coefficients)} coefficients of joint corrections as comments "
+        "only. Without these corrections, the tip positions in the poses of the calibration differ by up to "
+        f"{moved.max():.3g} mm."
     ]
 
 
@@ -134,10 +140,10 @@ def _urdf(record: Any, specification: Any) -> tuple[str, list[str]]:
     if not result.changed and not result.notes:
         return result.text, ["No origin changed."]
     return result.text, [
-        f"Joints with another origin: {shorten(result.changed, 12) or 'none'}.",
+        f"Joints whose origin changed: {shorten(result.changed, 12) or 'none'}.",
         *(note[0].upper() + note[1:] for note in result.notes),
-        "The base, and where each frame is along its axis and about it, stay as they were as far as they can: data on "
-        "the tip do not determine them.",
+        "The base, and the position of each frame along its axis and its angle about the axis, are left unchanged as "
+        "far as possible, because data on the tip do not determine them.",
     ]
 
 
@@ -153,7 +159,9 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
     if evaluation is not None:
         tested = files.load_evaluation(read := InputFile(evaluation))
         if not isinstance(tested, EvaluationRecord):
-            raise InputError(f"{evaluation} is of points; name an evaluation of the calibrated arm on a capture.")
+            raise InputError(
+                f"{evaluation} is an evaluation of points; name an evaluation of the calibrated arm on a capture."
+            )
         sources += [fingerprint(read), *tested.recording.sources]
     return dcc_xml(
         record,
@@ -172,55 +180,60 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
 def correct(
     calibration: Path = options.CALIBRATION_FILE,
     poses: Path = argument(
-        "A row for each commanded pose: the joint readings (columns q_1, q_2, ..., or no others); or position x, y, z "
-        "(mm) with qw, qx, qy, qz (quaternion) or rx, ry, rz (rotation vector).",
+        "Table with one row per commanded pose. The columns are either joint readings (q_1, q_2, ..., or any names if "
+        "there are no other columns), or positions x, y, z (mm) with qw, qx, qy, qz (quaternion) or rx, ry, rz "
+        "(rotation vector).",
         "POSES.csv",
     ),
     output: Path = output("Table with corrected readings to write.", "FILE.csv"),
     unit: Literal["deg", "rad"] | None = option(
-        "Unit of joint readings and rotation vectors when the header states none (q_1_deg). Readings of prismatic "
-        "joints are in mm."
+        "Unit of joint readings and rotation vectors if the header does not state it (as q_1_deg does). Readings of "
+        "prismatic joints are in mm."
     ),
     columns: str | None = option(
-        "Columns of the joint readings where they are not named q_1, q_2, ...: names, a pattern, or numbers from 1, "
-        "separated by commas. Default: all columns of a table with one for each joint.",
+        "Columns of the joint readings if they are not named q_1, q_2, ...: names, a pattern, or column numbers from "
+        "1, separated by commas. Default: all columns of a table that has one column per joint.",
         "NAMES",
     ),
     length_unit: Literal["mm", "m", "um", "inch"] | None = option(
-        "Unit of positions when the column header has none (e.g. x_m). Default: mm."
+        "Unit of positions if the column header does not state it (as x_m does). Default: mm."
     ),
     near: str | None = option(
-        "Search near these readings, for positions with orientations. Default: columns q_1, q_2, ... of the table.",
+        "For positions with orientations: search for joint readings near these. Default: the columns q_1, q_2, ... of "
+        "the table.",
         "Q1,Q2,...",
     ),
     probe: str | None = option(
-        "Use this tip of the tool in the last frame for both arms, mm. Default: the nominal and the calibrated probe, "
-        "whose difference is corrected too.",
+        "Position (mm) of the tip of the tool in the last frame, used for both arms. Default: the nominal and the "
+        "calibrated probe; their difference is then corrected too.",
         "X,Y,Z",
     ),
     temperature: float | None = option(
-        "Temperature of an arm that was calibrated with its thermal expansion. Default: column temperature_C.", "C"
+        "Temperature (C) of an arm that was calibrated with thermal expansion. Default: the column temperature_C of "
+        "the table.",
+        "C",
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Turn commanded poses into corrected joint readings.
 
-    A controller that knows the nominal arm means by joint readings the pose that the nominal arm has at them. The
-    corrected readings put the calibrated arm there: position and orientation in the base frame of both arms. Positions
-    with orientations in POSES.csv are in that frame, too; of a URDF, in its base link. Seven or more joints change as
-    little as possible; fewer than six correct the position alone. Rotations of the tool that the calibration's data do
-    not determine stay nominal.
+    A controller that uses the nominal parameters expects the pose that the nominal arm has at the commanded joint
+    readings. The corrected readings bring the calibrated arm to this pose: to its position and orientation in the base
+    frame, which both arms have in common. Positions with orientations in POSES.csv are in this frame too (for a URDF:
+    in its base link). With seven or more joints, the readings change as little as possible; with fewer than six
+    joints, only the position is corrected. Rotations of the tool that the calibration data do not determine stay
+    nominal.
 
-    Readings are those of the nominal arm, as its joints count them: signs and offsets that a manifest gives for the
-    recorded angles of a capture are not applied.
+    The readings are those of the nominal arm. The signs and offsets that a manifest gives for the recorded angles of a
+    capture are not applied.
 
-    The table written has the columns and the unit of the one that was read. The readings of a row that cannot be
-    reached, within the nominal arm's joint limits, are left empty, and the exit code is 1: no arm is to be sent there.
+    The output table has the columns and the unit of the input table. If the pose of a row cannot be reached within the
+    joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm there.
     """
     from ..core.numpy_or_jax import to_numpy
     from ..files.table_columns import corrected_csv, read_poses
 
-    begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with a reading for each joint")
+    begin = None if near is None else numbers_option("--near", near, "Q1,Q2,... with one reading per joint")
     picked = None if columns is None else [int(x) if x.isdecimal() else x for x in names_option(columns)]
     with together(output):
         record = files.load_calibration(InputFile(calibration))
@@ -243,8 +256,8 @@ def correct(
         summary["probe_mm"] = [np.asarray(arm.probe).tolist() for arm in (nominal, calibrated)]
         if commanded.temperature is not None and q.shape[1] == calibrated.joints:
             summary["warnings"].append(
-                "the arm was calibrated without thermal expansion, so that column temperature_C changes nothing; "
-                "calibrate with --model expansion for corrections by temperature."
+                "The arm was calibrated without thermal expansion, so the column temperature_C has no effect; "
+                "calibrate with --model expansion to correct for temperature."
             )
         write_text(output, corrected_csv(commanded, np.asarray(corrected.q), np.asarray(corrected.reached)))
         summary["written"] = str(output)

@@ -88,7 +88,7 @@ def _prepare(folder: Path, true_name: str) -> None:
         there = sorted(item.name for item in folder.iterdir() if not item.name.endswith(".part"))
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{folder} cannot be used as a folder: {reason}; name another.") from error
+        raise InputError(f"{folder} cannot be used as a folder: {reason}; name another folder.") from error
     foreign = [name for name in there if name not in _FILES]
     if there and not foreign:
         with contextlib.suppress(InputError):
@@ -98,7 +98,7 @@ def _prepare(folder: Path, true_name: str) -> None:
         foreign = there
     if foreign:
         raise InputError(
-            f"{folder} holds files that are not of a demonstration ({shorten(foreign)}); name a new or an empty folder."
+            f"{folder} contains files that no demonstration wrote ({shorten(foreign)}); name a new or an empty folder."
         )
 
 

@@ -31,7 +31,7 @@ def flag(name: str, help: str) -> Any:
 
 def output(help: str, metavar: str, default: Any = ...) -> Any:
     """The option -o."""
-    kept = " An existing file that aacmm did not write is kept unless --overwrite."
+    kept = " An existing file that aacmm did not write is replaced only with --overwrite."
     return option(help + kept, metavar, "--output", "-o", default=default)
 
 
@@ -41,18 +41,20 @@ def seed(of: str) -> Any:
 
 
 JSON = flag("--json", "Print one JSON object on standard output, and nothing else.")
-ONLY = option("Use only the sockets that match this shell pattern; repeatable.", "PATTERN")
-WITHOUT = option("Leave out the sockets that match this shell pattern; repeatable.", "PATTERN")
+ONLY = option("Use only the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
+WITHOUT = option("Leave out the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
 CALIBRATION_FILE = argument("Calibration, written by calibrate.", "CALIBRATION.h5")
 NOMINAL_ARM = argument(
     "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM"
 )
 ABOUT = option("Administrative data of a certificate: laboratory, customer, item, persons, dates.", "FILE.toml")
-BASE_LINK = option("Link of a URDF that does not move. Default: its root.", "LINK", "--base")
-TIP_LINK = option("Link at the end of a URDF. Default: the only one with no link after it.", "LINK", "--tip")
+BASE_LINK = option("Link of a URDF that serves as the fixed base. Default: the root of the URDF.", "LINK", "--base")
+TIP_LINK = option(
+    "Link of a URDF at which the arm ends. Default: the only link that no other link follows.", "LINK", "--tip"
+)
 _ENCODER = "the standard deviation of a joint reading"
 _SEATING = "the standard deviation of the tip in its socket, for each coordinate"
-_ESTIMATED, _OF_CLASS = "Default: estimated.", "Default: the arm file's [noise], or that of the arm's class."
+_ESTIMATED, _OF_CLASS = "Default: estimated.", "Default: as in [noise] of the arm file, else as for the arm's class."
 ENCODER_NOISE = option(f"Set {_ENCODER}.", default=0.0, min=0)
 SEATING_NOISE = option(f"Set {_SEATING}.", default=0.0, min=0)
 KNOWN_ENCODER_NOISE = option(f"State {_ENCODER}, for the weights. {_ESTIMATED}", min=0)
@@ -60,10 +62,13 @@ KNOWN_SEATING_NOISE = option(f"State {_SEATING}. {_ESTIMATED}", min=0)
 USUAL_ENCODER_NOISE = option(f"Assume {_ENCODER}. {_OF_CLASS}", min=0)
 USUAL_SEATING_NOISE = option(f"Assume {_SEATING}. {_OF_CLASS}", min=0)
 LINEAR_ENCODER_NOISE = option(
-    "Do the same for prismatic joints. Default: what the other encoders are at a distance of 1 m.", min=0
+    "Standard deviation of a reading of a prismatic joint. Default: the displacement that the other encoders' "
+    "standard deviation causes at a distance of 1 m.",
+    min=0,
 )
 REFERENCE_LENGTHS = option(
-    "Reference length between two sockets, u in mm; repeatable. Quote a name with a comma: '\"a, b\",C'.",
+    "Reference length between two sockets, with its standard uncertainty U in mm; may be given several times. Put a "
+    "name that contains a comma in double quotes: '\"a, b\",C'.",
     "A,B[,U]",
     "--length",
 )
@@ -91,7 +96,7 @@ def numbers_option(option: str, text: str, form: str, count: int | None = None) 
     """Finite numbers that an option lists, separated by commas."""
     values = _numbers(option, text, text, form, count)
     if not all(map(math.isfinite, values)):
-        raise InputError(f"{option} '{text}' holds a value that is not finite; give finite numbers.")
+        raise InputError(f"{option} '{text}' contains a value that is not finite; give finite numbers.")
     return values
 
 
@@ -116,9 +121,9 @@ def numbers_by_name(
         if named and not equals:
             bad_option(option, text, form)
         if any(is_control(character) for character in name):
-            raise InputError(f"{option} {quoted(text)} has a control character in its name; leave it out.")
+            raise InputError(f"{option} {quoted(text)} has a control character in its name; remove the character.")
         if name in by_name:
-            raise InputError(f"{option} is given twice for {repr(name) if name else 'all sockets'}; give one.")
+            raise InputError(f"{option} is given twice for {repr(name) if name else 'all sockets'}; give it once.")
         by_name[name] = _numbers(option, text, values, form, count)
     return by_name
 

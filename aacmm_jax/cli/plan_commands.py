@@ -46,22 +46,27 @@ _OF_ACCEPTANCE = {"acceptance", "sphere_mm", "stylus_mm", "bar_mm", "range_mm"}
 def plan(
     context: _CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
     arm: str = options.NOMINAL_ARM,
-    output: Path = output("Plan to write: one row a pose, in the order to take them.", "FILE.csv"),
-    poses: int = option("Number of poses, all sockets together.", "N", default=30, min=2, max=10_000),
+    output: Path = output(
+        "File to write the plan to: one row per pose, in the order in which to take the poses.", "FILE.csv"
+    ),
+    poses: int = option("Total number of poses.", "N", default=30, min=2, max=10_000),
     sockets: int | None = option(
-        f"Position this many sockets, in pairs at the ends of the reference length. Default: {_SOCKETS}.",
+        f"Plan the positions of this many sockets, in pairs at the ends of the reference length. Default: {_SOCKETS}.",
         "N",
         min=1,
         max=1000,
     ),
-    socket: list[str] | None = option("Use a socket at this given position instead, mm; repeatable.", "NAME=X,Y,Z"),
+    socket: list[str] | None = option(
+        "Use a socket at this position (mm) instead of planning its position; may be given several times.", "NAME=X,Y,Z"
+    ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     length_mm: str = option(
-        "Reference length to position; of a range, the best length is chosen.", "L[:M]", default="500"
+        "Reference length whose position is planned; from a range, the best length is chosen.", "L[:M]", default="500"
     ),
-    u_mm: float = option("Standard uncertainty of the reference length to position.", default=0.002),
+    u_mm: float = option("Standard uncertainty of the reference length whose position is planned.", default=0.002),
     model: str | None = option(
-        "Model of the joints, as for calibrate: the poses determine its coefficients too.", "MODEL"
+        "Model of the joints, as for calibrate --model. The poses are chosen to determine its coefficients too.",
+        "MODEL",
     ),
     held: str | None = option(
         "Fix these parameters, as for calibrate, separated by commas. Default: the list in the arm's file.", "NAMES"
@@ -70,12 +75,15 @@ def plan(
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     seating_mm: float | None = options.USUAL_SEATING_NOISE,
     cone_deg: list[str] | None = option(
-        "Largest tilt of the tool from the normal of a socket (of all, or of one by name); 180 for any direction. "
-        "Default: 60 for robots, any for measuring arms. With --kit: half_angle_deg in its tables.",
+        "Largest tilt of the tool from the normal of all sockets, or of the named socket; 180 allows any direction. "
+        "The option may be given several times. Default: 60 for robots, any direction for measuring arms. With --kit, "
+        "set half_angle_deg in the tables of the kit instead.",
         "[NAME=]DEG",
     ),
     normal: list[str] | None = option(
-        "Direction out of a socket (of all, or of one by name). Default: 0,0,1.", "[NAME=]X,Y,Z"
+        "Direction that points out of all sockets, or out of the named socket; may be given several times. Default: "
+        "0,0,1.",
+        "[NAME=]X,Y,Z",
     ),
     tool_axis: str = option(
         "Axis of the last frame that points from the tool into a socket: x, y, z, -x, -y or -z.",
@@ -83,62 +91,67 @@ def plan(
         default="z",
     ),
     retract_mm: float | None = option(
-        "Distance of the approach point of each pose along the socket's normal; 0 for none. Default: 50 for robots, 0 "
-        "for measuring arms.",
+        "Distance of the approach point of each pose from the socket, along its normal; 0 for no approach points. "
+        "Default: 50 for robots, 0 for measuring arms.",
         min=0,
     ),
     cell: Path | None = option("Keep the arm clear of the boxes, walls and posts in this file.", "FILE.toml"),
     collisions: bool = flag(
         "--collisions",
-        "Keep the arm's body (collision shapes of its URDF, else capsules along its links) clear of itself and of the "
-        "table. Implied by --cell and --link-radius-mm.",
+        "Keep the arm's body (collision shapes of its URDF, otherwise capsules along its links) clear of the table, "
+        "and its parts clear of each other. Implied by --cell and --link-radius-mm.",
     ),
-    link_radius_mm: float | None = option("Take capsules of this radius as the arm's body.", min=0),
-    unconstrained: bool = flag("--unconstrained", "Predict also without cones, obstacles and approach points."),
+    link_radius_mm: float | None = option("Use capsules of this radius along the links as the arm's body.", min=0),
+    unconstrained: bool = flag(
+        "--unconstrained", "Also predict the uncertainty of a plan without cones, obstacles and approach points."
+    ),
     angles: Literal["deg", "rad"] = option("Unit of the joint readings in the plan and its manifest.", default="deg"),
     criterion: Literal["length", "A", "D", "E"] = option(
-        "Minimise the largest uncertainty of a length in the volume, or A, D or E of the parameters.",
+        "Criterion to minimise: length, the largest uncertainty of a length in the volume; or the A, D or E criterion "
+        "of the parameters.",
         default="length",
     ),
     region: list[str] | None = option(
-        "Place sockets in this range of x, y, z or distance from the base, mm; repeatable. Default: z=0:.",
+        "Place sockets only where x, y, z or the distance from the base is in this range (mm); may be given several "
+        "times. Default: z=0:.",
         "AXIS=LOW:HIGH",
     ),
     margin_deg: float = option("Keep joints at least this far from their limits.", default=5.0, min=0),
     above_mm: float = option("Height of the table in the base frame: every joint and tip stays above it.", default=0.0),
     candidates: int = option("Number of poses to choose from.", "N", default=3000, min=100, max=1_000_000),
     check_length_mm: float | None = option(
-        "Predict the uncertainty of this length all over the volume. Default: 300, or half a small arm's reach."
+        "Predict the uncertainty of lengths of this size all over the volume. Default: 300, or half the reach of a "
+        "small arm."
     ),
     farthest: float | None = option(
-        f"Largest distance of what is placed from the shoulder, part of the reach. Default: {_FARTHEST}.", "PART"
+        f"Place nothing farther from the shoulder than this fraction of the reach. Default: {_FARTHEST}.", "FRACTION"
     ),
     kit: Path | None = option(
-        "Place these artefacts and use these instruments, with their uncertainties, instead of sockets.", "FILE.toml"
+        "Plan with the artefacts and instruments in this file, and with their uncertainties, instead of sockets.",
+        "FILE.toml",
     ),
     acceptance: Literal["asme", "iso"] | None = option(
-        "Plan the poses of an acceptance test instead, by ASME B89.4.22 or ISO 10360-12."
+        "Plan the poses of an acceptance test to ASME B89.4.22 or ISO 10360-12 instead."
     ),
     sphere_mm: float = option("Diameter of the sphere of an acceptance test.", default=25.0),
     stylus_mm: float = option("Diameter of the probe's ball in an acceptance test.", default=6.0, min=0),
     bar_mm: list[float] | None = option(
-        "Length of an available bar for an acceptance test; twice for asme, five times for iso."
+        "Length of an available bar for an acceptance test; give the option twice for asme, five times for iso."
     ),
     range_mm: float | None = option(
-        "Measuring range that the maker states, a diameter, for an acceptance test. Default: twice the reach.",
+        "Measuring range (a diameter) that the maker states, for an acceptance test. Default: twice the reach.",
         min=0,
     ),
-    manifest: Path | None = option(
-        "Write a manifest, for the import of the readings once they are recorded.", "FILE.toml"
-    ),
+    manifest: Path | None = option("Write a manifest with which the recorded readings can be imported.", "FILE.toml"),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
     seed: int = seed("the random choices"),
     as_json: bool = options.JSON,
 ) -> None:
-    """Choose the poses to take, before measuring.
+    """Plan the poses of a measurement.
 
-    For a calibration: poses, and positions of sockets and reference lengths. For an acceptance test: its poses.
+    For a calibration, the poses and the positions of sockets and reference lengths are planned; for an acceptance test,
+    its poses.
     """
     from ..files.arm_tables import with_model
     from ..files.plans import plan_csv, plan_manifest
@@ -184,10 +197,16 @@ def _check_options(context: Any, kit: bool, acceptance: bool) -> None:
         return
     names = listed(ignored)
     if acceptance:
-        raise InputError(f"--acceptance has its own poses, sockets and bars and ignores {names}; leave out {names}.")
+        raise InputError(
+            f"--acceptance sets its own poses, sockets and bars, so {names} would have no effect; leave out {names}."
+        )
     if kit:
-        raise InputError(f"--kit names what is used and where it is, and ignores {names}; leave out {names}.")
-    raise InputError(f"{names} {'is' if len(ignored) == 1 else 'are'} for acceptance tests; give --acceptance too.")
+        raise InputError(
+            f"--kit states what is used and where it is placed, so {names} would have no effect; leave out {names}."
+        )
+    raise InputError(
+        f"{names} {'applies' if len(ignored) == 1 else 'apply'} to acceptance tests only; give --acceptance too."
+    )
 
 
 def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
@@ -196,13 +215,14 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
     from ..data.noise import CLASSES
 
     if given["socket"] and given["sockets"] is not None:
-        raise InputError("--sockets has sockets positioned and --socket gives their positions; give one of the two.")
+        raise InputError("--sockets asks for planned positions, but --socket gives the positions; give one of the two.")
     if given["length"] and not given["socket"]:
         raise InputError(
-            "--length is between sockets of --socket; to have a reference length positioned, use --length-mm."
+            "--length needs two sockets given with --socket; to plan the position of a reference length, use "
+            "--length-mm."
         )
     if given["region"] and given["socket"]:
-        raise InputError("--region is for sockets that are to be positioned; leave it out with --socket.")
+        raise InputError("--region applies to sockets whose positions are planned; leave it out with --socket.")
     points, count = options.sockets_option(given["socket"]), given["sockets"] or _SOCKETS
     names = list(points) or [chr(ord("A") + i) for i in range(min(count, 26))]
     cell, radius, axis = given["cell"], given["link_radius_mm"], given["tool_axis"]
@@ -300,7 +320,7 @@ def _region(texts: list[str] | None) -> dict[str, tuple[float, float]] | None:
         axis, _, values = text.partition("=")
         low, colon, high = values.partition(":")
         if axis in region:
-            raise InputError("an axis is named twice in --region; give each one range.")
+            raise InputError("--region names an axis twice; give one range per axis.")
         try:
             if not colon:
                 raise ValueError

@@ -35,48 +35,51 @@ _KINDS = {
 )
 def evaluate(
     calibration: Path = argument(
-        "Calibration, written by calibrate; or, alone, a manifest of points (TOML).", "CALIBRATION.h5"
+        "Calibration, written by calibrate; or a manifest of points (TOML), without a capture.", "CALIBRATION.h5"
     ),
     capture: Path | None = argument("Capture, written by import or simulate.", "CAPTURE.h5", None),
     output: Path | None = output("Evaluation to write (HDF5), for aacmm report.", "FILE.h5", None),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     mpe: list[str] | None = option(
-        "Maximum permissible error of an acceptance test, mm (L: the length); repeatable. Exit code 1 where one is not "
-        "met by the decision rule.",
+        "Maximum permissible error of an acceptance test, mm (L: the length); may be given several times. The exit "
+        "code is 1 if a value does not conform by the decision rule.",
         "NAME=A[+L/K]",
     ),
     acceptance: list[str] | None = option(
-        "Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; repeatable. Default: those of the "
-        "standard that the capture was made for, of --mpe, and of all for a manifest of points.",
+        "Run the acceptance tests of JJF 1408, ASME B89.4.22 or ISO 10360-12; may be given several times. Default: "
+        "the tests of the standard for which the capture was made, and those that --mpe names; for a manifest of "
+        "points, the tests of all standards.",
         "[jjf|asme|iso]",
     ),
     test_u_mm: str = option(
-        "Standard uncertainty that seat and fixture add to every test value (L: the length).",
+        "Standard uncertainty (mm) that seat and fixture add to every test value (L: the length).",
         "A[+L/K]",
         default="0",
     ),
     expansion: list[str] | None = option(
-        "Thermal expansion of the artefact or the arm in an acceptance test: coefficient in 1e-6/K, temperature in C, "
-        "each with its standard uncertainty; 'artefact=11.5,1,20.8,0.2'. Lengths are corrected. Give it for the arm "
-        "only where the arm does not compensate its own expansion.",
+        "Thermal expansion of the artefact or the arm in an acceptance test: coefficient (1e-6/K) and temperature "
+        "(C), each followed by its standard uncertainty, for example 'artefact=11.5,1,20.8,0.2'. Lengths are "
+        "corrected for expansion. Give the expansion of the arm only if the arm does not compensate it itself.",
         "OF=C,U,T,U",
     ),
     rule: Literal["iso-2017", "iso-2013", "simple"] | None = option(
-        "Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance "
-        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, else iso-2017."
+        "Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance (ASME "
+        "B89.7.3.1, 4:1). Default: simple for ASME, otherwise iso-2017."
     ),
     range_mm: float | None = option(
-        "Measuring range that the maker states, a diameter. Default: that of the files.", min=0
+        "Measuring range (a diameter) that the maker states. Default: the range in the files.", min=0
     ),
-    max_rms_mm: float | None = option("Exit code 1 where the RMS distance is larger.", min=0),
-    max_deltam_mm: float | None = option("Exit code 1 where Deltam is larger.", min=0),
-    max_length_error_mm: float | None = option("Exit code 1 where the error of any length is larger.", min=0),
+    max_rms_mm: float | None = option("Exit with code 1 if the RMS distance is larger than this.", min=0),
+    max_deltam_mm: float | None = option("Exit with code 1 if Deltam is larger than this.", min=0),
+    max_length_error_mm: float | None = option(
+        "Exit with code 1 if the error of any length is larger than this.", min=0
+    ),
     as_json: bool = options.JSON,
 ) -> None:
-    """Test a calibration on a capture that it has not seen.
+    """Test a calibration on a capture that was not used for it.
 
-    Errors on data that the calibration has not used are printed next to those that its uncertainty predicts. A manifest
+    Errors on held-out data are printed next to the errors that the uncertainty of the calibration predicts. A manifest
     of points is tested without a calibration.
     """
     from ..acceptance.judgement import limit_of_text, read_expansions, read_limits
@@ -92,8 +95,8 @@ def evaluate(
     maxima = {name: value for name, value in maxima.items() if value is not None}
     if capture is None and (maxima or only or without):
         raise InputError(
-            "a manifest of points takes no --max-..., --only and --without; name a calibration and a capture for "
-            "these options."
+            "--max-..., --only and --without do not apply to a manifest of points; name a calibration and a capture, "
+            "or leave these options out."
         )
     with together(output):
         if capture is None:
@@ -111,8 +114,9 @@ def evaluate(
         }
         if capture is not None and not summary["acceptance"] and any(given.values()):
             raise InputError(
-                f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only; this "
-                "capture supports none, or none was requested: name them with --acceptance, or leave the option out."
+                f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only, but "
+                "this capture supports none, or none was requested; request one with --acceptance, or leave the "
+                "option out."
             )
         if output is not None:
             files.save_evaluation(output, record, summary)
@@ -161,7 +165,7 @@ def report(
 ) -> None:
     """Write a report of a result as one HTML file.
 
-    It holds warnings, results, uncertainties, charts and tables, and can be printed.
+    The report contains warnings, results, uncertainties, charts and tables, and can be printed.
     """
     from ..report import write_report
 
@@ -174,8 +178,8 @@ def report(
 @command("aacmm show calibration.h5", "aacmm show panda")
 def show(
     file: str = argument(
-        "File to show: a capture, calibration, evaluation, study or model comparison (HDF5), or an arm: a TOML file, a "
-        "URDF, a kinematics.yaml or a shipped name.",
+        "File to show: a capture, calibration, evaluation, study or model comparison (HDF5), or an arm (TOML file, "
+        "URDF, kinematics.yaml, or the name of an arm that ships with aacmm).",
         "FILE",
     ),
     cell: int | None = option("Show this cell of a study in full.", "N", min=1),
@@ -195,7 +199,7 @@ def show(
         show_summary(summary, as_json, views.arm)
         return
     if base is not None or tip is not None:
-        raise InputError(f"--base and --tip are links of a URDF, and {file} is none; leave them out.")
+        raise InputError(f"--base and --tip name links of a URDF, but {file} is not a URDF; leave them out.")
     attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study", "model comparison"))
     kind = attributes["kind"]
     if kind == "study":
@@ -205,7 +209,7 @@ def show(
         show_study(path, cell, figures, as_json)
         return
     if cell is not None or figures is not None:
-        raise InputError(f"{file} holds a {kind}; --cell and --figures are for studies.")
+        raise InputError(f"{file} is not a study but a file of the kind '{kind}'; leave out --cell and --figures.")
     if kind == "model comparison":  # whose tables hold all of it
         prepare_jax()
         summary, view = dict(files.load_compared_models(path)), summaries.compared_models.compared_models

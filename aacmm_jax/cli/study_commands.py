@@ -29,17 +29,21 @@ def study(
         "Specification: a TOML file, or the name of a study that ships with aacmm.", "SPEC.toml", None
     ),
     resume: bool = flag("--resume", "Continue the study in the output file."),
-    trials: int | None = option("Trials in each cell. Default: as the specification says.", "N", min=1),
-    seed: int | None = option("Seed. Default: as the specification says.", "N", min=0),
-    chunk: int | None = option("Trials computed at a time; no result depends on it. Default: 1000.", "N", min=1),
+    trials: int | None = option("Number of trials per cell. Default: that of the specification.", "N", min=1),
+    seed: int | None = option("Seed. Default: that of the specification.", "N", min=0),
+    chunk: int | None = option(
+        "Number of trials computed at a time; results do not depend on it. Default: 1000.", "N", min=1
+    ),
     dask: str | None = option(
-        "Run on a Dask cluster: the address of its scheduler. tcp:// trusts everybody who can reach its port, who can "
-        "run programs with your rights; tls:// asks for certificates (see docs/scaling.md).",
+        "Run on the Dask cluster whose scheduler has this address. With tcp://, everybody who can reach the port can "
+        "run programs with your rights; tls:// requires certificates (see docs/scaling.md).",
         "ADDRESS",
     ),
-    workers: int | None = option("Threads of this process. Default: one a core.", "N", min=1),
+    workers: int | None = option("Number of threads of this process. Default: one per core.", "N", min=1),
     shards: bool = flag(
-        "--shards", "Dask workers write their trials themselves, to the output's folder, which they share."
+        "--shards",
+        "Let the Dask workers write their trials themselves, to the folder of the output, which all of them "
+        "must share.",
     ),
     as_json: bool = options.JSON,
 ) -> None:
@@ -61,7 +65,9 @@ def study(
         if not resume:
             raise InputError("name a specification, or use --resume to continue the study in the output file.")
         if changes:
-            raise InputError("--trials and --seed stay those of the study; leave them out with --resume.")
+            raise InputError(
+                "a resumed study keeps its trials and its seed; leave out --trials and --seed with --resume."
+            )
         asked = read(output).study
     else:
         with together(output):  # refuses an output that the specification reads
@@ -73,7 +79,9 @@ def study(
                 changed = validated(type(asked.specification), stated, specification)
                 asked = Study(changed, asked.nominal, asked.recording)
     if shards and dask is None:
-        raise InputError("--shards is for the workers of --dask; leave it out, or name a cluster.")
+        raise InputError(
+            "--shards applies to the workers of a Dask cluster only; leave it out, or name a cluster with --dask."
+        )
     if workers is not None and dask is not None:
         raise InputError("a running Dask cluster has its own workers; leave --workers out.")
     with _leaving_threads():
@@ -131,7 +139,7 @@ def _progress_display() -> Iterator[Any]:
                 number = state.programs - state.compiling + 1
                 description = f"Compiling program {number} of {state.programs} ..."
             elif state.stopping:
-                description = "Stopping: running blocks are kept; Ctrl-C again drops them"
+                description = "Stopping when running blocks are done; Ctrl-C again discards them"
             bar.update(task, description=description, total=state.total, completed=state.done)
 
         yield show
@@ -140,9 +148,12 @@ def _progress_display() -> Iterator[Any]:
 def _ended(summary: dict[str, Any]) -> list[str]:
     if not summary["finished"]:
         return []
-    ran = f"{summary['trials_this_run']:,} trials run" if summary["trials_this_run"] else "nothing was left to run"
+    ran = f"{summary['trials_this_run']:,} trials run" if summary["trials_this_run"] else "no trials were left to run"
     written = summary["written"]
-    return [f"Written: {written} ({summary['trials']:,} trials, {ran}).", f"See it with: aacmm show {written}"]
+    return [
+        f"Written: {written} ({summary['trials']:,} trials, {ran}).",
+        f"Show the results with: aacmm show {written}",
+    ]
 
 
 def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
@@ -174,11 +185,11 @@ def study_view(summary: dict[str, Any]) -> View:
     if any(cell["trials_run"] for cell in summary["results"]):
         yield cell_table(summary)
         yield from metric_tables(summary)
-        yield "Length and angle error: the largest of all parameters."
+        yield "Length and angle errors are the largest of all parameters."
         if len(summary["results"]) == 1:
             yield parameter_table(summary)
         else:
-            yield "One cell with every parameter's bias: --cell N. Figures: --figures FOLDER."
+            yield "--cell N shows one cell with the bias of every parameter; --figures FOLDER writes the figures."
     else:
         yield "No trial has ended yet."
     yield from (f"Written: {path}" for path in summary.get("figures_written", ()))

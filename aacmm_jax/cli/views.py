@@ -41,7 +41,10 @@ def arm(summary: dict[str, Any]) -> View:
         else None,
         "limits of the reading" if slides else "limits [deg]": limits,
     })  # fmt: skip
-    yield f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed: {', '.join(summary['held'])}."
+    yield (
+        f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed parameters: "
+        f"{', '.join(summary['held'])}."
+    )
     calibrated = [row for row in summary["corrections"] if row["value"] != 0]
     if calibrated:
         cells = []
@@ -55,14 +58,14 @@ def arm(summary: dict[str, Any]) -> View:
             zero.setdefault(row["of"], []).append(row["coefficient"])
     for kind, names in zero.items():
         amount = pluralise(len(names), "coefficient")
-        yield f"Joint corrections of 0, until they are calibrated: {amount}, {kind} ({shorten(names)})."
+        yield f"Joint corrections that are 0 until they are calibrated: {amount}, {kind} ({shorten(names)})."
     if urdf is not None:
         base, frame = urdf["base"], urdf["first_frame_in_base_mm"]
         where = f"in the frame of {base}"
         if any(x != (row == column) for row, values in enumerate(frame) for column, x in enumerate(values)):
             z, origin = (", ".join(f"{values[column]:.6g}" for values in frame[:3]) for column in (2, 3))
             where = f"in a frame at ({origin}) mm in {base}, with its z axis along ({z})"
-        yield f"From a URDF: {base} to {urdf['tip']}; positions are {where}."
+        yield f"From a URDF, links {base} to {urdf['tip']}; positions are {where}."
 
 
 def capture(summary: dict[str, Any]) -> View:
@@ -120,13 +123,18 @@ def calibration(summary: dict[str, Any]) -> View:
     if summary["cross_validation"] is not None:
         yield from tables.validation_tables(summary["cross_validation"])
     if summary.get("sessions"):
-        columns = {"session": "session", "poses": "poses", "together": "rms_mm", "alone": "rms_alone_mm"}
-        yield listed("Sessions, RMS distance of poses from their geometry [mm]", summary["sessions"], columns)
+        columns = {
+            "session": "session",
+            "poses": "poses",
+            "all sessions fitted": "rms_mm",
+            "this session alone": "rms_alone_mm",
+        }
+        yield listed("Sessions: RMS distance of poses from their geometry [mm]", summary["sessions"], columns)
     yield from _observations(summary)
     stages = {stage: name for stage, name in STAGES.items() if stage != "stage1" or summary["method"] != "joint"}
     fixed_scale = summary["fixed_by_one_length"]
     if summary["nominal"]:
-        title = "On the poses it was identified from [mm]"
+        title = "On the poses used for identification [mm]"
         yield tables.metrics_table(title, summary, stages, fixed_scale=fixed_scale)
     if "truth" in summary:
         yield tables.truth_table(summary["truth"])
@@ -134,7 +142,7 @@ def calibration(summary: dict[str, Any]) -> View:
     yield tables.parameter_table("Parameters", apart)
     if harmonics:
         yield tables.harmonics_table(harmonics)
-        yield "Every coefficient: --json, or aacmm export --format csv."
+        yield "All coefficients: --json, or aacmm export --format csv."
     if summary["held"]:
         yield f"Fixed at their nominal values: {', '.join(summary['held'])}."
     if summary.get("prior"):
@@ -151,7 +159,7 @@ def solve(summary: dict[str, Any]) -> Line:
     """How the solve ended; a residual that no arm has is not called converged, whatever the solver says."""
     ended = Styled("converged", "green") if summary["converged"] else Styled("did not converge", "red")
     if summary["converged"] and not summary["residual_plausible"]:
-        ended = Styled("ended with a residual that no arm has,", "red")
+        ended = Styled("ended with residuals too large for this arm,", "red")
     rows = summary["observations"]  # with observations of other kinds, or a probe for each session: sockets too
     sockets = {*summary["sockets_used"], *(row["observation"] for row in rows if row["kind"] == "socket")}
     observed = words.observed_words(len(sockets), sum(row["kind"] != "socket" for row in rows))
@@ -169,13 +177,16 @@ def _observations(summary: dict[str, Any]) -> View:
             yield tables.geometry_table(parts, factor)
         hidden = len(summary["geometry"]) - len(parts)
         if hidden:
-            yield f"{pluralise(hidden, 'more part')} of the geometry, positions of sockets too: --json."
+            yield f"{pluralise(hidden, 'more part')} of the geometry, including positions of sockets: --json."
     if summary.get("base"):
         yield base(summary["base"], factor)
     if summary["robust"]:
         rows = summary["less_weight"]
-        least = f"; the {_MOST_PARTS} of least weight, all by --json" if len(rows) > _MOST_PARTS else ""
-        yield f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half the weight or less{least}."
+        least = f"; the {_MOST_PARTS} with the least weight are listed (all: --json)" if len(rows) > _MOST_PARTS else ""
+        yield (
+            f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half of the full weight or "
+            f"less{least}."
+        )
         if rows:
             yield tables.weights_table(summary, _MOST_PARTS)
     if "other_poses" in summary:
@@ -194,7 +205,7 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
             pairs = list(zip(frame[quantity.format("")], expanded, strict=True))
             rows.append((name, title, *(number(scale * x, decimals_for(u), rounded=True) for x, u in pairs)))
             rows.append(("", "U", *(number(u, decimals_for(u)) for u in expanded)))
-    title = "Base frame as seen from frames with known coordinates, U (95 %)"
+    title = "Base frame in each frame with known coordinates, with U (95 %)"
     return listed(title, rows, ("in", "", "x", "y", "z"))
 
 
@@ -203,7 +214,10 @@ def _uncertainty(summary: dict[str, Any]) -> View:
     part = summary["uncertainty"]
     factors = ", ".join(filter(None, ("95 %", words.factor_words(part["volume"]))))
     yield tables.volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
-    yield "Propagated from u of the parameters to 400 positions that random poses within the joint limits reach."
+    yield (
+        "U is propagated from the uncertainties of the parameters to 400 positions, those of random poses within the "
+        "joint limits."
+    )
     if part.get("tried"):
         yield words.tried_sentence(part["tried"])
     pairs = [f"{row['one']} with {row['other']} ({row['r']:+.3f})" for row in part["correlated"][:6]]
@@ -221,11 +235,11 @@ def _uncertainty(summary: dict[str, Any]) -> View:
 def demo(summary: dict[str, Any]) -> View:
     """The demonstration: nominal arm, stage 1 and calibrated arm against the truth."""
     yield (
-        f"The simulated arm of Cheng et al. 2018, off by up to {summary['deviation_mm']:g} mm and "
-        f"{summary['deviation_deg']:g} deg, measured with {summary['encoder_arcsec']:g} arcsec and "
-        f"{summary['seating_um']:g} um of noise:\n{summary['poses']} poses in one socket, {summary['more_poses']} in "
-        f"another (stage 1), between them one length of {summary['length_mm']:.4f} mm with u = "
-        f"{summary['length_u_um']:g} um (stage 2)."
+        "Simulated arm of Cheng et al. 2018: its parameters differ from the nominal ones by up to "
+        f"{summary['deviation_mm']:g} mm and {summary['deviation_deg']:g} deg; the noise is "
+        f"{summary['encoder_arcsec']:g} arcsec for the encoders and {summary['seating_um']:g} um for the seat.\nStage "
+        f"1 uses {summary['poses']} poses in one socket and {summary['more_poses']} in another. Stage 2 uses one "
+        f"length of {summary['length_mm']:.4f} mm between the sockets, with u = {summary['length_u_um']:g} um."
     )
     rows = {
         "DE, mean distance from centroid [mm]": "de_mm",
@@ -236,11 +250,11 @@ def demo(summary: dict[str, Any]) -> View:
     yield listed("Lengths and repeatability", cells, ("", *STAGES.values()))
     yield tables.truth_table(summary)
     yield (
-        f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 sees repeatability only and leaves "
-        "every length off by this one factor; stage 2 divides it out."
+        f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 uses repeatability only, so all "
+        "lengths are wrong by this common factor; stage 2 divides them by it."
     )
     yield f"Files in {summary['folder']}: {', '.join(summary['files'])}"
-    yield from (f"Not made: {reason}" for reason in summary["left_out"].values())
+    yield from (f"Not written: {reason}" for reason in summary["left_out"].values())
 
 
 def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False, predicted: bool = False) -> Table:
@@ -315,11 +329,12 @@ def _predicted(part: dict[str, Any]) -> View:
         yield listed(title, groups, {"group": "group"} | numbers)
     if poses["rms_mm"] is not None:
         prediction = poses["rms_predicted_mm"]
-        predicted = "not, because something is not determined" if prediction is None else f"{formatted(prediction)} mm"
-        yield (
-            f"All held-out poses: RMS {formatted(poses['rms_mm'])} mm, predicted {predicted} by the uncertainty of the "
-            "calibration and the noise."
+        predicted = (
+            "no prediction, because the data do not determine everything that it needs"
+            if prediction is None
+            else f"{formatted(prediction)} mm predicted from the uncertainty of the calibration and the noise"
         )
+        yield f"All held-out poses: RMS {formatted(poses['rms_mm'])} mm; {predicted}."
 
 
 def report(summary: dict[str, Any]) -> View:
@@ -343,16 +358,21 @@ def _acceptance(summary: dict[str, Any]) -> View:
     """Every metric with its limit, and what the full procedure of each test would need."""
     tests = summary["acceptance"]
     if not tests:
-        yield "No acceptance test applies: there is no socket with several poses, no length and no sphere for it."
+        yield (
+            "No acceptance test applies: the data contain no socket with several poses, no length and no sphere for "
+            "such a test."
+        )
         return
     yield "\nAcceptance tests, single readings"
     for test, metrics in zip(tests, tables.acceptance_tables(tests, brief=True), strict=True):
         yield metrics
         if test["missing"]:
-            yield "Not the full procedure:"
+            yield "The procedure is not complete:"
             yield from (f"  - {sentence}" for sentence in test["missing"])
     limited = any(metric["limit_mm"] is not None for test in tests for metric in test["figures"])
     rules = dict.fromkeys(test["rule"] for test in tests if test["decision"])
     of_test = summary["u_test_mm"] or any(summary["influences"].values())
     stated = " and of the test (--test-u-mm, --expansion)" if of_test else ""
-    yield f"U: the uncertainty of the artefacts{stated}." + (f" Decisions: {'; '.join(rules)}." if limited else "")
+    yield f"U is the uncertainty of the artefacts{stated}." + (
+        f" Decision rule: {'; '.join(rules)}." if limited else ""
+    )

@@ -22,8 +22,10 @@ from .tables import attributes, plain
 
 _SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
 _SHOWN = (15, 30, 60, 120)  # poses
-_NO_MOMENT = "Gravity has no moment about joint {joint}, whose axis is vertical or meets the load: left out {names}."
-_OTHERS = "Left out as constant, or as combinations of other functions of their joint: {names}."
+_NO_MOMENT = (
+    "Gravity has no moment about joint {joint}, because its axis is vertical or meets the load; left out: {names}."
+)
+_OTHERS = "Left out, because constant or a combination of other functions of the same joint: {names}."
 
 
 def arm_survey(
@@ -58,10 +60,10 @@ def arm_survey(
         "warnings": [],
     }
     if not _SHORTEST <= links <= _LONGEST:
-        summary["warnings"].append(f"The links together measure {links:.4g} mm; is the unit of the lengths right?")
+        summary["warnings"].append(f"The total length of the links is {links:.4g} mm; check the unit of the lengths.")
     if arm.limits is None:
         summary["warnings"].append(
-            "No joint limits are given, so joints are taken to go from -180 to 180 deg; add them."
+            "No joint limits are given, so joints are assumed to move from -180 to 180 deg; add the limits."
         )
     try:
         best, chosen, still = determined_by(arm), Parameters.independent(arm), still_joints(arm)
@@ -84,7 +86,7 @@ def arm_survey(
         needed = _needed(usual, u_reading, expected)
         summary |= {"needed": [needed], "advice": _advice(expected, moving, arm.joints)}
     except InputError as error:
-        summary["warnings"].append(f"What a calibration needs cannot be computed for this arm: {error}")
+        summary["warnings"].append(f"The data that a calibration needs cannot be computed for this arm: {error}")
     return summary
 
 
@@ -143,19 +145,18 @@ def _advice(expected: list[Expected], moving: list[str], joints: int) -> str:
     rows = [(row.enough, row.sockets, row) for row in expected if row.sockets and row.enough is not None]
     if not rows:
         return (
-            "Random poses in sockets do not determine this arm well; use a tracker, or see what aacmm plan finds for "
-            "chosen poses."
+            "Random poses in sockets do not determine this arm well; use a tracker, or let aacmm plan choose the poses."
         )
     poses, _, best = min(rows, key=lambda row: row[:2])
     to_move = f"These joints must move: {shorten(moving, 20)}." if moving else ""
     to_move = "Every joint must move." if len(moving) == joints else to_move
     tracked = "".join(
-        f" With a tracker: {pluralise(2 * row.enough, 'pose')} all over its workspace."
+        f" With a tracker, record {pluralise(2 * row.enough, 'pose')} all over the workspace."
         for row in expected
         if not row.sockets and row.enough is not None
     )
     return (
-        f"Record {2 * poses} poses, as different as possible, in {best.data}. From {pluralise(poses, 'pose')} on the "
-        "calibration adds less to a measured length than the readings themselves; the others are its check."
-        f"{tracked} {to_move}"
+        f"Record {2 * poses} poses, as different as possible, in {best.data}. From {pluralise(poses, 'pose')} on, the "
+        "calibration adds less to the uncertainty of a measured length than the readings themselves; the other poses "
+        f"serve to check the calibration.{tracked} {to_move}"
     )

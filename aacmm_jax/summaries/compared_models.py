@@ -31,13 +31,14 @@ def compared_models_summary(compared: ComparedModels, arm: str) -> dict[str, Any
         }
         for model, (difference, u_difference) in zip(compared.models, compared.differences, strict=True)
     ]
-    finding = f"Recommended: {chosen.model}, which predicts regions that it has not seen best."
+    finding = f"Recommended: {chosen.model}. Of all models, it predicts held-out regions best."
     if chosen is not best:
         difference, u = rms_difference(rows[compared.models.index(chosen)], best.rms_outside)
         finding = (
-            f"Recommended: {chosen.model}. Regions that it has not seen cannot tell it from the best outside "
-            f"({best.model}): its error is larger by {difference:.2g} mm, standard error {u:.2g} mm, region by region. "
-            "It is the simplest of such models that makes the measurement as probable."
+            f"Recommended: {chosen.model}. On held-out regions, its error is not significantly larger than that of "
+            f"the best model ({best.model}): the difference is {difference:.2g} mm, with a standard error of {u:.2g} "
+            "mm from the scatter of the regions. Of the models that are as good, it is the simplest under which the "
+            "measurements are as probable."
         )
     return {
         "arm": arm,
@@ -55,8 +56,9 @@ def _warnings(compared: ComparedModels) -> list[str]:
     sentences = [f"{model.model} did not converge." for model in compared.models if not model.result.converged]
     if chosen.ratio >= _EXCESS:
         sentences.append(
-            f"With {chosen.model}, errors outside are {math.sqrt(chosen.ratio):.1f} times what its noise and prior "
-            "predict: it lacks an effect that none of these models has, or poses all over the joints' travel."
+            f"With {chosen.model}, errors in held-out regions are {math.sqrt(chosen.ratio):.1f} times as large as its "
+            "noise and prior predict: either all of these models lack an effect, or the poses do not cover the whole "
+            "travel of the joints."
         )
     return sentences
 
@@ -65,8 +67,8 @@ def compared_models(summary: dict[str, Any]) -> View:
     """Compared models."""
     yield [
         Styled(summary["arm"]),
-        f": {len(summary['models'])} models on {summary['poses']} poses, "
-        f"{len(summary['regions'])} regions left out one by one",
+        f": {len(summary['models'])} models on {summary['poses']} poses, {len(summary['regions'])} regions held out "
+        "in turn",
     ]
     yield from warnings_of(summary)
     yield from summary["findings"]

@@ -53,7 +53,7 @@ def correction_summary(
         summary["not_reached"].append(plain(missed | {"joints_at_limit": np.flatnonzero(at_limit[row]) + 1}))
     if summary["position_only"]:
         warnings.append(
-            f"the arm has {pluralise(nominal.joints, 'joint')}, fewer than six, so positions alone are corrected, not "
+            f"The arm has {pluralise(nominal.joints, 'joint')}, fewer than six, so only positions are corrected, not "
             "orientations."
         )
     if not reached.any():
@@ -63,9 +63,10 @@ def correction_summary(
     if summary["singular"]:
         rows = shorten([str(row) for row in summary["singular"]])
         warnings.append(
-            f"In {pluralise(len(summary['singular']), 'row')} (row {rows}) the nominal arm is singular, or nearly so: "
-            "axes align, or it is stretched. Its controller's inverse has no unique answer there, and may take other "
-            "readings for such a pose than these; command readings there, not poses, or keep away from it."
+            f"In {pluralise(len(summary['singular']), 'row')} (row {rows}) the nominal arm is at a singularity, or "
+            "close to one: axes align, or the arm is stretched. There, the inverse kinematics of its controller has "
+            "no unique solution and may choose other joint readings than the corrected ones. Command joint readings "
+            "instead of poses there, or avoid these poses."
         )
     summary["largest_distance_mm"] = float(distance[reached].max())
     summary["largest_angle_deg"] = float(angle[reached].max() / DEG)
@@ -84,9 +85,9 @@ def correction_summary(
     large = np.flatnonzero(change.max(axis=1) > _LARGE_CHANGE) + 1
     if len(large):
         warnings.append(
-            f"{pluralise(len(large), 'row')} (row {shorten([str(x) for x in large])}) changed a reading by more "
-            f"than {_LARGE_CHANGE:g} deg: near there axes of the arm align, and small corrections take large "
-            "motions; look at them before an arm is sent there."
+            f"In {pluralise(len(large), 'row')} (row {shorten([str(x) for x in large])}) the correction changes a "
+            f"reading by more than {_LARGE_CHANGE:g} deg: axes of the arm nearly align there, so small corrections "
+            "need large motions. Check these rows before you send an arm there."
         )
     return summary
 
@@ -99,28 +100,31 @@ def corrections(summary: dict[str, Any]) -> View:
         yield f"The tip is at ({has}) mm in the last frame."
     else:
         yield (
-            f"The controller means the tip at ({meant}) mm in the last frame, the calibrated arm's is at ({has}) mm: "
-            "right for the probe of the calibration. State another tool with --probe X,Y,Z."
+            f"In the last frame, the controller assumes the tip at ({meant}) mm, and the calibrated arm has the tip "
+            f"at ({has}) mm. This is right for the probe of the calibration; for another tool, give --probe X,Y,Z."
         )
     rows, missed = summary["rows"], summary["not_reached"]
-    yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} reached with corrected readings."
+    yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} are reached with corrected readings."
     if len(missed) < rows:
         # Of the arithmetic, not of the arm: how far it is really off is what an evaluation with unseen data says.
         distance = formatted(summary["largest_distance_mm"])
-        yield f"Largest distance from a pose with them, if the arm is as calibrated: {distance} mm."
+        yield (
+            "Largest distance of the tip from its pose with the corrected readings, if the arm is exactly as "
+            f"calibrated: {distance} mm."
+        )
     if summary["largest_distance_before_mm"] is not None:
-        yield f"Without the correction: {formatted(summary['largest_distance_before_mm'])} mm."
+        yield f"Largest distance without the correction: {formatted(summary['largest_distance_before_mm'])} mm."
     for key, what, unit in (("largest_change", "reading", "deg"), ("largest_slide", "slide", "mm")):
         row = summary[key]
         if row is not None:
             where = f"(joint {row['joint']}, row {row['row']})"
             yield f"Largest change of a {what}: {row[f'change_{unit}']:.4f} {unit} {where}."
     if missed:
-        first = f", the first {_MOST_ROWS}, all by --json" if len(missed) > _MOST_ROWS else ""
-        yield listed(f"Not reached{first}", missed[:_MOST_ROWS], {
+        first = f" (the first {_MOST_ROWS}; all: --json)" if len(missed) > _MOST_ROWS else ""
+        yield listed(f"Poses that are not reached{first}", missed[:_MOST_ROWS], {
             "row": "row",
-            "distance left [mm]": "distance_mm",
-            "angle left [deg]": "angle_deg",
+            "remaining distance [mm]": "distance_mm",
+            "remaining angle [deg]": "angle_deg",
             "joints at a limit": lambda row: ", ".join(map(str, row["joints_at_limit"])) or "-",
         })  # fmt: skip
     yield from written_of(summary)

@@ -105,7 +105,7 @@ def drift_csv(trend: Trend, labels: list[str]) -> str:
 def comparison(summary: dict[str, Any]) -> View:
     """Findings in sentences, then the numbers: the last against the first; of three or more, all against the first."""
     new, old = (f"{summary[which]} ({summary[f'{which}_created'][:10]})" for which in ("new", "old"))
-    yield [Styled(summary["arm"]), f": {new} against {old}"]
+    yield [Styled(summary["arm"]), f": {new} compared with {old}"]
     yield from tables.warnings_of(summary)
     yield from summary["findings"]
     yield from _parameters(summary)
@@ -114,7 +114,7 @@ def comparison(summary: dict[str, Any]) -> View:
     yield listed(
         f"Lengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
         [["not determined" if lengths[key] is None else lengths[key] for key in keys]],
-        ("RMS", "RMS by the uncertainties alone", "95th percentile", "largest", "mean"),
+        ("RMS", "RMS from the uncertainties alone", "95th percentile", "largest", "mean"),
     )
     if len(summary["trend"]) > 2:
         first, *others = summary["trend"]
@@ -125,10 +125,19 @@ def comparison(summary: dict[str, Any]) -> View:
             numbers = [lengths[key] for key in ("rms_mm", "rms_by_chance_mm", "largest_mm")]
             cells = [row["moved"], probability, *numbers, number(lengths["mean_um_per_m"], 1, signed=True)]
             rows.append([str(i), row["calibration"], row["created"][:10], *cells])
-        headings = ("", "calibration", "date", "beyond U", "p together", "RMS [mm]", "by chance [mm]", "largest [mm]")
-        title = "Each calibration against the first (whose own error is in all of them)"
+        headings = (
+            "",
+            "calibration",
+            "date",
+            "beyond U",
+            "p of all changes",
+            "RMS [mm]",
+            "by chance [mm]",
+            "largest [mm]",
+        )
+        title = "Each calibration compared with the first (every row contains the error of the first)"
         yield listed(title, rows, (*headings, "mean [um/m]"))
-        yield "The change of every parameter from the first calibration: --csv, --json, --figure."
+        yield "For the change of every parameter from the first calibration, use --csv, --json or --figure."
     yield from tables.limits_of(summary)
     yield from tables.written_of(summary)
 
@@ -151,4 +160,4 @@ def _parameters(summary: dict[str, Any]) -> View:
     yield listed(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
     left_out = len(summary["parameters"]) - len(shown)
     if left_out:
-        yield f"Not listed: {left_out} coefficients of harmonics that did not move beyond U; --json, --csv."
+        yield f"Not listed: {left_out} coefficients of harmonics that did not change beyond U; see --json or --csv."

@@ -28,7 +28,7 @@ _EXPANSION = {
     "temperature_celsius": "temperature",
     "u_temperature_celsius": "u_temperature",
 }
-_GROUPS = {"held_out": "held-out data", "identified_from": "the data identified from"}
+_GROUPS = {"held_out": "held-out data", "identified_from": "the data used for identification"}
 
 
 def evaluation_summary(
@@ -188,9 +188,7 @@ def _exceeded(summary: dict[str, Any], record: EvaluationRecord) -> tuple[list[s
                 )
                 break
         else:
-            failed.append(
-                f"{_LIMITED[name]} has a limit of {limit:g} mm, but the data contain nothing to measure it on."
-            )
+            failed.append(f"{_LIMITED[name]} has a limit of {limit:g} mm, but cannot be determined from these data.")
     return kept, failed
 
 

@@ -20,10 +20,10 @@ from .tables import Styled, View, attributes, listed, number, warnings_of, writt
 
 _PREDICTED = {
     "predicted": "this plan",
-    "loose": "this plan, joints kept to about 5 deg only",
+    "loose": "this plan, with joints set only to within about 5 deg",
     "random": "{poses} random poses in the same {where}",
     "more": "this plan and {more_poses} more poses",
-    "unconstrained": "as many without cones, obstacles and approach points",
+    "unconstrained": "as many poses, planned without cones, obstacles and approach points",
 }
 
 
@@ -156,7 +156,7 @@ def kit_plan(summary: dict[str, Any]) -> View:
             names = (row["observation"], row["kind"]) if i == 0 else ("", "")
             rows.append((*names, *(number(value, 0) for value in place["position_mm"]), place["poses"]))
     yield listed("", rows, ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"))
-    yield "Positions are those of the points of an artefact; elsewhere the middle of the tips."
+    yield "For an artefact, the position is that of its points; for anything else, it is the centre of the tips."
     without = {}
     for name, prediction in summary["without"].items():
         # The places of a thing of the kit are named after it.
@@ -182,25 +182,25 @@ def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | 
     by_joint = isinstance(encoders, list)
     arcsec = ", ".join(f"{value:.3g}" for value in encoders) if by_joint else f"{encoders:.3g}"
     linear, option = (
-        ("", "") if slide is None else (f", linear ones of {slide:.3g} mm", f"--linear-encoder-mm {slide:.3g} ")
+        ("", "") if slide is None else (f", linear encoders of {slide:.3g} mm", f"--linear-encoder-mm {slide:.3g} ")
     )
     model = "" if summary.get("model") is None else f"--model {summary['model']} "
     options = f" (--method joint {model}--encoder-arcsec {arcsec} {option}--seating-mm {seat:g})"
     yield (
-        f"For a joint calibration with encoders of {arcsec} arcsec{linear} and a seat of {seat:g} mm"
-        f"{'' if by_joint else options}; {summary['noise_source']}."
+        f"Assumed: a joint calibration with encoders of {arcsec} arcsec{linear} and a seat of {seat:g} "
+        f"mm{'' if by_joint else options}; noise: {summary['noise_source']}."
     )
     collisions, retract, tilt = summary["collisions"], summary["retract_mm"], summary["largest_tilt_deg"]
-    by_way = f" by way of approach points {retract:g} mm above the sockets" if retract else ""
+    by_way = f" via approach points {retract:g} mm above the sockets" if retract else ""
     yield (
-        ("" if tilt is None else f"Largest tilt from a normal {tilt:.0f} deg. ")
-        + f"Joint travel {summary['travel_deg']:,.0f} deg{by_way} ({summary['unordered_travel_deg']:,.0f} before "
-        "ordering; each joint counts by what it carries)."
+        ("" if tilt is None else f"Largest tilt from a normal: {tilt:.0f} deg. ")
+        + f"Joint travel: {summary['travel_deg']:,.0f} deg{by_way} ({summary['unordered_travel_deg']:,.0f} deg "
+        "before ordering; each joint is weighted by what it carries)."
     )
     if collisions is None:
         yield (
-            "Checked: joint limits, reach, cones of approach, and that nothing comes below the table. Not checked: "
-            "obstacles and collisions of the arm with itself (--collisions, --cell, --link-radius-mm)."
+            "Checked: joint limits, reach, cones of approach, and that no part of the arm is below the table. Not "
+            "checked: obstacles and collisions of the arm with itself (use --collisions, --cell or --link-radius-mm)."
         )
     else:
         yield from _collisions(collisions)
@@ -210,17 +210,17 @@ def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | 
 def _collisions(collisions: dict[str, Any]) -> View:
     """Clearance, and what was checked."""
     yield (
-        "Checked: joint limits, reach, cones of approach, the arm's body against itself and obstacles "
-        f"({', '.join(collisions['obstacles']) or 'none'}), in each pose and along the straight joint moves between "
-        f"them. Smallest clearance of a pose {collisions['smallest_clearance_mm']:.0f} mm."
+        "Checked: joint limits, reach, cones of approach, and collisions of the arm's body with itself and with "
+        f"obstacles ({', '.join(collisions['obstacles']) or 'none'}), in each pose and along the straight joint moves "
+        f"between poses. Smallest clearance in a pose: {collisions['smallest_clearance_mm']:.0f} mm."
     )
     if collisions["unchecked"]:
         pairs = "; ".join(" and ".join(pair) for pair in collisions["unchecked"])
-        yield f"Not checked, since they touch wherever the arm is: {pairs}."
+        yield f"Not checked, because these parts touch in every pose of the arm: {pairs}."
     for row in collisions["blocked_moves"]:
         yield Styled(
-            f"The straight joint move to pose {row['before_pose']} ({row['at']}) hits: {' and '.join(row['between'])}; "
-            "go there by another way.",
+            f"The straight joint move to pose {row['before_pose']} ({row['at']}) makes {' and '.join(row['between'])} "
+            "collide; take another path to this pose.",
             "yellow",
         )
 
@@ -231,7 +231,7 @@ def procedure(summary: dict[str, Any]) -> View:
     def at(point: list[float]) -> str:
         return ", ".join(f"{value:.0f}" for value in point)
 
-    stated = "" if summary["measuring_range_stated"] else " (twice the reach; state the maker's)"
+    stated = "" if summary["measuring_range_stated"] else " (twice the reach; give the maker's with --range-mm)"
     yield [
         Styled(summary["arm"]),
         f": {summary['standard']}, {summary['poses']} poses. Measuring range {summary['measuring_range_mm']:.0f} mm"
@@ -254,7 +254,7 @@ def procedure(summary: dict[str, Any]) -> View:
     headings = ("test", "name", "group", "at (x, y, z) [mm]", "to (x, y, z) [mm]", "poses")
     yield listed("", rows, headings)
     yield (
-        "Checked: joint limits, reach, that nothing comes below the table, and that spheres are touched from outside. "
-        "Not checked: obstacles, collisions of the arm with itself, and how artefacts are mounted."
+        "Checked: joint limits, reach, that no part of the arm is below the table, and that spheres are touched from "
+        "outside. Not checked: obstacles, collisions of the arm with itself, and how artefacts are mounted."
     )
     yield from written_of(summary)

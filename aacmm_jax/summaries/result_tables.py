@@ -15,10 +15,11 @@ STAGES = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
 BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
 MODELS_MEANING = (
-    "Determined: parameters that the data determine. Inside, outside: RMS distance from the geometry of all poses, and "
-    "of regions left out one by one. To the best: difference of the error outside to the best one, compared region by "
-    "region. u: standard errors by the scatter of the regions. Ratio: mean of (error / predicted standard deviation)² "
-    "outside. Evidence: its logarithm, less that of the most probable model."
+    "Determined: number of parameters that the data determine. Inside: RMS distance of all poses from their geometry. "
+    "Outside: RMS distance of held-out poses, with each region held out in turn. Above the best: error outside, minus "
+    "that of the best model, from the differences in each region. u: standard errors from the scatter of the regions. "
+    "Ratio: mean of (error / predicted standard deviation)² outside. Evidence: logarithm of the evidence, minus that "
+    "of the most probable model."
 )
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
@@ -69,7 +70,7 @@ def truth_table(truth: Row, stages: Mapping[str, str] = STAGES) -> Table:
         ["largest error of an angle parameter [deg]",
          *(truth[stage]["angle_error_largest_rad"] / DEG for stage in stages)],
     ]  # fmt: skip
-    return listed("Against the true arm of the simulation", rows, ("", *stages.values()))
+    return listed("Largest differences from the true arm of the simulation", rows, ("", *stages.values()))
 
 
 def validation_tables(summary: Row) -> list[Table]:
@@ -105,14 +106,14 @@ def prior_table(rows: Rows) -> Table:
     def deviation(row: Row) -> str:
         scale, unit = people_read(row["unit"])
         given = f"{row['sd'] * scale:.3g} {unit}".strip()
-        return given if row["supported"] else "0: not supported by the data, so exact"
+        return given if row["supported"] else "0: the data support no deviation, so treated as exact"
 
     return listed("Priors of the parameters, and effective parameters", rows, {
         "group": "group",
         "prior": lambda row: "learned" if row["learned"] else "given",
         "standard deviation": deviation,
         "parameters": "parameters",
-        "of these determined by the data": lambda row: number(row["effective_parameters"], 1),
+        "determined by the data": lambda row: number(row["effective_parameters"], 1),
     })  # fmt: skip
 
 
@@ -186,7 +187,7 @@ def harmonics_table(rows: Rows) -> Table:
         "coefficients": "coefficients",
         "orders": "orders",
         "RMS over a revolution": lambda row: _value(row, row["rms"], row["largest"]["expanded"]),
-        "largest": lambda row: row["largest"]["parameter"],
+        "largest coefficient": lambda row: row["largest"]["parameter"],
         "its value": lambda row: _value(row, row["largest"]["calibrated"], row["largest"]["expanded"], signed=True),
         "its U": lambda row: _expanded(row, row["largest"]["expanded"]),
         "unit": lambda row: people_read(row["unit"])[1],
@@ -229,14 +230,20 @@ def agreement_tables(summary: Row) -> list[Table]:
 
 def other_poses_table(others: Row) -> Table:
     """How the calibrated arm agrees with poses that it was not calibrated with."""
-    caption = f"Other poses, drawn at random and not calibrated with: {others['poses']}, RMS {others['rms_mm']:.4f} mm"
+    caption = (
+        f"Poses that were not used for the calibration, drawn at random: {others['poses']}, RMS "
+        f"{others['rms_mm']:.4f} mm"
+    )
     columns: Columns = {"observation": "observation", "poses": "poses", "RMS [mm]": "rms_mm", "RMS [deg]": _in_degrees}
     return listed(caption, others["observations"], columns)
 
 
 def weights_table(summary: Row, most: int | None = None) -> Table:
     """The poses that a robust loss took weight from; ``most``: the first ones only."""
-    caption = f"Poses that the robust loss ({summary['robust']}) took half of their weight from or more, and why"
+    caption = (
+        f"Poses to which the robust loss ({summary['robust']}) gives half of the full weight or less, with their "
+        "residuals"
+    )
     return listed(caption, summary["less_weight"][:most], {
         "observation": "observation",
         "pose": "pose",
@@ -339,8 +346,8 @@ def model_tables(summary: Row) -> tuple[Table, Table]:
         "inside [mm]": "rms_inside",
         "outside [mm]": "rms_outside",
         "u of outside": "u_outside",
-        "to the best": lambda row: to_best(row)[0],
-        "u of it": lambda row: to_best(row)[1],
+        "above the best": lambda row: to_best(row)[0],
+        "u of this": lambda row: to_best(row)[1],
         "ratio": _two_decimals("ratio"),
         "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
         "CPU [s]": lambda row: number(row["cpu_seconds"], 1),

@@ -242,11 +242,12 @@ def noise_sentence(summary: Mapping[str, Any]) -> str:
     seat = "seat" if summary["sockets_used"] else "each coordinate of the tip"
     noise = f"encoders {joined(part['encoder_arcsec'], 1.0)} arcsec{slides}, {seat} {seating}"
     joints = ", ".join(str(row["joint"]) for row in part.get("noisy_encoders", ()))
-    replaced = f", but for joint {joints}" if joints else ""
+    replaced = f", except for joint {joints}" if joints else ""
     return {
-        "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times what it predicts.",
+        "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times as large as this "
+        "noise predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (only their combination is well determined).",
-        "common": f"One variance for all poses: {seating} a coordinate.",
+        "common": f"One noise for all poses: {seating} per coordinate.",
         "robust": "The variance of each pose is taken from its own residual (robust noise model).",
     }[part["form"]]
 
@@ -264,7 +265,7 @@ def lengths_sentence(row: Mapping[str, Any]) -> str:
     size = f"{low} mm" if low == high else f"{low} to {high} mm"
     untested = f"Lengths over {high} mm are untested."
     if row["rms_mm"] is None:
-        return f"Lengths tested: none, as the only one ({size}) fixed the scale. {untested}"
+        return f"Lengths tested: none, because the only reference length ({size}) fixed the scale. {untested}"
     held = f"{row['held_out']} of them" if row["held_out"] else "none"
     predicted = "" if row["predicted_mm"] is None else f", predicted {two_digits(row['predicted_mm'])} mm"
     return (
@@ -284,14 +285,17 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
 
     functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
     parts = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
-    parts += [f"functions that the model lacks: {', '.join(functions)}"] if functions else []
-    return f"Errors that poses share, part of the uncertainty (standard deviations): {'; '.join(parts)}."
+    parts += [f"functions missing from the model: {', '.join(functions)}"] if functions else []
+    return (
+        "Errors that several poses have in common, included in the uncertainty (standard deviations): "
+        f"{'; '.join(parts)}."
+    )
 
 
 def tried_sentence(row: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
-        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses: as near to "
-        f"one as these are to one another ({row['spacing_rad'] / DEG:.2g} deg RMS over the joints). Outside these "
-        "poses U is an extrapolation by the model."
+        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses, which means "
+        f"that a calibration pose is as near as these poses are to each other ({row['spacing_rad'] / DEG:.2g} deg RMS "
+        "over the joints). Elsewhere, U is an extrapolation by the model."
     )

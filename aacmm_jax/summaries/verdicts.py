@@ -12,7 +12,7 @@ from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from .tables import two_digits
 
-_LACKING = "the residuals show errors that the model lacks"  # what tests of residuals doubt
+_LACKING = "the residuals show errors that the model does not describe"  # what tests of residuals doubt
 _LARGER = 1.25  # times what is predicted: less is as good as predicted
 
 
@@ -35,14 +35,14 @@ def calibration_verdict(
     doubts = list(dict.fromkeys(finding.doubt or _LACKING for finding in findings if finding.severity == "doubt"))
     median, largest = (volume[f"expanded_length_reading_{which}_mm"] for which in ("median", "largest"))
     if median is None or largest is None:
-        doubts = ["the data do not determine lengths all over the working volume", *doubts]
+        doubts = ["the data do not determine lengths everywhere in the working volume", *doubts]
         return Verdict("unsure", f"To be used with care: {'; '.join(doubts)}.")
     stated = (
-        f"U (95 %) of a measured length of {volume['length_mm']:g} mm, {two_digits(median)} mm "
-        f"(at worst {two_digits(largest)} mm)"
+        f"U (95 %) of a measured length of {volume['length_mm']:g} mm is {two_digits(median)} mm (at worst "
+        f"{two_digits(largest)} mm)"
     )
     if doubts:
-        says = f"To be used with care: {'; '.join(doubts)}, so errors may exceed the stated {stated}."
+        says = f"To be used with care: {'; '.join(doubts)}, so errors may exceed the stated uncertainty. {stated}."
         return Verdict("unsure", says)
     agrees = held_out is not None and held_out["rms_mm"] is not None
     checked = "held-out data agree with it" if agrees else "no held-out data confirm it"
@@ -120,13 +120,13 @@ def _as_predicted(predicted: Mapping[str, Any]) -> Verdict:
         return Verdict("neutral", "Measured on held-out data; no limit was given.")
     measured, expected = poses["rms_mm"], poses["rms_predicted_mm"]
     chances = [row["probability"] for row in (poses, predicted["lengths"]) if row["probability"] is not None]
-    rms = f"held-out poses are {measured:.3g} mm RMS from their geometry, predicted {expected:.3g} mm"
+    rms = f"held-out poses deviate by {measured:.3g} mm RMS from their geometry, where {expected:.3g} mm was predicted"
     ratio = predicted["lengths"]["normalised_error_rms"]
     if ratio is not None:
-        rms += f", and lengths err by {ratio:.2g} times what is predicted"
+        rms += f", and length errors are {ratio:.2g} times as large as predicted"
     if any(chance < LEVEL / len(chances) for chance in chances):
         chance = min(chances)
         return Verdict("unsure", f"Errors on held-out data exceed the prediction (p = {chance:.1g}): {rms}.")
     if max(measured / expected if expected else 0.0, ratio or 0.0) > _LARGER:
-        return Verdict("unsure", f"Errors on unseen data are larger than predicted, but may be so by chance: {rms}.")
-    return Verdict("neutral", f"The calibration holds on unseen data: {rms}. No limit was given.")
+        return Verdict("unsure", f"Errors on held-out data are larger than predicted, but this may be chance: {rms}.")
+    return Verdict("neutral", f"The calibration holds on held-out data: {rms}. No limit was given.")
