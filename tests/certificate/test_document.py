@@ -368,7 +368,9 @@ def test_acceptance_results_have_their_conformity_beside_them(evaluation, certif
     # D_Eff has no limit, so that nothing is said of its conformity.
     assert {name for name, _ in said} <= {"Conformity of Deltam", "Conformity of E_Uni"}
     lacking = [text for text in contents(certificates["all stated"], ".//dcc:result/dcc:description")]
-    assert any("The full procedure was not carried out." in text and "30 different positions" in text for text in lacking)
+    assert any(
+        "The full procedure was not carried out." in text and "30 different positions" in text for text in lacking
+    )
     assert not [key for key in parse_dcc(certificates["nothing stated"]) if key[0].startswith("Acceptance")]
 
 
@@ -791,7 +793,9 @@ def test_a_certificate_whose_number_was_edited_is_refused(record):
     numbers = (f"<si:value>{number}</si:value>" for number in ("1_0", "\u0663", "NaN", "INF", "1e300", "9" * 5001))
     for edited in (k.replace(".", ","), "", *numbers):
         assert_refused(
-            lambda edited=edited: parse_dcc(text.replace(k, edited)), "'Calibrated parameters / Scale / k'", "not a number"
+            lambda edited=edited: parse_dcc(text.replace(k, edited)),
+            "'Calibrated parameters / Scale / k'",
+            "not a number",
         )
 
 
