@@ -21,7 +21,7 @@ from .standards import ASME_B89_4_22, EDITIONS, ISO_10360_12, JJF_1408
 Confidence = Literal[
     "public source",  # a public page that is named
     "background",  # background knowledge of the standard, without a source at hand
-    "own reading",  # required by the standard in words; the number by which the test is judged is ours
+    "own reading",  # required by the standard in words; the numerical limit is ours
 ]
 Metrics = Callable[[Measured, Influences], Sequence[Metric]]
 Origin = tuple[str, Confidence]  # the source, and how certain it is
@@ -292,13 +292,13 @@ _KREON: Origin = ("digitalscan3d.com/iso-10360-12-standard-for-measuring-arms (K
 _OBERON: Origin = ("oberon3d.com, on ISO 10360-12 (Kreon, in Polish)", "public source")
 _ISO_5: Origin = ("as in ISO 10360-5", "background")
 _PAPER = "Cheng et al. 2018, section 4"
-_RANGE = _need("range", ("data sheets of makers give it as a diameter", "background"))
+_RANGE = _need("range", ("data sheets of makers give the range as a diameter", "background"))
 _CONDITIONS = Requirement(
     "the test is done within the rated conditions of the maker: temperature and its gradients, warm-up, mounting",
     *("ISO 10360 and ASME B89.4.22 in general", "background"),
 )
 _CALIBRATED = Requirement(
-    "artefacts are calibrated and traceable, and are not those that the probe was qualified on",
+    "artefacts are calibrated and traceable, and differ from those on which the probe was qualified",
     *("ISO 10360 in general", "background"),
 )
 
@@ -379,7 +379,7 @@ TESTS = (
         _need("positions of each", ("as in ISO 10360-2 (a maker's public summary: 7 directions)", "own reading"), 7),
         _need("readings", ("as in ISO 10360-2 (a maker's public summary: 3 readings)", "background"), 3),
         _need("directions", ("as in ISO 10360-2, with diagonals of the volume", "own reading"), True),
-        _need("places", ("the lengths are to sample the volume", "own reading"), True),
+        _need("places", ("the lengths must sample the volume", "own reading"), True),
         _RANGE,
         _need("longest", ("as in ISO 10360-2 for the longest diagonal", "background")),
         Requirement(
