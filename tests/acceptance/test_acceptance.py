@@ -412,7 +412,7 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
                 "length error": [
                     "5 different lengths are required (1 given)",
                     "7 different positions of every length are required (one has 1)",
-                    "3 readings in each position are required (a position has 1)",
+                    "3 readings in each position are required (one position has 1)",
                     "not in one plane",
                     "10 % are required",
                     "measuring range",
