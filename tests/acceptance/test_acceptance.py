@@ -133,7 +133,7 @@ def test_articulated_location_by_hand():
     "points", [np.zeros((4, 3)), np.eye(3), np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0.0]])]
 )
 def test_points_that_fix_no_sphere_are_refused(points):
-    assert_refused(lambda: fit_sphere(points), "sphere", "touch it")
+    assert_refused(lambda: fit_sphere(points), "sphere", "touch the sphere")
 
 
 # --- Decisions ---
@@ -460,7 +460,7 @@ def test_metrics_that_could_not_fail_are_left_out(test):
 
 def test_a_limit_without_data_is_refused():
     sockets = {"A": PLACE + np.eye(3)}
-    assert_refused(lambda: run(Measured(sockets), {"P_Size": Limit(0.1)}), "P_Size", "nothing to measure it on")
+    assert_refused(lambda: run(Measured(sockets), {"P_Size": Limit(0.1)}), "P_Size", "no data for this metric")
 
 
 # --- Files ---
@@ -665,7 +665,7 @@ def test_bars_at_hand_are_planned_for(cheng):
     for start, end, value in procedure.lengths:
         ends = [next(item for item in procedure.sockets if item.name == name).points[0] for name in (start, end)]
         assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(value, abs=1e-5)
-    assert_refused(lambda: plan_procedure(cheng.arm, "iso", bars=[500.0]), "takes 5")
+    assert_refused(lambda: plan_procedure(cheng.arm, "iso", bars=[500.0]), "needs 5")
 
 
 def test_an_arm_that_cannot_take_a_zone_goes_without_it():
