@@ -143,7 +143,7 @@ def _acceptance(
     limited = any(metric["limit_mm"] is not None for metric in metrics)
     nominal = any(metric["as_found_mm"] is not None for metric in metrics)
     if limited:
-        used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
+        used = dict.fromkeys(f"{test['rule']} (for {test['standard']})" for test in rows if test["decision"])
         blocks.append(f"Decision rules: {'; '.join(used)}. What a rule does not decide is undecided.")
     for test, metrics_of_test in zip(rows, result_tables.acceptance_tables(rows), strict=True):
         blocks.append(metrics_of_test)

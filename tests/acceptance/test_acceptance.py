@@ -394,7 +394,7 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
 @pytest.mark.parametrize(
     ("sockets", "lengths", "reach", "missing"),
     [
-        ({"A": 10}, [], None, {"single-point articulation": ["reach of the arm", "elbow", "measuring range"]}),
+        ({"A": 10}, [], None, {"single-point articulation": ["reach and the shoulder", "elbow", "measuring range"]}),
         (
             {"A": 10, "B": 1, "C": 1},
             [("B", "C", 100.0)],
@@ -402,11 +402,11 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
             {
                 "single-point articulation": ["at 0 to 20 % of the reach (0 to 200 mm", "elbow", "measuring range"],
                 "volumetric": [
-                    "Two bars are required, no fewer",
+                    "Exactly two bars are required",
                     "500 to 750 mm) and one of 120 to 150 % of the reach (1200 to 1500 mm",
                     "20 different positions are required (1 given)",
                     "not in one plane",
-                    "scatter by 0.0 % of it",
+                    "scatter by 0.0 % of its size",
                     "measuring range",
                 ],
                 "length error": [
@@ -414,7 +414,7 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
                     "7 different positions of every length are required (one has 1)",
                     "3 readings in each position are required (one position has 1)",
                     "not in one plane",
-                    "10 % are required",
+                    "at least 10 % is required",
                     "measuring range",
                 ],
             },
