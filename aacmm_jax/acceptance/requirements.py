@@ -1,7 +1,7 @@
 """The tests of the standards as data: metrics, what a test needs, from which source that is known, and how certain.
 
-What the texts say was not available to this project; a source names where the requirement was found, and no clause
-number that was not.
+The texts of the standards were not available to this project. A source names where the requirement was found; clause
+numbers are given only if they were found there.
 """
 
 import itertools
@@ -21,7 +21,7 @@ from .standards import ASME_B89_4_22, EDITIONS, ISO_10360_12, JJF_1408
 Confidence = Literal[
     "public source",  # a public page that is named
     "background",  # background knowledge of the standard, without a source at hand
-    "own reading",  # required by the standard in words; the number by which the test is judged is ours
+    "own reading",  # required by the standard in words; the numerical limit is ours
 ]
 Metrics = Callable[[Measured, Influences], Sequence[Metric]]
 Origin = tuple[str, Confidence]  # the source, and how certain it is
@@ -37,7 +37,7 @@ class Requirement(NamedTuple):
     says: str
     source: str
     confidence: Confidence
-    # A sentence on what the measured lacks of it, "" where nothing; None where nothing recorded can tell.
+    # Gives a sentence on what is lacking, "" if nothing is; None if recorded data cannot show whether it is met.
     lacking: Callable[[Measured], str] | None = None
 
 
@@ -93,7 +93,7 @@ def _sphere_positions(measured: Measured, test: SphereTest, positions: int) -> i
 
 def _orientations(measured: Measured) -> str | None:
     if measured.postures is None:
-        return "Points do not tell the orientations of the probe; record joint readings."
+        return "Points alone do not show the orientations of the probe; record joint readings."
     for (name, test), groups in measured.postures.probes.items():
         if test == "articulation":
             means = geometry.unit_rows(np.array([directions.mean(axis=0) for directions in groups]))
@@ -104,7 +104,7 @@ def _orientations(measured: Measured) -> str | None:
 
 def _zones(measured: Measured) -> str | None:
     if measured.reach is None:
-        return "The reach of the arm and its shoulder are unknown, so that its zones cannot be told apart."
+        return "The reach and the shoulder of the arm are unknown, so its zones cannot be determined."
     radius = (measured.size or 0.0) / 2
     zones = {zone_of(measured, points) for points in articulated(measured).values()}
     absent = [
@@ -117,7 +117,7 @@ def _zones(measured: Measured) -> str | None:
 
 def _elbow(measured: Measured) -> str | None:
     if measured.postures is None:
-        return "Points do not tell on which side the elbow was; record joint readings."
+        return "Points alone do not show on which side the elbow was; record joint readings."
     bad = []
     for name in articulated(measured):
         sides = np.sin(measured.postures.elbows[name])
@@ -134,14 +134,14 @@ def _elbow(measured: Measured) -> str | None:
 def _two_bars(measured: Measured, positions: int) -> str | None:
     bars = _bars(measured)
     if len(bars) != len(BARS):
-        return f"Two bars are required, no fewer and no more ({len(bars)} given)."
+        return f"Exactly two bars are required ({len(bars)} given)."
     fewest = min(len(bar.lengths) for bar in bars)
     return None if fewest >= positions else f"Each bar is required in {positions} positions."
 
 
 def _bar_lengths(measured: Measured) -> str | None:
     if measured.size is None:
-        return "The reach of the arm is unknown, so that the lengths of the bars cannot be judged."
+        return "The reach of the arm is unknown, so the lengths of the bars cannot be checked."
     radius = measured.size / 2
     values = np.array([float(length.value) for length in measured.lengths]) / radius
     wanted = [bar_range(bar, radius) for bar in BARS if not np.any((values >= bar[0]) & (values <= bar[1]))]
@@ -152,7 +152,7 @@ def _longest(measured: Measured) -> str | None:
     if measured.measuring_range is None:
         return None  # a requirement of its own
     longest, least = max(float(length.value) for length in measured.lengths), LONGEST * measured.measuring_range
-    sentence = f"A length of {least:.0f} mm or more is required (66 % of the range); the longest has {longest:.0f} mm."
+    sentence = f"A length of {least:.0f} mm or more is required (66 % of the range); the longest is {longest:.0f} mm."
     return None if longest >= least else sentence
 
 
@@ -165,11 +165,11 @@ def _places(measured: Measured, by_bar: bool) -> str | None:
     """Of bars over the measuring volume; not judged where its size is unknown."""
     size = measured.size
     if size is None:
-        return "The size of the measuring volume is unknown, so that the places of the bars cannot be judged."
+        return "The size of the measuring volume is unknown, so the places of the bars cannot be checked."
     narrowest = min(bar.spread(size) for bar in _bars(measured, by_bar))
     sentence = (
-        f"The places must be spread over the measuring volume: their middles scatter by {100 * narrowest:.1f} % of "
-        f"it, and {100 * _LEAST_SPREAD:.0f} % are required."
+        f"The bars must be spread over the measuring volume: their midpoints scatter by {100 * narrowest:.1f} % of its "
+        f"size; at least {100 * _LEAST_SPREAD:.0f} % is required."
     )
     return None if narrowest >= _LEAST_SPREAD else sentence
 
@@ -179,8 +179,8 @@ def _places(measured: Measured, by_bar: bool) -> str | None:
 # both texts, {0} is what is lacking, {1} and so on the numbers that a test gives.
 _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     "size": (
-        "a sphere of {2} to {3} mm",
-        "A sphere of {2} to {3} mm is required ({0}).",
+        "a sphere with a diameter of {2} to {3} mm",
+        "A sphere with a diameter of {2} to {3} mm is required ({0}).",
         lambda m, test, low, high: _wrong(
             m, test, lambda s: [] if low <= s.diameter <= high else [f"'{s.name}' has {s.diameter:g} mm"]
         ),
@@ -214,7 +214,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     ),
     "places of the sphere": (
         "the sphere in {2} positions at least 10 % of the range apart; the worse result counts",
-        "The sphere must be measured in {2} positions far apart; it was in {0}.",
+        "The sphere must be measured in {2} positions far apart; it was measured in {0}.",
         _sphere_positions,
     ),
     "orientations": ("five orientations of the probe that differ by at least 10 degrees", "{0}", _orientations),
@@ -268,7 +268,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     ),
     "range": (
         "the measuring range is the one that the maker states",
-        "The measuring range that the maker states is not given (measuring_range).",
+        "The measuring range that the maker states is missing (measuring_range).",
         lambda m: "" if m.measuring_range is None else None,
     ),
 }
@@ -292,13 +292,13 @@ _KREON: Origin = ("digitalscan3d.com/iso-10360-12-standard-for-measuring-arms (K
 _OBERON: Origin = ("oberon3d.com, on ISO 10360-12 (Kreon, in Polish)", "public source")
 _ISO_5: Origin = ("as in ISO 10360-5", "background")
 _PAPER = "Cheng et al. 2018, section 4"
-_RANGE = _need("range", ("data sheets of makers give it as a diameter", "background"))
+_RANGE = _need("range", ("data sheets of makers give the range as a diameter", "background"))
 _CONDITIONS = Requirement(
     "the test is done within the rated conditions of the maker: temperature and its gradients, warm-up, mounting",
     *("ISO 10360 and ASME B89.4.22 in general", "background"),
 )
 _CALIBRATED = Requirement(
-    "artefacts are calibrated and traceable, and are not those that the probe was qualified on",
+    "artefacts are calibrated and traceable, and differ from those on which the probe was qualified",
     *("ISO 10360 in general", "background"),
 )
 
@@ -379,7 +379,7 @@ TESTS = (
         _need("positions of each", ("as in ISO 10360-2 (a maker's public summary: 7 directions)", "own reading"), 7),
         _need("readings", ("as in ISO 10360-2 (a maker's public summary: 3 readings)", "background"), 3),
         _need("directions", ("as in ISO 10360-2, with diagonals of the volume", "own reading"), True),
-        _need("places", ("the lengths are to sample the volume", "own reading"), True),
+        _need("places", ("the lengths must sample the volume", "own reading"), True),
         _RANGE,
         _need("longest", ("as in ISO 10360-2 for the longest diagonal", "background")),
         Requirement(
