@@ -398,7 +398,7 @@ def test_a_conformity_rests_on_results(record, full, evaluation):
     assert_refused(certificate(None, "pass"), "conformity", "--evaluation", "remove [conformity]")
     assert_refused(certificate(evaluation._replace(limits={}), "conditionalPass"), "no limit was given")
     failing = evaluation._replace(limits={"Deltam": aj.acceptance.Limit(1e-4)})
-    assert_refused(certificate(failing, "pass"), "a limit is not kept")
+    assert_refused(certificate(failing, "pass"), "a limit is not met")
     simulated = evaluation._replace(recording=evaluation.recording._replace(true=record.calibrated))
     assert_refused(certificate(simulated, "pass"), "simulated")
     text = dcc_xml(record, AdministrativeData(), created=CREATED, evaluation=simulated)
