@@ -89,7 +89,7 @@ def least_squares(
     check_x64()
     y0 = jax.tree.map(lambda leaf: jnp.asarray(as_array(leaf, "the start")), y0)
     if not sum(leaf.size for leaf in jax.tree.leaves(y0)):
-        raise InputError("the start holds no number, so nothing is unknown; give at least one.")
+        raise InputError("the start contains no number, so there are no unknowns; give at least one number.")
     checked(max_steps, Count, "max_steps")
     steps = None if scale is None else _flat(y0, scale, 1.0, "scale")
     box = Box(_flat(y0, lower, -jnp.inf, "lower"), _flat(y0, upper, jnp.inf, "upper"), steps)
@@ -98,7 +98,7 @@ def least_squares(
         for i in np.flatnonzero(~(low <= high))[:1]:
             raise InputError(
                 f"lower bound {low[i]:g} of unknown {i + 1} is above its upper bound {high[i]:g}; exchange or widen "
-                "them."
+                "the bounds."
             )
     value, last = _minimum(fn, y0, args, box, normal, Rules(*solver), max_steps)
     failures = {STALLED: "nonlinear_divergence", NONFINITE: "nonfinite", MAX_STEPS: "nonlinear_max_steps_reached"}
@@ -136,7 +136,9 @@ def _flat(y: PyTree[Array], given: PyTree, absent: float, what: str) -> Flat:
     try:
         return ravel_pytree(jax.tree.map(leaf_of, y, given))[0]
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what} does not fit the start; give a number, or a PyTree like it ({error}).") from error
+        raise InputError(
+            f"{what} does not match the start; give a number, or a PyTree like the start ({error})."
+        ) from error
 
 
 @eqx.filter_jit
@@ -149,7 +151,9 @@ def _minimum(
     def residual(point: Array, args: PyTree) -> Float[Array, " r"]:
         value = ravel_pytree(fn(unravel(point), args))[0]
         if not value.size or jnp.iscomplexobj(value):
-            raise InputError("the residual must be real numbers, at least one; look at what the function returns.")
+            raise InputError(
+                "the residual must consist of real numbers and contain at least one; check what the function returns."
+            )
         return value
 
     # What the function closes over becomes an argument, so that derivatives by it pass too.
