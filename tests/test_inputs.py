@@ -378,7 +378,7 @@ WRONG_TYPES = {
     "aj.identify(arm, capture, bounds, noise=2.0)": "noise is 2.0; give a Noise.",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=2.5)": "poses is 2.5; give a whole number",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=1, seed=1.5)": "seed is 1.5; give a whole number",
-    "aj.load_arm(None)": "a file is named by a NoneType",
+    "aj.load_arm(None)": "the path of a file is of type NoneType",
     "aj.Arm(alpha=[0.0], a=[1.0], d=[0.0], limits=[0, 1])": "limits must be 1 row of (lowest, highest)",
 }
 

@@ -392,8 +392,9 @@ def fit(task: Task, args: Args, z: Float[AnyArray, " n"], begun: Begun, rules: R
         last = minimise(observed_model, z, args, box, rules, task.max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     # Optimistix takes 0.2 s to import, and NumPy needs none of it.
-    from ..solver.bounded import least_squares
+    from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
 
+    solver = BoundedLevenbergMarquardt(**rules._asdict())
     within: dict[str, Any] = {**box._asdict(), "max_steps": task.max_steps}
-    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=rules, throw=False, **within)
+    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=solver, throw=False, **within)
     return Fit(solution.value, *(solution.stats[name] for name in ("num_steps", "reason", "optimality")))

@@ -62,12 +62,17 @@ def arm(
     table [angles] that a manifest then needs. Positions of a table are in the base frame (of a URDF: in its base link),
     those of a manifest's tracker in a frame that is found. Exit code 1 where nothing makes them fit.
     """
-    from ..files.arm_tables import with_model
+    from ..files.arm_tables import arm_template, with_model
 
     if new is not None:
         if file is not None or check is not None or figure is not None:
             raise InputError("--new writes a template and reads no arm; leave out the arm, --check and --figure.")
-        _write_template(new, 6 if joints is None else joints, as_json)
+        with together(new):
+            if os.path.lexists(new):
+                raise InputError(f"{new} exists; give another name, or remove it.")
+            write_text(new, arm_template(joints or 6))
+        summary = {"kind": "arm template", "joints": joints or 6, "written": str(new)}
+        show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. Look at it: aacmm arm {new}"])
         return
     if file is None:
         raise InputError("name an arm: a file or a shipped arm; or write a template with --new my-arm.toml.")
@@ -106,17 +111,6 @@ def arm(
 def first_frame(specification: Any) -> Any:
     """The first frame of an arm in the base link of its URDF; None for other arms."""
     return None if specification.urdf is None else files.urdf_chain(specification.urdf).base
-
-
-def _write_template(path: Path, joints: int, as_json: bool) -> None:
-    from ..files.arm_tables import arm_template
-
-    with together(path):
-        if os.path.lexists(path):
-            raise InputError(f"{path} exists; give another name, or remove it.")
-        write_text(path, arm_template(joints))
-    summary = {"kind": "arm template", "joints": joints, "written": str(path)}
-    show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. Look at it: aacmm arm {path}"])
 
 
 def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]:

@@ -101,13 +101,11 @@ def geometry_of(arm: Arm) -> Geometry:
 def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geometry]:
     """Exact D-H parameters of a chain; readings keep their sign, since z of every frame is along its axis.
 
-    Neighbouring axes within about 1 degree of parallel or antiparallel get Hayati's beta, with a ``d`` that is chosen;
-    standard D-H would put the next frame hundreds of metres away. The last frame has the orientation of the tip, by
-    alpha, theta and beta of the last joint. Source: Hayati and Mirmirani 1985.
-
-    With ``keep_points``, ``d`` between nearly parallel axes is such that the next frame is at the given point of its
-    axis; otherwise it is 0. Returned are the first D-H frame in the frame of the base (the same frame where the first
-    axis is its z axis), and the parameters, mm and rad; ``beta`` is None where it is not needed.
+    Neighbouring axes within about 1 degree of parallel or antiparallel get Hayati's beta; standard D-H would put the
+    next frame hundreds of metres away (Hayati and Mirmirani 1985). Their ``d`` is such that the next frame is at the
+    given point of its axis, or 0 without ``keep_points``. The last frame has the orientation of the tip, by alpha,
+    theta and beta of the last joint. Returned are the first D-H frame in the frame of the base (the same frame where
+    the first axis is its z axis), and the parameters, mm and rad; ``beta`` is None where it is not needed.
     """
     base = _first_frame(axes.directions[0], axes.points[0])
     frame, rows = base, []
@@ -121,10 +119,8 @@ def dh_of_axes(axes: Axes, *, keep_points: bool = True) -> tuple[Transform, Geom
 
 
 def _first_frame(direction: Vector, point: Vector) -> Transform:
-    """The frame with z along the first axis that is rotated least, with its origin nearest to that of the base.
-
-    For an axis that points down, the base is first rotated by pi about x.
-    """
+    """The frame with z along the first axis that is rotated least (after pi about x, for an axis that points down),
+    with its origin nearest to that of the base."""
     frame, down = np.eye(4), direction[2] < 0
     x, y, z = (direction[0], -direction[1], -direction[2]) if down else direction
     # Rodrigues' formula about z cross the axis, whose sine is the length of (x, y) and whose cosine is z.
@@ -219,11 +215,8 @@ def calibrated_frames(
 
     A frame on axis i turns about its axis with theta_i, so that a link keeps its shape where only zero offsets changed,
     and is where the axis passes nearest to the nominal origin, as the calibrated joint before it carries that; that of
-    a prismatic joint moves on along its axis with d_i, for the same reason (anywhere else would do as well). An origin
-    that does not change comes back as it was, to the bit.
-
-    The first nominal origin is in the frame of the base, and ``base`` the first D-H frame in it, which calibration does
-    not change; ``nominal`` are the parameters that `dh_of_axes` gave.
+    a prismatic joint moves on along its axis with d_i, for the same reason. An origin that does not change comes back
+    as it was, to the bit. ``nominal`` and ``base`` are what `dh_of_axes` gave; calibration does not change ``base``.
     """
     before, after = dh_frames(nominal, base), dh_frames(calibrated, base)
     was, now, changed = np.eye(4), np.eye(4), []
@@ -245,8 +238,7 @@ def calibrated_frames(
 def canonical_origins(geometry: Geometry) -> list[Transform]:
     """Origins of the joints with z along every axis, as D-H has them: T_i = Tx(a) Rx(alpha) Ry(beta) Rz(theta) Tz(d).
 
-    Length, twist and beta are of the joint before, so that the first origin is Rz(theta_1) Tz(d_1). The transform of
-    the tip in the last joint's frame follows as one more.
+    Length, twist and beta are of the joint before. The transform of the tip in the last joint's frame is one more.
     """
     origins, link = [], np.eye(4)
     for theta, d, a, alpha, beta in _links(geometry):

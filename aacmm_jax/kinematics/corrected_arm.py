@@ -11,9 +11,8 @@ from ..core.errors import InputError
 from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import namespace, to_numpy
 from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
-from .chain import Corrections, Geometry, forward_pass, joint_motion, joints_first
+from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
 from .corrections import Loads, Term, term_of, terms_of
-from .joint_functions import KnownFunctions
 
 _CONFIGURATIONS = 300
 _TEMPERATURES = (10.0, 30.0)  # C

@@ -1,6 +1,6 @@
 """What joints do besides their Denavit-Hartenberg motion: the kinds of corrections, and their coefficients by name.
 
-Each coefficient multiplies a known function of the readings (`joint_functions`). A new kind is one class here, added to
+Each coefficient multiplies a known function of the readings (`chain`). A new kind is one class here, added to
 `KINDS`: whatever else the package does with kinds, it asks them.
 """
 

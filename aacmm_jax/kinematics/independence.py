@@ -215,8 +215,7 @@ def poses_in_sockets(q: Float[np.ndarray, "N n"], sizes: tuple[int, ...]) -> Soc
 def generic_poses(arm: Arm, limits: JointLimits | None = None) -> SocketPoses:
     """What a thorough calibration would record, without noise: poses in several sockets and one reference length.
 
-    The sockets are where random configurations within the limits (default: the arm's own) put the tip; the same arm
-    always gets the same.
+    The sockets are where configurations of a fixed seed within the limits (default: the arm's own) put the tip.
     """
     random = np.random.default_rng(0)
     limits = np.asarray(joint_limits(arm, None)) if limits is None else limits
@@ -308,8 +307,8 @@ def trade_offs(
 def reduced_echelon(basis: Float[np.ndarray, "p r"]) -> tuple[Float[np.ndarray, "p r"], list[int]]:
     """The same space by vectors that are each 0 at the other vectors' leading parameters, and these parameters.
 
-    Orthonormal vectors of the same space give the same result, whatever a processor's rounding made of them: the
-    parameter that the remaining space changes most leads, and of equal ones the first.
+    The parameter that the remaining space changes most leads, and of equal ones the first, so that a processor's
+    rounding does not decide.
     """
     rest, leading = basis.copy(), []
     for _ in range(basis.shape[1]):

@@ -30,6 +30,7 @@ from .chain import (
     Geometry,
     JointKinds,
     JointMotion,
+    KnownFunctions,
     Vectors,
     components_last,
     forward_pass,
@@ -39,7 +40,6 @@ from .chain import (
     joints_first,
     of_joints,
 )
-from .joint_functions import KnownFunctions
 
 Indices = tuple[tuple[str, int], ...]  # parameters: each a kind (or ``q``, a reading) and a 0-based index
 Columns = Float[AnyArray, "... p 3 N"]

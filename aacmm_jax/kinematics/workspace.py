@@ -328,7 +328,7 @@ def configurations_at(
 ) -> tuple[Configurations, Places]:
     """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point.
 
-    With several cones, point i has the cone i; or modulo their number, for several placements of the same sockets.
+    Of several cones, point i has the cone i, modulo their number (for several placements of the same sockets).
     """
     owner = np.repeat(np.arange(len(points)), each)
     sockets = owner % (1 if region.cones is None else len(region.cones.normals))

@@ -21,7 +21,6 @@ from jaxtyping import Float
 from ..core.linear_algebra import (
     inverse_cholesky,
     inverse_positive_definite,
-    length_and_direction,
     semidefinite_eigen,
 )
 from ..core.numpy_or_jax import AnyArray, added_to, namespace
@@ -112,7 +111,9 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
 
 def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
     """Rows whose products have the curvature of a robust loss (`Loss.along`) and the gradient of these."""
-    xp, (_, direction) = namespace(block.white), length_and_direction(block.white)
+    xp = namespace(block.white)
+    size = xp.sqrt(xp.sum(block.white**2, axis=0))  # differentiated nowhere, so 0 needs no care (and seeds rest on it)
+    direction = block.white / xp.where(size > 0, size, 1.0)[None]
     changed = []
     for by in (block.by_head, block.by_own):
         if by is not None:

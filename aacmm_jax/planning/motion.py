@@ -17,7 +17,7 @@ _STEP = np.radians(2.0)  # largest step of a joint between samples of a move
 _ROUNDS = 25  # of ordering and checking
 _LEAST_WEIGHT = 0.1
 _BLOCKED = 1e4  # rad: what a move that hits something counts, more than any detour
-_MOST, _MANY = 2000, 150  # poses: beyond the first only nearest neighbours; up to the second every start is tried
+_MANY = 150  # poses, up to which every start is tried
 _IMPROVED = 6  # starts that are improved
 
 
@@ -160,11 +160,6 @@ def short_order(
     """
     given = np.argsort(groups, kind="stable")
     scaled = q * weights
-    if len(q) > _MOST:
-        return min(
-            (given, _nearest(lambda i, rows: np.abs(scaled[rows] - scaled[i]).sum(axis=1), groups, int(given[0]))),
-            key=lambda order: float(np.abs(np.diff(scaled[order], axis=0)).sum()),
-        ).tolist()
     cost = np.zeros((len(q) + 1, len(q) + 1))  # the last one stands for what is before the first and after the last
     for i in range(len(q)):
         cost[i, :-1] = np.abs(scaled - scaled[i]).sum(axis=1)
@@ -172,7 +167,7 @@ def short_order(
         cost[i, j] += _BLOCKED
         cost[j, i] += _BLOCKED
     starts = range(len(q)) if len(q) <= _MANY else [int(np.argmin(np.abs(scaled).sum(axis=1)))]
-    orders = [_nearest(lambda i, rows: cost[i, rows], groups, start) for start in starts]
+    orders = [_nearest(cost, groups, start) for start in starts]
     orders = [given, *sorted(orders, key=lambda order: _length(cost, order))[:_IMPROVED]]
     best = min((_reversed(cost, order, groups) for order in orders), key=lambda order: _length(cost, order))
     return best.tolist()
@@ -182,7 +177,7 @@ def _length(cost: Float[np.ndarray, "M M"], order: Int[np.ndarray, " N"]) -> flo
     return float(cost[order[:-1], order[1:]].sum())
 
 
-def _nearest(cost_from, groups: Int[np.ndarray, " N"], start: int) -> Int[np.ndarray, " N"]:
+def _nearest(cost: Float[np.ndarray, "M M"], groups: Int[np.ndarray, " N"], start: int) -> Int[np.ndarray, " N"]:
     """From pose to nearest pose; a group is left when none of it is left."""
     left = np.ones(len(groups), dtype=bool)
     order = [start]
@@ -190,7 +185,7 @@ def _nearest(cost_from, groups: Int[np.ndarray, " N"], start: int) -> Int[np.nda
     while left.any():
         of_group = left & (groups == groups[order[-1]])
         rows = np.flatnonzero(of_group if of_group.any() else left)
-        order.append(int(rows[np.argmin(cost_from(order[-1], rows))]))
+        order.append(int(rows[np.argmin(cost[order[-1], rows])]))
         left[order[-1]] = False
     return np.array(order)
 

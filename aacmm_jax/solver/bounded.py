@@ -1,4 +1,4 @@
-"""Box-bounded nonlinear least squares with exact derivatives, also where bounds are active.
+"""Box-bounded nonlinear least squares by Optimistix, with exact derivatives, also where bounds are active.
 
 The minimum is found by the steps of `levenberg_marquardt`, which are not differentiated, and then takes its derivatives
 from its stationarity, y = clip(y - gradient), by the implicit function theorem. A common implicit adjoint takes the
@@ -24,14 +24,17 @@ from ..core.jax_setup import check_x64
 from ..core.linear_algebra import singular_values
 from ..core.numpy_or_jax import stop_gradient
 from .active_set import Box, Flat, QuadraticModel
-from .levenberg_marquardt import Progress, Rules, minimise
-from .reason import MAX_STEPS, NONFINITE, STALLED, Reason, reasons
+from .levenberg_marquardt import Progress, Rules, advance, begin
+from .reason import MAX_STEPS, NONFINITE, RUNNING, STALLED, Reason, reasons
 
 _UNDETERMINED = 1e-14  # of the largest singular value
 
 
-class BoundedLevenbergMarquardt(Rules):
-    """Tolerances and initial damping of `least_squares`: ``rtol``, ``atol``, ``gtol`` and ``initial_damping``.
+class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt within a box, as a least-squares solver of Optimistix.
+
+    The box is in ``options``: ``lower``, ``upper`` and ``scale`` as in `least_squares`, and ``normal``. Use it through
+    `least_squares`: `optimistix.least_squares` takes it too, but has no derivatives that hold on an active bound.
 
     Example:
         >>> import jax.numpy as jnp
@@ -40,6 +43,55 @@ class BoundedLevenbergMarquardt(Rules):
         >>> print(aj.least_squares(lambda y, target: y - target, jnp.zeros(2), target, upper=2.0, solver=loose).value)
         [1. 2.]
     """
+
+    # As in `Rules`.
+    rtol: float = Rules().rtol
+    atol: float = Rules().atol
+    gtol: float = Rules().gtol
+    initial_damping: float | None = Rules().initial_damping
+    # Optimistix asks for a norm; every test of the steps is written out, since it scales by unknowns.
+    norm: Callable[[PyTree], Array] = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
+        form = None
+        if options.get("normal") is not None:
+            form = jax.eval_shape(options["normal"], y, args).gram
+            form = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
+        return begin(ravel_pytree(y)[0], _box(y, options), form)
+
+    def step(self, fn, y, args, options, state, tags):
+        unravel: Callable = ravel_pytree(y)[1]
+
+        def residual(point: Array) -> tuple[Array, tuple[Array, PyTree]]:
+            out, aux = fn(unravel(point), args)
+            value = ravel_pytree(out)[0]
+            return value, (value, aux)
+
+        if options.get("normal") is None:
+            jacobian, (value, aux) = jax.jacfwd(residual, has_aux=True)(state.step.trial)
+            evaluated = QuadraticModel(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian)
+        else:
+            evaluated, aux = options["normal"](unravel(state.step.trial), args), None
+        rules = Rules(self.rtol, self.atol, self.gtol, self.initial_damping)
+        state = advance(state, evaluated, _box(y, options), rules)
+        return unravel(state.y), state, aux
+
+    def terminate(self, fn, y, args, options, state, tags):
+        result = optx.RESULTS.where(state.reason == STALLED, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        result = optx.RESULTS.where(state.reason == NONFINITE, optx.RESULTS.nonfinite, result)
+        return state.reason != RUNNING, result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        # Optimistix itself stops, before any step, where y is not finite.
+        unfinished = jnp.where(result == optx.RESULTS.nonfinite, NONFINITE, MAX_STEPS)
+        stats = {
+            "reason": reasons(jnp.where(state.reason == RUNNING, unfinished, state.reason)),
+            "num_accepted_steps": state.accepted,
+            "cost": state.model.cost,
+            "gradient": state.model.gradient,
+            "optimality": state.optimality,
+        }
+        return y, aux, stats
 
 
 def least_squares(
@@ -51,7 +103,7 @@ def least_squares(
     upper: PyTree = None,
     scale: PyTree = None,
     normal: Callable[[PyTree, PyTree], QuadraticModel] | None = None,
-    solver: Rules = BoundedLevenbergMarquardt(),
+    solver: BoundedLevenbergMarquardt = BoundedLevenbergMarquardt(),
     max_steps: int = 1000,
     throw: bool = True,
 ) -> optx.Solution:
@@ -91,8 +143,8 @@ def least_squares(
     if not sum(leaf.size for leaf in jax.tree.leaves(y0)):
         raise InputError("the start contains no number, so there are no unknowns; give at least one number.")
     checked(max_steps, Count, "max_steps")
-    steps = None if scale is None else _flat(y0, scale, 1.0, "scale")
-    box = Box(_flat(y0, lower, -jnp.inf, "lower"), _flat(y0, upper, jnp.inf, "upper"), steps)
+    options = {"lower": lower, "upper": upper, "scale": scale}
+    box = _box(y0, options)
     if is_concrete(box.lower, box.upper):
         low, high = np.asarray(box.lower), np.asarray(box.upper)
         for i in np.flatnonzero(~(low <= high))[:1]:
@@ -100,28 +152,25 @@ def least_squares(
                 f"lower bound {low[i]:g} of unknown {i + 1} is above its upper bound {high[i]:g}; exchange or widen "
                 "the bounds."
             )
-    value, last = _minimum(fn, y0, args, box, normal, Rules(*solver), max_steps)
-    failures = {STALLED: "nonlinear_divergence", NONFINITE: "nonfinite", MAX_STEPS: "nonlinear_max_steps_reached"}
-    result = optx.RESULTS.successful
-    for number, name in failures.items():
-        result = optx.RESULTS.where(last.reason == number, getattr(optx.RESULTS, name), result)
-    stats = {
-        "reason": reasons(last.reason),
-        "num_steps": last.steps,
-        "num_accepted_steps": last.accepted,
-        "cost": last.model.cost,
-        "gradient": last.model.gradient,
-        "optimality": last.optimality,
-    }
-    solution = optx.Solution(value=value, result=result, aux=None, stats=stats, state=None)
+    solution = _minimum(fn, y0, args, box, normal, solver, max_steps)
     if not throw:
         return solution
-    failed = result != optx.RESULTS.successful
+    failed = solution.result != optx.RESULTS.successful
     if not is_concrete(failed):
-        return result.error_if(solution, failed)
+        return solution.result.error_if(solution, failed)
     if bool(failed):
-        raise InputError(Reason[stats["reason"]])
+        raise InputError(Reason[solution.stats["reason"]])
     return solution
+
+
+def _box(y: PyTree[Array], options: dict[str, Any]) -> Box:
+    """The box that options state, with the unknowns as a vector."""
+    scale = options.get("scale")
+    return Box(
+        _flat(y, options.get("lower"), -jnp.inf, "lower"),
+        _flat(y, options.get("upper"), jnp.inf, "upper"),
+        None if scale is None else _flat(y, scale, 1.0, "scale"),
+    )
 
 
 def _flat(y: PyTree[Array], given: PyTree, absent: float, what: str) -> Flat:
@@ -143,9 +192,15 @@ def _flat(y: PyTree[Array], given: PyTree, absent: float, what: str) -> Flat:
 
 @eqx.filter_jit
 def _minimum(
-    fn: Callable, y0: PyTree[Array], args: PyTree, box: Box, normal: Callable | None, rules: Rules, max_steps: int
-) -> tuple[PyTree[Array], Progress]:
-    """The minimum with its derivatives, and the last state of the solve."""
+    fn: Callable,
+    y0: PyTree[Array],
+    args: PyTree,
+    box: Box,
+    normal: Callable | None,
+    solver: BoundedLevenbergMarquardt,
+    max_steps: int,
+) -> optx.Solution:
+    """The minimum with its derivatives."""
     start, unravel = ravel_pytree(y0)
 
     def residual(point: Array, args: PyTree) -> Float[Array, " r"]:
@@ -159,16 +214,13 @@ def _minimum(
     # What the function closes over becomes an argument, so that derivatives by it pass too.
     inputs = (eqx.filter_closure_convert(residual, start, args), args, box)
     constant_residual, constant_args, still_box = stop_gradient(inputs)
-
-    def model(point: Array, _: None) -> QuadraticModel:
-        if normal is not None:
-            return normal(unravel(point), constant_args)
-        value = constant_residual(point, constant_args)
-        jacobian = jax.jacfwd(constant_residual)(point, constant_args)
-        return QuadraticModel(0.5 * jnp.dot(value, value), jacobian.T @ value, jacobian.T @ jacobian)
-
-    last = minimise(model, stop_gradient(start), None, still_box, rules, max_steps)
-    return unravel(_with_derivatives(last.y, inputs)), last
+    options = {"lower": still_box.lower, "upper": still_box.upper, "scale": still_box.scale}
+    if normal is not None:
+        options["normal"] = lambda point, args: normal(unravel(point), args)
+    solution = optx.least_squares(
+        constant_residual, solver, stop_gradient(start), constant_args, options, max_steps=max_steps, throw=False
+    )
+    return eqx.tree_at(lambda s: s.value, solution, unravel(_with_derivatives(solution.value, inputs)))
 
 
 @eqx.filter_custom_jvp

@@ -334,7 +334,7 @@ def test_poses_that_a_calibration_did_not_use_are_held_out(aacmm, folder):
     found = json.loads(aacmm("evaluate", "c.h5", folder / "tracker.h5", "--json").stdout)
     unseen, seen = (found[group]["observations"] for group in ("held_out", "identified_from"))
     assert sum(row["poses"] for row in unseen) == 25
-    assert {row["observation"] for row in unseen} == {f"{row['observation']}, unseen" for row in seen}
+    assert {row["observation"] for row in unseen} == {f"{row['observation']}, held out" for row in seen}
     assert found["warnings"] == []
 
 

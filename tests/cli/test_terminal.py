@@ -242,7 +242,7 @@ SAME = [
 
 
 REFUSED = [
-    (("calibrate", "there.h5", "-o", "x.h5", "--figure", "x.txt"), "x.txt is no figure that can be drawn"),
+    (("calibrate", "there.h5", "-o", "x.h5", "--figure", "x.txt"), "a figure cannot be written as x.txt"),
     (("export", "there.h5", "--format", "csv", "--arm", "true"), "--arm is for --format toml"),
     (
         ("evaluate", "there.h5", "there.h5", "--mpe", "zzz=1"),

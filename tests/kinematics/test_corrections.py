@@ -10,11 +10,10 @@ from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.diagnostics.missing_terms import FoundTerm, wider_model
 from aacmm_jax.kinematics import parameter_names, with_corrections
 from aacmm_jax.kinematics.arm import correction_names
-from aacmm_jax.kinematics.chain import forward_pass, joint_motion, joints_first
+from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motion, joints_first
 from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections import terms_of
 from aacmm_jax.kinematics.jacobian import rotation_columns
-from aacmm_jax.kinematics.joint_functions import KnownFunctions
 
 MODEL = "gravity,harmonics,gear,coupled"
 

@@ -50,8 +50,8 @@ def test_a_blocked_move_is_avoided_where_there_is_another_way():
     assert sorted(alone) == [0, 1]
 
 
-def test_many_poses_are_ordered_by_nearest_neighbours(monkeypatch):
-    monkeypatch.setattr(motion, "_MOST", 20)
+def test_many_poses_are_ordered_from_one_start(monkeypatch):
+    monkeypatch.setattr(motion, "_MANY", 20)
     q, owner = problem(0, 60, 3)
     order = short_order(q, owner, WEIGHTS)
     assert sorted(order) == list(range(60))

@@ -327,3 +327,11 @@ def test_the_solution_is_a_point_that_was_evaluated():
     solution = aj.least_squares(lambda y, _: jnp.sqrt(y - 1.0), jnp.array([1.05]), throw=False)
     assert np.all(np.isfinite(np.sqrt(np.asarray(solution.value) - 1.0)))
     assert float(solution.stats["cost"]) == pytest.approx(0.5 * float(solution.value[0] - 1.0), rel=1e-12)
+
+
+def test_optimistix_takes_the_solver():
+    fn, start, target = (lambda y, target: y - target), jnp.zeros(2), jnp.array([1.0, 3.0])
+    options = {"lower": jnp.zeros(2), "upper": jnp.full(2, 2.0)}
+    solution = optx.least_squares(fn, aj.solver.BoundedLevenbergMarquardt(), start, target, options)
+    assert solution.result == optx.RESULTS.successful
+    np.testing.assert_allclose(solution.value, [1.0, 2.0], rtol=0, atol=1e-12)
