@@ -13,7 +13,13 @@ from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.observations.geometry import distances_from_axis, fitted_cylinder, placed
 from aacmm_jax.data.observations.held import platform_frames
-from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
+from aacmm_jax.data.observations.observation import (
+    AbstractObservation,
+    AbstractSimulated,
+    Tips,
+    certified_quantities,
+    stated_quantities,
+)
 from aacmm_jax.data.observations.observation import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
@@ -46,6 +52,18 @@ ALL = {
     "distances": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), u=0.1),
     "distances with a constant": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), constant=True),
 }
+
+
+def test_every_kind_and_its_simulation_are_public():
+    public = {getattr(kinds, name) for name in dir(kinds)}
+    for base in (AbstractObservation, AbstractSimulated):
+        for kind in subclasses(base):
+            if kind.__module__.startswith("aacmm_jax") and not kind.__name__.startswith("Abstract"):
+                assert kind in public, f"add {kind.__name__} to data/observations/__init__.pyi"
+
+
+def subclasses(base):
+    return [inner for kind in base.__subclasses__() for inner in (kind, *subclasses(kind))]
 
 
 def unknowns_of(observation):
