@@ -467,7 +467,7 @@ def test_a_limit_without_data_is_refused():
 
 
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(procedure, recorded, cheng, tmp_path):
-    """As in a laboratory: plan, record a file for each socket and group of touches, import."""
+    """As in a laboratory: plan, record one file per socket and per group of touches, import."""
     (tmp_path / "acceptance.toml").write_text(plan_manifest(procedure, "cheng2018-simulation"))
     files: dict[str, list[str]] = {}
     for row in csv.DictReader(plan_csv(procedure).splitlines()):
@@ -543,7 +543,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
         (
             ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
-            "target, session and temperature_C are for",
+            "target, session and temperature_C apply to",
         ),
     ],
 )

@@ -408,7 +408,7 @@ def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
         )
     measured = aj.acceptance.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
     save_evaluation(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
-    assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
+    assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not met")
     save_evaluation(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
     write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
     assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
@@ -570,7 +570,9 @@ def test_lengths_stand_placement_by_placement():
 
 def test_what_cannot_be_reported_is_refused(written, tmp_path):
     aj.files.save_capture(tmp_path / "capture.h5", written.record.recording)
-    assert_refused(lambda: write_report(tmp_path / "capture.h5", tmp_path / "r.html"), "capture.h5", "holds a capture")
+    assert_refused(
+        lambda: write_report(tmp_path / "capture.h5", tmp_path / "r.html"), "capture.h5", "contains a capture"
+    )
     assert_refused(lambda: write_report(tmp_path / "none.h5", tmp_path / "r.html"), "does not exist")
     calibration = written.folder / "calibration.h5"
     assert_refused(lambda: write_report(calibration, calibration), "choose another output")
