@@ -597,7 +597,7 @@ def test_what_was_left_out_is_stated(record):
     assert dcc_model.faults(text) == []
     (said,) = [one for one in contents(text, "*/dcc:statements") if "T2" in one]
     assert said.startswith(
-        "Left out: station T2, which contradicts the rest (F = 45.6 with 6 and 60 degrees of freedom"
+        "Left out: station T2, which contradicts the other data (F = 45.6 with 6 and 60 degrees of freedom"
     )
     assert said.endswith("Sockets and observations left out: T2/day, T2/night.")
     assert sum("they contradict the rest: station T2;" in one for one in contents(text, ".//dcc:usedMethods")) == 2
@@ -610,7 +610,7 @@ def test_warnings_and_simulations_are_stated(record):
     given = aj.Noise(encoder_arcsec=2.0 / 3, seating=0.005 / 3)
     simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0, noise=given)
     warnings = sentences(findings_of(simulated))
-    assert any("times what the given noise predicts" in sentence for sentence in warnings)
+    assert any("times as large as the given noise predicts" in sentence for sentence in warnings)
     text = dcc_xml(simulated, AdministrativeData(), created=CREATED)
     assert dcc_model.faults(text) == []
     said = contents(text, "*/dcc:statements")

@@ -77,7 +77,7 @@ def test_a_table_of_known_positions(aacmm, tmp_path, few):
     header = [*(f"q_{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"]
     write(tmp_path / "poses.csv", header, np.hstack([np.rad2deg(columns), np.asarray(arm.position(Q)) / 1000]))
     said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv").stdout
-    assert said.startswith("Columns 4 and 5 are exchanged; column 3 runs the other way. Correcting it")
+    assert said.startswith("Columns 4 and 5 are exchanged; column 3 has the opposite sign. Correcting this")
     angles = tomllib.loads(said[said.index("[angles]") : said.index("12 poses")])["angles"]
     assert angles == {"unit": "deg", "columns": [1, 2, 3, 5, 4, 6], "sign": [1, 1, -1, 1, 1, 1]}
 
@@ -91,7 +91,7 @@ def test_positions_in_metres_are_no_matter_of_the_angles(aacmm, tmp_path, few, m
     tables = '[[points]]\nfile = "p.csv"\ncolumns = { points = "p*_m" }\n'
     (tmp_path / "m.toml").write_text(f'arm = "cheng2018-simulation"\nangles = {{ unit = "rad" }}\n{tables}')
     said = aacmm("arm", "cheng2018-simulation", "--check", "m.toml").stdout
-    assert said.startswith("The positions are in m, and were taken for mm. Correcting it")
+    assert said.startswith("The positions are in m, but were read as mm. Correcting this")
     assert 'units = { points = "m" }' in said
     assert "[angles]" not in said
     arm = aj.load_arm("cheng2018-simulation")

@@ -144,7 +144,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     record = aj.calibration.record_of(result, aj.Recording(capture, nominal))
     assert record.implausible_residual
     summary = calibration_summary(record)
-    assert any("mm that are plausible for this arm" in warning for warning in summary["warnings"])
+    assert any("mm is plausible for this arm" in warning for warning in summary["warnings"])
     assert not summary["residual_plausible"]
     assert not any("determine" in warning for warning in summary["warnings"])
 

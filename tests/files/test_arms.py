@@ -236,7 +236,7 @@ def test_what_is_not_an_arm_file(tmp_path):
 
 def test_a_batch_of_arms_has_no_file(tmp_path):
     batch = aj.Arm(alpha=np.zeros((2, 3)), a=np.zeros(3), d=np.zeros(3))
-    assert_refused(lambda: aj.files.save_arm(batch, tmp_path / "arm.toml"), "one arm", "take one of it first")
+    assert_refused(lambda: aj.files.save_arm(batch, tmp_path / "arm.toml"), "one arm", "select one arm of the batch")
 
 
 ROBOT = """

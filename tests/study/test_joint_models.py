@@ -83,7 +83,7 @@ MESSAGES = {
         "deviation.gear_ppm applies to coefficients that",
     ),
     "two stages": ({}, {"model": "gear", "method": "two-stage"}, "identification.method is 'two-stage', which ignores"),
-    "prior": ({}, {"prior": "lenghts=1mm"}, "identification.prior: the prior is of 'lenghts'"),
+    "prior": ({}, {"prior": "lenghts=1mm"}, "identification.prior: the prior names 'lenghts'"),
     "empty": ({}, {"model": " "}, "identification.model: a model is empty"),
 }
 

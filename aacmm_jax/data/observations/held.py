@@ -113,18 +113,25 @@ class Artefact(AbstractObservation):
     def __init__(self, name: str, points: Mapping[str, Numbers], q: Mapping[str, Numbers], **options: Any):
         where = f"artefact '{name}'"
         if not isinstance(points, Mapping) or not isinstance(q, Mapping) or not points or not q:
-            raise InputError(f"{where} needs two dictionaries: its points' coordinates, and the readings in them.")
+            raise InputError(
+                f"{where} needs two dictionaries: the coordinates of its points, and the readings at these points."
+            )
         blocks = {point: checked_readings(f"{where} point '{point}'", readings) for point, readings in q.items()}
         widths = {block.shape[1] for block in blocks.values()}
         if len(widths) > 1:
-            raise InputError(f"{where} has readings of {sorted(widths)} columns; give one column a joint.")
+            raise InputError(
+                f"{where} has readings with {' and '.join(map(str, sorted(widths)))} columns; give one column per "
+                "joint."
+            )
         readings = namespace(*blocks.values()).concatenate(list(blocks.values()))
         held = [point for point, block in blocks.items() for _ in range(block.shape[0])]
         super().__init__(name, readings, held, list(points), list(points.values()), **options)
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if len(self.names) != len(self.coordinates):
-            raise InputError(f"{where} has {len(self.names)} names of {len(self.coordinates)} points; give one each.")
+            raise InputError(
+                f"{where} has {len(self.names)} names for {len(self.coordinates)} points; give one name per point."
+            )
         for point in dict.fromkeys(self.point):
             if point not in self.names:
                 raise InputError(

@@ -93,13 +93,15 @@ class MeasuredPoints(AbstractObservation):
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         where, points = f"observation '{self.name}'", np.asarray(self.points)
         if len(points) < 3:
-            raise InputError(f"{where} has {len(points)} points, but its frame needs three at least; measure more.")
+            raise InputError(
+                f"{where} has {len(points)} points, but its frame needs at least three; measure more points."
+            )
         sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         # The rotation of the frame is of no consequence where all points are one, such as a socket.
         if sizes[0] >= _SAME and sizes[1] <= _FLAT * sizes[0]:
             raise InputError(
-                f"the points of {where} are on one line, about which its frame can turn; measure points beside the "
-                "line."
+                f"the points of {where} lie on one line, so the rotation of its frame about this line is "
+                "undetermined; measure points off the line."
             )
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
@@ -211,7 +213,9 @@ class Distances(AbstractObservation):
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if not self.constant and is_concrete(self.values) and np.any(np.asarray(self.values) <= 0):
-            raise InputError(f"{where} has a distance that is not positive; give distances in mm, or constant=True.")
+            raise InputError(
+                f"{where} has a distance that is not positive; give positive distances in mm, or constant=True."
+            )
         return {}
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
@@ -228,9 +232,11 @@ class Distances(AbstractObservation):
         return Rows((distance - values)[None], towards[None], by_unknowns, variances(self.u, m))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        needs = "pivot and constant need five" if self.constant else "pivot needs four"
+        needs = "pivot and constant need at least five" if self.constant else "pivot needs at least four"
         if tips.shape[1] < 4 + self.constant:
-            raise InputError(f"observation '{self.name}' has {tips.shape[1]} distances, but its {needs}; measure more.")
+            raise InputError(
+                f"observation '{self.name}' has {tips.shape[1]} distances, but its {needs}; measure more distances."
+            )
 
 
 class AbstractInBox(AbstractSimulated):
