@@ -92,7 +92,7 @@ def simulate(
     temperatures = _checked_temperatures(arm, temperature)
     simulated = items_of(observations, "observations")
     if not isinstance(sockets, Mapping) or not (sockets or simulated):
-        raise InputError("simulate needs at least one socket with its position.")
+        raise InputError("simulate needs at least one socket with its position, or one observation.")
     limits_array = np.asarray(joint_limits(arm, limits))
     arm, noise = to_numpy((arm, noise))
     points = {name: socket_point(name, point) for name, point in sockets.items()}

@@ -217,7 +217,7 @@ def checked_limits(limits: Limits, joints: int, prismatic: tuple[int, ...] = ())
     except (TypeError, ValueError):
         rows = []  # no rows of numbers
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        units = "rad, of prismatic joints in mm" if prismatic else "rad"
+        units = "rad (prismatic joints: mm)" if prismatic else "rad"
         raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in {units}, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:

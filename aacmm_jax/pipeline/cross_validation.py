@@ -222,8 +222,8 @@ def regions_of(capture: Capture, patterns: Iterable[str] | None = None, joints: 
     regions = {label: poses for label, poses in regions.items() if _POSES <= poses.sum() <= len(owner) - _POSES}
     if len(regions) < 2:
         raise InputError(
-            "models are compared on regions held out from the calibration, and these poses form fewer than two "
-            "regions; record more poses."
+            "models are compared on regions that are held out, but these poses form fewer than two regions; record "
+            "more poses."
         )
     return regions
 

@@ -270,7 +270,7 @@ def test_a_plane_is_read_by_its_normal():
         (lambda: kinds.MeasuredPoints("p", Q, POINTS, u=1, covariance=np.eye(3)), "both given"),
         (lambda: kinds.MeasuredPoints("p", Q, POINTS, covariance=-np.eye(3)), "not symmetric and positive"),
         (lambda: kinds.MeasuredPoints("", Q, POINTS), "name of one line"),
-        (lambda: kinds.MeasuredTransforms("p", Q, POINTS, 2 * MEASURED, u_angle=1e-3), "no rotation"),
+        (lambda: kinds.MeasuredTransforms("p", Q, POINTS, 2 * MEASURED, u_angle=1e-3), "not a rotation"),
         (lambda: kinds.MeasuredTransforms("p", Q, POINTS, MEASURED, u_angle=0.0), "must be positive"),
         (lambda: kinds.Sphere("s", Q, diameter=0), "must be positive"),
         (lambda: kinds.Cylinder("c", Q, diameter=0), "must be positive"),

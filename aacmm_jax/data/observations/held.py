@@ -95,13 +95,15 @@ class Artefact(AbstractObservation):
     u: Float[AnyArray, ""] = declared(
         "standard uncertainty of a coordinate", "mm", default=0.0, more="its error is the same in every placement"
     )
-    artefact: str = declared("name of the artefact", default=NAME, more="observations of one share its errors")
+    artefact: str = declared(
+        "name of the artefact", default=NAME, more="all observations of one artefact share its errors"
+    )
     placement: str = declared(
-        "name of its placement", default=NAME, of_session=True, more="those of one share its frame"
+        "name of its placement", default=NAME, of_session=True, more="all observations of one placement share its frame"
     )
     index: str | None = declared(
         "index of the platform that carries it", default=None, of_session=True,
-        more="the placement is then one on the platform, which has a frame for each index",
+        more="the placement is then relative to the platform, and the platform has one frame per index",
     )  # fmt: skip
     derived = ("free",)  # whether the coordinates are unknowns with certified values
     frame = Part("placement {placement}", *FRAME)
@@ -284,7 +286,7 @@ class SimulatedArtefact(AbstractSimulated):
         "its frame in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6, moves="frame"
     )
     errors: Float[np.ndarray, "c 3"] | None = declared(
-        "errors of the certified coordinates", "mm", default=None, more="all placements share them"
+        "errors of the certified coordinates", "mm", default=None, more="all placements have the same errors"
     )
     u: float = declared("their standard uncertainty", "mm", default=0.0)
     artefact: str = declared("name of the artefact", default=NAME)

@@ -90,7 +90,7 @@ class AbstractTouched(AbstractObservation):
 
     @property
     def certified_size(self) -> Float[AnyArray, "*batch"] | None:
-        """Certified distance of the tip's centre from the geometry, mm; None where it is unknown."""
+        """Certified distance of the tip's centre from the geometry, mm; None if the diameter is unknown."""
         value = getattr(self, self.certificate) if self.certificate else None
         if value is None:
             return None
@@ -153,12 +153,15 @@ class AbstractRound(AbstractTouched):
 
     certificate, share = "diameter", 0.5
     diameter: Float[AnyArray, ""] | None = declared(
-        "certified diameter", "mm", default=None, uncertainty="u", positive=True, more="None where it is unknown"
+        "certified diameter", "mm", default=None, uncertainty="u", positive=True, more="None if the diameter is unknown"
     )
     u: Float[AnyArray, ""] = declared("standard uncertainty of the diameter", "mm", default=0.0)
     stylus: Float[AnyArray, ""] = declared(
         "diameter of the tip's ball", "mm", default=0.0,
-        more="0 where the tip itself is on the surface, or where the diameter is unknown, which then includes it",
+        more=(
+            "0 if the tip itself touches the surface, or if the diameter is unknown (the fitted diameter then "
+            "includes the stylus)"
+        ),
     )  # fmt: skip
     derived = ("free",)
 
@@ -382,7 +385,7 @@ class SimulatedPlanes(AbstractSimulated):
     poses: int = declared("number of poses")
     distance: float | None = declared(
         "true distance to the second plane", "mm", default=None,
-        more="along the cross product of the sides; None for one",
+        more="along the cross product of the sides; None for a single plane",
     )  # fmt: skip
     u: float = declared("standard uncertainty of the certified distance", "mm", default=0.0)
 
