@@ -184,7 +184,7 @@ def predicted(case: Case, data: str, poses: int, seed: int) -> dict[str, float |
     try:
         result = aj.calibrate(case.arm, capture, bounds, method="joint", noise=noise, **options)
     except aj.InputError as error:
-        if "numbers are unknown" not in str(error):
+        if "equations, but there are" not in str(error):
             raise
         return found  # too few poses for so many parameters
     uncertainty = aj.uncertainty_of(result)
@@ -218,8 +218,8 @@ def table(rows: list[dict]) -> str:
         length = default_length(case.arm)
         says = (
             f"{case.arm.joints} joints, {_noise(case)}; artefacts u = {1000 * case.u_artefact:g} um, tracker u = "
-            f"{1000 * case.u_tracker:g} um a coordinate{_tolerance(case)}. Sockets and a length determine {every} "
-            f"parameters at best. U (95 %) of a length of {length:.0f} mm, mm: median over the volume, largest in "
+            f"{1000 * case.u_tracker:g} um per coordinate{_tolerance(case)}. Sockets and a length determine {every} "
+            f"parameters at most. U (95 %) of a length of {length:.0f} mm, mm: median over the volume, largest in "
             "brackets."
         )
         parts.append(f"### {case.title}\n\n{textwrap.fill(says, 120)}\n")

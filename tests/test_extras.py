@@ -46,7 +46,7 @@ def test_the_extras_are_those_of_the_project():
 )
 def test_a_missing_extra_is_one_sentence_in_python(module, extra, use, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    message = rf'^[^.]* needs {module}; install it with: pip install "aacmm_jax\[{extra}\]"$'
+    message = rf'^[^.]* needs {module}; install {module} with: pip install "aacmm_jax\[{extra}\]"$'
     with pytest.raises(aj.InputError, match=message):
         use()
     with pytest.raises(ImportError, match=message):
@@ -64,7 +64,7 @@ def test_a_missing_extra_is_one_sentence_on_the_command_line(module, extra, argu
     monkeypatch.chdir(tmp_path)
     done = run_without(module, *arguments)
     assert (done.returncode, done.stdout) == (2, "")
-    assert re.fullmatch(rf'Error: .* needs {module}; install it with: .*"aacmm_jax\[{extra}\]"\n', done.stderr)
+    assert re.fullmatch(rf'Error: .* needs {module}; install {module} with: .*"aacmm_jax\[{extra}\]"\n', done.stderr)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -65,7 +65,7 @@ def shifted(given: SimpleNamespace, **changes: float) -> np.ndarray:
         (lambda q: {"A": q > 0}, ["socket 'A' must be real numbers", "true or false"]),
         (lambda q: {"": q}, ["a socket has the name ''", "of one line"]),
         (lambda q: {"A\n": q}, ["a socket has the name 'A\\n'"]),
-        (lambda q: {"A": q, "B": q[:, :5]}, ["socket 'B' has 5 columns", "socket 'A' has 6", "one column a joint"]),
+        (lambda q: {"A": q, "B": q[:, :5]}, ["socket 'B' has 5 columns", "socket 'A' has 6", "one column per joint"]),
         (lambda q: {"A": q[0]}, ["socket 'A' has shape (6,)", "expected (poses, joints)"]),
         (lambda q: {"A": q[:0]}, ["socket 'A' has shape (0, 6)", "at least one"]),
         (lambda q: {}, ["at least one socket"]),
@@ -101,7 +101,7 @@ def test_angles(given, sockets, parts):
             ["unknown socket '9'", "known are plate, B"],
         ),
         (lambda q: aj.Capture({"plate": q}).select("palte"), ["'palte'", "did you mean 'plate'?"]),
-        (lambda q: aj.Capture({"plate": q}).select(without="p*"), ["no socket is left", "widen"]),
+        (lambda q: aj.Capture({"plate": q}).select(without="p*"), ["leaves no socket", "select more"]),
         (lambda q: aj.scale_from_lengths(measured=[200.0, -1.0], nominal=200.0), ["measured[1] is -1 mm", "positive"]),
         (lambda q: aj.scale_from_lengths(measured=[200.0], nominal=[1.0, 2.0]), ["(2,)", "one number"]),
         (lambda q: aj.scale_from_lengths(measured=[], nominal=200.0), ["measured", "at least one"]),
@@ -124,8 +124,11 @@ def test_lengths_and_sockets(given, call, parts):
         ({"d": ["one"] * 6}, ["d must be real numbers", "text"]),
         ({"d": [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]}, ["d[2] is inf; give finite numbers"]),
         ({"probe": [0.0, 102.0]}, ["probe has shape (2,)", "give (..., 3)"]),
-        ({"alpha": np.zeros((3, 6)), "a": np.zeros((2, 6))}, ["(3,), (2,)", "make them alike"]),
-        ({"limits": [(-1, 1)] * 3 + [(1, -1)] + [(-1, 1)] * 2}, ["joint 4", "1 to -1 rad", "lower below the upper"]),
+        ({"alpha": np.zeros((3, 6)), "a": np.zeros((2, 6))}, ["(3,), (2,)", "the same batch shape"]),
+        (
+            {"limits": [(-1, 1)] * 3 + [(1, -1)] + [(-1, 1)] * 2},
+            ["joint 4", "1 to -1 rad", "lower limit below the upper limit"],
+        ),
         ({"limits": [(-1, np.inf)] + [(-1, 1)] * 5}, ["joint 1", "inf rad", "finite"]),
         ({"limits": [(-1, 1)] * 5}, ["limits must be 6 rows"]),
         ({"limits": [(-1, 0, 1)] * 6}, ["6 rows of (lowest, highest)"]),
@@ -144,7 +147,10 @@ def test_arm(paper_arm, changes, parts):
     [
         (lambda x: aj.Parameters.free_of(x.arm, held=["d_33"]), ["'d_33'", "6-joint arm", "did you mean 'd_3'?"]),
         (lambda x: aj.Parameters.free_of(x.arm, free=["beto_2"]), ["'beto_2'", "did you mean 'beta_2'?"]),
-        (lambda x: aj.Parameters.free_of(x.arm, held=["d_1"], free=["d_1"]), ["'d_1'", "as held and as free", "once"]),
+        (
+            lambda x: aj.Parameters.free_of(x.arm, held=["d_1"], free=["d_1"]),
+            ["'d_1'", "as held and as free", "only one"],
+        ),
         (lambda x: aj.Parameters.free_of(x.arm, held=["d_1", "d_1"]), ["'d_1'", "twice in held", "once"]),
         (
             lambda x: aj.Parameters.free_of(x.arm, held=aj.kinematics.parameter_names(x.arm)),
@@ -168,7 +174,10 @@ def test_arm(paper_arm, changes, parts):
         (lambda x: aj.Parameters(x.arm, ("d_3", "d_3")), ["'d_3' is named twice in names", "once"]),
         (lambda x: x.arm.jacobian(x.q, "d_9"), ["unknown parameter 'd_9'"]),
         (lambda x: x.arm.jacobian(x.q, ["q_7"]), ["'q_7'", "6-joint arm", "did you mean"]),
-        (lambda x: x.arm.position(x.q[:, :5]), ["q has shape (10, 5)", "6 joints", "last axis is the joint"]),
+        (
+            lambda x: x.arm.position(x.q[:, :5]),
+            ["q has shape (10, 5)", "6 joints", "last axis must run over the joints"],
+        ),
         (lambda x: x.arm.position("straight up"), ["q must be real numbers"]),
     ],
     ids=[
@@ -198,7 +207,7 @@ def test_parameters_and_bounds(given, call, parts):
         (lambda x: {"hold": "dd_3"}, ["'dd_3'", "did you mean 'd_3'?"]),
         (lambda x: {"hold": "theta_2"}, ["'theta_2'", "is an angle", "hold a length", "'a_1'"]),
         (lambda x: {"hold": "d_1"}, ["'d_1' is held, not free"]),
-        (lambda x: {"capture": aj.Capture({"A": x.q[:, :5]})}, ["5 columns", "6 joints", "one column a joint"]),
+        (lambda x: {"capture": aj.Capture({"A": x.q[:, :5]})}, ["5 columns", "6 joints", "one column per joint"]),
         (
             lambda x: {"bounds": aj.Bounds(x.space, shifted(x, d_3=1.0), shifted(x, d_3=2.0))},
             ["the arm is outside the bounds: d_3 is 750, not within 751 to 752", "move the start or widen"],
@@ -206,7 +215,10 @@ def test_parameters_and_bounds(given, call, parts):
         (lambda x: {"start": shifted(x, a_4=11.0)}, ["the start is outside", "a_4 is 73, not within 52 to 72"]),
         (lambda x: {"start": shifted(x, a_4=np.nan)}, ["the start is outside", "a_4 is nan"]),
         (lambda x: {"max_steps": -1}, ["max_steps is -1", "at least 1"]),
-        (lambda x: {"start": x.start[:-2]}, ["the start has shape (19,)", "21 parameters are free", "one value each"]),
+        (
+            lambda x: {"start": x.start[:-2]},
+            ["the start has shape (19,)", "21 parameters are free", "one value per free parameter"],
+        ),
     ],
     ids=["misspelt", "angle", "held", "columns", "arm outside", "start outside", "start nan", "steps", "start short"],
 )
@@ -225,10 +237,13 @@ def test_identification(given, run, arguments, parts):
     [
         (
             lambda x: aj.calibrate(x.arm, aj.Capture({"A": x.q}), x.bounds),
-            ["no reference length", "add one", "identify for stage 1"],
+            ["no reference length", "add a reference length", "identify for stage 1"],
         ),
-        (lambda x: aj.fix_scale(x.arm, aj.Capture({"A": x.q})), ["no reference length", "add one"]),
-        (lambda x: aj.evaluate(x.arm, aj.Capture({"A": x.q[:, :5]})), ["5 columns", "6 joints", "one column a joint"]),
+        (lambda x: aj.fix_scale(x.arm, aj.Capture({"A": x.q})), ["no reference length", "add a reference length"]),
+        (
+            lambda x: aj.evaluate(x.arm, aj.Capture({"A": x.q[:, :5]})),
+            ["5 columns", "6 joints", "one column per joint"],
+        ),
         (
             lambda x: aj.calibrate(x.arm, x.capture, x.bounds, method="both"),
             ["method is 'both'", "two-stage, joint"],
@@ -358,12 +373,12 @@ def test_values_are_not_looked_at_inside_jit(given):
 
 # Of another type than the annotations say, which the run-time type checker of the tests would refuse first.
 WRONG_TYPES = {
-    "aj.Capture({'A': q, 'B': -q}, [('A', 'B', 100.0)])": "no reference length; give aj.ReferenceLength(",
+    "aj.Capture({'A': q, 'B': -q}, [('A', 'B', 100.0)])": "not a reference length; give aj.ReferenceLength(",
     "aj.Capture({1: q})": "a socket has the name 1",
     "aj.identify(arm, capture, bounds, noise=2.0)": "noise is 2.0; give a Noise.",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=2.5)": "poses is 2.5; give a whole number",
     "aj.simulate(arm, {'A': (400, 200, 300)}, poses=1, seed=1.5)": "seed is 1.5; give a whole number",
-    "aj.load_arm(None)": "a file is named by a NoneType",
+    "aj.load_arm(None)": "the path of a file is of type NoneType",
     "aj.Arm(alpha=[0.0], a=[1.0], d=[0.0], limits=[0, 1])": "limits must be 1 row of (lowest, highest)",
 }
 

@@ -74,13 +74,16 @@ def fit_sphere(points: Numbers) -> FittedSphere:
     given = points_of(points, "points on a sphere")
     if len(given) < EXACT_POINTS:
         raise InputError(
-            f"a sphere needs at least {EXACT_POINTS} points, but {len(given)} are given; touch it at more points."
+            f"a sphere needs at least {EXACT_POINTS} points, but {len(given)} are given; touch the sphere at more "
+            "points."
         )
     middle = given.mean(axis=0)
     centred = given - middle
     size = float(np.linalg.norm(centred, axis=1).max())
     if size == 0 or np.linalg.svd(centred / size, compute_uv=False)[2] < 1e-6:
-        raise InputError("the points on a sphere lie in one plane, which determines no sphere; touch it on all sides.")
+        raise InputError(
+            "the points on a sphere lie in one plane, which determines no sphere; touch the sphere on all sides."
+        )
     # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the centre; with lengths of about 1 it is also well conditioned.
     scaled = centred / size
     rows = np.column_stack([2 * scaled, np.ones(len(scaled))])

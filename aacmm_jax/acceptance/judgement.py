@@ -94,7 +94,7 @@ def worst(decisions: list[Decision]) -> Decision | None:
 def without_test(name: str, metrics: Collection[str]) -> str:
     """The end of a message on a metric that no test has: why it has none, or which names there are."""
     if name.strip().lower() == "e_bi":
-        return "; lengths probed from opposite directions cannot be recorded, and E_Uni is what is tested."
+        return "; lengths probed from opposite directions cannot be recorded, so E_Uni is tested instead."
     return nearest(name, metrics, len(metrics))
 
 
@@ -102,7 +102,7 @@ def checked_limit(limit: Limit, what: str) -> Limit:
     """The same limit, or `InputError` where it is impossible."""
     if not (0 <= limit.fixed <= MOST and limit.divisor >= LEAST_DIVISOR):
         raise InputError(
-            f"{what} is {limit} mm; A must be zero or positive and finite, and K at least {LEAST_DIVISOR:g}."
+            f"{what} is {limit} mm; in A+L/K, A must be zero or positive and finite, and K at least {LEAST_DIVISOR:g}."
         )
     return limit
 
@@ -115,7 +115,7 @@ def limit_of_text(text: str, given: str) -> Limit:
             raise ValueError(text)
         limit = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
     except ValueError as error:
-        raise InputError(f"{given} is not A or A+L/K with numbers in mm; give one such as 0.002+L/500000.") from error
+        raise InputError(f"{given} is not A or A+L/K with numbers in mm; give, for example, 0.002+L/500000.") from error
     return checked_limit(limit, given)
 
 
@@ -131,7 +131,7 @@ def read_limits(texts: list[str], metrics: Mapping[str, str]) -> dict[str, Limit
         if name is None:
             raise InputError(f"--mpe '{text}' names the unknown metric '{given}'{without_test(given, metrics)}")
         if name in limits:
-            raise InputError(f"--mpe gives {name} two limits; give it one.")
+            raise InputError(f"--mpe gives two limits for {name}; give one.")
         limits[name] = limit_of_text(value, f"--mpe {name}={value}")
     return limits
 
@@ -209,13 +209,13 @@ def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
             values = []
         if match is None or len(values) != 4:
             raise InputError(
-                f"--expansion '{text}' is not artefact=C,u,T,u or arm=C,u,T,u with C in 1e-6/K and T in C; for example "
-                "artefact=11.5,1,20.8,0.2."
+                f"--expansion '{text}' is not artefact=C,u,T,u or arm=C,u,T,u (coefficient C in 1e-6/K, temperature T "
+                "in degrees Celsius, each with its u); for example artefact=11.5,1,20.8,0.2."
             )
         if 0 < abs(values[0]) < _SMALLEST_GIVEN:
-            raise InputError(f"--expansion '{text}' gives the coefficient in 1/K; give it in 1e-6/K, 11.5 for steel.")
+            raise InputError(f"--expansion '{text}' gives the coefficient in 1/K; give it in 1e-6/K (steel: 11.5).")
         if match["body"] in expansions:
-            raise InputError(f"--expansion gives the {match['body']} two expansions; give it one.")
+            raise InputError(f"--expansion gives two expansions for the {match['body']}; give one.")
         body = Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:])
         expansions[match["body"]] = checked_fields(body, f"the {match['body']}")
     return expansions

@@ -51,7 +51,7 @@ def spat(points: Numbers) -> tuple[float, float]:
     """
     given = points_of(points, "points of a socket")
     if len(given) < 2:
-        raise InputError("one point has no scatter; articulate the arm about the socket and take at least two.")
+        raise InputError("one point has no scatter; articulate the arm about the socket and take at least two points.")
     distances = np.linalg.norm(given - given.mean(axis=0), axis=1)
     return float(distances.max()), 2 * math.sqrt(float(distances @ distances) / (len(given) - 1))
 
@@ -123,7 +123,7 @@ def two_rms(deviations: Numbers) -> float:
     """
     given = np.asarray(as_floats(deviations, "deviations"))
     if not given.size:
-        raise InputError("there are no deviations, so they have no root mean square; measure some.")
+        raise InputError("the root mean square of no deviations is not defined; give at least one deviation.")
     return 2 * math.sqrt(float(np.mean(given**2)))
 
 

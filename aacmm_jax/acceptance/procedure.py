@@ -119,7 +119,7 @@ def plan_procedure(
         97 poses, 20 bars
     """
     if not is_single(arm):
-        raise InputError("plan_procedure takes one arm, not a batch; give one of its arms.")
+        raise InputError("plan_procedure takes one arm, not a batch; give one arm of the batch.")
     search, reach = search_region(arm, None, margin, above, seed), arm_reach(arm)
     if reach.radius < 10 * diameter:
         raise InputError(
@@ -128,7 +128,7 @@ def plan_procedure(
     size = 2 * reach.radius if measuring_range is None else float(measuring_range)
     if not reach.radius / 2 <= size <= 4 * reach.radius:
         raise InputError(
-            f"a measuring range of {size:g} mm does not suit a reach of {reach.radius:.0f} mm; give a diameter in mm."
+            f"a measuring range of {size:g} mm does not suit a reach of {reach.radius:.0f} mm; give its diameter in mm."
         )
     if standard == "asme":
         default = [round(float(np.mean(bar)) * size / 2) for bar in BARS]
@@ -136,7 +136,9 @@ def plan_procedure(
         default = [round(_LONGEST_PLANNED * size * number / 5) for number in range(1, 6)]
     lengths = default if bars is None else sorted(map(float, bars))
     if len(lengths) != len(default):
-        raise InputError(f"{len(lengths)} bars are given, but {standard} takes {len(default)}; give as many.")
+        raise InputError(
+            f"{len(lengths)} bars are given, but {standard} needs {len(default)}; give {len(default)} bars."
+        )
     planner = _Planner(search, reach._replace(radius=size / 2), diameter, stylus)
     left_out = [] if bars is None else _unsuitable_bars(standard, size, lengths)
     if standard == "asme":
@@ -160,10 +162,10 @@ def plan_procedure(
 def _unsuitable_bars(standard: Planned, size: float, lengths: Sequence[float]) -> list[str]:
     if standard == "iso":
         least = LONGEST * size
-        sentence = f"The longest bar, {lengths[-1]:g} mm, is under 66 % of the range ({least:.0f} mm)."
+        sentence = f"The longest bar, {lengths[-1]:g} mm, is shorter than 66 % of the measuring range ({least:.0f} mm)."
         return [sentence] if lengths[-1] < least else []
     return [
-        f"A bar of {length:g} mm is not {bar_range(bar, size / 2)}."
+        f"A bar of {length:g} mm is outside the range of {bar_range(bar, size / 2)}."
         for bar, length in zip(BARS, lengths, strict=True)
         if not bar[0] <= length / (size / 2) <= bar[1]
     ]
@@ -191,7 +193,7 @@ class _Planner:
             try:
                 point, q = self._socket_in_zone(zone, SPAT_POSES)
             except _OutOfReach as error:
-                left_out.append(f"{error} The test leaves out that zone.")
+                left_out.append(f"{error} The test leaves out this zone.")
                 continue
             middle = point if name == "middle" else middle
             q = q[_both_sides(elbow_sides(self.search.arm, q, self.reach), q)]
@@ -199,7 +201,7 @@ class _Planner:
             self.sockets.append(ProcedureItem("single-point articulation", f"spat/{name}", 1, points, q))
         if middle is None:
             raise InputError(
-                f"{left_out[0]} Nothing can be tested without the middle zone; lower the table or the margin."
+                f"{left_out[0]} Nothing can be tested without the middle zone; give a lower table or a smaller margin."
             )
         sphere = self._sphere("sphere", "effective-diameter", middle)
         for number in range(1, 4):
@@ -248,8 +250,8 @@ class _Planner:
                 best = int(counts.argmax())
                 return points[best], q[owner == best]
         raise _OutOfReach(
-            f"No point at {percent(zone)} of the reach was found with {poses} poses within the joint limits and above "
-            "the table."
+            f"No point at {percent(zone)} of the reach was found that {poses} poses within the joint limits and above "
+            "the table can reach."
         )
 
     def _bar(self, name: str, length: float, positions: int, repeats: int, test: str) -> None:
@@ -261,8 +263,8 @@ class _Planner:
         start, end = start[good], end[good]
         if len(start) < positions:
             raise InputError(
-                f"a bar of {length:.0f} mm needs {positions} positions above the table, but {len(start)} were found; "
-                "give a lower --above-mm or a smaller --margin-deg."
+                f"a bar of {length:.0f} mm needs {positions} positions above the table, but only {len(start)} were "
+                "found; give a lower --above-mm or a smaller --margin-deg."
             )
         tips = [np.asarray(search.arm.position(q)) for q in (start, end)]
         between = (tips[1] - tips[0]) / length
@@ -362,7 +364,8 @@ def simulate_procedure(
         q, arrived = project_to_targets(true.arm, item.q, targets)
         if not np.all(arrived):
             raise InputError(
-                f"{item.test} '{item.name}': the true arm does not reach it; let it differ less from the nominal one."
+                f"{item.test} '{item.name}': the true arm does not reach it; let the true arm differ less from the "
+                "nominal arm."
             )
         return q + scatter * random.normal(size=q.shape)
 

@@ -111,15 +111,15 @@ def run(
     tests = [result for test in TESTS if (result := test.run(measured, influences)) is not None]
     tests = [test._replace(rule=rule or DEFAULT_RULES[test.standard]) for test in tests]
     if measured.none_held_out:
-        held_out = "Everything was used to identify the arm; measure sockets and lengths that were not."
+        held_out = "All data were used to identify the arm; measure sockets and lengths that were not used."
         tests = [test._replace(missing=(held_out, *test.missing)) for test in tests]
     present = {metric.name for test in tests for metric in test.metrics}
     for name in given:
         if name not in present:
-            held_out = " that the calibration was not identified from" if measured.identified_from else ""
+            held_out = "held-out " if measured.identified_from else ""
             raise InputError(
-                f"a limit is given for {name} ({METRICS[name]}), but the capture has nothing{held_out} to measure it on"
-                "; leave the limit out."
+                f"a limit is given for {name} ({METRICS[name]}), but the capture has no {held_out}data for this "
+                "metric; remove the limit."
             )
     return [
         test._replace(metrics=tuple(_decided(metric, given.get(metric.name), test.rule) for metric in test.metrics))
@@ -164,7 +164,8 @@ def _decided(metric: Metric, limit: Limit | None, rule: Rule) -> Metric:
     for value in metric.values:
         if value.length is None and math.isfinite(limit.divisor):
             raise InputError(
-                f"the limit of {metric.name} grows with a length, but the metric is not of one; give only a number."
+                f"the limit of {metric.name} grows with a length, but the metric does not measure a length; give a "
+                "constant limit."
             )
         most = limit.at(value.length or 0.0)
         values.append(value._replace(limit=most, decision=decide(value.value, most, value.expanded, rule)))
@@ -306,18 +307,21 @@ def evaluation_of(
     warnings = []
     if not record.converged or not record.plausible_scale:
         reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
-        warnings.append(f"The calibration failed, so the results mean nothing: {reason}")
+        warnings.append(f"The calibration failed, so the results are meaningless: {reason}")
     if recording.true is not None:
         warnings.append(SIMULATED)
     warnings += recording.capture.repeated.sentences()
     counts = ((name, count, len(readings[name])) for name, count in shared.items())
     if partly := [f"{name} ({count} of {poses} poses)" for name, count, poses in counts if 0 < count < poses]:
         names = ", ".join(partly)
-        warnings.append(f"The arm was identified from some poses of {names}; these count as identified from.")
+        warnings.append(
+            f"The arm was identified from some poses of {names}; the other poses of these sockets and observations "
+            "count as used, too."
+        )
     if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
         warnings.append(
             f"The capture is of '{recording.nominal.name}', but the calibration is of "
-            f"'{record.recording.nominal.name}'; check that it is the same arm."
+            f"'{record.recording.nominal.name}'; check that the arm is the same."
         )
     made_for = (*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres))
     evaluation = EvaluationRecord(
@@ -334,8 +338,8 @@ def evaluation_of(
     )
     if not evaluation.independent:
         warnings.append(
-            "The arm was identified from all of this capture, so the results are too favourable and are not a test; "
-            "measure what the calibration does not use."
+            "The calibration used all data of this capture, so the results are too favourable and are not a test; "
+            "measure sockets or lengths that the calibration does not use."
         )
     warnings += unstated_uncertainty_warning(evaluation.acceptance()["calibrated"])
     return evaluation._replace(warnings=tuple(warnings))
@@ -348,7 +352,7 @@ def _divided(arm: Arm, capture: Capture, used: Collection[bytes]) -> Capture:
         seen = np.array([row.tobytes() in used for row in np.asarray(observation.q)])
         parts = [observation]
         if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
-            unseen = observation.select(np.flatnonzero(~seen)).changed(name=f"{observation.name}, unseen")
+            unseen = observation.select(np.flatnonzero(~seen)).changed(name=f"{observation.name}, held out")
             try:
                 check_geometry(arm, Capture({}, [], [unseen]))
                 parts = [observation.select(np.flatnonzero(seen)), unseen]
@@ -369,8 +373,8 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     metrics = (metric for test in tests for metric in test.metrics)
     names = [metric.name for metric in metrics if metric.decision is not None and metric.worst.expanded == 0]
     sentence = (
-        f"No uncertainty was stated for {', '.join(names)}, so U is 0 and the decision ignores it; state what seat "
-        "and fixture contribute (--test-u-mm), and the temperatures (--expansion)."
+        f"No uncertainty was stated for {', '.join(names)}, so the decision takes U as 0; state the contribution "
+        "of seat and fixture (--test-u-mm) and the temperatures (--expansion)."
     )
     return [sentence] if names else []
 

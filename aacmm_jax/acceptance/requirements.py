@@ -1,7 +1,7 @@
 """The tests of the standards as data: metrics, what a test needs, from which source that is known, and how certain.
 
-What the texts say was not available to this project; a source names where the requirement was found, and no clause
-number that was not.
+The texts of the standards were not available to this project. A source names where the requirement was found; clause
+numbers are given only if they were found there.
 """
 
 import itertools
@@ -21,7 +21,7 @@ from .standards import ASME_B89_4_22, EDITIONS, ISO_10360_12, JJF_1408
 Confidence = Literal[
     "public source",  # a public page that is named
     "background",  # background knowledge of the standard, without a source at hand
-    "own reading",  # the standard asks for it in words; the number by which it is judged is ours
+    "own reading",  # required by the standard in words; the numerical limit is ours
 ]
 Metrics = Callable[[Measured, Influences], Sequence[Metric]]
 Origin = tuple[str, Confidence]  # the source, and how certain it is
@@ -37,7 +37,7 @@ class Requirement(NamedTuple):
     says: str
     source: str
     confidence: Confidence
-    # A sentence on what the measured lacks of it, "" where nothing; None where nothing recorded can tell.
+    # Gives a sentence on what is lacking, "" if nothing is; None if recorded data cannot show whether it is met.
     lacking: Callable[[Measured], str] | None = None
 
 
@@ -93,7 +93,7 @@ def _sphere_positions(measured: Measured, test: SphereTest, positions: int) -> i
 
 def _orientations(measured: Measured) -> str | None:
     if measured.postures is None:
-        return "Points do not tell the orientations of the probe; record joint readings."
+        return "Points alone do not show the orientations of the probe; record joint readings."
     for (name, test), groups in measured.postures.probes.items():
         if test == "articulation":
             means = geometry.unit_rows(np.array([directions.mean(axis=0) for directions in groups]))
@@ -104,7 +104,7 @@ def _orientations(measured: Measured) -> str | None:
 
 def _zones(measured: Measured) -> str | None:
     if measured.reach is None:
-        return "The reach of the arm and its shoulder are unknown, so that its zones cannot be told apart."
+        return "The reach and the shoulder of the arm are unknown, so its zones cannot be determined."
     radius = (measured.size or 0.0) / 2
     zones = {zone_of(measured, points) for points in articulated(measured).values()}
     absent = [
@@ -117,7 +117,7 @@ def _zones(measured: Measured) -> str | None:
 
 def _elbow(measured: Measured) -> str | None:
     if measured.postures is None:
-        return "Points do not tell on which side the elbow was; record joint readings."
+        return "Points alone do not show on which side the elbow was; record joint readings."
     bad = []
     for name in articulated(measured):
         sides = np.sin(measured.postures.elbows[name])
@@ -134,14 +134,14 @@ def _elbow(measured: Measured) -> str | None:
 def _two_bars(measured: Measured, positions: int) -> str | None:
     bars = _bars(measured)
     if len(bars) != len(BARS):
-        return f"Two bars are required, no fewer and no more ({len(bars)} given)."
+        return f"Exactly two bars are required ({len(bars)} given)."
     fewest = min(len(bar.lengths) for bar in bars)
     return None if fewest >= positions else f"Each bar is required in {positions} positions."
 
 
 def _bar_lengths(measured: Measured) -> str | None:
     if measured.size is None:
-        return "The reach of the arm is unknown, so that the lengths of the bars cannot be judged."
+        return "The reach of the arm is unknown, so the lengths of the bars cannot be checked."
     radius = measured.size / 2
     values = np.array([float(length.value) for length in measured.lengths]) / radius
     wanted = [bar_range(bar, radius) for bar in BARS if not np.any((values >= bar[0]) & (values <= bar[1]))]
@@ -152,7 +152,7 @@ def _longest(measured: Measured) -> str | None:
     if measured.measuring_range is None:
         return None  # a requirement of its own
     longest, least = max(float(length.value) for length in measured.lengths), LONGEST * measured.measuring_range
-    sentence = f"A length of {least:.0f} mm or more is required (66 % of the range); the longest has {longest:.0f} mm."
+    sentence = f"A length of {least:.0f} mm or more is required (66 % of the range); the longest is {longest:.0f} mm."
     return None if longest >= least else sentence
 
 
@@ -165,11 +165,11 @@ def _places(measured: Measured, by_bar: bool) -> str | None:
     """Of bars over the measuring volume; not judged where its size is unknown."""
     size = measured.size
     if size is None:
-        return "The size of the measuring volume is unknown, so that the places of the bars cannot be judged."
+        return "The size of the measuring volume is unknown, so the places of the bars cannot be checked."
     narrowest = min(bar.spread(size) for bar in _bars(measured, by_bar))
     sentence = (
-        f"The places must be spread over the measuring volume: their middles scatter by {100 * narrowest:.1f} % of "
-        f"it, and {100 * _LEAST_SPREAD:.0f} % are required."
+        f"The bars must be spread over the measuring volume: their midpoints scatter by {100 * narrowest:.1f} % of its "
+        f"size; at least {100 * _LEAST_SPREAD:.0f} % is required."
     )
     return None if narrowest >= _LEAST_SPREAD else sentence
 
@@ -179,8 +179,8 @@ def _places(measured: Measured, by_bar: bool) -> str | None:
 # both texts, {0} is what is lacking, {1} and so on the numbers that a test gives.
 _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     "size": (
-        "a sphere of {2} to {3} mm",
-        "A sphere of {2} to {3} mm is required ({0}).",
+        "a sphere with a diameter of {2} to {3} mm",
+        "A sphere with a diameter of {2} to {3} mm is required ({0}).",
         lambda m, test, low, high: _wrong(
             m, test, lambda s: [] if low <= s.diameter <= high else [f"'{s.name}' has {s.diameter:g} mm"]
         ),
@@ -191,8 +191,8 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         lambda m, test, points: _groups(m, test, lambda group: len(group) < points),
     ),
     "spread of touches": (
-        "touches evenly over at least a hemisphere: no gap wider by 8 degrees than those of the recommended pattern",
-        "The touches must be spread over a hemisphere ({0}: they are not).",
+        "touches spread over at least a hemisphere: no gap more than 8 degrees wider than in the recommended pattern",
+        "The touches must be spread over a hemisphere (not spread: {0}).",
         # Of groups that are too small, the number of touches speaks.
         lambda m, test, points: _groups(
             m, test, lambda group: len(group) >= points and not geometry.covers_hemisphere(group, points)
@@ -206,31 +206,31 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         ),
     ),
     "rings": (
-        "rings of touches turned against each other, by 22.5 deg or more (15 as touched by hand)",
-        "The rings of touches must be turned by 22.5 deg or more against each other ({0}).",
+        "each ring of touches rotated by at least 22.5 deg against the ring above it (15 deg accepted if by hand)",
+        "The rings of touches must be rotated by at least 22.5 deg relative to each other (not in {0}).",
         lambda m, test, points: _groups(
             m, test, lambda group: len(group) >= points and geometry.least_turn(group) < _LEAST_RING_TURN, "repeat"
         ),
     ),
     "places of the sphere": (
-        "the sphere in {2} positions, of which the worse counts; apart by 10 % of the range or more",
-        "The sphere must be measured in {2} positions far apart; it was in {0}.",
+        "the sphere in {2} positions at least 10 % of the range apart; the worse result counts",
+        "The sphere must be measured in {2} positions far apart; it was measured in {0}.",
         _sphere_positions,
     ),
-    "orientations": ("five different orientations of the probe, by 10 degrees or more", "{0}", _orientations),
+    "orientations": ("five orientations of the probe that differ by at least 10 degrees", "{0}", _orientations),
     "zones": (
         "a socket with 10 articulations in each of three zones: 0 to 20, 20 to 80, 80 to 100 % of the reach",
         "{0}",
         _zones,
     ),
     "elbow": (
-        "the elbow on the left and on the right: in 3 poses each or more, 15 degrees off the vertical",
+        "the elbow at least 15 degrees off the vertical, in at least 3 poses on the left and 3 poses on the right",
         "{0}",
         _elbow,
     ),
-    "two bars": ("two bars, each in {1} positions or more", "{0}", _two_bars),
+    "two bars": ("two bars, each in at least {1} positions", "{0}", _two_bars),
     "lengths of the bars": ("bars of 50 to 75 % and of 120 to 150 % of the reach", "{0}", _bar_lengths),
-    "longest": ("the longest length at least 66 % of the measuring range", "{0}", _longest),
+    "longest": ("a longest length of at least 66 % of the measuring range", "{0}", _longest),
     "lengths": (
         "{1} different calibrated lengths",
         "{1} different lengths are required ({0} given).",
@@ -238,37 +238,37 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     ),
     "readings": (
         "{1} readings of each length in each position",
-        "{1} readings in each position are required (a position has {0}).",
+        "{1} readings in each position are required (one position has {0}).",
         lambda m, needed: min(geometry.bar_positions(m).readings.tolist(), default=0),
     ),
     "positions": (
-        "{1} positions of the bars, different by 10 degrees, or in place by 5 % of the range",
+        "{1} positions of the bars that differ by at least 10 degrees in direction or 5 % of the range in place",
         "{1} different positions are required ({0} given).",
         lambda m, needed: sum(bar.distinct(m.size) for bar in _bars(m)),
     ),
     "positions of each": (
-        "{1} positions of every length, different by 10 degrees, or in place by 5 % of the range",
+        "{1} positions of every length that differ by at least 10 degrees in direction or 5 % of the range in place",
         "{1} different positions of every length are required (one has {0}).",
         lambda m, needed: min(bar.distinct(m.size) for bar in _bars(m)),
     ),
     "directions": (
-        "directions of the bars in all three dimensions, 10 degrees out of any plane (RMS)",
+        "bar directions spread over three dimensions: their RMS angle to every plane is at least 10 degrees",
         "The directions must be horizontal, vertical and inclined, not in one plane.",
         lambda m, by_bar: None if all(bar.in_all_directions for bar in _bars(m, by_bar)) else "",
     ),
     "places": (
-        "places over the measuring volume: middles scatter by 10 % of the range or more (RMS)",
+        "bars spread over the measuring volume: the RMS scatter of their midpoints is at least 10 % of the range",
         "{0}",
         _places,
     ),
     "socket": (
-        "a socket in {1} poses or more; the paper's Table 3 has 70",
+        "a socket in at least {1} poses (70 in the paper's Table 3)",
         "A socket measured in {1} poses or more is required.",
         lambda m, poses: None if any(len(points) >= poses for points in m.tested.values()) else "",
     ),
     "range": (
         "the measuring range is the one that the maker states",
-        "The measuring range that the maker states is not given (measuring_range).",
+        "The measuring range that the maker states is missing (measuring_range).",
         lambda m: "" if m.measuring_range is None else None,
     ),
 }
@@ -289,16 +289,16 @@ def _need(kind: str, origin: Origin, *numbers: int | str | bool) -> Requirement:
 _ASME: Origin = ("background knowledge of ASME B89.4.22", "background")
 _ASME_READING: Origin = (_ASME[0], "own reading")
 _KREON: Origin = ("digitalscan3d.com/iso-10360-12-standard-for-measuring-arms (Kreon)", "public source")
-_OBERON: Origin = ("oberon3d.com, on ISO 10360-12 (the same maker, in Polish)", "public source")
+_OBERON: Origin = ("oberon3d.com, on ISO 10360-12 (Kreon, in Polish)", "public source")
 _ISO_5: Origin = ("as in ISO 10360-5", "background")
 _PAPER = "Cheng et al. 2018, section 4"
-_RANGE = _need("range", ("data sheets of makers give it as a diameter", "background"))
+_RANGE = _need("range", ("data sheets of makers give the range as a diameter", "background"))
 _CONDITIONS = Requirement(
-    "the test is done within the maker's rated conditions: temperature and its gradients, warm-up, mounting",
+    "the test is done within the rated conditions of the maker: temperature and its gradients, warm-up, mounting",
     *("ISO 10360 and ASME B89.4.22 in general", "background"),
 )
 _CALIBRATED = Requirement(
-    "artefacts are calibrated and traceable, and are not those that the probe was qualified on",
+    "artefacts are calibrated and traceable, and differ from those on which the probe was qualified",
     *("ISO 10360 in general", "background"),
 )
 
@@ -376,14 +376,14 @@ TESTS = (
         "length error",
         metrics.length_error,
         _need("lengths", ("as in ISO 10360-2 (a maker's public summary: 5 gauges)", "background"), 5),
-        _need("positions of each", ("as in ISO 10360-2 (the same: 7 directions)", "own reading"), 7),
-        _need("readings", ("as in ISO 10360-2 (the same: 3 times)", "background"), 3),
+        _need("positions of each", ("as in ISO 10360-2 (a maker's public summary: 7 directions)", "own reading"), 7),
+        _need("readings", ("as in ISO 10360-2 (a maker's public summary: 3 readings)", "background"), 3),
         _need("directions", ("as in ISO 10360-2, with diagonals of the volume", "own reading"), True),
-        _need("places", ("the lengths are to sample the volume", "own reading"), True),
+        _need("places", ("the lengths must sample the volume", "own reading"), True),
         _RANGE,
-        _need("longest", ("as in ISO 10360-2 of the longest diagonal", "background")),
+        _need("longest", ("as in ISO 10360-2 for the longest diagonal", "background")),
         Requirement(
-            "lengths probed from one direction at both ends, or between centres; sockets are. E_Bi is another test",
+            "lengths probed from the same direction at both ends, or between centres, as with sockets (not E_Bi)",
             *("ISO 10360-12, symbols of makers", "background"),
         ),
         _CALIBRATED,

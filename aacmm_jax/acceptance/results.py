@@ -20,17 +20,17 @@ from .standards import EDITIONS, SYMBOLS
 METRICS = {
     "Deltam": "largest half range of a coordinate in a socket",
     "Length": "largest deviation of a length",
-    "Length_Range": "largest less smallest deviation of lengths",
+    "Length_Range": "largest minus smallest deviation of lengths",
     "Length_2RMS": "twice the RMS deviation of lengths",
     "D_Eff": "largest error of the effective diameter",
     "SPAT": "largest distance from the mean point",
     "SPAT_2s": "twice the standard deviation about the mean point",
     "Volumetric": "largest deviation of a bar",
-    "Volumetric_Range": "largest less smallest deviation of bars",
+    "Volumetric_Range": "largest minus smallest deviation of bars",
     "Volumetric_2RMS": "twice the RMS deviation of bars",
-    "P_Size": "size error of a sphere of 25 points",
-    "P_Form": "form error of a sphere of 25 points",
-    "L_Dia": "smallest sphere around five centres, one per orientation",
+    "P_Size": "size error of a sphere touched at 25 points",
+    "P_Form": "form error of a sphere touched at 25 points",
+    "L_Dia": "diameter of the smallest sphere around five centres, one per orientation",
     "E_Uni": "length error of single readings, unidirectional",
 }
 

@@ -207,19 +207,21 @@ def _laid_out(
     # A batch is distributed over threads by its values, so that it cannot be traced.
     if not is_concrete(*jax.tree.leaves((arm, capture, lower, upper, start))):
         raise InputError(
-            f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call it outside, "
-            f"or use jax.vmap of {single} there."
+            f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call {single}_many "
+            f"outside of these, or use jax.vmap of {single} inside."
         )
     if isinstance(lower, Bounds):
         for what, given in (("upper bounds", upper), ("a space", options.space)):
             if given is not None:
                 raise InputError(
-                    f"Bounds are given, and {what} as well, which they hold already; leave one out (a start goes by "
-                    "its name: start=...)."
+                    f"a Bounds object and {what} are both given, but Bounds already contain {what}; omit one of "
+                    "them (give a start by its name: start=...)."
                 )
         lower, upper, space = lower.lower, lower.upper, lower.space
     elif upper is None:
-        raise InputError("lower bounds are given without upper ones; give both, or Bounds, which hold both.")
+        raise InputError(
+            "lower bounds are given without upper bounds; give both, or a Bounds object, which contains both."
+        )
     else:
         space = Parameters.free_of(arm) if options.space is None else options.space
     check_finite(noise=options.noise)
@@ -238,16 +240,17 @@ def _laid_out(
     sizes |= {np.shape(length.value)[0] for length in capture.lengths if np.ndim(length.value)}
     if not sizes:
         raise InputError(
-            "nothing is a batch: give start, lower or upper as (batch, p), a batch of arms or of captures; or use "
-            "identify."
+            "no argument is a batch; give start, lower or upper with shape (batch, p), or a batch of arms or "
+            "captures; for a single problem, use identify."
         )
     if sizes == {0} or len(sizes) > 1:
         numbers = " and ".join(map(str, sorted(sizes)))
-        several = f"batches of {numbers} problems do not fit together; give each the same number."
+        several = f"batches of {numbers} problems cannot be combined; give every batch the same number of problems."
         raise InputError(several if len(sizes) > 1 else "the batch is empty; give at least one problem.")
     for row, i in np.argwhere(~(np.atleast_2d(boxes["lower"]) <= np.atleast_2d(boxes["upper"]))):
         raise InputError(
-            f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen them."
+            f"lower bound of {space.names[i]} is above its upper bound in problem {row + 1}; exchange or widen the "
+            "bounds."
         )
     space = based_on(space, arm)
     return Problems(*to_numpy((space.base, capture)), **boxes, near=None), space, sizes.pop()
@@ -267,7 +270,7 @@ class _Batch(NamedTuple):
         options = self.options
         devices = jax.local_devices() if options.devices is None else items_of(options.devices, "devices")
         if not devices:
-            raise InputError("devices is empty; name at least one, or leave it out.")
+            raise InputError("devices is empty; name at least one device, or omit devices.")
         slots, workers = _SLOTS_ELSEWHERE, len(devices)
         if devices[0].platform == "cpu":
             slots = min(_SLOTS_CPU, 2 ** max(round(math.log2(_POSES_IN_CACHE / len(self.form.pose))), 0))

@@ -101,11 +101,11 @@ def evaluate(
     """
     check_columns(arm, capture.columns)
     if capture.q.ndim > 2:
-        raise InputError("the capture is a batch; evaluate its captures one by one, or map over them with jax.vmap.")
+        raise InputError("the capture is a batch; evaluate each capture of the batch separately, or use jax.vmap.")
     check_finite(noise=noise)
     observed = Observed.of(capture, arm, lengths=False)
     if not isinstance(geometry, Mapping | None):
-        raise InputError("geometry must be a dictionary; give that of a calibration: result.observed.geometry.")
+        raise InputError("geometry must be a dictionary; give the geometry of a calibration: result.observed.geometry.")
     kept, given = {}, geometry or {}
     for name, units in observed.blocks.items():
         if name in given:
@@ -115,7 +115,7 @@ def evaluate(
     if given and not kept:
         first = next(iter(given))
         raise InputError(
-            f"the capture has no '{first}' or other part of this geometry{nearest(first, observed.blocks)}"
+            f"the capture has no '{first}' and no other part of this geometry{nearest(first, observed.blocks)}"
         )
     whole = bool(capture.observations) or bool(kept) or noise is not None
     subject = observed, *to_numpy((capture.lengths, kept, noise))

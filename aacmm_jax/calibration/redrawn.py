@@ -299,8 +299,8 @@ class ObservedTruth(NamedTuple):
         """
         if self.reading.max() + 1 < len(self.reading):
             raise InputError(
-                "some poses have exactly the readings of others, such as two targets seen at once, so they cannot be "
-                "drawn one by one; use monte_carlo."
+                "some poses have exactly the same readings (two targets seen at the same time, for example), so "
+                "poses cannot be drawn independently; use monte_carlo."
             )
         values = self.values(count, random, {name: value for name, (value, _) in self.observed.certified().items()})
         observations = []
@@ -308,8 +308,8 @@ class ObservedTruth(NamedTuple):
             observation = part.observation
             if np.bincount(observation.places).max() < 2:
                 raise InputError(
-                    f"observation '{observation.name}' has one pose in each point, so none can be drawn in the place "
-                    "of another; record several, or use monte_carlo."
+                    f"observation '{observation.name}' has only one pose per point, so no pose can be drawn in "
+                    "place of another; record several poses per point, or use monte_carlo."
                 )
             rows = np.empty((count, observation.q.shape[0]), dtype=int)
             for place in range(observation.places.max() + 1):
@@ -352,7 +352,9 @@ def truth_of(result: Calibration, capture: Capture) -> SocketTruth | ObservedTru
     geometry = result.observed.geometry
     for name in Observed.of(capture, None).blocks:
         if name not in geometry:
-            raise InputError(f"the calibration does not have the {name}; give the capture that it was identified from.")
+            raise InputError(
+                f"the calibration does not contain the {name}; give the capture from which the arm was calibrated."
+            )
     space = Parameters(result.arm, result.space.names)
     return ObservedTruth.at(capture, space, result.parameters, geometry)._replace(shared=shared)
 

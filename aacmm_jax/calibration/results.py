@@ -200,8 +200,8 @@ class AbstractSingleResult(AbstractResult):
     def _check_single(self) -> None:
         if self.active.ndim != 1 or not is_concrete(self.active):
             raise InputError(
-                "this result is a batch, or inside jit or vmap, where its values are not known; take one result of it "
-                "outside: jax.tree.map(lambda leaf: leaf[0], results)."
+                "this result is a batch, or is traced by jit or vmap, where its values are not known; outside jit "
+                "and vmap, select one result of the batch: jax.tree.map(lambda leaf: leaf[0], results)."
             )
 
 
@@ -293,7 +293,7 @@ class AbstractManyResults(AbstractResult):
     def u(self) -> Float[np.ndarray, "b p"]:
         """Standard uncertainties of the parameters, mm and rad. Raises `InputError` where they were not computed."""
         if self.covariance is None:
-            raise InputError("the batch was solved without covariances; solve it with covariance=True.")
+            raise InputError("the batch was solved without covariances; solve the batch with covariance=True.")
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     @property

@@ -72,19 +72,19 @@ class Sampled(NamedTuple):
 
     def sentences(self) -> list[str]:
         """Whether the linear result may be used, and where not."""
-        unstable = f"After {self.trials} trials the intervals are not yet stable; allow more."
-        failed = f"{self.failed} of {self.trials} trials did not converge and are left out."
+        unstable = f"After {self.trials} trials the intervals are not yet stable; allow more trials."
+        failed = f"{self.failed} of {self.trials} trials did not converge and were left out."
         sentences = [unstable] * (not self.stable) + [failed] * (self.failed > 0)
         apart = [name for name, good in zip(self.quantities, self.agrees, strict=True) if not good]
         says = (
-            f"agree with those of {self.trials} Monte Carlo trials within the tolerance of JCGM 101, for every "
-            f"parameter{', k,' if 'k' in self.quantities else ''} and lengths over the volume."
+            f"agree with the intervals from {self.trials} Monte Carlo trials within the tolerance of JCGM 101, for "
+            f"every parameter{', k,' if 'k' in self.quantities else ''} and lengths over the volume."
         )
         if apart:
             says = (
-                "differ from the Monte Carlo ones by more than the tolerance of JCGM 101 for "
-                f"{len(apart)} of {len(self.quantities)} quantities: {', '.join(apart[:8])}"
-                f"{' ...' if len(apart) > 8 else ''}; use the Monte Carlo ones."
+                f"differ from the Monte Carlo intervals by more than the tolerance of JCGM 101 for {len(apart)} of "
+                f"{len(self.quantities)} quantities: {', '.join(apart[:8])}{' ...' if len(apart) > 8 else ''}; use "
+                "the Monte Carlo intervals."
             )
         return [*sentences, f"The linear {100 * self.level:g} % intervals {says}"]
 
@@ -141,7 +141,7 @@ def monte_carlo(
     noise = result.noise if noise is None else noise
     block = max(math.ceil(100 / (1 - level)), 10_000)
     if most < block:
-        raise InputError(f"most is {most}, but one block of trials has {block}; allow that many at least.")
+        raise InputError(f"most is {most}, but one block has {block} trials; allow at least {block} trials.")
     repeated, truth = Repeated.of(result, capture, lengths), truth_of(result, capture)
     freedom = result.degrees_of_freedom
     values, failed, blocks, stable = [], 0, [], False
@@ -209,7 +209,7 @@ def bootstrap(
     random, repeated = random_generator(seed), Repeated.of(result, capture, None, robust)
     captures = truth_of(result, capture).resampled(trials, random)
     values, failed = repeated.solved(captures, repeated.prior_means(trials, random, about_means=True))
-    _check_some(values, trials, "bootstrap", "there are too few poses a socket for this, so record more")
+    _check_some(values, trials, "bootstrap", "there are too few poses per socket for a bootstrap; record more poses")
     return repeated.sampled(values, failed, level, 1)
 
 
@@ -242,20 +242,21 @@ class Repeated(NamedTuple):
         joint = result.method == "joint"
         if not joint and (capture.observations or robust is not None):
             raise InputError(
-                "the calibration is of sockets and lengths without a robust loss; give its own capture and loss."
+                "the calibration used sockets and lengths without a robust loss; give the capture of this "
+                "calibration, and no robust loss."
             )
         lost = any(bool(np.any(np.asarray(weights) < 1)) for weights in result.observed.weights)
         if joint and lost and robust is None:
             raise InputError(
-                "a robust loss took weight from poses of this calibration; name it for the bootstrap (robust='huber'), "
-                "which keeps such poses, or calibrate without it."
+                "a robust loss reduced the weight of poses in this calibration; give the bootstrap, which keeps "
+                "such poses, the same loss (robust='huber', for example), or calibrate without a robust loss."
             )
         if lengths is None:
             lengths = sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))
         shapes = [np.shape(poses) for poses in lengths] if isinstance(lengths, tuple | list) else []
         if len(shapes) != 2 or len(shapes[0]) != 2 or shapes[0] != shapes[1]:
             raise InputError(
-                "lengths must be two arrays of poses, (v, n) each: where each length starts, and where it ends."
+                "lengths must be two arrays of poses, each of shape (v, n): the start and the end of each length."
             )
         return cls(result, (np.asarray(lengths[0]), np.asarray(lengths[1])), robust)
 

@@ -142,13 +142,13 @@ def _checked_hold(hold: object, space: Parameters, lengths: list[str], concrete:
         raise InputError(f"hold is {shown(hold)}; give the name of a length, 'longest' or None.")
     if hold not in (None, "longest", *lengths):
         space.index(hold)
-        example = f", for example '{lengths[0]}'" if lengths else ", or leave out hold, since no length is free"
+        example = f", for example '{lengths[0]}'" if lengths else ", or omit hold, since no length is free"
         raise InputError(f"hold is '{hold}', which is an angle; hold a length{example}.")
     if hold == "longest" and (not lengths or len(space.names) == 1):
         return None
     if hold == "longest" and not concrete:
         raise InputError(
-            "hold='longest' needs an arm with known values; where the arm itself is traced, name the length to hold."
+            "hold='longest' needs an arm with known values; if the arm itself is traced, name the length to hold."
         )
     return hold
 
@@ -178,13 +178,14 @@ def method_of(
     method = default_method(arm, at_once) if method is None else method
     if method == "two-stage" and at_once:
         raise InputError(
-            "method='two-stage' is for sockets with reference lengths, without a robust loss, a prior and covariances "
-            "of batches; use method='joint'."
+            "method='two-stage' is for sockets with reference lengths, without a robust loss, without a prior and "
+            "without covariances of batches; use method='joint'."
         )
     if not by_slides and not fixes_scale(capture):
         raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two sockets, or take "
-            "the scale from the nominal arm (--scale nominal; from Python, identify for stage 1 alone)."
+            "the capture contains no reference length, so the scale cannot be fixed; add a reference length "
+            "between two sockets, or take the scale from the nominal arm (--scale nominal; from Python, identify "
+            "for stage 1 alone)."
         )
     return method, at_once
 

@@ -130,7 +130,8 @@ def task_of(arm: Arm, capture: Capture, bounds: Bounds, solving: Solving) -> Tas
     what = "the arm" if solving.start is None else "the start"
     if vector.shape != (len(space.names),):
         raise InputError(
-            f"{what} has shape {vector.shape}, but {len(space.names)} parameters are free; give one value each."
+            f"{what} has shape {vector.shape}, but {len(space.names)} parameters are free; give one value per free "
+            "parameter."
         )
     if is_concrete(vector, bounds.lower, bounds.upper):
         values, lower, upper = (np.asarray(x) for x in (vector, bounds.lower, bounds.upper))
@@ -180,7 +181,7 @@ def checked_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joi
     if noise_model == "given" and noise is None:
         raise InputError("noise_model='given' needs the noise; give noise=aj.Noise(encoder_arcsec=..., seating=...).")
     if noise_model == "estimated" and noise is not None:
-        raise InputError("the noise is given, so it is not estimated; leave out noise, or choose another noise_model.")
+        raise InputError("the noise is given, so it is not estimated; omit noise, or choose another noise_model.")
     return noise_model
 
 
@@ -238,15 +239,15 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
         axes = [np.asarray(forward.frame[i])[:, np.concatenate(parts)] for i in (0, 2)]
         if max(np.ptp(axis, axis=1).max() for axis in axes) < _LEAST_TURN:
             raise InputError(
-                f"target '{target}' was seen from one orientation of the last frame, in which its place cannot be told "
-                "from that of the instrument; take poses with the wrist turned."
+                f"target '{target}' was seen in only one orientation of the last frame, so the position of the "
+                "target cannot be distinguished from that of the instrument; record poses with the wrist turned."
             )
     geometry = len(observed.steps)
     if observed.equations < count + geometry:
         raise InputError(
-            f"the observations give {observed.equations} equations, but {count + geometry} numbers are unknown "
-            f"({count} parameters and {geometry} of the unknown geometry); record more poses, fix more parameters, or "
-            "give a prior of them together with the noise."
+            f"the observations give {observed.equations} equations, but there are {count + geometry} unknowns "
+            f"({count} parameters and {geometry} coordinates of the geometry); record more poses, fix more "
+            "parameters, or give both a prior of the parameters and the noise."
         )
 
 
@@ -391,8 +392,9 @@ def fit(task: Task, args: Args, z: Float[AnyArray, " n"], begun: Begun, rules: R
         last = minimise(observed_model, z, args, box, rules, task.max_steps)
         return Fit(last.y, last.steps, reasons(last.reason), last.optimality)
     # Optimistix takes 0.2 s to import, and NumPy needs none of it.
-    from ..solver.bounded import least_squares
+    from ..solver.bounded import BoundedLevenbergMarquardt, least_squares
 
+    solver = BoundedLevenbergMarquardt(**rules._asdict())
     within: dict[str, Any] = {**box._asdict(), "max_steps": task.max_steps}
-    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=rules, throw=False, **within)
+    solution = least_squares(observed_rows, z, args, normal=observed_model, solver=solver, throw=False, **within)
     return Fit(solution.value, *(solution.stats[name] for name in ("num_steps", "reason", "optimality")))

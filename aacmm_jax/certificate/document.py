@@ -56,7 +56,8 @@ def dcc_xml(
     if not record.converged:
         reason = record.reason.partition(";")[0].rstrip(".")
         raise InputError(
-            f"a calibration that failed has no certificate ({reason}); calibrate again until it converges."
+            f"a certificate cannot be issued: the calibration failed ({reason}); calibrate again until the calibration "
+            "converges."
         )
     if record.method == REPEATABILITY:
         raise InputError(
@@ -65,15 +66,15 @@ def dcc_xml(
         )
     if not record.plausible_scale:
         raise InputError(
-            f"k = {record.k:.6g} cannot be the scale of an arm, so there is no certificate; correct the lengths and "
-            "calibrate again."
+            f"a certificate cannot be issued: k = {record.k:.6g} is not a plausible scale of an arm; correct the "
+            "reference lengths and calibrate again."
         )
     _check_evaluation(record, administrative_data, evaluation)
     try:
         day = datetime.datetime.fromisoformat(record.recording.measured or created).date()
     except ValueError as error:
         raise InputError(
-            f"created is '{created}'; give a date and time after ISO 8601, such as 2026-01-31T12:00:00."
+            f"created is '{created}'; give a date and time as in ISO 8601, such as 2026-01-31T12:00:00."
         ) from error
     root = element(
         "digitalCalibrationCertificate",
@@ -101,12 +102,12 @@ def _check_evaluation(
         check_conformity(administrative_data, simulated=simulated)
         if administrative_data.conformity is not None:
             raise InputError(
-                "conformity is stated, but the certificate has no acceptance results that it rests on; give an "
-                "evaluation with limits (--evaluation), or leave [conformity] out."
+                "conformity is stated, but the certificate has no acceptance results to support it; give an "
+                "evaluation with limits (--evaluation), or remove [conformity]."
             )
         return
     if not same_arm(record.calibrated.arm, evaluation.calibrated.arm):
-        raise InputError("the evaluation is of another calibration; evaluate this one.")
+        raise InputError("the evaluation is of another calibration; evaluate this calibration.")
     simulated |= evaluation.recording.true is not None
     tests = evaluation.acceptance()["calibrated"]
     decision = worst([test.decision for test in tests if test.decision is not None])
@@ -151,12 +152,13 @@ def _core(administrative_data: AdministrativeData, day: datetime.date) -> Elemen
     end = given.end or max(day, begin)
     if given.received is not None and given.received > begin:
         raise InputError(
-            f"certificate.received is {given.received}, after the calibration began on {begin}; "
-            "correct it, or state begin."
+            f"certificate.received ({given.received}) is later than the beginning of the calibration ({begin}); "
+            "correct certificate.received, or state certificate.begin."
         )
     if given.issued is not None and given.issued < end:
         raise InputError(
-            f"certificate.issued is {given.issued}, before the calibration ended on {end}; correct it, or state end."
+            f"certificate.issued ({given.issued}) is earlier than the end of the calibration ({end}); correct "
+            "certificate.issued, or state certificate.end."
         )
     return element(
         "coreData",
@@ -174,14 +176,13 @@ def _core(administrative_data: AdministrativeData, day: datetime.date) -> Elemen
 
 def _statements(record: CalibrationRecord, given: AdministrativeData, sources: Sequence[str]) -> Iterator[Element]:
     if record.recording.true is not None:
-        yield _statement("Simulation", "The readings are simulated, so this is no certificate of a real arm.")
-    scale = "the reference lengths alone: its measurements are traceable as far as these lengths are"
+        yield _statement("Simulation", "The readings are simulated, so this is not a certificate of a real arm.")
+    scale, traceable = "the reference lengths alone", "the reference lengths"
     if record.recording.capture.observations:
-        scale = (
-            f"{', '.join(scale_sources(record))}: its measurements are traceable as far as the certified values of "
-            "these artefacts, and the instruments that measured, are"
-        )
-    yield _statement("Scale", f"The scale of the arm comes from {scale}, and have no other connection to the metre.")
+        scale = ", ".join(scale_sources(record))
+        traceable = "the certified values of these artefacts and the measuring instruments"
+    says = f"The scale of the arm comes from {scale}. Measurements of the arm are traceable to the metre"
+    yield _statement("Scale", f"{says} only as far as {traceable} are.")
     yield _statement("Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
@@ -207,7 +208,7 @@ def _statement(name: str, words: str, verdict: Element | None = None, *, norm: s
 
 def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
     """The measurement results of the acceptance tests of an evaluation, if it has any."""
-    which = "." if record.independent else ", as far as there are any: here there are none."
+    which = "not used." if record.independent else "used: there are no others."
     # With the uncertainties of their own certificates.
     lengths = [record.recording.capture.lengths[i] for i in record.held_out_lengths()]
     values = {f"Length {x.start} - {x.end}": (float(x.value), float(x.u)) for x in lengths}
@@ -221,8 +222,8 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
         if not tests:
             continue
         status = {"nominal": "beforeAdjustment", "calibrated": "afterAdjustment"}[stage]
-        formulas = "Formulas and requirements as secondary sources state them."
-        contributions = "Contributions of the tester alone (ISO 14253-5), combined as independent ones."
+        formulas = "Formulas and requirements are taken from secondary sources."
+        contributions = "Only the contributions of the tester (ISO 14253-5), combined as independent."
         data = element("data", english("text", _influences(record)))
         condition = named("influenceCondition", "Uncertainty of the test", element("status", status), data)
         editions = dict.fromkeys(test.called for test in tests)
@@ -239,7 +240,7 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
             artefacts,
             element("influenceConditions", condition),
             element("results", (_test(test, judged=record.recording.true is None) for test in tests)),
-            says=f"Of single readings in poses that the calibration has not used{which}",
+            says=f"Computed from single readings in poses that the calibration has {which}",
         )
 
 
@@ -252,13 +253,14 @@ def _influences(record: EvaluationRecord) -> str:
         if body is not None:
             parts.append(
                 f"the {name} expands by {body.coefficient:.4g} / K (u = {body.u_coefficient:.2g} / K), at "
-                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected"
+                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this"
             )
-    return "; ".join(parts) + ". The arm's own scatter is what is tested."
+    return "; ".join(parts) + ". The arm's own scatter is what is tested, so it is not included."
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:
-    lacking = f"Not the full procedure. {' '.join(test.missing)}" if test.missing else "The full procedure."
+    full, missing = "The full procedure was", " ".join(test.missing)
+    lacking = f"{full} not carried out. {missing}" if missing else f"{full} carried out."
     lists = (
         named(
             "list",
@@ -284,7 +286,7 @@ def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, 
             "metaData",
             f"Conformity of {test.symbol(metric)}",
             element("norm", RULES[test.rule]),
-            english("declaration", f"|value| against the maximum permissible error: {value.decision}."),
+            english("declaration", f"|value| compared with the maximum permissible error: {value.decision}."),
             element("conformity", _conformity(value)),
             element("data", limit),
         )

@@ -21,14 +21,17 @@ from ..uncertainty.degrees_of_freedom import LEVEL
 from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
-_METHODS = {"two-stage": "from repeatability first, and then the scale from the lengths", "joint": "from both jointly"}
+_METHODS = {
+    "two-stage": "first from repeatability, and then the scale from the lengths",
+    "joint": "from repeatability and lengths together",
+}
 _METRICS = {
     "DE": ("de", "Mean distance of the tip from its mean position in the socket"),
     "Deltam": ("deltam", "Largest half range of a coordinate of the tip in a socket"),
     "RMS": ("rms", "Root mean square distance of the tip from its mean position in the socket"),
 }
 _FIXED_SCALE = (
-    "This length fixed the scale, so that the arm measures it as calibrated by construction; no error was measured."
+    "This length fixed the scale, so the arm measures its calibrated value by construction; no error was measured."
 )
 _DECIMALS = {MILLIMETRE: 5, ONE: 3, RADIAN: 8}  # of what has no uncertainty
 _SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared as one
@@ -42,7 +45,7 @@ def results_of(record: CalibrationRecord, given: AdministrativeData, command: st
         celsius = real(given.certificate.temperature_celsius, xml.CELSIUS, given.certificate.temperature_u_celsius)
         temperature = named("quantity", "Ambient temperature", celsius)
     for stage, status, says in (
-        ("nominal", "before", "The readings, evaluated with the nominal parameters, those before the calibration."),
+        ("nominal", "before", "The readings, evaluated with the nominal parameters (those before the calibration)."),
         (
             "calibrated",
             "after",
@@ -64,55 +67,56 @@ def results_of(record: CalibrationRecord, given: AdministrativeData, command: st
 
 def uncertainty_statement(record: CalibrationRecord) -> str:
     """How the uncertainties were evaluated, and what they do not include."""
-    noise = "as it was given" if record.noise_model == "given" else "as estimated from the residuals"
+    noise = "as given" if record.noise_model == "given" else "as estimated from the residuals"
     sources = "uncertainty of the reference lengths"
     if record.recording.capture.observations:
-        sources = "uncertainties of what was measured and certified"
+        sources = "uncertainties of measured and certified values"
     if record.prior is not None:
         groups = ". ".join(map(prior_sentence, prior_rows(record.prior)))
         sources += (
-            ", and from what was known of the parameters beforehand, as normal distributions (standard deviation of "
-            f"each group: {groups})"
+            ", and from prior knowledge of the parameters, stated as normal distributions (standard deviation of each "
+            f"group: {groups})"
         )
     model = "Denavit-Hartenberg model"
     if record.calibrated.arm.corrections is not None:
         model += " with the joint corrections below"
     return (
-        "Expanded uncertainties are standard uncertainties times the coverage factor that is stated with each: of "
-        f"Student's t for a coverage probability of {LEVEL:.0%} and the effective degrees of freedom of that quantity, "
-        "which follow from what each part of its variance rests on. "
-        f"They follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and from the "
-        f"{sources}. They apply to each parameter alone; the parameters are correlated, as the covariance matrix says. "
-        "Expanded uncertainties have two digits, and values are rounded to them. "
+        "Each expanded uncertainty is the standard uncertainty times the coverage factor stated with it. This factor "
+        f"is that of Student's t distribution for a coverage probability of {LEVEL:.0%} and the effective degrees of "
+        "freedom of the quantity, which follow from what each part of its variance rests on. The standard "
+        f"uncertainties follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and "
+        f"from the {sources}. Uncertainties apply to each parameter alone; the covariance matrix gives the "
+        "correlations. Expanded uncertainties are rounded to two digits, and values to the same decimal place. "
         f"Errors that the {model} does not describe are not included."
     )
 
 
 def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, ...]) -> Element:
     capture = record.recording.capture
-    poses = f"Number of sockets in which the tip was seated: {len(capture.sizes)}; of poses: {sum(capture.sizes)}; of "
+    poses = f"Sockets in which the tip was seated: {len(capture.sizes)}; poses in sockets: {sum(capture.sizes)}; "
     lengths = f"reference lengths between sockets: {len(capture.lengths)}"
     squares = "Parameters were identified by bounded least squares"
     words = (
-        f"{poses}{lengths}. {squares}, {_METHODS[record.final_method]}: those with which the positions of "
-        "the tip in each socket agree best, and the distances between the sockets with the reference lengths."
+        f"{poses}{lengths}. {squares}, {_METHODS[record.final_method]}. With these parameters, the positions of the "
+        "tip in each socket agree best, and the distances between sockets agree best with the reference lengths."
     )
     if not record.sockets_alone:
         others = len(capture.observations)
         words = (
-            f"{poses}{lengths}; of other observations: {others}, of their poses: "
-            f"{len(capture.readings) - sum(capture.sizes)}. {squares} together with the unknown geometry of each "
-            "observation, weighted by the uncertainties of what was measured and by the scatter of the tip."
+            f"{poses}{lengths}; other observations: {others}; poses in these observations: "
+            f"{len(capture.readings) - sum(capture.sizes)}. {squares}, together with the unknown geometry of each "
+            "observation. Weights follow from the uncertainties of the measured values and from the scatter of the tip."
         )
     if record.robust:
         words += (
-            f" The robust loss '{record.robust}' took weight from poses with large residuals; "
-            f"{len(less_weight(residuals))} have half of their weight or less."
+            f" The robust loss '{record.robust}' reduced the weight of poses with large residuals; "
+            f"{len(less_weight(residuals))} poses have half of their weight or less."
         )
     if record.removed:
         groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
         words += (
-            f" Left out, because they contradict the rest by an F test: {groups}; see the statements on data left out."
+            f" These data were left out because, by an F test, they contradict the rest: {groups}; see the statements "
+            "on data left out."
         )
     statement = uncertainty_statement(record)
     return element(
@@ -181,7 +185,7 @@ def _results(
             named("quantity", name, real(value, MILLIMETRE, decimals=_DECIMALS[MILLIMETRE]), says=_METRICS[name][1])
             for name, value in values.items()
         )
-        yield _result("Repeatability", "Over all sockets with more than one pose.", quantities)
+        yield _result("Repeatability", "Computed over all sockets with more than one pose.", quantities)
     if record.recording.capture.lengths:
         yield _lengths(record, evaluation, calibrated, uncertainty)
     if not record.sockets_alone:
@@ -199,7 +203,7 @@ def _results(
         k = real(record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
         yield _result(
             "Scale",
-            "Reference lengths as the arm measured them before its scale was set, over their calibrated values.",
+            "Reference lengths that the arm measured before its scale was set, divided by their calibrated values.",
             named("quantity", "k", k),
         )
 
@@ -238,8 +242,8 @@ def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool
         rows.append(element("list", text("name", _length_name(number, length)), construction, quantities))
     return _result(
         "Reference lengths",
-        "An error is the measured value minus the calibrated one; its uncertainty is that of the calibrated value and "
-        "of the scatter of the poses at both ends.",
+        "An error is the measured value minus the calibrated one; its uncertainty includes that of the calibrated "
+        "value and the scatter of the poses at both ends.",
         *rows,
     )
 
@@ -273,13 +277,13 @@ def _parameters(record: CalibrationRecord, calibrated: bool, uncertainty: Uncert
         measured = real(value, _in_d_si(parameter_unit(arm, name)), u, factors.get(name))
         quantities.append(named("quantity", name, measured, says=note))
     corrections = (
-        " To theta (d of a prismatic joint) each joint correction adds its coefficient times a known function of the "
-        "readings; gravity is its direction in the base frame."
+        " Each joint correction adds its coefficient times a known function of the readings to theta (to d for a "
+        "prismatic joint). The gravity components give the direction of gravity in the base frame."
     )
     return _result(
         "Denavit-Hartenberg parameters",
-        "Standard convention; of one joint: Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is the tip in the "
-        "last frame." + ("" if arm.corrections is None else corrections),
+        "Standard convention; the transform of a joint is Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta). The probe is "
+        "the tip in the last frame." + ("" if arm.corrections is None else corrections),
         *quantities,
     )
 
@@ -306,9 +310,9 @@ def _covariance(record: CalibrationRecord) -> Element | None:
         rows.append(element("quantity", text("name", record.names[i]), row))
     return _result(
         "Covariance matrix",
-        "Of the parameters with an uncertainty of their own, a row each, columns in the same order. The diagonal has "
-        "the squares of the standard uncertainties. Expanded uncertainties elsewhere are rounded; what is computed of "
-        "several parameters needs this table.",
+        "Covariances of the parameters that have an uncertainty of their own: one row per parameter, columns in the "
+        "same order. The diagonal contains the squares of the standard uncertainties. Expanded uncertainties elsewhere "
+        "in the certificate are rounded; use this matrix for quantities that depend on several parameters.",
         named("list", "Covariance", rows),
     )
 

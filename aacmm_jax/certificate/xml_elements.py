@@ -214,7 +214,7 @@ def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
 
 class _NoDocumentType(ElementTree.TreeBuilder):
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise InputError(f"the XML has a document type, '{name}', as no certificate has; leave it out.")
+        raise InputError(f"the XML declares a document type, '{name}', which a certificate must not have; remove it.")
 
 
 def _collect(element: Element, path: tuple[str, ...], values: dict[tuple[str, ...], CertifiedValue]) -> None:
@@ -239,4 +239,4 @@ def _number(text: str, what: str, path: tuple[str, ...]) -> float:
             return value
     except ValueError:
         pass
-    raise InputError(f"the {what} of {quoted(' / '.join(path))} is no number; export the certificate again.")
+    raise InputError(f"the {what} of {quoted(' / '.join(path))} is not a number; export the certificate again.")

@@ -16,7 +16,7 @@ from .numpy_or_jax import AnyArray, namespace
 # What people pass for an array of numbers; lists are converted and checked.
 Numbers = ArrayLike | Sequence[Any]
 
-_KINDS = {"U": "text", "S": "text", "b": "true or false", "c": "complex numbers"}
+_KINDS = {"U": "text", "S": "text", "b": "true or false values", "c": "complex numbers"}
 
 
 def is_concrete(*arrays: object) -> bool:
@@ -39,9 +39,9 @@ def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
     except jax.errors.TracerArrayConversionError:
         array = jnp.asarray(value)  # a list with traced numbers in it
     except ValueError as error:
-        raise InputError(f"{what} has rows of unequal length; give rows of one length.") from error
+        raise InputError(f"{what} has rows of unequal length; give rows of equal length.") from error
     if not jnp.issubdtype(array.dtype, jnp.number) or jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise InputError(f"{what} must be real numbers, but holds {_KINDS.get(array.dtype.kind, 'something else')}.")
+        raise InputError(f"{what} must be real numbers, but contains {_KINDS.get(array.dtype.kind, 'something else')}.")
     return jnp.asarray(array, dtype=jnp.float64)
 
 
@@ -64,5 +64,5 @@ def as_floats(value: Numbers, what: str) -> AnyArray:
     """A finite float64 array, or `InputError` that names ``what``."""
     array = as_array(value, what)
     if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
-        raise InputError(f"{what} holds a value that is not finite; give finite numbers.")
+        raise InputError(f"{what} contains a value that is not finite; give finite numbers.")
     return array

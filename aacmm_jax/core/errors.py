@@ -38,7 +38,7 @@ def require(extra: str, use: str) -> None:
     package = _PACKAGES[extra]
     if importlib.util.find_spec(package) is None:
         # Double quotes are right in every shell, cmd.exe included.
-        raise MissingExtra(f'{use} needs {package}; install it with: pip install "aacmm_jax[{extra}]"')
+        raise MissingExtra(f'{use} needs {package}; install {package} with: pip install "aacmm_jax[{extra}]"')
 
 
 class IdentifiabilityWarning(UserWarning):

@@ -38,8 +38,8 @@ def _turn_on_x64() -> None:
     setting = os.environ.get("JAX_ENABLE_X64")
     if setting is not None and setting.strip().lower() in _NO:
         refusal = (
-            f"aacmm_jax needs 64-bit floats, but JAX_ENABLE_X64={setting} forbids them: in float32 a calibration is "
-            "wrong by tens of micrometres; unset JAX_ENABLE_X64 or set it to 1."
+            f"aacmm_jax needs 64-bit floats, but JAX_ENABLE_X64={setting} turns them off, and a calibration in "
+            "float32 is wrong by tens of micrometres; unset JAX_ENABLE_X64 or set it to 1."
         )
         # The command line imports the package before any code of its own can catch this.
         if Path(sys.argv[0]).stem == "aacmm" or (sys.argv[0] == "-m" and "aacmm_jax" in sys.orig_argv):
@@ -62,8 +62,9 @@ def check_x64() -> None:
     check_setting()
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
-            "64-bit floats were turned off after aacmm_jax was imported, and in float32 a calibration is wrong by tens "
-            "of micrometres; leave jax.enable_x64(False), or call jax.config.update('jax_enable_x64', True)."
+            "64-bit floats were turned off after aacmm_jax was imported, and a calibration in float32 is wrong by "
+            "tens of micrometres; leave the block of jax.enable_x64(False), or call "
+            "jax.config.update('jax_enable_x64', True)."
         )
 
 
@@ -83,8 +84,9 @@ def check_backend() -> None:
     except Exception as error:  # a RuntimeError, or an AssertionError where nothing that is named is there
         told = _told()
         raise RuntimeError(
-            f"JAX cannot start, as {f'{told} names no device' if told else 'it finds no device'} that this machine and "
-            f"this installation have; {'unset it' if told else 'see its message'}, or set JAX_PLATFORMS=cpu."
+            f"JAX cannot start, because {told or 'JAX'} {'names' if told else 'finds'} no device that this machine "
+            f"and this installation have; {'remove this setting' if told else 'see the message of JAX'}, or set "
+            "JAX_PLATFORMS=cpu."
         ) from error
 
 
@@ -143,8 +145,9 @@ def set_up() -> None:
         os.environ.pop(_FOLDER, None)
         os.environ[_TURNED_OFF] = "0"  # for processes started from here
         warnings.warn_explicit(
-            f"the compilation cache {folder} is not used, because {unsafe}, and what is read there is run; remove the "
-            f"folder, which is then made anew, or set {_FOLDER} to one that only you can write to.",
+            f"the compilation cache {folder} is not used, because {unsafe}, and programs read from the cache are "
+            f"run; remove the folder (it is then created again), or set {_FOLDER} to a folder that only you can "
+            "write to.",
             UserWarning,
             "aacmm_jax",
             1,
@@ -164,7 +167,7 @@ def set_up() -> None:
 def _unsafe(folder: Path) -> str:
     """Why others could put programs into a folder, which is made if there is none; empty where only the user can."""
     if not folder.is_absolute():
-        return "its path is relative, so it depends on where a program is started"
+        return "its path is relative, so the folder depends on where a program is started"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not POSIX:
         return ""
@@ -173,7 +176,7 @@ def _unsafe(folder: Path) -> str:
     if not is_ours(status):
         return "it belongs to another user"
     if status.st_mode & 0o022:
-        return f"others may write to it (mode {stat.S_IMODE(status.st_mode):04o})"
+        return f"other users may write to it (mode {stat.S_IMODE(status.st_mode):04o})"
     owner, others_may_enter = status.st_uid, status.st_mode & 0o011
     # Whoever can rename a folder above can put another one there.
     for above in folder.parents:
@@ -181,7 +184,7 @@ def _unsafe(folder: Path) -> str:
         if status.st_uid != 0 and not is_ours(status):
             return f"{above} belongs to another user"
         if others_may_rename(status):
-            return f"others may write to {above} (mode {stat.S_IMODE(status.st_mode):04o})"
+            return f"other users may write to {above} (mode {stat.S_IMODE(status.st_mode):04o})"
     # What was put there while others could: JAX reads it by its name, and a link leads to where others may write now.
     with os.scandir(folder) as entries:
         for entry in entries:  # of which there may be thousands: 2 microseconds each
@@ -189,7 +192,7 @@ def _unsafe(folder: Path) -> str:
                 status = entry.stat(follow_symlinks=False)
                 changeable = others_may_enter and status.st_mode & 0o022 and others_may_write(status)
                 if status.st_uid != owner or changeable or entry.is_symlink():
-                    return f"others can have written {entry.name} in it"
+                    return f"other users may have written {entry.name} in this folder"
     return ""
 
 

@@ -29,7 +29,7 @@ def random_key(seed: int | Array) -> Array:
             raise InputError(f"the seed is {seed}; give a whole number of at most 63 bits.")
         halves = np.array([seed >> 32, seed & 0xFFFFFFFF])
     if not _compat.jax_setting("jax_threefry_partitionable", True):
-        raise InputError("JAX_THREEFRY_PARTITIONABLE=0 changes every random number; unset it.")
+        raise InputError("JAX_THREEFRY_PARTITIONABLE=0 changes every random number; unset this variable.")
     # `jax.random.key` would add JAX's offset to the seed.
     return jax.random.wrap_key_data(halves.astype(np.uint32), impl="threefry2x32")
 

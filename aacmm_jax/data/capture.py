@@ -118,8 +118,8 @@ class Capture(eqx.Module):
         sessions = [session for session in self.sessions if name.startswith(f"{session}/")]
         if not sessions:
             raise InputError(
-                f"'{name}' is in none of the sessions {shorten(self.sessions)}; name it session/name, as join_sessions "
-                "does."
+                f"'{name}' does not belong to any of the sessions {shorten(self.sessions)}; give its name as "
+                "session/name, as join_sessions does."
             )
         return max(sessions, key=len)
 
@@ -170,7 +170,7 @@ class Capture(eqx.Module):
         dropped = _matching(names, without, "without")
         kept = [name for name in kept if name not in dropped]
         if not kept:
-            raise InputError("no socket is left after the selection; widen it.")
+            raise InputError("the selection leaves no socket; select more.")
         poses, lengths = self.repeated
         copies = tuple((start, end) for start, end in lengths if start in kept and end in kept)
         return part_of(self, kept, repeated=Repeated(tuple(row for row in poses if row[0] in kept), copies))
@@ -337,7 +337,8 @@ def check_one_capture(capture: Capture) -> None:
     """Raise `InputError` for a batch of `stack_captures`."""
     if capture.q.ndim != 2:
         raise InputError(
-            "the capture is a batch of stacked captures, but one capture is needed; use the captures one by one."
+            "the capture is a batch of stacked captures, but a single capture is needed; use the captures of the "
+            "batch separately."
         )
 
 

@@ -84,8 +84,8 @@ class ReferenceLength(eqx.Module):
         check_temperatures(where, np.asarray(temperature, dtype=float))
         if not (abs(expansion) <= _LARGEST_EXPANSION and 0 <= u_expansion <= _LARGEST_EXPANSION):
             raise InputError(
-                f"{where} has an expansion of {expansion:g} /K with u = {u_expansion:g} /K, and no artefact expands by "
-                f"more than {_LARGEST_EXPANSION:g} /K; give 1/K, 11.5e-6 for steel."
+                f"{where} has an expansion of {expansion:g} /K with u = {u_expansion:g} /K, but no artefact expands "
+                f"by more than {_LARGEST_EXPANSION:g} /K; give both in 1/K (steel: 11.5e-6)."
             )
         if not 0 <= u_temperature < np.inf:
             raise InputError(f"{where} has u_temperature = {u_temperature:g} K; give zero or a positive number.")
@@ -107,14 +107,15 @@ class Repeated(NamedTuple):
             number = pluralise(sum(count for _, count in self.poses), "pose")
             sockets = shorten([f"{name} ({count})" for name, count in self.poses])
             sentences.append(
-                f"Counted once: {number} with exactly the readings and values of another pose of the same socket or "
-                f"observation: {sockets}; a copy is no measurement of its own. Was the arm recorded at rest, or a file "
-                "pasted twice?"
+                f"Duplicates ignored: {number} with exactly the readings and values of another pose of the same "
+                f"socket or observation: {sockets}. A copy is not an independent measurement. Was the arm recorded "
+                "at rest, or was a file pasted twice?"
             )
         if self.lengths:
             ends = shorten([f"{start} - {end}" for start, end in self.lengths])
             sentences.append(
-                f"Counted once: reference lengths given again with the same value and u: {ends}; delete the copies."
+                f"Duplicates ignored: reference lengths given more than once with the same value and u: {ends}; "
+                "delete the copies."
             )
         return sentences
 
@@ -141,10 +142,13 @@ def checked_parts(sockets: Mapping[str, Numbers], observations: Any) -> tuple[Ab
     names = set(sockets)
     for observation in others:
         if not isinstance(observation, AbstractObservation):
-            raise InputError(f"{observation!r} is no observation; give one of aj.data.observations, such as a Sphere.")
+            raise InputError(
+                f"{observation!r} is not an observation; give an observation from aj.data.observations, such as a "
+                "Sphere."
+            )
         if observation.name in names:
             both = "a socket and an observation" if observation.name in sockets else "two observations"
-            raise InputError(f"{both} have the name '{observation.name}'; give each a name of its own.")
+            raise InputError(f"{both} have the name '{observation.name}'; give them different names.")
         names.add(observation.name)
     parts = (*seats, *others)
     if not parts:
@@ -154,7 +158,7 @@ def checked_parts(sockets: Mapping[str, Numbers], observations: Any) -> tuple[Ab
         if part.q.shape[-1] != width:
             raise InputError(
                 f"{described(part)} has {part.q.shape[-1]} columns, but {described(parts[0])} has {width}; give one "
-                "column a joint, and the temperature after them to all or to none."
+                "column per joint, followed by the temperature either everywhere or nowhere."
             )
     return parts
 
@@ -182,7 +186,7 @@ def different_poses(parts: Iterable[AbstractObservation]) -> list[list[int] | No
         if twin is not part:
             what = "sockets" if part.kind == Socket.kind else "observations"
             raise InputError(
-                f"{what} '{twin.name}' and '{part.name}' have exactly the same poses; is one file given twice?"
+                f"{what} '{twin.name}' and '{part.name}' have exactly the same poses; was one file given twice?"
             )
         kept.append(None if len(first) == part.q.shape[0] else list(first.values()))
     return kept
@@ -196,7 +200,9 @@ def different_lengths(
     different, copies, seen = [], [], set()
     for length in (lengths,) if isinstance(lengths, ReferenceLength) else items_of(lengths, "lengths"):
         if not isinstance(length, ReferenceLength):
-            raise InputError(f"{shown(length)} is no reference length; give aj.ReferenceLength(start, end, value, u).")
+            raise InputError(
+                f"{shown(length)} is not a reference length; give aj.ReferenceLength(start, end, value, u)."
+            )
         ends = length.start, length.end
         for end in ends:
             if end not in sockets:

@@ -85,12 +85,15 @@ class Noise(eqx.Module):
         given = self._given()
         if is_concrete(*given.values()) and not any(np.any(np.asarray(values)) for values in given.values()):
             raise InputError(
-                "noise is zero everywhere, so poses cannot be weighted by it; give a standard deviation, or no noise."
+                "every standard deviation of the noise is zero, so the noise cannot weight poses; give a positive "
+                "standard deviation, or omit the noise."
             )
         # Not in the constructor: residuals of a failed calibration may be as large, and its file must still be read.
         for what, values in given.items():
             if is_concrete(values) and np.any(np.asarray(values) > _MOST[what]):
-                raise InputError(f"{what} is over {_MOST[what]:g}, more than any arm's; is it in another unit?")
+                raise InputError(
+                    f"{what} is above {_MOST[what]:g}, which is more than any arm has; is {what} in another unit?"
+                )
         self.check_joints(joints)
 
     def check_joints(self, joints: int) -> None:
@@ -98,8 +101,8 @@ class Noise(eqx.Module):
         for what, values in self._given().items():
             if values.ndim and values.shape != (joints,):
                 raise InputError(
-                    f"{what} has {values.shape[0]} values, but the arm has {joints} joints; give one number, or one a "
-                    "joint."
+                    f"{what} has {values.shape[0]} values, but the arm has {joints} joints; give one number, or one "
+                    "number per joint."
                 )
 
 
@@ -200,7 +203,7 @@ def small_arm_noise() -> Noise:
 def class_noise(arm: Arm, name: str) -> Noise:
     """The noise that plans assume of an arm of a class; `InputError` where there is no such class."""
     if name not in CLASSES:
-        raise InputError(f"there is no class of arms '{name}'; give one of {', '.join(CLASSES)}.")
+        raise InputError(f"unknown class of arms '{name}'; give one of {', '.join(CLASSES)}.")
     repeatability = CLASSES[name].repeatability
     return small_arm_noise() if repeatability is None else noise_of_repeatability(arm, repeatability)
 
@@ -220,7 +223,7 @@ def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEAT
         InputError: The repeatability is not above 0.
     """
     if not (math.isfinite(repeatability) and repeatability > 0):
-        raise InputError(f"a repeatability of {repeatability:g} mm is given; it must be positive.")
+        raise InputError(f"the repeatability is {repeatability:g} mm; it must be positive.")
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
     geometry = to_numpy(arm.geometry)
@@ -228,5 +231,7 @@ def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEAT
     scattered = np.asarray(encoder_covariances(geometry, joint_motion(geometry, q), unit))
     lever = math.sqrt(float(np.mean(np.trace(scattered))) / 3)
     if lever == 0:
-        raise InputError("no joint moves the tip of this arm, so its repeatability says nothing of the readings.")
+        raise InputError(
+            "no joint moves the tip of this arm, so the noise of the readings cannot be derived from its repeatability."
+        )
     return noise_of(np.asarray(repeatability / _REPEATABILITY / lever), np.asarray(seating))

@@ -54,7 +54,7 @@ def checked_sphere(sphere: ProbedSphere, columns: int | None = None) -> ProbedSp
         raise InputError(f"sphere '{sphere.name}' has no probed points; give at least one group.")
     width = checked.groups[0].shape[1]
     if columns not in (None, width):
-        raise InputError(f"groups of sphere '{sphere.name}' have {width} columns; give {columns}.")
+        raise InputError(f"groups of sphere '{sphere.name}' have {width} columns; give {columns} columns.")
     return checked
 
 

@@ -83,16 +83,16 @@ def simulate(
     short = {"encoder_arcsec": encoder_arcsec, "seating": seating}
     given = {name: value for name, value in short.items() if value is not None}
     if noise is not None and given:
-        raise InputError(f"simulate is given noise and {' and '.join(given)}; put all of it into noise.")
+        raise InputError(f"simulate is given both noise and {' and '.join(given)}; give everything in noise.")
     noise = Noise(**given) if noise is None else noise
     if not is_single(arm):
-        raise InputError("simulate takes one arm, not a batch; take one of it first.")
+        raise InputError("simulate takes one arm, not a batch; select one arm of the batch.")
     check_finite(arm=arm, noise=noise)
     noise.check_joints(arm.joints)
     temperatures = _checked_temperatures(arm, temperature)
     simulated = items_of(observations, "observations")
     if not isinstance(sockets, Mapping) or not (sockets or simulated):
-        raise InputError("simulate needs at least one socket with its position.")
+        raise InputError("simulate needs at least one socket with its position, or one observation.")
     limits_array = np.asarray(joint_limits(arm, limits))
     arm, noise = to_numpy((arm, noise))
     points = {name: socket_point(name, point) for name, point in sockets.items()}
@@ -147,7 +147,8 @@ class _Recorder(NamedTuple):
         """One simulated observation."""
         if not isinstance(simulated, AbstractSimulated):
             raise InputError(
-                f"{simulated!r} cannot be simulated; give one of aj.data.observations, such as SimulatedSphere."
+                f"{simulated!r} cannot be simulated; give a simulated observation from aj.data.observations, such "
+                "as SimulatedSphere."
             )
         reach_key, seat_key, encoder_key, own_key = jax.random.split(key, 4)
         random = np.random.default_rng(np.asarray(jax.random.key_data(own_key)))
@@ -164,10 +165,12 @@ class _Recorder(NamedTuple):
 def _checked_temperatures(arm: Arm, given: Numbers | None) -> Float[np.ndarray, " 2"]:
     """The lowest and the highest temperature of an arm with a thermometer."""
     if given is not None and not arm.thermometer:
-        raise InputError("a temperature is given, but the arm has no thermometer; make it with thermometer=True.")
+        raise InputError(
+            "a temperature is given, but the arm has no thermometer; create the arm with thermometer=True."
+        )
     values = np.asarray(as_floats(REFERENCE_TEMPERATURE if given is None else given, "temperature"))
     if values.shape not in ((), (2,)) or np.any(np.diff(np.atleast_1d(values)) < 0):
-        raise InputError("temperature must be one number, or the lowest and the highest; C.")
+        raise InputError("temperature must be one number, or the lowest and the highest temperature, in C.")
     check_temperatures("the simulation", values)
     return np.broadcast_to(values, (2,))
 

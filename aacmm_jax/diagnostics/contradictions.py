@@ -67,11 +67,11 @@ def removal(removed: Removed) -> Finding:
     first, second = removed.degrees_of_freedom
     return Finding(
         LEFT_OUT,
-        f"Left out: {removed.kind} {removed.group}, which contradicts the rest (F = {removed.ratio:.3g} with {first} "
-        f"and {second} degrees of freedom, {chance_text(removed.probability)}).",
-        f"Without it, the rest is {removed.rms_without:.3g} mm RMS from its geometry instead of "
-        f"{removed.rms_with:.3g} mm, and {removed.changed_most} changed most, by {removed.change:.2g} standard "
-        "uncertainties.",
+        f"Left out: {removed.kind} {removed.group}, which contradicts the other data (F = {removed.ratio:.3g} with "
+        f"{first} and {second} degrees of freedom, {chance_text(removed.probability)}).",
+        f"Without this {removed.kind}, the other poses are {removed.rms_without:.3g} mm RMS from their geometry "
+        f"instead of {removed.rms_with:.3g} mm. The parameter that changed most is {removed.changed_most}, by "
+        f"{removed.change:.2g} standard uncertainties.",
         probability=removed.probability,
         concerns=removed.members,
     )
@@ -87,12 +87,13 @@ def _finding(contradiction: Contradiction) -> Finding:
     elif cause is not None:
         sort, joint = cause.names[0].split("_")
         more = f"{-cause.values[0]:+.3g} mm" if sort == "d" else f"{-cause.values[0] / DEG:+.3g} deg"
-        seems = f" In {suspects[-1].group}, joint {joint} seems to read {more} more."
+        seems = f" In {suspects[-1].group}, the readings of joint {joint} seem to have an offset of {more}."
     # Whichever session is the wrong one, the probe of each other one is displaced from it.
     suspects = suspects[-1:] if remounted else suspects
     changes = "; ".join(
         f"without {suspect.group}, the others scatter by {suspect.rms_others[1]:.2g} mm RMS instead of "
-        f"{suspect.rms_others[0]:.2g} mm, and it by {suspect.rms[1]:.2g} mm instead of {suspect.rms[0]:.2g} mm"
+        f"{suspect.rms_others[0]:.2g} mm, and {suspect.group} scatters by {suspect.rms[1]:.2g} mm instead of "
+        f"{suspect.rms[0]:.2g} mm"
         for suspect in suspects
     )
     patterns = []  # of a shell, which select the groups
@@ -108,14 +109,14 @@ def _finding(contradiction: Contradiction) -> Finding:
     says = (
         f"{kind.capitalize()} {suspects[0].group} contradicts the other {plural}"
         if len(suspects) == 1
-        else f"Some {plural} contradict each other, and the data do not show which of these is wrong"
+        else f"Some {plural} contradict each other, and the data do not show which of them is wrong"
     )
     return Finding(
         "contradiction",
         f"{says}: {changes}.{seems}",
         advice="Calibrate with a probe for each session (without --same-probe)."
         if remounted
-        else f"Check the readings, and calibrate without what is wrong ({options}).",
+        else f"Check the readings, and leave the wrong ones out of the calibration ({options}).",
         probability=max(suspect.test.probability for suspect in suspects),
         concerns=tuple(name for suspect in suspects for name in suspect.members),
     )

@@ -19,13 +19,13 @@ _TOGETHER = 1e-3  # part of an undetermined direction, from which a parameter be
 # Of those that the data hardly determine apart from others, and of the others, which wider bounds help.
 _ON_BOUNDS = {
     "weak-on-bounds": (
-        "On a bound because the data hardly determine them: {names}.",
-        "The width of the bounds is part of their uncertainties.",
+        "On a bound because the data hardly determine these parameters: {names}.",
+        "The uncertainties of these parameters depend on the width of the bounds.",
         "Fix one parameter of each combination named below (--held), and do not widen the bounds.",
     ),
     "on-bounds": (
         "On a bound: {names}.",
-        "Every uncertainty, that of k too, takes these values as exact.",
+        "Every uncertainty, including that of k, takes these values as exact.",
         "Widen the bounds unless they are known limits.",
     ),
 }
@@ -68,10 +68,10 @@ def test(case: Case) -> list[Finding]:
         findings.append(
             Finding(
                 "hardly-determined",
-                "Hardly determined one by one, as they are strongly correlated or have a standard uncertainty over "
-                f"half of what the bounds allow: {shorten(names, 12)}.",
+                "Hardly determined individually, because these parameters are strongly correlated or have a "
+                f"standard uncertainty above half of the half-width of their bounds: {shorten(names, 12)}.",
                 "Tip and length uncertainties remain valid.",
-                "Fix some (--held), or record poses that separate them.",
+                "Fix some of these parameters (--held), or record poses that separate them.",
                 concerns=tuple(names),
             )
         )
@@ -86,14 +86,14 @@ def _redundancy(record: CalibrationRecord) -> Iterator[Finding]:
     if redundancy < unknown / 2:
         yield Finding(
             "little-redundancy",
-            f"Only {redundancy} more equations than unknowns, which makes the residuals small whatever the errors are.",
+            f"Only {redundancy} more equations than unknowns, so the residuals are small even if the errors are large.",
             advice="Record more poses.",
         )
     if len(capture.lengths) == 1 and record.method != REPEATABILITY and not record.scale_set_by:
         (length,) = capture.lengths
         yield Finding(
             "one-reference-length",
-            "With a single reference length its residual is zero by construction.",
-            advice="Hold a second one out as a check.",
+            "With a single reference length, the residual of this length is zero by construction.",
+            advice="Hold out a second reference length as a check.",
             concerns=(f"{length.start} - {length.end}",),
         )

@@ -131,7 +131,9 @@ def case_of(
     """The case of a result, or the same one again for the same record: what it has computed is kept."""
     if not isinstance(result, CalibrationRecord):
         if capture is None:
-            raise InputError("the result does not hold its capture; give the capture that it was calibrated from.")
+            raise InputError(
+                "the result does not contain its capture; give the capture from which the arm was calibrated."
+            )
         record = record_of(result, Recording(capture, ArmSpecification(result.space.base)))
         return Case(record, class_noise)
     if class_noise is not None:
@@ -205,8 +207,8 @@ def warnings_of(
 
     Example:
         >>> for sentence in aj.warnings_of(result, capture):
-        ...     print(sentence)
-        With a single reference length its residual is zero by construction. Hold a second one out as a check.
+        ...     print(sentence.partition(". ")[2])
+        Hold out a second reference length as a check.
     """
     return sentences(findings_of(result, capture, class_noise=class_noise))
 

@@ -37,10 +37,12 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
     if 0 < count < len(validation.groups) / 2:
         finding = Finding(
             "held-out-group",
-            f"Held out one after the other, some groups disagree with the others by more than predicted: {named}; "
-            f"the other {len(validation.groups) - count} agree.",
-            advice="Look for what differs there (a socket or tool that moved, a wrong length, poses far from all "
-            "others).",
+            "When each group is held out in turn, some groups disagree with the others by more than predicted: "
+            f"{named}; the remaining {len(validation.groups) - count} agree.",
+            advice=(
+                "Look for what differs in these groups (a socket or tool that moved, a wrong length, poses far "
+                "from all others)."
+            ),
         )
         return [finding._replace(severity="doubt", doubt=doubt, concerns=concerns)]
     ratios = []
@@ -53,10 +55,12 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
             ratios.append(f"{name} {error:.3g} mm RMS, {times}")
     finding = Finding(
         "held-out-all",
-        f"Held out one after the other, placements have larger errors than predicted: {'; '.join(ratios)}"
+        f"When each placement is held out in turn, the errors are larger than predicted: {'; '.join(ratios)}"
         + (f"; worst in {named}" if named else "")
-        + ". Errors of neighbouring poses are alike, as of effects outside the D-H model (compliant joints, "
-        "eccentric encoders).",
+        + (
+            ". Neighbouring poses have similar errors; effects outside the D-H model (compliant joints, eccentric "
+            "encoders) cause such errors."
+        ),
         "Every stated uncertainty is too small.",
         "Use the cross-validated values.",
     )
@@ -85,15 +89,17 @@ def surprise(
         )
     if lengths.probability < level:
         texts.append(
-            f"reference lengths err by {lengths.rms / lengths.predicted:.1f} times their standard uncertainty (RMS)"
+            f"the errors of the reference lengths are {lengths.rms / lengths.predicted:.1f} times their standard "
+            "uncertainty (RMS)"
         )
     if not texts:
         return []
     finding = Finding(
         "unseen-data",
-        f"Data that the calibration has not seen disagree with it by more than chance: {'; '.join(texts)}.",
-        "The arm or its probe has changed since (a remounted tip), these data have errors of their own, or the model "
-        "misses effects that poses of the calibration did not show: its uncertainties do not hold here.",
+        f"Data that the calibration has not seen disagree with it by more than chance explains: {'; '.join(texts)}.",
+        "Either the arm or its probe has changed since the calibration (a remounted tip, for example), or these "
+        "data have errors that the data of the calibration did not have, or the model lacks effects that the poses "
+        "of the calibration did not show. The uncertainties of the calibration do not apply to these data.",
         severity="doubt",
         probability=min(probabilities),
         concerns=tuple(worst),
@@ -102,10 +108,10 @@ def surprise(
     # Most of the excess: more than half of it, in squares.
     if again is not None and poses.rms**2 - again.rms**2 > (poses.rms**2 - poses.predicted**2) / 2:
         says = (
-            f" With the probe's place in the last frame fitted to them, they are {again.rms:.3g} mm RMS: the tip was "
-            "remounted, or is another one."
+            " If the position of the probe in the last frame is fitted to these data, the poses are "
+            f"{again.rms:.3g} mm RMS from their geometry: the tip was remounted or exchanged."
         )
-        advice = "Calibrate such data as a session with a probe of its own (aacmm calibrate A.h5 B.h5)."
+        advice = "Calibrate such data as a separate session with its own probe (aacmm calibrate A.h5 B.h5)."
         return [finding._replace(code="unseen-probe", says=finding.says + says, costs="", advice=advice)]
     return [finding]
 
@@ -115,7 +121,7 @@ def no_better(nominal: float | None, calibrated: float | None) -> list[Finding]:
     if nominal is None or calibrated is None or calibrated < nominal:
         return []
     says = (
-        f"On data that it has not seen, the calibrated arm is no better than the nominal one: {calibrated:.3g} mm "
-        f"RMS instead of {nominal:.3g} mm."
+        "On data that the calibration has not seen, the calibrated arm is no better than the nominal arm: "
+        f"{calibrated:.3g} mm RMS instead of {nominal:.3g} mm."
     )
     return [Finding("no-better-than-nominal", says, severity="doubt")]

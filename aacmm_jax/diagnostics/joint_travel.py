@@ -78,7 +78,7 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
     the free parameters that a calibration of the capture would take, where there is one."""
     still = standing_joints(arm, np.asarray(capture.readings))
     joints = [standing.joint for standing in still]
-    remedy = "move it" if len(still) == 1 else "move them"
+    remedy = "move this joint" if len(still) == 1 else "move the joints that stand still"
     if nominal is not None and still:
         space = nominal.space()
         added = _open_parameters(space, capture, joints)
@@ -87,7 +87,7 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
         if added:
             remedy += f"with --held {','.join(name for name in parameter_names(space.base) if name in held)}"
         else:
-            remedy += "as it is: the parameters that are free by default leave nothing open"
+            remedy += "without changes: these data determine all parameters that are free by default"
     rows = []
     for (joint, travel, poses), names in zip(still, lost_by_standing(arm, capture, joints), strict=True):
         unit, size = ("mm", travel) if joint in arm.prismatic else ("deg", travel / DEG)
@@ -95,7 +95,7 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
         if names:
             says += f": {listed(names)} cannot be identified; {remedy}."
         else:
-            says += ", which leaves nothing open that such poses could determine."
+            says += ", but this leaves no further parameter undetermined."
         rows.append({"joint": joint, f"range_{unit}": size, "poses": poses, "lost": list(names), "says": says})
     return rows
 
@@ -179,7 +179,8 @@ def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
     poses, others = (np.asarray(values, dtype=float)[:, : arm.joints] / units for values in (calibrated, q))
     if len(poses) < 2:
         raise InputError(
-            f"{len(poses)} pose has no distance from another; give at least two that were calibrated with."
+            f"the distance from the nearest other pose needs at least two poses, but there are {len(poses)}; give "
+            "at least two poses of the calibration."
         )
     turns = np.array(by_joint(arm, True, False))
 

@@ -86,8 +86,8 @@ def test(case: Case) -> list[Finding]:
     return [
         Finding(
             "missing-terms",
-            f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model lacks: "
-            f"{', '.join(dict.fromkeys(causes))}{f'; try --model {model}' if model else ''}."
+            f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model does not describe. "
+            f"Possible causes: {', '.join(dict.fromkeys(causes))}{f'; try --model {model}' if model else ''}."
             + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
             "The stated uncertainties include these errors as estimated from the residuals."
             if shared - {PLACES, VISITS, SUCCESSIVE}

@@ -66,11 +66,14 @@ def test(case: Case) -> list[Finding]:
             Finding(
                 "successive-poses",
                 f"Residuals of successive poses are autocorrelated (correlation {successive.correlation:.2f}, "
-                f"{chance_text(successive.probability)}): a seat that shifts at each visit, or errors that the model "
-                "lacks.",
-                "The stated uncertainties include what they share, as estimated from the residuals."
+                f"{chance_text(successive.probability)}): either the seat shifts at each visit, or there are errors "
+                "that the model does not describe.",
+                "The stated uncertainties include the errors that successive poses share, as estimated from the "
+                "residuals."
                 if shared & {VISITS, SUCCESSIVE}
-                else "Such poses count as independent, so every stated uncertainty is too small.",
+                else (
+                    "The calibration treats successive poses as independent, so every stated uncertainty is too small."
+                ),
                 severity="doubt",
                 probability=successive.probability,
             )
@@ -82,7 +85,7 @@ def test(case: Case) -> list[Finding]:
             Finding(
                 "noisy-observations",
                 f"Residuals are larger than the uncertainties and the scatter of the tips predict: {shorten(texts)}.",
-                advice="Check these observations, or their u.",
+                advice="Check these observations and their u.",
                 severity="doubt",
                 probability=max(part.probability for part in noisy),
                 concerns=tuple(part.name for part in noisy),
@@ -96,18 +99,18 @@ def _misfit(misfit: Misfit) -> Finding:
     if misfit.usual:
         return Finding(
             "residuals-unusual",
-            f"Residuals are {misfit.ratio:.2g} times what is usual for such an arm ({misfit.usual}; {chance}): errors "
-            "that the model lacks, or worse encoders.",
+            f"Residuals are {misfit.ratio:.2g} times as large as is usual for such an arm ({misfit.usual}; "
+            f"{chance}): either there are errors that the model does not describe, or the encoders are worse.",
             severity="doubt",
             probability=misfit.probability,
         )
     return Finding(
         "residuals-not-as-given",
-        f"Residuals are {misfit.ratio:.3g} times what the given noise predicts ({chance}).",
-        "Every uncertainty follows from that noise: it is about "
+        f"Residuals are {misfit.ratio:.3g} times as large as the given noise predicts ({chance}).",
+        "Every uncertainty follows from the given noise. Either every uncertainty is about "
         f"{max(misfit.ratio, 1 / misfit.ratio):.3g} times too {'small' if small else 'large'}, or the model lacks "
         "something.",
-        "Check the noise, or leave it out to have it estimated.",
+        "Check the given noise, or omit it; the noise is then estimated.",
         severity="doubt" if small else "note",  # noise given too large makes every uncertainty too large
         probability=misfit.probability,
     )

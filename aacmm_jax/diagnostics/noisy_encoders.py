@@ -46,7 +46,11 @@ def test(case: Case) -> list[Finding]:
     """Encoders whose noise was replaced, and one that seems noisier than it was taken to be."""
     record, findings, texts = case.record, [], []
     slides, given = record.calibrated.arm.prismatic, record.given_noise is not None
-    others, kept = ("given", "the noise as given") if given else ("those of the others", "one noise for all encoders")
+    others, kept = (
+        ("given", "keeps the given noise")
+        if given
+        else ("those of the other joints", "keeps one noise for all encoders")
+    )
     for encoder in record.noisy_encoders:
         # Of the others nothing may be left beside the noise of the tip, and what is given may be 0.
         comparable = encoder.found < _FAR_MORE * encoder.expected
@@ -61,8 +65,9 @@ def test(case: Case) -> list[Finding]:
             Finding(
                 "noisy-encoders-replaced",
                 f"Readings of {shorten(texts, 3)}.",
-                f"Their noise was re-estimated; weights and uncertainties use the estimate (--keep-noise: {kept}).",
-                "Check the encoder, and the joint for play.",
+                "The noise of these encoders was re-estimated; weights and uncertainties use the estimate "
+                f"(--keep-noise {kept}).",
+                "Check the encoder, and look for play in the joint.",
                 probability=max(encoder.probability for encoder in record.noisy_encoders),
                 concerns=tuple(f"joint {encoder.joint}" for encoder in record.noisy_encoders),
             )
@@ -72,9 +77,10 @@ def test(case: Case) -> list[Finding]:
         findings.append(
             Finding(
                 "noisy-encoder",
-                f"Residuals are larger the more the reading of joint {noisiest.joint} moves the tip "
-                f"({chance_text(noisiest.probability)}), as if its encoder were noisier than the others.",
-                advice="State the noise joint by joint, or look for play in this joint.",
+                f"Residuals are larger where the reading of joint {noisiest.joint} moves the tip more "
+                f"({chance_text(noisiest.probability)}), as if the encoder of this joint were noisier than the "
+                "others.",
+                advice="State the noise of each joint, or look for play in this joint.",
                 severity="doubt",
                 probability=noisiest.probability,
                 concerns=(f"joint {noisiest.joint}",),

@@ -34,7 +34,7 @@ def test(case: Case) -> list[Finding]:
     texts = [f"{pose} ({distances[i]:.3g} mm)" for pose, i in zip(poses, worst, strict=True)]
     finding = Finding(
         "outlying-poses",
-        f"Poses far from their socket, where {typical:.2g} mm is typical: {shorten(texts)}.",
+        f"Poses far from the centroid of their socket (typical distance: {typical:.2g} mm): {shorten(texts)}.",
         advice="Was the tip seated?",
         concerns=tuple(poses),
     )

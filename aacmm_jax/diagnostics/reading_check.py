@@ -110,10 +110,10 @@ def check_readings(
     """
     arm = to_numpy(arm)
     if not is_single(arm):
-        raise InputError("check_readings takes one arm, not a batch; give one of its arms.")
+        raise InputError("check_readings takes one arm, not a batch; give one arm of the batch.")
     q = np.asarray(q)
     if q.shape[1] != arm.joints or not len(q):
-        raise InputError(f"q has shape {q.shape}; give a row for each pose and {arm.joints} columns.")
+        raise InputError(f"q has shape {q.shape}; give one row per pose and {arm.joints} columns.")
     if (sockets is None) == (positions is None):
         raise InputError("give either the sockets of the poses or the positions of the tip.")
     if positions is not None:
@@ -175,7 +175,8 @@ def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
     measured = [observation for observation in capture.observations if isinstance(observation, MeasuredPoints)]
     if not measured:
         raise InputError(
-            "readings are checked against poses in a socket, at least two, or measured points; the capture has neither."
+            "readings are checked against at least two poses in one socket, or against measured points; the "
+            "capture has neither."
         )
     station, target = measured[0].station, measured[0].target
     seen = [part for part in measured if (part.station, part.target) == (station, target)]
@@ -276,30 +277,33 @@ def reading_check_summary(
     if not check.explained:
         sentence = (
             f"No permutation, sign or zero offset of the columns explains these readings: {given.rms:.3g} mm RMS as "
-            f"they are, {best.rms:.3g} mm at best. Is it the right arm, do the rows belong to these sockets or "
-            "positions, and was the tip where it is said to have been?"
+            f"they are, {best.rms:.3g} mm at best. Is this the right arm, do the rows belong to these sockets or "
+            "positions, and was the tip really at these places?"
         )
     elif check.fits:
         sentence = (
-            f"The readings fit as they are: {given.rms:.3g} mm RMS by the nominal arm, {given.rms_fitted:.3g} mm with "
-            "parameters as real arms have them."
+            f"The readings fit as they are: {given.rms:.3g} mm RMS with the nominal arm, {given.rms_fitted:.3g} mm "
+            "with the most probable parameters of a real arm."
         )
     else:
         sentence = (
-            f"{words[0].upper()}{words[1:]}. Correcting it reduces the residuals (nominal arm) {improved} with "
-            "parameters as real arms have them)."
+            f"{words[0].upper()}{words[1:]}. Correcting this reduces the residuals (nominal arm) {improved} with "
+            "the most probable parameters of a real arm)."
         )
     # How much of the residual is due to the place of the tip, which a calibration finds.
     if check.explained and check.rms_with_tip is not None and _MUCH * check.rms_with_tip <= best.rms:
         place = (
-            "what was seen is taken to be where the arm's probe is. A calibration finds its place"
+            "this check assumes that the target is at the arm's probe. A calibration identifies the position of "
+            "the target"
             if check.free_tip
-            else "what was seen is not where the arm's probe is. In its table of the manifest write target = "
-            '"reflector", and a calibration finds its place'
+            else (
+                "the target is not at the arm's probe. In the table of the observation in the manifest, write "
+                'target = "reflector"; a calibration then identifies the position of the target'
+            )
         )
         tip = (
-            f"Most of the {best.rms:.3g} mm is an offset of the tip: {place} in the last frame; with it the nominal "
-            f"arm leaves {check.rms_with_tip:.3g} mm RMS."
+            f"Most of the {best.rms:.3g} mm is due to an offset of the tip: {place} in the last frame. With this "
+            f"position fitted, the residuals of the nominal arm are {check.rms_with_tip:.3g} mm RMS."
         )
     return {
         "kind": "reading check",
@@ -341,13 +345,13 @@ def explanation_words(explanation: Explanation, positions: str = "mm") -> str:
     words, (order, signs, offsets, angle, length) = [], explanation[:5]
     if angle != 1:
         units = ("degrees", "radians") if angle < 1 else ("radians", "degrees")
-        words.append("the readings are in {}, and were taken for {}".format(*units))
+        words.append("the readings are in {}, but were read as {}".format(*units))
     if length != 1:
         unit = length_unit(length * LENGTH_UNITS[positions])
         words.append(
-            f"the positions are {length:.4g} times as large as they were taken to be"
+            f"the positions are {length:.4g} times as large as assumed"
             if unit is None
-            else f"the positions are in {unit}, and were taken for {positions}"
+            else f"the positions are in {unit}, but were read as {positions}"
         )
     moved = [joint for joint, column in enumerate(order) if column != joint]
     if order == tuple(reversed(range(len(order)))) and len(order) > 3:
@@ -360,7 +364,9 @@ def explanation_words(explanation: Explanation, positions: str = "mm") -> str:
         words.append(f"joints {listed([str(joint + 1) for joint in moved])} are in columns {columns}")
     wrong = [f"{column + 1}" for column, sign in sorted(zip(order, signs, strict=True)) if sign < 0]
     if wrong:
-        words.append(f"column{'s' * (len(wrong) > 1)} {listed(wrong)} run{'s' * (len(wrong) == 1)} the other way")
+        words.append(
+            f"column{'s' * (len(wrong) > 1)} {listed(wrong)} {'has' if len(wrong) == 1 else 'have'} the opposite sign"
+        )
     for joint, zero in enumerate(offsets, start=1):
         offset = math.remainder(zero, 2 * math.pi)
         if abs(offset) > _QUARTERS:
@@ -377,6 +383,9 @@ def alternatives_sentence(rows: list[dict[str, Any]], known_positions: bool) -> 
         (f"that {row['says']}" if row["says"] else "that nothing is wrong") + " (a mirror image)" * row["mirror_image"]
         for row in rows[:_WORDED]
     ]
-    more = f"; or {len(rows) - _WORDED} further ones" if len(rows) > _WORDED else ""
+    more = f"; or one of {len(rows) - _WORDED} further explanations" if len(rows) > _WORDED else ""
     needed = "More poses at known positions" if known_positions else "A pose at a known position"
-    return f"These data fit nearly as well if one assumes {'; or '.join(texts)}{more}. {needed} would tell them apart."
+    return (
+        f"These data fit nearly as well if one assumes {'; or '.join(texts)}{more}. {needed} would tell these "
+        "explanations apart."
+    )

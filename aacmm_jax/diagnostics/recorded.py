@@ -90,7 +90,7 @@ def _outside_limits(recording: Recording) -> Iterator[Finding]:
                 "outside-limits",
                 f"Joint {joint + 1}: {outside} of {len(q)} readings lie outside its limits, {low} to {high} "
                 f"{'mm' if slides else 'deg'}.",
-                advice="Is the unit right, and the order of the columns?",
+                advice="Are the unit and the order of the columns right?",
                 concerns=(f"joint {joint + 1}",),
             )
 
@@ -129,11 +129,11 @@ _POSES, _OBSERVATIONS = 60, 24  # of which as many as these are looked at
 _TURN = 2 * np.pi * 1.02  # rad; readings of few joints go further
 _ROUNDS = 4  # Gauss-Newton steps of the geometry
 _UNITS = {
-    "measured values in m are taken for mm": M,
-    "measured values in cm are taken for mm": 10.0,
-    "measured values in inches are taken for mm": INCH,
-    "measured values in um are taken for mm, or those in mm for m": UM,
-    "measured values in mm are taken for inches": 1 / INCH,
+    "measured values are in m, but were read as mm": M,
+    "measured values are in cm, but were read as mm": 10.0,
+    "measured values are in inches, but were read as mm": INCH,
+    "measured values are in um, but were read as mm (or are in mm, but were read as m)": UM,
+    "measured values are in mm, but were read as inches": 1 / INCH,
 }
 # A cause, readings, observations (None: as given), and a sentence on what corrects it in the manifest.
 _Correction = tuple[str, np.ndarray, tuple[AbstractObservation, ...] | None, str]
@@ -162,8 +162,8 @@ def likely_cause(arm: Arm, capture: Capture) -> str:
     if not rms < min(given / _BETTER, _SMALL * size):
         return ""
     return (
-        f"Likely cause: {cause}. Correcting it reduces the residuals (nominal arm) from {given:.3g} to {rms:.3g} mm "
-        f"RMS.{write}"
+        f"Likely cause: {cause}. Correcting this reduces the residuals (nominal arm) from {given:.3g} to {rms:.3g} "
+        f"mm RMS.{write}"
     )
 
 
@@ -220,34 +220,34 @@ def _corrections(arm: Arm, observed: Observed) -> Iterator[_Correction]:
             for i, changes in zip(several, corrected, strict=True):
                 changed[i] = changes.get(cause, observations[i])
             unit = length_unit(_UNITS.get(cause, 0.0))
-            write = f' In its table of the manifest write units = {{ {field} = "{unit}" }}.'
+            write = f' In the table of the observation in the manifest, write units = {{ {field} = "{unit}" }}.'
             yield f"{cause} ({names})", q, tuple(changed), write if unit in ("m", "inch") else ""
 
 
 def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[tuple[str, Float[np.ndarray, "M n"]]]:
     joints = range(q.shape[1])
     for i in joints:
-        yield f"joint {i + 1} read with the wrong sign", np.where(np.isin(joints, [i]), -q, q)
+        yield f"joint {i + 1} was read with the wrong sign", np.where(np.isin(joints, [i]), -q, q)
     pairs = list(itertools.combinations(joints, 2))
     for i, j in pairs:
-        yield f"joints {i + 1} and {j + 1} read with the wrong sign", np.where(np.isin(joints, [i, j]), -q, q)
-    yield "all joints read with the wrong sign", -q
+        yield f"joints {i + 1} and {j + 1} were read with the wrong sign", np.where(np.isin(joints, [i, j]), -q, q)
+    yield "all joints were read with the wrong sign", -q
     for i, j in pairs:
         order = list(joints)
         order[i], order[j] = j, i
         yield f"the columns of joints {i + 1} and {j + 1} are exchanged", q[:, order]
     yield "the columns are in reverse order", q[:, ::-1]
-    yield "the columns begin with that of the last joint", np.roll(q, -1, axis=1)
-    yield "the columns end with that of the first joint", np.roll(q, 1, axis=1)
+    yield "the column of the last joint comes first", np.roll(q, -1, axis=1)
+    yield "the column of the first joint comes last", np.roll(q, 1, axis=1)
     slides = np.array(by_joint(arm, False, True))
-    yield "readings in gon are taken for degrees", np.where(slides, q, 0.9 * q)
+    yield "readings are in gon, but were read as degrees", np.where(slides, q, 0.9 * q)
     largest = float(np.abs(q[:, ~slides]).max(initial=0.0))
     if 0 < largest < _TURN * DEG:
-        yield "readings in radians are taken for degrees", np.where(slides, q, q / DEG)
+        yield "readings are in radians, but were read as degrees", np.where(slides, q, q / DEG)
     if largest > _TURN:  # otherwise every tip would come near every other
-        yield "readings in degrees are taken for radians", np.where(slides, q, q * DEG)
+        yield "readings are in degrees, but were read as radians", np.where(slides, q, q * DEG)
     if slides.any():
-        yield "readings of prismatic joints in m are taken for mm", np.where(slides, 1000.0 * q, q)
+        yield "readings of prismatic joints are in m, but were read as mm", np.where(slides, 1000.0 * q, q)
 
 
 def _measured_field(observation: AbstractObservation) -> str | None:
@@ -286,8 +286,8 @@ def _of_measured(observation: AbstractObservation) -> Iterator[tuple[str, Abstra
                 yield f"the columns of positions are {read}", changed(values[:, order] * signs)
     first, last = (Rotation.from_matrix(rotations).as_quat(scalar_first=scalar_first) for scalar_first in (True, False))
     for cause, corrected in (
-        ("quaternions in the order x y z w are taken for w x y z", Rotation.from_quat(first)),
-        ("quaternions in the order w x y z are taken for x y z w", Rotation.from_quat(last, scalar_first=True)),
+        ("quaternions are in the order x y z w, but were read as w x y z", Rotation.from_quat(first)),
+        ("quaternions are in the order w x y z, but were read as x y z w", Rotation.from_quat(last, scalar_first=True)),
     ):
         yield cause, changed(corrected.as_matrix(), "rotations")
     inverse = changed(rotations.swapaxes(-1, -2), "rotations")

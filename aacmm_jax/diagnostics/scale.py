@@ -70,12 +70,12 @@ def test(case: Case) -> list[Finding]:
 def _of_k(record: CalibrationRecord) -> Finding | None:
     k, set_by = record.k, record.scale_set_by
     if record.method == REPEATABILITY and not set_by:
-        by_lengths = f" By the reference lengths, k = {k:.6f}." if math.isfinite(k) else ""
+        by_lengths = f" According to the reference lengths, k = {k:.6f}." if math.isfinite(k) else ""
         return Finding(
             "nominal-scale",
             "The scale is taken from the nominal arm and assumed exact; all lengths carry its error." + by_lengths,
             severity="doubt",
-            doubt="nothing that was measured set its scale",
+            doubt="no measurement sets the scale",
         )
     if not math.isfinite(k):
         return None
@@ -87,32 +87,32 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
             f"k = {k:.6g} is not plausible (expected {low:g} to {high:g}).",
             advice=next(mistakes, "Check units, sockets, lengths and arm."),
             severity="unusable",
-            doubt="the reference lengths give the arm a scale that is not plausible",
+            doubt="the reference lengths give an implausible scale",
         )
     if set_by and record.method == "two-stage":
         return Finding(
             "scale-set-by-fixed-lengths",
-            f"{scale_set_by_clause(set_by)}, so the reference lengths changed nothing: by them the arm is {k:.6f} "
-            f"times too large (u = {record.u_k:.2g}).",
-            advice="Free one of these lengths, or use both with the joint solve (--method joint).",
+            f"{scale_set_by_clause(set_by)}, so the reference lengths had no effect: according to them, the arm is "
+            f"{k:.6f} times too large (u = {record.u_k:.2g}).",
+            advice="Free one of these lengths, or use the fixed and the reference lengths together (--method joint).",
             concerns=set_by,
         )
     sides = on_bounds(record)
     if record.hold is None and sides and not set_by:
         return Finding(
             "scale-stopped-by-bounds",
-            f"Stage 1 ran with every length free and {'shrank' if k < 1 else 'stretched'} the arm to k = {k:.5f} until "
-            f"a bound stopped it: {shorten([f'{name} ({side})' for name, side in sides.items()])}. The scale fix "
-            "undoes that.",
+            f"Stage 1 ran with every length free and {'shrank' if k < 1 else 'stretched'} the arm to k = {k:.5f} "
+            f"until bounds stopped it: {shorten([f'{name} ({side})' for name, side in sides.items()])}. Stage 2 "
+            "(scale fix) undoes this.",
             "The uncertainty of k takes these bounds as exact.",
-            "Hold a length (--hold) to avoid it.",
+            "Hold a length (--hold) to avoid this.",
             concerns=tuple(sides),
         )
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS, 3 * record.u_k):
         return Finding(
             "scale-far-from-1",
             f"k = {k:.5f} is far from 1.",
-            advice=f"Is {record.hold} at its nominal value, and is each reference length right?",
+            advice=f"Is the nominal value of {record.hold} right, and is each reference length right?",
             concerns=(record.hold,),
         )
     return None
@@ -123,15 +123,16 @@ def _of_lengths(case: Case) -> Finding | None:
     if lengths is None or lengths.probability >= LEVEL:
         return None
     kinds = set() if case.record.shared is None else set(case.record.shared.kinds)
-    odd = f"; without {lengths.odd} ({lengths.difference:+.3g} mm) the others agree" if lengths.odd else ""
-    predicted = "u, the poses and the errors that these share" if kinds and not odd else "u and the poses"
+    odd = f"; {lengths.odd} differs by {lengths.difference:+.3g} mm from the others, which agree" if lengths.odd else ""
+    predicted = "u, the poses and the errors common to several poses" if kinds and not odd else "u and the poses"
     # Errors of places take the part of what u(k) had for lengths that disagree.
     enlarged = case.record.final_method == "two-stage" and PLACES not in kinds
     return Finding(
         "lengths-disagree",
-        f"Reference lengths that disagree with the arm: the {lengths.number} err {lengths.birge_ratio:.2g} times "
-        f"as much as their {predicted} predict (Birge ratio, {chance_text(lengths.probability)}){odd}.",
-        "u(k) allows for it." if enlarged else "",
+        f"Reference lengths disagree with the arm: the errors of the {lengths.number} lengths are "
+        f"{lengths.birge_ratio:.2g} times as large as their {predicted} predict (Birge ratio, "
+        f"{chance_text(lengths.probability)}){odd}.",
+        "u(k) includes this disagreement." if enlarged else "",
         "Look for a wrong length, or for errors outside the D-H model.",
         severity="doubt",
         probability=lengths.probability,

@@ -33,11 +33,11 @@ def test(case: Case) -> list[Finding]:
         findings.append(
             Finding(
                 "implausible-residuals",
-                f"{subject}, more than the {record.largest_plausible_residual:.2g} mm that are plausible for this arm, "
-                "so data and arm do not belong together.",
-                advice=f"Check columns, units, signs, sockets and the arm. {case.once(cause_or_check)}",
+                f"{subject}, but at most {record.largest_plausible_residual:.2g} mm is plausible for this arm, so "
+                "the data do not match the arm.",
+                advice=f"Check the columns, units, signs, sockets and the arm. {case.once(cause_or_check)}",
                 severity="unusable",
-                doubt="data and arm do not belong together",
+                doubt="the data do not match the arm",
                 concerns=names,
             )
         )
@@ -46,8 +46,10 @@ def test(case: Case) -> list[Finding]:
         findings.append(
             Finding(
                 "many-on-bounds",
-                f"{len(sides)} of {len(record.names)} parameters are on a bound, so the arm does not fit the data.",
-                advice=f"Check unit, order of columns, sockets and arm. {case.once(cause_or_check)}",
+                f"{len(sides)} of {len(record.names)} parameters are on a bound, so the data do not match the arm.",
+                advice=(
+                    f"Check the unit, the order of the columns, the sockets and the arm. {case.once(cause_or_check)}"
+                ),
                 severity="doubt",
                 doubt=f"on a bound: {shorten(sorted(sides), 3)}",
                 concerns=tuple(sides),

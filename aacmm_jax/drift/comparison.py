@@ -90,7 +90,9 @@ def trend(
     if len(records) < 2:
         raise InputError("a trend needs at least two calibrations; give more.")
     if len(dates) != len(records):
-        raise InputError(f"there are {len(records)} calibrations and {len(dates)} dates; give one date each.")
+        raise InputError(
+            f"there are {len(records)} calibrations and {len(dates)} dates; give one date per calibration."
+        )
     moments = [moment(date) for date in dates]
     order = sorted(range(len(records)), key=lambda i: moments[i])
     names = [f"calibration {number} ({moments[i]:%Y-%m-%d})" for number, i in enumerate(order, start=1)]
@@ -104,7 +106,9 @@ def moment(date: datetime.datetime | str) -> datetime.datetime:
     try:
         time = datetime.datetime.fromisoformat(date) if isinstance(date, str) else date
     except ValueError as error:
-        raise InputError(f"'{date}' is not a date; give it like 2026-03-01 or 2026-03-01T12:00:00+00:00.") from error
+        raise InputError(
+            f"'{date}' is not a date; give one such as 2026-03-01 or 2026-03-01T12:00:00+00:00."
+        ) from error
     return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
 
 
@@ -120,8 +124,8 @@ def _compared(
     for arm, label in zip(arms, labels, strict=True):
         if arm.arm.joints != arms[0].arm.joints:
             raise InputError(
-                f"{labels[0]} is of '{arms[0].name}' with {arms[0].arm.joints} joints and {label} of '{arm.name}' with "
-                f"{arm.arm.joints}, which are different arms; compare calibrations of one arm."
+                f"{labels[0]} is of '{arms[0].name}' with {arms[0].arm.joints} joints, but {label} is of '{arm.name}' "
+                f"with {arm.arm.joints} joints; compare calibrations of one arm."
             )
     points, length, seed = volume
     length = default_length(first.calibrated.arm) if length is None else length
@@ -190,25 +194,28 @@ def _why_open(records: Sequence[CalibrationRecord], name: str) -> str:
             reasons.append(ON_BOUND)
         else:
             closed = record.determined[i] and record.open[i, i] < 1e-6 and np.isfinite(record.covariance[i, i])
-            reasons.append("" if closed else "left open by the data")
+            reasons.append("" if closed else "not determined by the data")
     if reasons[0] == reasons[1]:
-        return f"{reasons[0]} in both" if reasons[0] else ""
+        return f"{reasons[0]} in both calibrations" if reasons[0] else ""
     places = zip(reasons, ("old", "new"), strict=True)
-    return " and ".join(f"{reason} in the {which} one" for reason, which in places if reason)
+    return " and ".join(f"{reason} in the {which} calibration" for reason, which in places if reason)
 
 
 def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str, str]) -> Iterator[str]:
     """What makes a comparison doubtful, the most serious first."""
     for record, label in zip((old, new), labels, strict=True):
         if not record.converged:
-            yield f"Failed: {label}. {record.reason} Its changes mean nothing."
+            yield f"Failed: {label}. {record.reason} Changes computed from this calibration are meaningless."
         elif not record.plausible_scale:
-            yield f"Implausible: {label}, with k = {record.k:.6g}. Check its units, sockets, lengths and arm."
+            yield (
+                f"Implausible scale: k = {record.k:.6g} in {label}. Check the units, sockets, lengths and arm of this "
+                "calibration."
+            )
     poses = [{row.tobytes() for row in np.asarray(record.recording.capture.readings)} for record in (old, new)]
     if poses[0] == poses[1]:
         values = [_values(record.calibrated.arm, old.names) for record in (old, new)]
         same = old.names == new.names and np.array_equal(values[0], values[1])
-        what = "are one and the same calibration" if same else "are of the same capture"
+        what = "are the same calibration" if same else "were computed from the same capture"
         yield f"Not independent: {labels[0]} and {labels[1]} {what}, so drift cannot be seen."
     elif common := len(poses[0] & poses[1]):
         yield (
@@ -222,17 +229,17 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
     if differing:
         arms = [f"'{specification.name}' of {label}" for specification, label in zip(nominal, labels, strict=True)]
         yield (
-            f"The nominal arms differ in {shorten(differing)} ({', '.join(arms)}): is it the same arm? Differences of "
-            "fixed parameters count as drift."
+            f"The nominal arms differ in {shorten(differing)} ({', '.join(arms)}); check that the arm is the same. "
+            "Differences between fixed parameters count as drift."
         )
     if old.final_method != new.final_method:
         yield (
-            f"Different methods: {labels[0]} is {old.final_method}, {labels[1]} {new.final_method}; "
-            "this is part of the change."
+            f"Different methods: {labels[0]} is {old.final_method}, {labels[1]} is {new.final_method}; "
+            "the changes include the effect of the method."
         )
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         if alone := [name for name in record.names if name not in other.names]:
             yield (
-                f"Free in {label} only: {shorten(alone)}. Other parameters may compensate for them in the other one; "
-                "lengths can still be compared."
+                f"Free in {label} only: {shorten(alone)}. In the other calibration, other parameters may compensate "
+                "for them; lengths can still be compared."
             )

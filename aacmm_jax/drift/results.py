@@ -71,7 +71,7 @@ class Drift(NamedTuple):
             if reason:
                 open_names.setdefault(reason, []).append(name)
         groups = [f"{shorten(names)} ({reason})" for reason, names in open_names.items()]
-        sentences += [f"Without an uncertainty of change: {'; '.join(groups)}."] if groups else []
+        sentences += [f"Changes without an uncertainty: {'; '.join(groups)}."] if groups else []
         return list(filter(None, sentences))
 
 
@@ -118,8 +118,11 @@ class Trend(NamedTuple):
 def _of_all(drift: Drift) -> str:
     test = drift.joint_test
     if math.isnan(test.p):
-        return "Together the changes cannot be tested: too few parameters or poses determine them in both calibrations."
-    law = f"chi-square {test.statistic:.1f} with {test.rank} degrees of freedom"
+        return (
+            "The changes cannot be tested together: too few parameters are determined in both calibrations, or there "
+            "are too few poses."
+        )
+    law = f"chi-squared {test.statistic:.1f} with {test.rank} degrees of freedom"
     if math.isfinite(test.degrees_of_freedom):
         ratio = test.statistic / test.rank
         law = f"F {ratio:.2f} with {test.rank} and {test.degrees_of_freedom:.0f} degrees of freedom"
@@ -130,10 +133,10 @@ def _of_all(drift: Drift) -> str:
     units = dict(zip(drift.names, drift.units, strict=True))
     causes = [f"{name} by {in_words(units[name], amount)}" for name, amount in test.causes]
     arm = "the arm has changed" if test.probe is None or not test.probe.remounted else "its probe has been remounted"
-    few = f" A change of these alone would explain all of it: {', '.join(causes)}." if causes else ""
+    few = f" A change of these parameters alone would explain all changes: {', '.join(causes)}." if causes else ""
     return (
         f"{start} more than their uncertainties explain ({law}, {probability}): {arm}, or there are "
-        f"errors that the uncertainties leave out.{few}"
+        f"errors that the uncertainties do not include.{few}"
     )
 
 
@@ -142,12 +145,13 @@ def _of_probe(drift: Drift, probe: ProbeTest) -> str:
     change = ", ".join(f"{name} by {in_words('mm', value)}" for name, value in probe.change)
     if not probe.remounted:
         return f"Not only the probe has changed: a remounted probe would explain {share:.0f} % of the changes."
-    start = f"Probe remounted: a change of the probe alone ({change}) explains {share:.0f} % of the changes, and"
+    start = f"Probe remounted: a change of the probe alone ({change}) explains {share:.0f} % of the changes"
     if not probe.p < 1 - drift.level:
-        return f"{start} chance the rest, so the arm has not changed."
+        return f"{start} and chance explains the rest, so the arm has not changed."
     return (
-        f"{start} the rest (chi-squared {probe.statistic:.0f} with {probe.rank} degrees of freedom) is more than the "
-        "uncertainties explain: errors outside the model, or a small change of the arm."
+        f"{start}, but the rest (chi-squared {probe.statistic:.0f} with {probe.rank} degrees of freedom) is more than "
+        "the uncertainties explain: either there are errors that the model does not describe, or the arm has changed "
+        "slightly."
     )
 
 
@@ -157,12 +161,12 @@ def _of_each(drift: Drift) -> str:
         return ""
     chance = f"{drift.by_chance:.0f}" if drift.by_chance >= 0.95 else f"{drift.by_chance:.1g}"
     whose = "its" if len(moved) == 1 else "their"
-    count = f"{len(moved) or 'None'} of {drift.compared} parameters moved beyond {whose} uncertainty"
+    count = f"{len(moved) or 'None'} of {drift.compared} parameters changed by more than {whose} uncertainty"
     changes = []
     for i in sorted(map(int, moved), key=lambda i: -abs(drift.change[i]) / drift.expanded[i]):
         name, unit, u = drift.names[i], drift.units[i], float(drift.expanded[i])
         changes.append(f"{name} by {in_words(unit, float(drift.change[i]))} (U = {in_words(unit, u, '')})")
-    start = f"{count} ({100 * drift.level:g} %; {chance} would by chance)"
+    start = f"{count} ({100 * drift.level:g} %; {chance} expected by chance)"
     return f"{start}: {shorten(changes)}." if changes else f"{start}."
 
 
@@ -172,13 +176,13 @@ def _of_lengths(lengths: LengthChange, level: float) -> Iterator[str]:
         percent = 100 * float(np.mean(lengths.moved))
         yield (
             f"{start} over the volume changed by {lengths.rms:.4f} mm RMS, where the uncertainties alone would give "
-            f"{lengths.rms_by_chance:.4f} mm, and at most by {lengths.largest:+.4f} mm; {percent:.0f} % of them moved "
-            f"beyond their uncertainty ({100 * (1 - level):.2g} % would by chance)."
+            f"{lengths.rms_by_chance:.4f} mm, and by at most {lengths.largest:+.4f} mm; {percent:.0f} % of the lengths "
+            f"changed by more than their uncertainty ({100 * (1 - level):.2g} % expected by chance)."
         )
     else:
         yield (
-            f"{start} changed by {lengths.rms:.4f} mm RMS, at most {lengths.largest:+.4f} mm, but the data of one "
-            "calibration leave them open, so this may not be drift."
+            f"{start} over the volume changed by {lengths.rms:.4f} mm RMS and by at most {lengths.largest:+.4f} mm, "
+            "but the data of one calibration do not determine all of these lengths, so this may not be drift."
         )
     if math.isfinite(lengths.u_scale_change):
         relation = "beyond" if abs(lengths.scale_change) > lengths.expanded_scale_change else "within"
@@ -186,8 +190,9 @@ def _of_lengths(lengths: LengthChange, level: float) -> Iterator[str]:
         expanded = 1e6 * lengths.expanded_scale_change
         decimals = 1 if expanded < 10 else 0  # no more than the uncertainty allows
         yield (
-            f"On average the same lengths measure {1e6 * abs(lengths.scale_change):.{decimals}f} um/m {word} than "
-            f"before (U = {expanded:.{decimals}f} um/m), which is {relation} the uncertainty."
+            f"On average, the new calibration measures these lengths {1e6 * abs(lengths.scale_change):.{decimals}f} "
+            f"um/m {word} than the old one does (U = {expanded:.{decimals}f} um/m); this change is {relation} its "
+            "uncertainty."
         )
 
 

@@ -23,7 +23,8 @@ def held_by_xml(text: str, what: str) -> str:
     character = _NOT_IN_XML.search(text)
     if character:
         raise InputError(
-            f"{what} holds the character U+{ord(character.group()):04X}, which no XML file can hold; take it out."
+            f"{what} contains the character U+{ord(character.group()):04X}, which XML does not allow; remove the "
+            "character."
         )
     return text
 
@@ -32,7 +33,7 @@ def _text(text: str) -> str:
     """Text without blanks around it, as the schema of the DCC requires."""
     text = held_by_xml(text, "the text").strip(" \t\n\r")
     if not text:
-        raise ValueError("the text is empty; give some, or leave the key out.")
+        raise ValueError("the text is empty; enter a text or remove the key.")
     return text
 
 
@@ -113,7 +114,7 @@ class Certificate(Strict):
         given = [(name, date) for name, date in dates if date is not None]
         for (earlier, first), (later, second) in itertools.pairwise(given):
             if first > second:
-                raise ValueError(f"{earlier} is {first}, after {later} on {second}; correct one of them.")
+                raise ValueError(f"{earlier} ({first}) is after {later} ({second}); correct one of the two dates.")
         if self.temperature_u_celsius is not None and self.temperature_celsius is None:
             raise ValueError("temperature_u_celsius is given without temperature_celsius; give both.")
         return self
@@ -174,11 +175,11 @@ def check_conformity(
         return
     verdict = about.conformity.verdict
     if simulated:
-        raise InputError("conformity is stated of a simulated arm, which cannot conform; leave [conformity] out.")
-    results = {"conforms": "every limit is kept", "fails": "a limit is not kept", "undecided": "a limit is undecided"}
+        raise InputError("conformity cannot be stated for a simulated arm; remove [conformity].")
+    results = {"conforms": "every limit is met", "fails": "a limit is not met", "undecided": "a limit is undecided"}
     passes = {"pass": ("conforms",), "fail": ("fails",)}.get(verdict, tuple(results))
     if tested and decision not in passes:
         raise InputError(
-            f"conformity.verdict is '{verdict}', but of this evaluation "
+            f"conformity.verdict is '{verdict}', but in this evaluation "
             f"{results.get(decision or '', 'no limit was given')}; correct the statement."
         )

@@ -42,7 +42,7 @@ class JointTable(Strict):
     def _ordered(self) -> "JointTable":
         if self.limits is not None and not self.limits[0] < self.limits[1]:
             low, high = self.limits
-            raise ValueError(f"the limits are {low:g} to {high:g}; the lower must be below the upper.")
+            raise ValueError(f"the limits are {low:g} to {high:g}; the lower limit must be below the upper limit.")
         return self
 
 
@@ -68,7 +68,9 @@ class NoiseTable(Strict):
     @model_validator(mode="after")
     def _one_statement(self) -> "NoiseTable":
         if self.repeatability_mm is not None and self.encoder_arcsec is not None:
-            raise ValueError("give repeatability_mm or encoder_arcsec; both say how precise the readings are.")
+            raise ValueError(
+                "give either repeatability_mm or encoder_arcsec, because both state the precision of the readings."
+            )
         return self
 
     def noise(self, arm: Arm, default: str) -> ArmNoise:
@@ -100,10 +102,13 @@ class CorrectionsTable(Strict):
         if (self.model is None) == (not self.coefficients):
             raise ValueError("give either model, such as 'gravity,harmonics=1', or coefficients by name.")
         if self.nominal and not self.coefficients:
-            raise ValueError("nominal is of coefficients; leave it out of a model.")
+            raise ValueError("nominal belongs to coefficients; remove nominal where a model is given.")
         unknown = set(self.nominal) - {*GEOMETRY}
         if unknown:
-            raise ValueError(f"nominal has no '{min(unknown)}'; it has lists of alpha, a, d, theta, beta, and probe.")
+            raise ValueError(
+                f"nominal has the unknown key '{min(unknown)}'; its keys are alpha, a, d, theta, beta and probe, each "
+                "with a list."
+            )
         return self
 
     def corrected(self, arm: Arm, units: Mapping[str, float]) -> Arm:
@@ -172,11 +177,14 @@ class ArmFile(Strict):
     @model_validator(mode="after")
     def _rows_or_urdf(self) -> "ArmFile":
         if bool(self.joint) == (self.urdf is not None):
-            raise ValueError("give either joint, one row a joint, or urdf, the name of a URDF file.")
+            raise ValueError("give either joint (one row per joint) or urdf (the name of a URDF file).")
         if self.urdf is None and (self.base is not None or self.tip is not None):
-            raise ValueError("base and tip are links of a URDF; leave them out, or give urdf.")
+            raise ValueError("base and tip name links of a URDF; remove both, or give urdf.")
         if self.urdf is not None and self.prismatic:
-            raise ValueError("prismatic is for rows of joints; a URDF states its prismatic joints, so leave it out.")
+            raise ValueError(
+                "prismatic applies to rows of joints; a URDF states which of its joints are prismatic, so remove "
+                "prismatic."
+            )
         return self
 
     @model_validator(mode="after")
@@ -185,15 +193,15 @@ class ArmFile(Strict):
         for i, joint in enumerate(self.joint, start=1):
             if self.angle_unit == "rad" and abs(joint.alpha) > 2 * math.pi:
                 raise ValueError(
-                    f"joint {i} has alpha = {joint.alpha:g} rad, more than a revolution; is it in degrees? "
-                    "Correct angle_unit or alpha."
+                    f"joint {i} has alpha = {joint.alpha:g} rad, more than a revolution; is alpha in degrees? Correct "
+                    "angle_unit or alpha."
                 )
         twists = [joint.alpha for joint in self.joint if joint.alpha]
         quarters = [twist / (math.pi / 2) for twist in twists]
         if self.angle_unit == "deg" and twists and all(abs(x - round(x)) < 1e-3 and 1 <= abs(x) < 3 for x in quarters):
             raise ValueError(
-                f"every alpha is a multiple of pi/2, such as {twists[0]:g}, which is unusual in degrees; is it in rad? "
-                "Correct angle_unit or alpha."
+                f"every alpha is a multiple of pi/2 (for example {twists[0]:g}), which is unusual in degrees; are the "
+                "angles in rad? Correct angle_unit or alpha."
             )
         return self
 
@@ -203,28 +211,32 @@ class ArmFile(Strict):
             return self
         first = self.joint[0]
         if len({joint.limits is None for joint in self.joint}) > 1:
-            raise ValueError("limits are given for some joints only; give them for all or for none.")
+            raise ValueError("limits are given for some joints only; give limits for all joints or for none.")
         if max(self.prismatic, default=0) > len(self.joint):
-            raise ValueError(f"prismatic names joint {max(self.prismatic)}, but there are {len(self.joint)} joints.")
+            raise ValueError(f"prismatic names joint {max(self.prismatic)}, but the arm has {len(self.joint)} joints.")
         if self.prismatic and first.limits is None:
             raise ValueError(
-                f"joint {min(self.prismatic)} is prismatic, but its travel is not stated; give every joint limits (in "
-                "length_unit of prismatic joints)."
+                f"joint {min(self.prismatic)} is prismatic, but its travel is not stated; give limits for every joint "
+                "(for prismatic joints in length_unit)."
             )
         if self.convention == "craig" and (first.alpha or first.a):
             raise ValueError(
-                "joint 1 has a twist or a length before its axis (alpha_0, a_0), which standard form cannot hold; "
-                "choose the base frame on the first axis, so that both are 0."
+                "joint 1 has a twist or a length before its axis (alpha_0, a_0), which the standard convention "
+                "cannot represent; place the base frame on the first axis, so that both are 0."
             )
         if self.convention == "craig" and any(joint.beta for joint in self.joint):
-            raise ValueError("beta is Hayati's angle of the standard form; leave it out of a craig table.")
+            raise ValueError(
+                "beta (Hayati's angle) belongs to the standard convention; remove beta from a craig table."
+            )
         return self
 
 
 def arm_template(joints: int = 6) -> str:
     """The text of an arm file in which every key is explained, valid as it stands; of 1 to 20 joints."""
     if not 1 <= joints <= _MOST_JOINTS:
-        raise InputError(f"an arm of {joints} joints cannot be written; give a number from 1 to {_MOST_JOINTS}.")
+        raise InputError(
+            f"no arm file can be written for {joints} joints; give a number of joints from 1 to {_MOST_JOINTS}."
+        )
     pattern = _FEW_ROWS if joints < len(_ROWS) else _ROWS
     rows = [pattern[i % len(pattern)] if i + 1 < joints else (0, 0, 0) for i in range(joints)]
     lines = [
@@ -251,7 +263,7 @@ def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
     """The specification with another model of its joints; masses are those of its URDF, where it has one. Raises
     `InputError` where the model names an unknown kind."""
     if not model.strip():
-        raise InputError("the model is empty; name dh alone for an arm without corrections.")
+        raise InputError("the model is empty; for an arm without joint corrections, give the model dh.")
     arm = with_corrections(specification.arm, model, **masses_of(specification))
     gone = {*correction_names(specification.arm)} - {*correction_names(arm)}
     held = specification.held
@@ -300,7 +312,7 @@ def prior_of_text(text: str, arm: Arm) -> Prior | None:
             if match["mean"] is not None:
                 mean[group] = number(match["mean"]) * factors[match["unit"]]
         except ValueError as error:
-            units = ", ".join(factors) or "one unit for lengths and one for angles, in groups of their own"
+            units = ", ".join(factors) or "lengths and angles need separate groups, each with its own unit"
             raise InputError(
                 f"--prior '{part}' is not of the form GROUP=NUMBER and unit ({units}), GROUP=MEAN+-NUMBER and unit, or "
                 "GROUP=learn."

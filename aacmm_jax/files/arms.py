@@ -165,7 +165,7 @@ def read_arm(
     if suffix in _ROBOTS:
         return read_urdf(path, base=base, tip=tip, probe=probe), False
     if base is not None or tip is not None:
-        raise InputError(f"{source} is not a URDF, so it has no links; leave out base and tip.")
+        raise InputError(f"{source} is not a URDF, so it has no links; omit base and tip.")
     if suffix in _OTHER_FORMATS:
         return read_ur_kinematics(path, probe=probe), False
     if suffix != ".toml" and not os.path.exists(path):
@@ -176,7 +176,9 @@ def read_arm(
         )
     model = read_toml(path, ArmFile)
     if probe is not None and any(model.probe):
-        raise InputError(f"{path} states the probe itself; change it there, or with arm.replace(probe=...).")
+        raise InputError(
+            f"{path} already states the probe; change the probe in that file, or with arm.replace(probe=...)."
+        )
     with naming(path):
         return _specification(path, model, probe), model.identification is not None
 
@@ -239,8 +241,8 @@ def _arm_of_rows(model: ArmFile) -> Arm:
     reach = float(np.linalg.norm(np.asarray(arm.position(q)), axis=1).max())
     if 0 < reach < _SMALLEST or reach > _LARGEST:
         raise InputError(
-            f"with its lengths in {model.length_unit}, the tip is at most {reach:.3g} mm from the base; are they in "
-            f"{'m' if reach < _SMALLEST else 'mm'}? Correct length_unit or the lengths."
+            f"with lengths in {model.length_unit}, the tip is at most {reach:.3g} mm from the base; are the lengths "
+            f"in {'m' if reach < _SMALLEST else 'mm'}? Correct length_unit or the lengths."
         )
     return arm
 

@@ -161,7 +161,7 @@ def _observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> O
         {
             "its results are of other observations": tuple(row["name"] for row in rows) != expected,
             "its geometry is that of other observations": {name: len(part) for name, part in parts.items()} != sizes,
-            "the covariance of its geometry has another size": not square,
+            "the covariance of its geometry has the wrong size": not square,
             "a weight is above 1": np.any(table["weights"] > 1),
         },
     )

@@ -74,7 +74,7 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket that held the tip"))
     if capture.visits is not None:
         visits = np.array(capture.visits)
-        poses |= columns("pose", visit=(visits, "1", "number of the visit to the socket; -1 unknown"))
+        poses |= columns("pose", visit=(visits, "1", "number of the visit to the socket; -1 if unknown"))
     # Copies that were left out: poses by socket, and lengths by their ends.
     (sockets, counts), (starts, ends) = (tuple(zip(*rows, strict=True)) or ((), ()) for rows in capture.repeated)
     attributes = {
@@ -161,8 +161,8 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
     kind = kinds().get(attributes["kind"])
     if kind is None:
         raise InputError(
-            f"{path} holds an observation of the unknown kind '{attributes['kind']}'; update aacmm_jax, or make the "
-            "file again."
+            f"{path} contains an observation of the unknown kind '{attributes['kind']}'; update aacmm_jax, or make "
+            "the file again."
         )
     values: dict[str, Any] = {}
     for entry in kind.entries:

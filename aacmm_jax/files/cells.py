@@ -124,7 +124,10 @@ def load_cell(
             body, notes = _urdf_body(specification, specification.urdf, urdf_folder(arm), slender)
         if body is None:
             if radius is None:
-                notes = (f"links are taken as {slender:.0f} mm in radius, 5 % of their length; state their radius.",)
+                notes = (
+                    f"each link is assumed to have a radius of {slender:.0f} mm (5 % of the total length of the "
+                    "links); state the radius.",
+                )
             stated = slender if radius is None else radius
             body = body_along_links(specification.arm, stated, content.body.tool_radius)
     return LoadedCell(Cell(body, tuple(obstacles), content.clearance), notes)
@@ -173,11 +176,11 @@ def _urdf_body(
     rows.sort(key=lambda row: row.end_frame)
     notes = []
     for partly, instead in (
-        (False, "capsules about their D-H rows are used"),
-        (True, "their joints' other shapes are used alone"),
+        (False, "capsules along their D-H rows are used instead"),
+        (True, "only the other shapes of their joints are used"),
     ):
         if links := [link for frame, link in missing.items() if (frame in with_shape) == partly]:
-            notes.append(f"meshes of {', '.join(links)} are not at hand as STL or OBJ; {instead}.")
+            notes.append(f"the meshes of {', '.join(links)} are not available as STL or OBJ; {instead}.")
     # Not of one or successive links may they touch, of which those without a shape do not count.
     rank = np.unique([row.end_frame for row in rows], return_inverse=True)[1]
     checked = {frozenset((simple.names[i], simple.names[j])) for i, j in simple.pairs}
@@ -277,9 +280,11 @@ def mesh_vertices(path: Path) -> Float[np.ndarray, "m 3"]:
             numbers = [[float(x) for x in row[1:4]] for row in rows if row and row[0] == word]
             vertices = np.array(numbers).reshape(-1, 3)
         except ValueError as error:
-            raise InputError(f"{path} has a vertex that is not three numbers; export the mesh again.") from error
+            raise InputError(
+                f"{path} has a vertex that does not consist of three numbers; export the mesh again."
+            ) from error
     if not len(vertices) or not np.all(np.isfinite(vertices)):
-        raise InputError(f"{path} has no vertices, or some that are not finite; export the mesh again.")
+        raise InputError(f"{path} has no vertices, or has vertices that are not finite; export the mesh again.")
     return np.unique(vertices, axis=0)
 
 
@@ -344,17 +349,20 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
             half_angle, normal = math.radians(stated.pop("half_angle_deg")), stated.pop("normal")
             with naming(f"{path}: [[{table}]] '{stated['name']}'"):
                 if not any(normal):
-                    raise InputError("it has the normal (0, 0, 0); give a direction.")
+                    raise InputError("its normal is (0, 0, 0); give a direction.")
                 # Tried once, so that what cannot be recorded is refused here.
                 simulated = kind(**stated)
                 tips = simulated.tips(np.random.default_rng(0))
                 if not np.all(np.isfinite(tips)):
-                    raise InputError("numbers that do not fit together, such as two ends in one point; correct them.")
+                    raise InputError(
+                        "its numbers contradict each other (for example, both ends are at the same point); correct "
+                        "them."
+                    )
                 transforms = np.tile(np.eye(4), (len(tips), 1, 1))
                 transforms[:, :3, 3] = tips
                 simulated.recorded(np.zeros((len(tips), 1)), transforms, np.random.default_rng(0))
             items.append(KitItem(simulated, places, turned, half_angle, tuple(normal)))
     if not items:
         tables = ", ".join(f"[[{table}]]" for table in _KINDS)
-        raise InputError(f"{path} names nothing; give tables {tables}.")
+        raise InputError(f"{path} contains no artefact and no instrument; add at least one of the tables {tables}.")
     return items

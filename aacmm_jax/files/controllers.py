@@ -137,7 +137,10 @@ def zero_offsets(nominal: Arm, calibrated: Arm, q: Float[np.ndarray, "N n"]) -> 
     """
     nominal, calibrated = single(nominal), single(calibrated)
     if nominal.joints != calibrated.joints:
-        raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")
+        raise InputError(
+            f"the arms have {nominal.joints} and {calibrated.joints} joints; give two arms with the same number of "
+            "joints."
+        )
     targets, probe = np.asarray(calibrated.position(q)), np.asarray(calibrated.probe)
     kinds, tip = by_joint(nominal, "theta", "d"), ["probe_x", "probe_y", "probe_z"]
     offsets, distances = [f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)], []
@@ -169,12 +172,13 @@ def zero_offsets_csv(zeros: ZeroOffsets) -> str:
     Example:
         >>> zeros = aj.files.zero_offsets(arm, result.arm, np.array(capture.q))
         >>> print(aj.files.zero_offsets_csv(zeros).splitlines()[0])
-        # To be added to the joint readings of the nominal arm.
+        # Add these offsets to the joint readings of the nominal arm.
     """
     lines = [
-        "# To be added to the joint readings of the nominal arm.",
-        f"# Distance of the tip from the calibrated arm's: RMS {zeros.rms:.4f} mm, largest {zeros.largest:.4f} mm; RMS",
-        f"# {zeros.rms_nominal:.4f} mm without the offsets. Tip in the last frame: {_row(zeros.probe, ' ')} mm.",
+        "# Add these offsets to the joint readings of the nominal arm.",
+        f"# Distance from the tip of the calibrated arm, with the offsets: RMS {zeros.rms:.4f} mm, largest "
+        f"{zeros.largest:.4f} mm",
+        f"# (RMS {zeros.rms_nominal:.4f} mm without the offsets). Tip in the last frame: {_row(zeros.probe, ' ')} mm.",
     ]
     units = ["deg", "rad", *(["mm"] if "mm" in zeros.units else [])]
     lines.append(",".join(["joint", *(f"offset_{unit}" for unit in units)]))
@@ -237,7 +241,7 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
         try:
             text = file.text
         except UnicodeDecodeError as error:
-            raise InputError("it is not text in UTF-8; name a YAML file.") from error
+            raise InputError("it is not UTF-8 text; name a YAML file.") from error
         entries = _entries(text)
         if any(name in entries for name in _DH):
             theta, a, d, alpha = (_numbers_of(entries, name, len(_JOINTS)) for name in _DH)
@@ -267,16 +271,18 @@ def ur_kinematics_yaml(arm: Arm) -> str:
           hash: aacmm_jax_calibration
     """
     if single(arm).joints != len(_JOINTS):
-        raise InputError(f"kinematics.yaml is of six joints, but the arm has {arm.joints}; choose another --format.")
+        raise InputError(
+            f"kinematics.yaml describes six joints, but the arm has {arm.joints}; choose another --format."
+        )
     values = [
         # 0.0 is added, as -0.0 becomes 0.0.
         [repr(float(x) + 0.0) for x in (*origin[:3, 3] / 1000, *roll_pitch_yaw(origin[:3, :3]))]
         for origin in canonical_origins(geometry_of(without_far_frames(arm)))
     ]
     lines = [
-        "# Written by aacmm_jax: origins of the joints of a calibrated arm, m and rad.",
-        "# The driver warns that the hash is not the controller's, as the parameters are not those of the factory.",
-        f"# The tip in the tool flange's frame, for the controller's TCP: {' '.join(values[-1])}",
+        "# Written by aacmm_jax: origins of the joints of a calibrated arm, in m and rad.",
+        "# The driver warns that the hash differs from the controller's, because these are not the factory parameters.",
+        f"# Tip in the frame of the tool flange, to be entered as TCP in the controller: {' '.join(values[-1])}",
         "kinematics:",
     ]
     for name, numbers in zip(_JOINTS, values[:-1], strict=True):
@@ -296,20 +302,20 @@ def _of_origins(entries: dict[str, str]) -> Geometry:
         points.append(frame[:3, 3])
     base, geometry = dh_of_axes(Axes(np.array(directions), np.array(points), frame))
     if np.abs(inverse(base)[:3, :] - np.eye(4)[:3, :]).max() > 1e-9:
-        raise InputError("the first axis is not the z axis of the base (kinematics.shoulder); correct it there.")
+        raise InputError("the first axis is not the z axis of the base; correct kinematics.shoulder.")
     return geometry
 
 
 def _numbers_of(entries: dict[str, str], name: str, count: int) -> Float[np.ndarray, " k"]:
     """The numbers of an entry, m and rad."""
     if name not in entries:
-        of_joints = "; a kinematics.yaml has it for each of six joints." if count == 1 else "; add it."
+        of_joints = "; a kinematics.yaml has this entry for each of its six joints." if count == 1 else "; add it."
         raise InputError(f"'{name}' is missing{of_joints}")
     parts = entries[name].strip("[] ").replace(",", " ").split()
     numbers = np.array([number(part) if is_number(part) else math.nan for part in parts])
     if len(parts) != count or not np.all(np.abs(numbers) < _LARGEST):
         asked = "a finite number" if count == 1 else "six finite numbers"
-        raise InputError(f"'{name}' is {quoted(entries[name])}; give {asked} below {_LARGEST:g}, m or rad.")
+        raise InputError(f"'{name}' is {quoted(entries[name])}; give {asked} below {_LARGEST:g}, in m or rad.")
     return numbers
 
 
@@ -328,7 +334,7 @@ def _entries(text: str) -> dict[str, str]:
             above.pop()
         name = ".".join([*(part for _, part in above), key])
         if name in entries:
-            raise InputError(f"line {count}: '{name}' is there twice; take one out.")
+            raise InputError(f"line {count}: '{name}' occurs twice; remove one of the two.")
         entries[name] = value
         if not value:
             above.append((indent, key))

@@ -124,7 +124,7 @@ def load_evaluation(path: str | os.PathLike) -> Any:
             parameters = values_in(Uncertainty, schema.UNCERTAINTY, table, table.attributes)
             names = set(parameters["names"])
             strange = not names <= set(parameter_names(calibrated.arm)) or len(names) < len(parameters["names"])
-            check_sense(path, {"a parameter is unknown, or named twice": strange})
+            check_sense(path, {"a parameter is unknown or is named twice": strange})
             within = records_within(stored.tables, _RECORDS)
             uncertainty = Uncertainty(arm=calibrated.arm, u_k=None, **within, **parameters)
         return EvaluationRecord(captures.recording_of(path, stored), calibrated, uncertainty=uncertainty, **values)
@@ -158,20 +158,20 @@ KIND = "model comparison"
 _MODELS: Fields = {
     "parameters": number("free parameters", "1"),
     "effective_parameters": number("parameters that the data determine", "1"),
-    "rms_inside": number("RMS distance of the poses that the model was fitted to", "mm"),
-    "rms_outside": number("RMS error in regions that the model has not seen", "mm"),
-    "u_outside": number("standard error of rms_outside, by the scatter of the regions", "mm"),
-    "ratio": number("mean of (error / predicted standard deviation)^2 outside", "1"),
-    "log_evidence": number("log of the evidence, but for what all models have in common", "1"),
-    "difference": number("mean square outside less that of the best model", "mm2"),
+    "rms_inside": number("RMS distance from the geometry, of the poses to which the model was fitted", "mm"),
+    "rms_outside": number("RMS error in held-out regions", "mm"),
+    "u_outside": number("standard error of rms_outside, from the scatter between regions", "mm"),
+    "ratio": number("mean of (error / predicted standard deviation)^2 in held-out regions", "1"),
+    "log_evidence": number("log of the evidence, without the terms that are the same for all models", "1"),
+    "difference": number("mean square error in held-out regions, minus that of the best model", "mm2"),
     "u_difference": number("standard error of the difference", "mm2"),
     "cpu_seconds": number("CPU time", "s"),
 }
 _REGIONS: Fields = {
     "model": text("model of the joints"),
-    "region": text("region that was left out"),
-    "poses": number("its poses", "1"),
-    "rms": number("RMS error of its poses", "mm"),
+    "region": text("region that was held out"),
+    "poses": number("number of poses in the region", "1"),
+    "rms": number("RMS error of the poses in the region", "mm"),
     "ratio": number("mean of (error / predicted standard deviation)^2", "1"),
 }
 _NEEDED = ("parameters", "effective_parameters", "rms_inside", "rms_outside", "log_evidence", "cpu_seconds")
@@ -240,12 +240,12 @@ def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
     check_sense(
         path,
         {
-            "it holds no models": not models,
+            "it contains no models": not models,
             "a model is named twice": len(set(names)) != len(names),
-            "the recommended model is not one of its models": not chosen <= set(names),
+            "the recommended model is not one of the models": not chosen <= set(names),
             "a model lacks a region": uneven,
             "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
-            "a number is larger than any can be": any(abs(value) > _LARGEST for value in numbers if value is not None),
-            "a number is negative that cannot be": any(value is not None and value < 0 for value in positive),
+            "a number is impossibly large": any(abs(value) > _LARGEST for value in numbers if value is not None),
+            "a number that cannot be negative is negative": any(value is not None and value < 0 for value in positive),
         },
     )

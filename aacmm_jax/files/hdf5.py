@@ -208,7 +208,7 @@ class Entries(dict[str, Any]):
         self.path, self._what = path, what
 
     def __missing__(self, name: str) -> Any:
-        raise InputError(f"{self.path} lacks the {self._what} '{name}'; it is damaged or was edited; make it again.")
+        raise InputError(f"{self.path} has no {self._what} '{name}', so it is damaged or was edited; make it again.")
 
 
 class StoredTable(Entries):
@@ -237,7 +237,10 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
         groups = {name: group for name, group in file.items() if hasattr(group, "keys") and name not in without}
         size = sum(data.size * data.dtype.itemsize for group in groups.values() for data in group.values())
         if size > largest_file():
-            raise InputError(f"{path} holds arrays of {size / 2**20:,.0f} MiB, more than are read; name another file.")
+            raise InputError(
+                f"{path} contains arrays of {size / 2**20:,.0f} MiB, more than the limit for reading; name another "
+                "file."
+            )
         tables = {
             name: StoredTable(path, {key: values_of(data) for key, data in group.items()}, attributes_of(group))
             for name, group in groups.items()
@@ -284,7 +287,7 @@ def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True
             seal = seal_of(io.BytesIO(source) if isinstance(source, bytes) else source)
             if seal is None:
                 raise InputError(
-                    f"{path} was not written by aacmm, or it is damaged, was cut short or was written to by another "
+                    f"{path} was not written by aacmm, or it is damaged, incomplete or was changed by another "
                     f"program: the SHA-256 at its end is missing; name {wanted} file as aacmm wrote it, or make it "
                     "again."
                 )
@@ -309,7 +312,7 @@ def undamaged(path: str | os.PathLike) -> Iterator[None]:
     except (InputError, ImportError):
         raise
     except MemoryError as error:
-        raise InputError(f"{path} cannot be read: this process has no memory left; free some.") from error
+        raise InputError(f"{path} cannot be read: this process has no memory left; free some memory.") from error
     except Exception as error:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
         check_backend()
         if is_from_jax(error) or isinstance(error, AssertionError | FloatingPointError):
@@ -323,8 +326,8 @@ def _check_kind(attributes: Entries, kinds: Sequence[str], wanted: str) -> None:
     check_sense(
         path,
         {
-            "an attribute that is text is of another type": not all(isinstance(text, str) for text in texts),
-            "it is not of aacmm": attributes["format"] != FORMAT,
+            "an attribute that must be text has another type": not all(isinstance(text, str) for text in texts),
+            "it was not written by aacmm": attributes["format"] != FORMAT,
             f"its format version is {version!r}": not isinstance(version, int) or version < 1,
             "the time of writing is not a date": not is_moment(attributes["created"]),
         },
@@ -337,7 +340,7 @@ def _check_kind(attributes: Entries, kinds: Sequence[str], wanted: str) -> None:
             f"{path} has format version {version}, {what} than this package reads ({FORMAT_VERSION}); {todo}."
         )
     if attributes["kind"] not in kinds:
-        raise InputError(f"{path} holds {_with_article(attributes['kind'])}; name {wanted} file.")
+        raise InputError(f"{path} contains {_with_article(attributes['kind'])}; name {wanted} file.")
 
 
 def _with_article(name: str) -> str:

@@ -87,7 +87,7 @@ class _Check:
 
     def _refuse(self, name: bytes, what: str) -> InputError:
         where = f"{self._path}: '{name.decode()}'"
-        return InputError(f"{where} is {what}, which is not read; name a file written by aacmm.")
+        return InputError(f"{where} is {what}, which aacmm does not read; name a file written by aacmm.")
 
     def _check_size(self, name: bytes, item: Any, size: float) -> None:
         if size > self._credible:
@@ -138,7 +138,7 @@ class _Check:
 
     def _check_type(self, name: bytes, item: Any) -> None:
         if item.get_type().get_class() not in _TYPES:
-            raise self._refuse(name, "of a type that no file of aacmm has")
+            raise self._refuse(name, "of a type that does not occur in files of aacmm")
 
 
 def values_of(data: h5py.Dataset) -> np.ndarray:

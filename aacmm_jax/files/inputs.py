@@ -20,7 +20,9 @@ def largest_file() -> int:
     """Size in bytes above which no input is read: 1 GiB, or what the environment variable says."""
     text = os.environ.get(LARGEST_FILE, "1024")
     if not text.isascii() or not text.isdigit() or not 0 < int(text[:9]) < 1e9:
-        raise InputError(f"{LARGEST_FILE} is {text!r}; give a whole number of MiB, or unset it for 1024.")
+        raise InputError(
+            f"{LARGEST_FILE} is {text!r}; give a whole number of MiB, or unset the variable for the default of 1024."
+        )
     return int(text[:9]) * 2**20
 
 
@@ -82,8 +84,8 @@ def open_input(path: str | os.PathLike, times: float = 1) -> Iterator[Any]:
         check_ordinary(status)
         if status.st_size > limit:
             raise InputError(
-                f"{path} has {status.st_size / 2**20:,.0f} MiB, more than the {limit / 2**20:,.0f} MiB that are read; "
-                f"name another file, or raise the limit with the environment variable {LARGEST_FILE}."
+                f"{path} has {status.st_size / 2**20:,.0f} MiB, more than the limit of {limit / 2**20:,.0f} MiB; name "
+                f"another file, or raise the limit with the environment variable {LARGEST_FILE}."
             )
         yield stream
 

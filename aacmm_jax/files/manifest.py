@@ -85,7 +85,7 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
             raise InputError("there is neither a [[socket]] nor another observation; add one.")
         probe = "remounted" if model.sessions is None else model.sessions.probe
         if model.sessions is not None and not any(session for session, _ in observed):
-            raise InputError("[sessions] is for tables with a session, but there is none; leave it out.")
+            raise InputError("[sessions] applies to tables with a session, but no table has one; remove [sessions].")
         capture = _capture(lengths, observed, probe == "remounted")
         if capture.columns == nominal.arm.joints + 1:
             nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
@@ -130,8 +130,8 @@ def read_points(path: str | os.PathLike) -> Measured:
             for end in (length.start, length.end):
                 if end not in seated:
                     raise InputError(
-                        f"length '{length.start}' to '{length.end}' names the unknown socket '{end}'"
-                        f"{nearest(end, seated)}"
+                        f"length from '{length.start}' to '{length.end}' names the unknown socket "
+                        f"'{end}'{nearest(end, seated)}"
                     )
         if not seated and not spheres:
             raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")
@@ -198,7 +198,9 @@ def _capture(lengths: Sequence[ReferenceLength], observed: Sequence[tuple[str, A
         by_session[session].append(item)
     if len(by_session) > 1 and "" in by_session:
         without = [item.name for item in by_session[""]]
-        raise InputError(f"{shorten(without)} has no session, but other tables have; state it for every table.")
+        raise InputError(
+            f"{shorten(without)} has no session, but other tables have one; state the session in every table."
+        )
     lengths_of: dict[str, list[ReferenceLength]] = {session: [] for session in by_session}
     for length in lengths:  # named session/name
         ends = (length.start, length.end)
@@ -207,8 +209,8 @@ def _capture(lengths: Sequence[ReferenceLength], observed: Sequence[tuple[str, A
             lengths_of[""].append(length)
         elif session is None:
             raise InputError(
-                f"length from '{length.start}' to '{length.end}' is not between two sockets of one session; name them "
-                "session/name."
+                f"length from '{length.start}' to '{length.end}' is not between two sockets of one session; name the "
+                "sockets as session/name."
             )
         else:
             start, end = (end.removeprefix(f"{session}/") for end in ends)
@@ -246,7 +248,9 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
                 f"{in_braces(fields)}; use the same fields in the name and in every file."
             )
     if entry.exclude and not fields:
-        raise InputError(f"exclude is for files with a field in braces, but '{first}' has none; leave it out.")
+        raise InputError(
+            f"exclude applies to file names with a field in braces, but '{first}' has none; remove exclude."
+        )
     yield from matches(folder, first, entry.exclude) if fields else [{}]
 
 
@@ -262,8 +266,8 @@ def _lengths(
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
         if not choices and names:
             raise InputError(
-                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; "
-                "name the fields alike."
+                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; use the same "
+                "field names."
             )
         choices = choices if names else {()}
         pairs = [(fill(entry.start, dict(choice)), fill(entry.end, dict(choice))) for choice in sorted(choices)]

@@ -44,12 +44,12 @@ def checked_unit(
     or it is none of ``units``."""
     if header is not None and stated not in (None, header):
         raise InputError(
-            f"{where}: the header of the {what} says {quoted(header)[1:-1]}, but the manifest {stated}; correct one of "
-            "them."
+            f"{where}: the header of the {what} says {quoted(header)[1:-1]}, but the manifest says {stated}; correct "
+            "one of the two."
         )
     unit = stated or header or usual
     if unit is not None and unit not in units:
-        raise InputError(f"{where}: the {what} are in {quoted(unit)}; give one of {', '.join(units)}.")
+        raise InputError(f"{where}: the {what} are in {quoted(unit)}; use one of {', '.join(units)}.")
     return unit
 
 
@@ -76,7 +76,7 @@ class Readings:
         thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
         if set(thermometer) & set(picked):
             raise InputError(
-                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; leave it out of "
+                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; remove it from "
                 "columns."
             )
         numbers = text.numbers(picked, measured=True, stated=stated is not None)
@@ -91,7 +91,7 @@ class Readings:
         if self._first[0] != readings.shape[1]:
             (_, without), (_, other) = sorted((self._first, (readings.shape[1], text.path)), key=lambda table: table[0])
             raise InputError(
-                f"{without} has no temperatures, but {other} has; give it a column {TEMPERATURE}, or state "
+                f"{without} has no temperatures, but {other} has; add a column {TEMPERATURE} to {without}, or state "
                 f"{TEMPERATURE} in its table."
             )
         return readings
@@ -112,8 +112,8 @@ class Readings:
         unit = checked_unit(text.path, "readings", angular, unit, wanted.usual_unit, possible)
         if unit is None:
             raise InputError(
-                "'angles' is missing, so that the unit of the readings is not known; add [angles] with unit = \"deg\" "
-                'or "rad", or state it in the header of the table, as J1 [deg].'
+                "'angles' is missing, so the unit of the readings is not known; add [angles] with unit = "
+                '"deg" or "rad", or state the unit in the header of the table, for example J1 [deg].'
             )
         stated = {} if angles is None else angles.model_dump(exclude_unset=True)
         if angles is None or unit != angles.unit:
@@ -134,7 +134,9 @@ def with_temperature(
     """Readings with the temperature as a last column: of a table, or stated once for all, but not both; as they are
     without either."""
     if column is not None and stated is not None:
-        raise InputError(f"{where} has a column {TEMPERATURE}, and {TEMPERATURE} is stated besides; give one of them.")
+        raise InputError(
+            f"{where} has a column {TEMPERATURE}, but the manifest also states {TEMPERATURE}; give only one of the two."
+        )
     if stated is not None:
         column = np.full(len(q), float(stated))
     return q if column is None else np.concatenate([q, column[:, None]], axis=1)
@@ -156,13 +158,13 @@ def points_of(text: TextTable, wanted: Wanted, points: PointsTable) -> Float[np.
     if len(picked) != 3:
         line = LINE.format(", ".join(str(i + 1) for i in proposed_columns(text, 3, wanted.taken)) or "...")
         raise InputError(
-            f"{text.path} has {text.shown()}, and it is not clear which of them are x, y and z; add {line} with these "
-            "three."
+            f"{text.path} has {text.shown()}, but it is not clear which columns are x, y and z; add {line} with these "
+            "three columns."
         )
     header = text.unit(picked, key="points") if named is None else named[1]
     unit = checked_unit(text.path, "points", header, wanted.unit or points.unit, wanted.usual_unit, LENGTH_UNITS)
     if unit is None:
-        raise InputError(f'{text.path} does not say the unit of its points; add unit = "mm" to [points].')
+        raise InputError(f'{text.path} does not state the unit of its points; add unit = "mm" to [points].')
     return text.numbers(picked, measured=True, stated=columns is not None) * LENGTH_UNITS[unit]
 
 
@@ -221,8 +223,8 @@ def parts(
         different = sorted(tables[0].keys() ^ rows.keys())
         if different:
             raise InputError(
-                f"{where}: only one of {files_read[0]} and {file} has '{different[0]}'; give it in all files of a "
-                "table, or make a table for each."
+                f"{where}: only one of {files_read[0]} and {file} has '{different[0]}'; add '{different[0]}' to all "
+                "files of the table, or make a separate table for each file."
             )
     by_pose = {key: np.concatenate([rows[key] for rows in tables]) for key in tables[0]}
     groups, sessions = by_pose.pop("group"), by_pose.pop("session")
@@ -230,7 +232,7 @@ def parts(
     stated = reader.stated(values)
     both = sorted(by_pose.keys() & stated.keys())
     if both:
-        raise InputError(f"{where}: {both[0]} is given and also in columns; give it once.")
+        raise InputError(f"{where}: {both[0]} is given both as a key and in columns; give it only once.")
     for name, entry in reader.entries.items():
         if entry.required and name not in by_pose.keys() | stated.keys():
             todo = f"pick its columns with columns = {{ {name} = ... }}" if entry.of_poses else "state it"
@@ -259,7 +261,7 @@ class _Reader:
         columns = table.columns if isinstance(table.columns, dict) else {source.quantity: table.columns}
         self._columns = {key: as_list(picked) for key, picked in columns.items()}
         if getattr(table, "session", None) is not None and "session" in columns:
-            raise InputError(f"{where}: session is given and also in columns; give it once.")
+            raise InputError(f"{where}: session is given both as a key and in columns; give it only once.")
         may_have_sessions = source.quantity == "q" and hasattr(table, "session")
         for key in (*columns, *table.units):
             if key not in self.entries and not (key == "session" and key in columns and may_have_sessions):
@@ -267,10 +269,10 @@ class _Reader:
         labels = [e.name for e in kind.entries if e.dimensions == ("pose",) and e.content == "text"]
         self._label = labels[0] if labels else None
         if isinstance(table.files, dict) and self._label is None:
-            raise InputError(f"{where} has files by name, but its poses have none; give files as a list.")
+            raise InputError(f"{where} has named files, but its poses have no names; give files as a list.")
         self._own_file = getattr(table, "readings", None)
         if self._own_file is not None and len(table.paths) > 1:
-            raise InputError(f"{where} has readings in a file of their own, so it needs one file of values.")
+            raise InputError(f"{where} has its readings in a separate file, so it needs exactly one file of values.")
 
     def read(self, label: str, file: str, session: str) -> dict[str, Any]:
         """Of each pose of a file what its columns hold, its group and its session."""
@@ -290,7 +292,7 @@ class _Reader:
         if table.group is not None and "" in group:
             raise InputError(
                 f"{self._where}: {file} row {group.tolist().index('') + 1} has an empty cell in column "
-                f"{quoted(str(table.group))}, which names its group; fill it, or leave out the row."
+                f"{quoted(str(table.group))}, which names the group of the row; fill the cell, or delete the row."
             )
         of_session, main = chosen.pop("session", None), chosen.pop(source.quantity, None)
         others = [*chosen.values(), of_session or [], [] if table.group is None else [table.group]]
@@ -312,7 +314,7 @@ class _Reader:
             if len(values) != len(rows):
                 raise InputError(
                     f"{self._where}: {file} has {len(values)} rows of '{key}', but there are {len(rows)} readings; "
-                    "give a row of each for every pose."
+                    "give one row of each per pose."
                 )
         return rows_of
 
@@ -329,10 +331,10 @@ class _Reader:
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if not entry.of_poses:
-            raise InputError(f"{self._where}: {entry.name} is one for all poses; state it outside columns.")
+            raise InputError(f"{self._where}: {entry.name} has one value for all poses; state it outside columns.")
         if entry.content == "text":
             if len(wanted) != 1:
-                raise InputError(f"{self._where}: {entry.name} is in one column; pick one.")
+                raise InputError(f"{self._where}: {entry.name} needs one column; pick one column.")
             return text.texts(wanted[0])
         picked = text.pick(wanted)
         numbers = text.numbers(picked)
@@ -351,7 +353,7 @@ class _Reader:
     def _check_count(self, name: str, given: int, counts: Sequence[int]) -> None:
         if given not in counts:
             wanted = " or ".join(map(str, counts))
-            raise InputError(f"{self._where}: {name} is in {wanted} columns, but {given} are picked; pick {wanted}.")
+            raise InputError(f"{self._where}: {name} needs {wanted} columns, but {given} are picked; pick {wanted}.")
 
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
@@ -368,7 +370,7 @@ class _Reader:
         convention = self._table.rotation or self._preset.rotation
         if convention is None:
             raise InputError(
-                f"{self._where} does not say how its rotations are written; give rotation = "
+                f"{self._where} does not state the convention of its rotations; give rotation = "
                 f"{', '.join(NUMBERS_OF_ROTATION)}, or three axes such as XYZ or xyz."
             )
         self._check_count(entry.name, numbers.shape[1], (NUMBERS_OF_ROTATION.get(convention, 3),))
@@ -376,7 +378,7 @@ class _Reader:
             return numbers.reshape(-1, 3, 3)
         if convention.startswith("quaternion"):
             if not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
-                raise InputError(f"{self._where} has quaternions that are not of length 1; pick their four columns.")
+                raise InputError(f"{self._where} has quaternions whose length is not 1; pick their four columns.")
             return Rotation.from_quat(numbers, scalar_first=convention.endswith("wxyz")).as_matrix()
         numbers = numbers * self._unit(entry, header)
         vector = convention == "vector"

@@ -87,8 +87,8 @@ PRESETS = {
 def _rotation(text: str) -> str:
     if text not in NUMBERS_OF_ROTATION and not _EULER.fullmatch(text):
         raise ValueError(
-            f"'{text}' is not a convention of rotations; give {', '.join(NUMBERS_OF_ROTATION)}, or three axes such as "
-            "XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx)."
+            f"'{text}' is not a convention for rotations; give {', '.join(NUMBERS_OF_ROTATION)}, or three axes such "
+            "as XYZ (moving axes, R = Rx Ry Rz) or xyz (fixed axes, R = Rz Ry Rx)."
         )
     return text
 
@@ -115,9 +115,9 @@ class Angles(Strict):
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
         if (self.unit == "counts") != (self.counts_per_turn is not None):
-            raise ValueError("give counts_per_turn with unit = 'counts', and only with it.")
+            raise ValueError("counts_per_turn and unit = 'counts' must be given together.")
         if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
-            raise ValueError("give counts_per_mm with linear_unit = 'counts', and only with it.")
+            raise ValueError("counts_per_mm and linear_unit = 'counts' must be given together.")
         return self
 
     def converted(self, readings: Float[np.ndarray, "N n"], arm: Arm) -> Float[np.ndarray, "N n"]:
@@ -127,8 +127,8 @@ class Angles(Strict):
             array = np.asarray(getattr(self, key), dtype=float)
             if array.ndim and array.shape != (arm.joints,):
                 raise InputError(
-                    f"angles.{key} has {array.size} values, but there are {arm.joints} joints; give one, or one a "
-                    "joint."
+                    f"angles.{key} has {array.size} values, but the arm has {arm.joints} joints; give one value, or "
+                    "one value per joint."
                 )
             return array
 
@@ -181,9 +181,9 @@ class SocketTable(_Named):
     @model_validator(mode="after")
     def _has_name(self) -> "SocketTable":
         if self.files is not None and self.name is None and self.group is None:
-            raise ValueError("a socket of several files needs a name.")
+            raise ValueError("a socket with several files needs a name.")
         if self.visits is not None and self.target:
-            raise ValueError("visits are of the arm's own probe; leave out visits of a socket with a target.")
+            raise ValueError("visits apply to the arm's own probe; remove visits from a socket with a target.")
         return self
 
 
@@ -264,7 +264,8 @@ class PointsTable(Strict):
     def _both(self) -> "PointsTable":
         if (self.reach is None) != (self.shoulder is None):
             raise ValueError(
-                "give reach and shoulder together: zones are distances from the shoulder, in the points' frame."
+                "give reach and shoulder together: zones are ranges of the distance from the shoulder, which is "
+                "stated in the frame of the points."
             )
         return self
 
@@ -272,7 +273,7 @@ class PointsTable(Strict):
 class Recorded(Strict):
     """What manifests of poses and of points have in common."""
 
-    date: _Day | None = None  # when it was recorded
+    date: _Day | None = None  # day of the measurement
     socket: list[SocketTable] = Field(default_factory=list)
     length: list[Length] = Field(default_factory=list)
     sphere: list[Sphere] = Field(default_factory=list)
@@ -313,7 +314,7 @@ class PointsManifest(Recorded):
             seated = isinstance(entry, SocketTable) and (entry.target or entry.session)
             if seated or entry.temperature_C is not None:
                 raise ValueError(
-                    "target, session and temperature_C are for manifests of poses, but "
-                    f"'{entry.name or entry.paths[0]}' has points, which say where the tip was; leave them out."
+                    "target, session and temperature_C apply to manifests of poses, but "
+                    f"'{entry.name or entry.paths[0]}' has points, which are positions of the tip; remove these keys."
                 )
         return self

@@ -36,14 +36,14 @@ _asking: ContextVar[bool] = ContextVar("asking", default=False)
 def as_path(path: Any) -> Path:
     """The path of a file, or `InputError` for anything else: a number would name an open file."""
     if not isinstance(path, str | os.PathLike):
-        raise InputError(f"a file is named by a {type(path).__name__}; give its path as text.")
+        raise InputError(f"the path of a file is of type {type(path).__name__}; give the path as text.")
     return Path(path)
 
 
 def storable(text: str) -> str:
     """The same text, or `InputError` where HDF5 and TOML cannot hold it (NUL, or a file name that is not UTF-8)."""
     if "\0" in text or text.encode(errors="ignore").decode() != text:
-        raise InputError(f"the name {text!r} holds a character that no file can hold; rename it.")
+        raise InputError(f"the name {text!r} contains a character that files cannot store; rename it.")
     return text
 
 
@@ -113,7 +113,7 @@ class OutputFile:
         self.named, self._advice, self._same_kind = as_path(path), advice, same_kind
         with self.refusing():
             if "\0" in str(path):
-                raise OSError(None, "its name holds a NUL")
+                raise OSError(None, "its name contains a NUL character")
             self.target = Path(os.path.realpath(self.named))
         self.temporary = _beside(self.target)
         self._lock: int | None = None
@@ -142,7 +142,7 @@ class OutputFile:
             "it is read-only": exists and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)),
             "not a directory": folder.stat() and not folder.is_dir(),  # there must be one
             "its folder is read-only": not os.access(folder, os.W_OK | os.X_OK),
-            "it belongs to another user, and only they can replace it in its folder": exists
+            "it belongs to another user, and only that user can replace it in its folder": exists
             and not may_replace(target),
         }
         for problem, present in problems.items():
@@ -272,7 +272,7 @@ def check_kept(path: str | os.PathLike, original: str) -> None:
     """Raise `InputError`, in a command, where the file that would be replaced is this text, which the user wrote."""
     if _asking.get() and os.path.isfile(path) and Path(path).read_bytes() == original.encode():
         raise InputError(
-            f"{path} is the original that the arm was read from; choose another name, or replace it with --overwrite."
+            f"{path} is the file from which the arm was read; choose another name, or replace it with --overwrite."
         )
 
 
@@ -318,7 +318,7 @@ def together(*paths: str | os.PathLike | None) -> Iterator[None]:
             output.check()
         output.check_replaced()
         if any(_same(output.target, other.target) for other in outputs[:number]):
-            raise InputError(f"{output.named} is named for two outputs; choose another for one of them.")
+            raise InputError(f"{output.named} is named for two outputs; choose another file for one of the two.")
     group = _Outputs(outputs, {}, [])
     token = _current.set(group)
     try:

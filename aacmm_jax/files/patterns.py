@@ -31,19 +31,25 @@ def check_fields(text: str) -> None:
     names = _FIELD.findall(text)
     for name in names:
         if not name[0].isalpha():
-            raise InputError(f"the field {{{name}}} in {quoted(text)} has no name; begin it with a letter.")
+            raise InputError(f"the field {{{name}}} in {quoted(text)} has no valid name; begin the name with a letter.")
     if len(names) > _MOST_FIELDS:
-        raise InputError(f"{quoted(text)} has more than {_MOST_FIELDS} fields; write more of it out.")
+        raise InputError(
+            f"{quoted(text)} has more than {_MOST_FIELDS} fields; use fewer fields and write out more of the name."
+        )
     if re.search(r"\{\w+\}\{\w+\}", text):
-        raise InputError(f"{quoted(text)} has two fields with nothing between them; write what divides them.")
+        raise InputError(
+            f"{quoted(text)} has two fields with nothing between them; add the text that separates the two fields."
+        )
 
 
 def check_name(name: str) -> None:
     """Refuse a name with characters that act on a terminal or end a text (NUL, ESC), and one longer than a line."""
     if any(map(is_control, name)):
-        raise InputError(f"the name {quoted(name)} holds a control character; rename it.")
+        raise InputError(f"the name {quoted(name)} contains a control character; rename it.")
     if len(name) > _LONGEST_NAME:
-        raise InputError(f"the name {quoted(name)} has {len(name):,} characters, over {_LONGEST_NAME}; shorten it.")
+        raise InputError(
+            f"the name {quoted(name)} has {len(name):,} characters, more than {_LONGEST_NAME}; shorten the name."
+        )
 
 
 def in_braces(fields: Iterable[str]) -> str:
@@ -86,12 +92,12 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     near = [f"'{path}'" for path in kept if loose.fullmatch(path)]
     if near:
         raise InputError(
-            f"{where}, but nearly {shorten(near, _SHOWN)}: next to other text in a name, a field is letters, digits "
-            "and '-' only; write more of the name out."
+            f"{where}. Nearest: {shorten(near, _SHOWN)}. Next to other text in a name, a field stands for letters, "
+            "digits and '-' only; write out more of the name."
         )
     if left_out:
         shown = shorten([f"'{path}'" for path in left_out], _SHOWN)
-        raise InputError(f"{where} but {shown}, which exclude leaves out; change exclude.")
+        raise InputError(f"{where} except {shown}, which the key exclude rules out; change exclude.")
     # Files as deep in the folders as the pattern, with names like it.
     fixed = _FIELD.split(pattern)[0].rpartition("/")[0]
     deeper = "/".join("*" for _ in pattern.removeprefix(fixed).strip("/").split("/"))

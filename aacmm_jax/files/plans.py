@@ -121,14 +121,14 @@ def _file_of(procedure: Procedure, item: ProcedureItem) -> str:
     return f"{item.name}/{item.test.replace(' ', '-')}" + (f"-{item.group}" if several else "") + ".csv"
 
 
-_ROWS = "(one row a pose, in the order of the plan{}), then: aacmm import THIS.toml -o {}.h5"
+_ROWS = "(one row per pose, in the order of the plan{}), then run: aacmm import THIS.toml -o {}.h5"
 _WHAT = {
-    Plan: "A calibration, as planned. Fill in the calibrated lengths and uncertainties (k = 1), record a file for each "
-    "socket " + _ROWS.format("", "capture"),
-    KitPlan: "A calibration, as planned. Fill in certified values and uncertainties (k = 1), record the files "
+    Plan: "Manifest of a planned calibration. Fill in the calibrated lengths and uncertainties (k = 1), record one "
+    "file per socket " + _ROWS.format("", "capture"),
+    KitPlan: "Manifest of a planned calibration. Fill in certified values and uncertainties (k = 1), record the files "
     + _ROWS.format(": joint readings, then what was measured", "capture"),
-    Procedure: "{}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, record a "
-    "file for each socket and each group of touches " + _ROWS.format("", "acceptance"),
+    Procedure: "{}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, record one "
+    "file per socket and per group of touches " + _ROWS.format("", "acceptance"),
 }
 
 
@@ -149,10 +149,13 @@ def plan_manifest(plan: Planned, arm: str, urdf: UrdfSource | None = None, angle
         tables += [(item.table, _observation(item, plan.arm.joints)) for item in plan.observations]
     else:
         entries, what = entries | {"acceptance": plan.standard}, what.format(PLANNED[plan.standard])
-        stated = f"measuring_range = {plan.measuring_range:.0f}   # mm: its diameter, as the maker states it"
-        size = [stated if plan.range_stated else f"# {stated}; planned: twice the reach"]
+        stated = (
+            f"measuring_range = {plan.measuring_range:.0f}   # mm: diameter of the measuring volume, as the maker "
+            "states it"
+        )
+        size = [stated if plan.range_stated else f"# {stated}; the plan uses twice the reach"]
         tables = _of_procedure(plan)
-    date = "# date = 2026-01-31   # when it was recorded"
+    date = "# date = 2026-01-31   # day of the measurement"
     comment = textwrap.fill(what, 118, initial_indent="# ", subsequent_indent="# ")
     lines = [comment, *_entries(entries), date, *size, "", "[angles]", f'unit = "{angles}"']
     for heading, table in tables:
@@ -178,11 +181,11 @@ def _of_procedure(procedure: Procedure) -> list[tuple[str, dict[str, Any]]]:
             "name": sphere.name,
             "test": sphere.test,
             "files": [_file_of(procedure, item) for item in touches],
-            "diameter": (sphere.diameter, "mm: the calibrated diameter"),
-            "u": (0.0005, "mm: its standard uncertainty"),
+            "diameter": (sphere.diameter, "mm: calibrated diameter"),
+            "u": (0.0005, "mm: standard uncertainty of the diameter"),
             "stylus": (sphere.stylus, "mm: diameter of the probe's ball"),
-            "form": (0.0, "mm: its calibrated form error"),
-            "u_form": (0.0, "mm: the standard uncertainty of that"),
+            "form": (0.0, "mm: calibrated form error"),
+            "u_form": (0.0, "mm: standard uncertainty of the form error"),
         }
         tables.append(("sphere", entries))
     return tables
@@ -240,4 +243,4 @@ def _toml(value: Any) -> str:
 
 
 def _length(value: float, u: float) -> dict[str, Any]:
-    return {"value": (value, "mm: the calibrated length"), "u": (u, "mm: its standard uncertainty")}
+    return {"value": (value, "mm: calibrated length"), "u": (u, "mm: standard uncertainty of the length")}

@@ -117,7 +117,7 @@ def rows_table(dimension: str, records: Iterable[Any], fields: Fields) -> Table:
         dimensions = field.dimensions or (dimension,)
         if field.dimensions:
             row = np.repeat(np.arange(len(records)), [len(value) for value in values])
-            says = f"row of '{dimension}' that it is of, from 0"
+            says = f"index of its row of '{dimension}', counted from 0"
             variables[_index(dimension, field)] = Variable(dimensions, row, "1", says)
             values = [entry for value in values for entry in value]
         variables[field.name or name] = Variable(dimensions, _array(values, field), field.unit, field.says)
@@ -228,8 +228,8 @@ def check_fields(fields: Fields, arrays: Entries, attributes: Entries) -> None:
         check_sense(
             arrays.path,
             {
-                f"{key} ({field.says}) is of another type": values.size and values.dtype.kind not in kinds,
-                f"{key} ({field.says}) has another shape": dimensions
+                f"{key} ({field.says}) has the wrong type": values.size and values.dtype.kind not in kinds,
+                f"{key} ({field.says}) has the wrong shape": dimensions
                 and (values.shape != shape or values.ndim != len(dimensions)),
             },
         )

@@ -49,7 +49,7 @@ LENGTHS: Fields = {
 # A row for each group of a sphere, whose numbers stand in every one.
 SPHERES: Fields = {
     "name": text("reference sphere", name="sphere"),
-    "test": text("acceptance test that the sphere was touched for"),
+    "test": text("acceptance test for which the sphere was touched"),
     "diameter": number("calibrated diameter", "mm"),
     "u": number("standard uncertainty of the diameter", "mm", least=0),
     "stylus": number("diameter of the probe's ball", "mm", least=0),
@@ -79,7 +79,9 @@ ARM: Fields = {
     "coefficient_unit": text("unit of the coefficient", "coefficient"),
     "gravity": number("direction of gravity in the base frame", "1", "axis"),
     **{
-        f"nominal_{kind}": field._replace(says=f"{field.says} of the arm of the functions")
+        f"nominal_{kind}": field._replace(
+            says=f"{field.says}, nominal arm at which the correction functions are evaluated"
+        )
         for kind, field in _GEOMETRY.items()
     },
     "mass": number("mass of the link", "kg", "joint"),
@@ -87,12 +89,12 @@ ARM: Fields = {
     "lowest": number("lowest reading of the joint", "rad", "joint"),
     "highest": number("highest reading of the joint", "rad", "joint"),
     "prismatic": count("prismatic joints"),
-    "thermometer": truth("whether a temperature follows the readings"),
+    "thermometer": truth("whether the temperature is recorded after the readings"),
     "prior_groups": text("groups of parameters with a prior"),
-    "prior_sd": number("their standard deviations, mm or rad", ""),
+    "prior_sd": number("standard deviations of these groups, mm or rad", ""),
     "prior_learned": text("groups whose standard deviation is learned"),
     "prior_mean_of": text("parameters or groups with a mean"),
-    "prior_mean": number("their means, mm or rad", ""),
+    "prior_mean": number("means of these parameters or groups, mm or rad", ""),
 }
 
 _SQUARE = ("parameter", "parameter_2")
@@ -104,32 +106,32 @@ CALIBRATION: Fields = {
         "-1 on the lower bound, +1 on the upper, in stage 1", "parameter", least=None, among=(-1, 0, 1)
     ),
     "active": count("-1 on the lower bound, +1 on the upper", "parameter", least=None, among=(-1, 0, 1)),
-    "determined": truth("whether it is determined, and not only a combination with others", "parameter"),
-    "open": number("projector onto what is not determined, in mm and mrad", "1", *_SQUARE),
+    "determined": truth("whether the parameter is determined, and not only in combination with others", "parameter"),
+    "open": number("projector onto the combinations that are not determined, in mm and mrad", "1", *_SQUARE),
     "covariance": number("covariance", "products of units", *_SQUARE),
     "held": text("fixed parameters"),
     "hold": text("scale anchor of stage 1"),
     "scale_set_by": text("fixed lengths that set the scale"),
-    "k": number("scale factor, measured over certified lengths", "1"),
+    "k": number("scale factor: measured divided by certified lengths", "1"),
     "u_k": number("standard uncertainty of k", "1", least=0),
-    "surplus_k": number("part of the variance of k by lengths that disagree", "1", least=0),
+    "surplus_k": number("part of the variance of k that comes from the disagreement of the lengths", "1", least=0),
     "noise": part(NOISE),
-    "noise_model": text("model of the errors of tips"),
+    "noise_model": text("model of the tip errors"),
     "degrees_of_freedom": number("degrees of freedom of the scatter of single poses", "1", least=0),
-    "reduced_chi": number("residuals in units of the given noise", "1", least=0),
+    "reduced_chi": number("size of the residuals, in units of the given noise", "1", least=0),
     "method": text("method", among=("two-stage", "joint", "repeatability")),
     "steps": count("number of evaluations"),
     "converged": truth("whether the solve converged"),
     "reason": text("why the solve ended"),
-    "divided": truth("whether the arm is that of stage 1 divided by k"),
-    "against_division": text("what stood against the division by k"),
+    "divided": truth("whether the lengths of the arm are those of stage 1 divided by k"),
+    "against_division": text("why the lengths were not divided by k"),
     "sampled_says": text("result of the Monte Carlo simulation"),
     "robust": text("robust loss"),
 }
 
 SAMPLED: Fields = {
     "quantity": text("parameter, k or length", "quantity"),
-    "estimate": number("value of the calibration", "mm or rad; 1 for k", "quantity"),
+    "estimate": number("value found by the calibration", "mm or rad; 1 for k", "quantity"),
     "u": number("standard uncertainty by Monte Carlo", "mm or rad; 1 for k", "quantity"),
     "low": number("lower end of the Monte Carlo interval", "mm or rad; 1 for k", "quantity"),
     "high": number("upper end of the Monte Carlo interval", "mm or rad; 1 for k", "quantity"),
@@ -139,72 +141,72 @@ SAMPLED: Fields = {
 
 NOISY_ENCODERS: Fields = {
     "joint": count("joint whose encoder is noisier than expected", least=1),
-    "expected": number("standard deviation as given, or as that of the others", "rad, or mm of a prismatic joint"),
-    "found": number("standard deviation, estimated", "rad, or mm of a prismatic joint"),
-    "u": number("its standard uncertainty", "rad, or mm of a prismatic joint"),
-    "probability": number("probability of such residuals, were the noise as expected", "1"),
+    "expected": number("standard deviation as given, or that of the other encoders", "rad, or mm of a prismatic joint"),
+    "found": number("estimated standard deviation", "rad, or mm of a prismatic joint"),
+    "u": number("standard uncertainty of the estimate", "rad, or mm of a prismatic joint"),
+    "probability": number("probability of such residuals if the noise were as expected", "1"),
 }
 
 LEFT_OUT: Fields = {
     "sockets": text("sockets left out together", "left_out_socket"),
-    "poses": count("poses in sockets with more than one"),
-    "rms": number("RMS distance from the centroid, found", "mm"),
-    "rms_predicted": number("the same, predicted", "mm"),
-    "length_error": number("error of a length left out", "mm", "left_out_length"),
-    "length_u": number("its standard uncertainty, predicted", "mm", "left_out_length"),
+    "poses": count("number of poses in sockets with more than one pose"),
+    "rms": number("RMS distance from the centroid, observed", "mm"),
+    "rms_predicted": number("RMS distance from the centroid, predicted", "mm"),
+    "length_error": number("error of a length that was left out", "mm", "left_out_length"),
+    "length_u": number("predicted standard uncertainty of this error", "mm", "left_out_length"),
     "converged": truth("whether the calibration with the others converged"),
     "rms_degrees_of_freedom": number("effective degrees of freedom of rms_predicted", "1"),
     "length_degrees_of_freedom": number("effective degrees of freedom of length_u", "1"),
-    "noise_degrees_of_freedom": number("degrees of freedom of the noise behind both", "1"),
+    "noise_degrees_of_freedom": number("degrees of freedom of the noise, used by both predictions", "1"),
 }
 
 REMOVED: Fields = {
     "kind": text("kind of group"),
     "group": text("group left out, because it contradicts the rest"),
     "members": text("socket or observation left out", "removed_member"),
-    "ratio": number("F: mean square that it added, over that of the rest", "1"),
+    "ratio": number("F: mean square that the group added, divided by that of the rest", "1"),
     "degrees_of_freedom": count("degrees of freedom of numerator and denominator", "fraction"),
-    "probability": number("probability of this F where nothing is wrong", "1"),
-    "rms_with": number("RMS distance of the rest from its geometry", "mm"),
-    "rms_without": number("the same without the group", "mm"),
+    "probability": number("probability of an F this large if nothing is wrong", "1"),
+    "rms_with": number("RMS distance of the rest from its geometry, with the group", "mm"),
+    "rms_without": number("RMS distance of the rest from its geometry, without the group", "mm"),
     "changed_most": text("parameter that changed most"),
-    "change": number("its change in standard uncertainties", "1"),
+    "change": number("change of this parameter, in standard uncertainties", "1"),
 }
 
 OBSERVED: Fields = {
     "name": text("observation", name="observation"),
-    "kind": text("its kind"),
+    "kind": text("kind of the observation"),
     "rms_before": number("root mean square distance from the geometry, nominal arm", "mm", least=0),
-    "rms_after": number("the same by the calibrated arm", "mm", least=0),
-    "reduced_chi": number("root mean square in standard deviations of a residual", "1"),
-    "weights": number("weight of a pose; below 1 by a robust loss", "1", "pose", least=0),
+    "rms_after": number("root mean square distance from the geometry, calibrated arm", "mm", least=0),
+    "reduced_chi": number("root mean square of the residuals, in standard deviations", "1"),
+    "weights": number("weight of a pose; below 1 if a robust loss reduced it", "1", "pose", least=0),
 }
 
 GEOMETRY: Fields = {
     "part": text("part of the unknown geometry"),
     "unit": text("unit"),
     "value": number("value", "mm or rad, see unit"),
-    "covariance": number("row of the covariance of the part's numbers", "products of units", "entry"),
+    "covariance": number("row of the covariance matrix of the values of this part", "products of units", "entry"),
 }
 
 OTHER_POSES: Fields = {
     "names": text("observation", "observation", name="observation"),
-    "poses": count("number of poses that the arm was not calibrated with", "observation"),
-    "rms": number("their root mean square distance from the geometry found", "mm", "observation"),
-    "rms_angle": number("their root mean square angle", "rad", "observation"),
+    "poses": count("number of poses that were not used in the calibration", "observation"),
+    "rms": number("root mean square distance of these poses from the estimated geometry", "mm", "observation"),
+    "rms_angle": number("root mean square angle of these poses from the estimated geometry", "rad", "observation"),
 }
 
 PRIOR: Fields = {
     "groups": text("group of parameters with one prior", "prior_group", name="prior_group"),
-    "learned": truth("whether its standard deviation was learned from the data", "prior_group"),
-    "units": text("unit of its standard deviation", "prior_group"),
-    "parameters": count("how many free parameters it has", "prior_group"),
+    "learned": truth("whether the standard deviation of the group was learned from the data", "prior_group"),
+    "units": text("unit of the standard deviation", "prior_group"),
+    "parameters": count("number of free parameters in the group", "prior_group"),
     "sd": number("standard deviation, given or learned", "mm or rad, see unit", "prior_group"),
-    "effective": number("how many of its parameters the data determine", "1", "prior_group"),
+    "effective": number("number of parameters of the group that the data determine (effective)", "1", "prior_group"),
     "supported": truth("whether the data support a deviation from the mean", "prior_group"),
     "names": text("free parameter", "prior_parameter", name="prior_parameter"),
     "mean": number("mean", _EITHER, "prior_parameter"),
-    "weight": number("one over the standard deviation; 0 without a prior", "1/mm or 1/rad", "prior_parameter"),
+    "weight": number("reciprocal of the standard deviation; 0 without a prior", "1/mm or 1/rad", "prior_parameter"),
 }
 
 
@@ -213,34 +215,37 @@ def _law(dimension: str) -> Field:
     return part(
         {
             "degrees_of_freedom": number("degrees of freedom of the variance", "1", dimension),
-            "ratios": number("possible variances over the stated one", "1", dimension, possible),
-            "weights": number("their probabilities", "1", dimension, possible),
+            "ratios": number("possible variances, divided by the stated variance", "1", dimension, possible),
+            "weights": number("probabilities of the possible variances", "1", dimension, possible),
         }
     )
 
 
 SHARED_ERRORS: Fields = {
-    "kinds": text("what poses share", "shared_kind", name="shared_kind"),
-    "units": text("unit of its standard deviation", "shared_kind"),
+    "kinds": text("kind of error that poses share", "shared_kind", name="shared_kind"),
+    "units": text("unit of the standard deviation", "shared_kind"),
     "names": text("coefficient of a function", "coefficient", name="coefficient"),
     "sd": number("standard deviation, learned from the residuals", "mm or rad, see units", "shared_kind"),
     "moments": number("second moments of the coefficients about 0", "products of units", *_COEFFICIENTS),
     "follow": number(
-        "derivatives of the parameters by the coefficients", "quotients of units", "shared_parameter", "coefficient"
+        "derivatives of the parameters with respect to the coefficients",
+        "quotients of units",
+        "shared_parameter",
+        "coefficient",
     ),
     "correlation_length": number("correlation length of successive poses", "1"),
     "added": number(
         "part of the covariance", "products of units", "tip_kind", "shared_parameter", "shared_parameter_2"
     ),
     "by_group": number(
-        "derivatives of the moments by the logarithm of each kind's variance", "products of units",
+        "derivatives of the moments with respect to the logarithm of each kind's variance", "products of units",
         "function_kind", *_COEFFICIENTS,
     ),
     "law": _law("shared_kind"),
 }  # fmt: skip
 
 COMPONENTS: Fields = {
-    "names": text("what a part of the covariance rests on", "component", name="component"),
+    "names": text("source of a part of the covariance", "component", name="component"),
     "matrices": number(
         "part of the covariance", "products of units", "component", "component_parameter", "component_parameter_2"
     ),
@@ -250,23 +255,23 @@ COMPONENTS: Fields = {
 UNCERTAINTY: Fields = {
     "names": text("free parameter", "parameter", name="parameter"),
     "covariance": number("covariance", "products of units", *_SQUARE),
-    "open": number("projector onto what is not determined, in mm and mrad", "1", *_SQUARE),
+    "open": number("projector onto the combinations that are not determined, in mm and mrad", "1", *_SQUARE),
     "noise": part(NOISE),
     "scatter_degrees_of_freedom": number("degrees of freedom of the noise", "1", least=0),
 }
 
 JUDGED: Fields = {
-    "limits": mapping("fixed part, mm, and divisor of the length, of each MPE by metric"),
+    "limits": mapping("MPE of each metric: fixed part (mm) and divisor of the length"),
     "u_test": number("standard uncertainty that seat and fixture add", "mm", least=0),
     "standards": text("standards whose tests are run", among=("", *STANDARDS)),
-    "influences": mapping("relative uncertainty, and the expansion of artefact and arm"),
+    "influences": mapping("uncertainty (mm, and relative to a length), and thermal expansion of artefact and arm"),
     "rule": text("decision rule"),
 }
 
 EVALUATION: Fields = {
-    "used": text("sockets that the arm was identified from"),
-    "warnings": text("what makes the results doubtful"),
-    "calibration_warnings": text("what should be read about the calibration"),
+    "used": text("sockets from which the arm was identified"),
+    "warnings": text("warnings about the results"),
+    "calibration_warnings": text("warnings about the calibration"),
     "maxima": mapping("largest values allowed, mm"),
     **JUDGED,
 }
@@ -313,12 +318,19 @@ def read_checked(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
             joints = stored.tables["capture"]["angle"].shape[1]
             arms = [table["alpha"].shape for name, table in stored.tables.items() if name.endswith("_arm")]
             others = any(shape != (joints,) for shape in arms)
-            check_sense(path, {"its arm has another number of joints than its readings": others})
+            check_sense(path, {"the numbers of joints of its arm and of its readings differ": others})
         if stored.attributes["kind"] == "calibration":
             _check_calibration(path, stored.tables["parameters"], stored.tables["reference"])
         if "uncertainty" in stored.tables:
             covariance = stored.tables["uncertainty"]["covariance"]
-            check_sense(path, {"the covariance is not that of real numbers": not _is_semidefinite(covariance)})
+            check_sense(
+                path,
+                {
+                    "the covariance matrix has negative eigenvalues or is not symmetric": not _is_semidefinite(
+                        covariance
+                    )
+                },
+            )
         if "points" in stored.tables:
             _check_points(path, stored.tables["points"])
     return stored
@@ -334,7 +346,7 @@ def check_shown(path: str | os.PathLike, kind: str, summary: Mapping[str, Any]) 
             shown = [np.nan if summary[name] is None else summary[name] for name in names]
             held = [attributes[name] for name in names.values()]
             same = np.allclose(np.array(shown, float), np.array(held, float), rtol=0, atol=0, equal_nan=True)
-            check_sense(path, {"its summary is not that of its values": not same})
+            check_sense(path, {"its summary does not agree with its values": not same})
 
 
 def _check_calibration(path: str | os.PathLike, table: StoredTable, reference: StoredTable) -> None:
@@ -363,8 +375,9 @@ def _check_calibration(path: str | os.PathLike, table: StoredTable, reference: S
             "a lower bound is above the upper": not np.all(table["lower"] <= table["upper"]),
             "the scale k is not positive": not k > 0 and not np.isnan(k),
             "a converged calibration has a scale or covariance that is not finite": converged and not finite,
-            "the scale k is not that of its lengths": needed and not of_lengths,
-            "the covariance is not that of real numbers": finite and not _is_semidefinite(covariance),
+            "the scale k does not agree with its lengths": needed and not of_lengths,
+            "the covariance matrix has negative eigenvalues or is not symmetric": finite
+            and not _is_semidefinite(covariance),
         },
     )
 

@@ -65,8 +65,8 @@ def _check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[i
     if both is not None:
         name = f" {quoted(table.header[both])}" if table.header else ""
         raise InputError(
-            f"{table.path} column {both + 1}{name} is one of the joint readings, but is also picked for something else "
-            "(group, session, or a measured value); pick another."
+            f"{table.path} column {both + 1}{name} is one of the joint readings, but is also picked for something "
+            "else (group, session, or a measured value); pick another column."
         )
 
 
@@ -91,7 +91,7 @@ def reading_columns(
         if len(picked) != joints:
             raise InputError(
                 f"{table.path}: {len(picked)} columns are picked for the readings, but the arm has {joints} joints; "
-                "pick one a joint."
+                "pick one column per joint."
             )
         return picked
 
@@ -103,7 +103,7 @@ def reading_columns(
     whole = [family.columns for family in named if family.whole]
     if len(whole) > 1:
         choices = [f"{stated_by(columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
-        raise InputError(f"{table.path} has several columns of each joint; add {' or '.join(choices[:4])}.")
+        raise InputError(f"{table.path} has several columns for each joint; add {' or '.join(choices[:4])}.")
     # Where none is whole, one of as many columns is there twice.
     for columns in whole or [family.columns for family in named if len(family.columns) == joints]:
         table.check_ascending(columns, line)
@@ -124,15 +124,15 @@ def reading_columns(
     if joints == len(_OF_UR) and all(len(columns) == 1 for columns in of_ur):
         guess = [[columns[0] for columns in of_ur]]
     proposed = guess[0] if guess else proposed_columns(table, joints, taken)
-    add = f"add {stated_by(proposed)} if these are the joints in their order"
+    add = f"add {stated_by(proposed)} if these columns are the joints in order"
     if not proposed:
         add = (
-            "correct the header, or the delimiter where decimal commas are taken for it, or pick one column a joint "
-            f"with {line.format('...')}, or name them q_1 to q_{joints}"
+            "correct the header, or the delimiter if it is confused with decimal commas, or pick one column per "
+            f"joint with {line.format('...')}, or name the columns q_1 to q_{joints}"
         )
     raise InputError(
-        f"{table.path} has {table.shown()}, and it is not clear which of them are those of the arm's {joints} joints; "
-        f"{add}."
+        f"{table.path} has {table.shown()}, but it is not clear which columns hold the readings of the arm's {joints} "
+        f"joints; {add}."
     )
 
 
@@ -184,8 +184,8 @@ def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str |
         if unit not in (None, "counts", *possible):
             raise InputError(
                 f"{text.path} states {quoted(unit)} for readings of {joints} joints "
-                f"({quoted(text.header[columns[0]])}), but these are in {', '.join(possible)} or counts; pick their "
-                "columns with columns = [...], or correct the header."
+                f"({quoted(text.header[columns[0]])}), but such readings are in {', '.join(possible)} or counts; pick "
+                "their columns with columns = [...], or correct the header."
             )
         units.append(unit)
     return units[0], units[1]
@@ -249,19 +249,23 @@ def read_poses(
     if linear not in (None, "mm"):
         raise InputError(f"{path} states {linear} for readings of prismatic joints; convert them to mm.")
     if header is not None and (header not in _ANGLES or unit not in (None, header)):
-        raise InputError(f"{path} states {header} for joint readings; give them in deg or rad, and leave out --unit.")
+        raise InputError(
+            f"{path} states {header} for joint readings; give the readings in deg or rad, and omit --unit."
+        )
     if bool(picked) == (near is not None):
         raise InputError(
-            f"{path} needs joint readings once: give columns q_1 to q_{joints} and leave out --near, or --near alone."
+            f"{path} needs exactly one set of joint readings: give either columns q_1 to q_{joints} or --near."
         )
     if near is not None and len(near) != joints:
-        raise InputError(f"--near has {len(near)} readings, but the arm {joints} joints; give one per joint.")
+        raise InputError(
+            f"--near has {len(near)} readings, but the arm has {joints} joints; give one reading per joint."
+        )
     readings = table.numbers(picked) if near is None else np.tile(near, (table.length, 1))
     unit = header or unit
     if unit is None and recorded:
         unit = "deg" if np.abs(readings[:, by_joint(arm, True, False)]).max(initial=0) > 2 * np.pi else "rad"
     if unit is None:
-        raise InputError(f"{path} does not say the unit of joint readings; give --unit deg or --unit rad.")
+        raise InputError(f"{path} does not state the unit of the joint readings; give --unit deg or --unit rad.")
     poses = None
     if orientation is not None or (recorded and position is not None):
         poses = _poses(table, _ANGLES[unit], position, orientation or ([], None), length_unit)
@@ -311,12 +315,12 @@ def _poses(
     from scipy.spatial.transform import Rotation
 
     if position is None:
-        raise InputError(f"{table.path} has orientations, but no positions in columns x, y and z; add them.")
+        raise InputError(f"{table.path} has orientations, but no positions in columns x, y and z; add these columns.")
     unit, (columns, rotation_unit) = position[1] or length or "mm", orientation
     if unit not in LENGTH_UNITS or length not in (None, unit) or rotation_unit not in (None, *_ANGLES):
         raise InputError(
-            f"{table.path} states positions in {unit}; give one of {', '.join(LENGTH_UNITS)}, angles in deg or rad, "
-            "and leave out --length-unit."
+            f"{table.path} states positions in {unit}; give positions in one of {', '.join(LENGTH_UNITS)} and angles "
+            "in deg or rad, and omit --length-unit."
         )
     poses = np.tile(np.eye(4), (table.length, 1, 1))
     poses[:, :3, 3] = LENGTH_UNITS[unit] * table.numbers(position[0])
@@ -325,7 +329,8 @@ def _poses(
         wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=1) - 1) > _ROUNDED)
         if len(wrong):
             raise InputError(
-                f"{table.path} row {wrong[0] + 1}: the quaternion is not of length 1; correct it, or its columns."
+                f"{table.path} row {wrong[0] + 1}: the length of the quaternion is not 1; correct the quaternion, or "
+                "the choice of its columns."
             )
         poses[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
     elif columns:

@@ -37,7 +37,7 @@ def table_lines(path: str | os.PathLike) -> tuple[list[str], bool]:
     sixteen = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     latin = not set(content.translate(None, bytes(range(128)))) - set(_LATIN)
     if max(map(content.count, (b"\n", b"\r"))) > _MOST_LINES:
-        raise InputError(f"{path} has more than the {_MOST_LINES:,} lines that a text table may have; divide it.")
+        raise InputError(f"{path} has more than the {_MOST_LINES:,} lines that a text table may have; split the table.")
     try:
         text = content.decode("utf-16" if sixteen else "latin-1" if latin else "utf-8-sig")
     except UnicodeDecodeError:
@@ -216,9 +216,9 @@ def names_of_columns(
         names = fitting if len(fitting) == 1 else [line for line in names if are_numbered(line[1])]
         if len(names) != 1:
             raise InputError(
-                f"{path} has a word for each column in lines {first} ({quoted(shorten(upper, 3))}) and {last} "
-                f"({quoted(shorten(lower, 3))}); add skip = {last - 1} if line {last} names the columns, or leave it "
-                "out."
+                f"{path} has words in all columns in both line {first} ({quoted(shorten(upper, 3))}) and line {last} "
+                f"({quoted(shorten(lower, 3))}); add skip = {last - 1} if line {last} names the columns; otherwise "
+                f"remove line {last}."
             )
     chosen = names[0][1] if names else [""] * width if units else []
     if not units:

@@ -75,14 +75,14 @@ class TextTable:
             else:
                 rows.append((line_number, cells))
         if not rows:
-            raise InputError(f"{path} holds no numbers; give one line a pose.")
+            raise InputError(f"{path} contains no numbers; give one line per pose.")
         width = len(rows[0][1])
         for line_number, cells in rows:
             if len(cells) != width:
                 raise InputError(
-                    f"{path} line {line_number} has {len(cells)} columns, the lines before it {width}; give all the "
-                    f"same, copy the file again if it is cut there, or add skip = {line_number - 1} if the table "
-                    "begins there."
+                    f"{path} line {line_number} has {len(cells)} columns, but the lines before it have {width}; give "
+                    "all lines the same number of columns, copy the file again if it is incomplete, or add skip = "
+                    f"{line_number - 1} if the table begins there."
                 )
         self._lines, self._rows = [number for number, _ in rows], [cells for _, cells in rows]
         # Columns at the end that are empty in all rows and without a name: lines that end with delimiters.
@@ -116,8 +116,8 @@ class TextTable:
         if missing and len(missing) < len(wanted):
             others = shorten([str(column) for column in wanted if column not in missing])
             raise InputError(
-                f"{self.path} has no column {quoted(str(missing[0]))}, but columns {others}; correct its header, or "
-                "pick the columns by number."
+                f"{self.path} has no column {quoted(str(missing[0]))}, but the columns {others}; correct the header, "
+                "or pick the columns by number."
             )
         return not missing
 
@@ -136,11 +136,11 @@ class TextTable:
         names.pop(None, None)
         if len(names) > 1:
             shown = shorten([f"{quoted(name)} is in {str(unit)[:_LONG]}" for unit, name in names.items()], 2)
-            raise InputError(f"{self.path} mixes units: {shown}; convert one of them, and change its header.")
+            raise InputError(f"{self.path} mixes units: {shown}; convert one of the columns, and change its header.")
         if AMBIGUOUS in names and stated_unit not in ("deg", "gon"):
             raise InputError(
-                f"{self.path}: the header says {quoted(names[AMBIGUOUS])}, and grad is deg in German and gon elsewhere"
-                f'; add units = {{ {key} = "deg" }}, or "gon", or write it in the header.'
+                f"{self.path}: the header says {quoted(names[AMBIGUOUS])}, but grad means deg in German and gon "
+                f'elsewhere; add units = {{ {key} = "deg" }} or {{ {key} = "gon" }}, or write deg or gon in the header.'
             )
         return stated_unit if AMBIGUOUS in names else next(iter(names), None)
 
@@ -151,13 +151,13 @@ class TextTable:
             indices = self._matching(column)
             if not indices:
                 raise InputError(
-                    f"{self.path} has no column {quoted(str(column))}; it has {self.shown()}: pick others, by name "
-                    "or by number, or correct the header."
+                    f"{self.path} has no column {quoted(str(column))}; it has {self.shown()}: pick other columns, by "
+                    "name or by number, or correct the header."
                 )
             if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self.header):
                 raise InputError(
-                    f"{self.path} names the columns {shorten([str(i + 1) for i in indices])} all {quoted(column)}; "
-                    "give each name once, or pick them by number."
+                    f"{self.path} gives the columns {shorten([str(i + 1) for i in indices])} the same name "
+                    f"{quoted(column)}; use each name once, or pick the columns by number."
                 )
             self.check_ascending(indices)
             picked += indices
@@ -177,9 +177,12 @@ class TextTable:
         if order == sorted(order) and len(set(numbers)) == len(numbers):
             return
         ordered = ", ".join(str(picked[i] + 1) for i in order)
-        advice = f"add {line.format(ordered)} for that of their numbers, each once, or the order of the joints."
+        advice = (
+            f"add {line.format(ordered)} to use the order of their numbers, each column once, or list the columns in "
+            "the order of the joints."
+        )
         if axes is not None:
-            advice = f"pick them as a list, [{ordered}], in that of the axes."
+            advice = f"pick the columns as a list in the order of the axes: [{ordered}]."
         shown = shorten([quoted(name[:_LONG]) for name in names], _LONG)
         raise InputError(f"{self.path} has its columns in the order {shown}; {advice}")
 
@@ -189,16 +192,16 @@ class TextTable:
         hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip(' \t"').startswith("#")), None)
         if hashed is not None and not self._hashes:
             raise InputError(
-                f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; leave it "
-                "out if it is a comment, else write its first cell without #."
+                f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; remove "
+                "the line if it is a comment, otherwise write its first cell without #."
             )
         # A file without a last line's end may be cut: then its last number has fewer decimals than the others.
         decimals = [len(row[-1].partition(self._decimal)[2]) for row in self._rows]
         if self.width - 1 in picked and not self._ended and len(decimals) >= _FEW and decimals[-1] < min(decimals[:-1]):
             raise InputError(
                 f"{self.path} line {self._lines[-1]}: the last number, {quoted(self._rows[-1][-1])}, has fewer digits "
-                "than all above it and no end of the line after it, so the file may be cut; copy it again, or end that "
-                "line if it is complete."
+                "than all numbers above it, and the line has no end-of-line character, so the file may be "
+                "incomplete; copy the file again, or end that line if it is complete."
             )
         table = np.stack([self._column(i) for i in picked], axis=1)
         if not measured:
@@ -207,14 +210,15 @@ class TextTable:
         if count > 1 and any(sorted(cells) == sorted(map(str, range(i, i + count))) for i in (0, 1)):
             order = ", ".join(str(picked[i] + 1) for i in np.argsort(table[0]))
             raise InputError(
-                f"{self.path} line {self._lines[0]} is {cells[0]} to {cells[-1]}, which are numbers of columns; add "
-                f"skip = {self._lines[0]} and columns = [{order}], or write it with decimal points if it was measured."
+                f"{self.path} line {self._lines[0]} contains the column numbers {cells[0]} to {cells[-1]}; add skip = "
+                f"{self._lines[0]} and columns = [{order}], or write the numbers with decimal points if they were "
+                "measured."
             )
         for (i, column), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
             if not stated and self.length >= _FEW and np.ptp(column) > 0 and np.array_equal(column, other):
                 raise InputError(
                     f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
-                    f"columns = [{', '.join(str(index + 1) for index in picked)}] if these are right."
+                    f"columns = [{', '.join(str(index + 1) for index in picked)}] if these columns are right."
                 )
         return table
 
@@ -235,11 +239,12 @@ class TextTable:
             mark = 'add decimal = "," to its table' if self._decimal == "." else 'leave out decimal = ","'
             raise InputError(
                 f"{place} is not a number with the decimal mark '{self._decimal}'; write it without quotes and "
-                f"separators of thousands, or {mark}, or add skip = {self._lines[row]} if the table begins below."
+                f"thousands separators, or {mark}, or add skip = {self._lines[row]} if the table begins after this "
+                "line."
             )
         value = number(plain)
         if not abs(value) <= _LARGEST:
-            raise InputError(f"{place} is not finite, or larger than anything that is measured; correct it.")
+            raise InputError(f"{place} is not finite, or is implausibly large; correct it.")
         return value
 
     def cells(self, index: int) -> list[str]:

@@ -48,7 +48,9 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
         text = InputFile(path).text
         # What would take a parser gigabytes or minutes.
         if len(text) > _MOST_CHARACTERS:
-            raise InputError(f"{path} has {len(text):,} characters, over {_MOST_CHARACTERS:,}; name a shorter file.")
+            raise InputError(
+                f"{path} has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; name a shorter file."
+            )
         if long_key := _LONG_KEY.search(text):
             line = text.count("\n", 0, long_key.start()) + 1
             raise InputError(f"{path} line {line} has a key of more than {_DEEPEST} parts; correct it.")
@@ -56,13 +58,13 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     except InputError:
         raise
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not text in UTF-8, as TOML is; name a TOML file.") from error
+        raise InputError(f"{path} is not UTF-8 text; name a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}; correct it there.") from error
+        raise InputError(f"{path} is not valid TOML: {error}; correct the file there.") from error
     except RecursionError as error:
-        raise InputError(f"{path} nests tables or lists too deeply; no such file has more than {_DEEPEST}.") from error
+        raise InputError(f"{path} nests tables or lists too deeply; at most {_DEEPEST} levels are allowed.") from error
     except ValueError as error:  # digits beyond those that Python converts
-        raise InputError(f"{path} holds a number of thousands of digits; correct it.") from error
+        raise InputError(f"{path} contains a number with thousands of digits; correct it.") from error
     _check_content(path, content)
     return validated(model, content, str(path))
 
@@ -70,11 +72,13 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
 def _check_content(path: str | os.PathLike, value: Any, place: str = "", depth: int = 0) -> None:
     """Refuse depth, numbers and characters that no file of this package has, with the key at which they are."""
     if depth > _DEEPEST:
-        raise InputError(f"{path} nests tables or lists too deeply; no such file has more than {_DEEPEST}.")
+        raise InputError(f"{path} nests tables or lists too deeply; at most {_DEEPEST} levels are allowed.")
     for text in (place, value if isinstance(value, str) else ""):
         control = next(filter(is_control, text), None)
         if control is not None:
-            raise InputError(f"{path}: {quoted(place)} holds the control character U+{ord(control):04X}; take it out.")
+            raise InputError(
+                f"{path}: {quoted(place)} contains the control character U+{ord(control):04X}; remove the character."
+            )
     if isinstance(value, Mapping):
         for key, item in value.items():
             _check_content(path, item, f"{place}.{key}" if place else key, depth + 1)
@@ -82,7 +86,7 @@ def _check_content(path: str | os.PathLike, value: Any, place: str = "", depth: 
         for number, item in enumerate(value, start=1):
             _check_content(path, item, f"{place} {number}", depth + 1)
     elif isinstance(value, int | float) and _LARGEST < abs(value) < math.inf:
-        raise InputError(f"{path}: '{place}' is larger than any number that is meant; correct it.")
+        raise InputError(f"{path}: '{place}' is implausibly large; correct it.")
 
 
 def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Model:

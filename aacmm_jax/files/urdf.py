@@ -106,7 +106,7 @@ def read_urdf(
         try:
             text = file.content.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise InputError("it is not text in UTF-8; save it as UTF-8.") from error
+            raise InputError("it is not UTF-8 text; save the file as UTF-8.") from error
         robot = parse_urdf(text)
         source = UrdfSource(text, *_ends(robot, base, tip))
         arm = urdf_chain(source).arm
@@ -142,8 +142,8 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
     length = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in path)
     if length > _LONGEST:
         raise InputError(
-            f"the chain from {quoted(source.base)} to {quoted(source.tip)} is {length / 1000:,.0f} m long, as if its "
-            "lengths were in mm; a URDF is in m, so divide them by 1000."
+            f"the chain from {quoted(source.base)} to {quoted(source.tip)} is {length / 1000:,.0f} m long, so its "
+            "lengths are probably in mm; a URDF uses m, so divide the lengths by 1000."
         )
     *after, last = path[path.index(joints[-1]) :]
     tip_joint = last if last.kind == "fixed" else None
@@ -206,7 +206,8 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
     chain = urdf_chain(nominal.urdf)
     if single(arm).joints != len(chain.joints):
         raise InputError(
-            f"the arm has {arm.joints} joints, but the URDF {len(chain.joints)}; give one that was calibrated from it."
+            f"the arm has {arm.joints} joints, but the URDF has {len(chain.joints)}; give an arm that was calibrated "
+            "from this URDF."
         )
     before, after = geometry_of(chain.arm), geometry_of(arm)
     origins: dict[str, dict[str, str]] = {}
@@ -284,10 +285,11 @@ def _check_moving(joint: UrdfJoint) -> None:
     if joint.kind not in ("revolute", "continuous", "prismatic"):
         of_format = joint.kind in ("floating", "planar")
         kind = f"is {joint.kind}" if of_format else f"has the unknown type {quoted(joint.kind)}"
-        raise InputError(f"{what} {kind}, which is no joint of an arm; name links without it between them.")
+        raise InputError(f"{what} {kind}, which an arm cannot have; name links without this joint between them.")
     if joint.mimics is not None:
         raise InputError(
-            f"{what} mimics {quoted(joint.mimics)}, so it has no reading; name links without it between them."
+            f"{what} mimics {quoted(joint.mimics)}, so it has no reading of its own; name links without this joint "
+            "between them."
         )
     if joint.axis is None:
         raise InputError(f"{what} has an axis of length 0; correct its <axis xyz=...>.")
@@ -298,12 +300,13 @@ def _check_moving(joint: UrdfJoint) -> None:
     if joint.limits is None or not joint.limits[0] < joint.limits[1]:
         state = f"has the limits {' and '.join(limits)} {unit}" if limits else "has no limits"
         raise InputError(
-            f"{what} is {joint.kind} and {state}; give it <limit lower=... upper=...> in {unit}, the lower below the "
+            f"{what} is {joint.kind} and {state}; give it <limit lower=... upper=...> in {unit}, with lower below "
             f"upper{other}."
         )
     if not slides and _LARGEST < max(map(abs, joint.limits)) <= _IN_DEGREES:
         raise InputError(
-            f"{what} has the limits {' and '.join(limits)} rad, as if in degrees; a URDF is in rad, so convert them."
+            f"{what} has the limits {' and '.join(limits)} rad, which are probably in degrees; a URDF uses rad, so "
+            "convert the limits."
         )
 
 
@@ -312,7 +315,9 @@ def _joints_before(robot: Robot, link: str) -> list[UrdfJoint]:
     joints: list[UrdfJoint] = []
     while link in robot.joint_before:
         if len(joints) > len(robot.joint_before):
-            raise InputError(f"the joints before link {quoted(link)} form a circle; a URDF is a tree, so correct it.")
+            raise InputError(
+                f"the joints before link {quoted(link)} form a loop; a URDF must be a tree, so correct the joints."
+            )
         joints.append(robot.joint_before[link])
         link = joints[-1].parent
     return joints
@@ -325,7 +330,7 @@ def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
     if base in parents:
         return back[: parents.index(base) + 1][::-1]
     if base == tip:
-        raise InputError(f"base and tip are the same link, {quoted(base)}; name two.")
+        raise InputError(f"base and tip are the same link, {quoted(base)}; name two different links.")
     other = [joint.parent for joint in _joints_before(robot, base)]
     if tip in other:
         raise InputError(f"{quoted(base)} comes after {quoted(tip)}, not before it; exchange base and tip.")
@@ -333,8 +338,8 @@ def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
     if common is None:
         raise InputError(f"there is no chain of joints from {quoted(base)} to {quoted(tip)}; name links of one arm.")
     raise InputError(
-        f"{quoted(base)} and {quoted(tip)} are on two branches that part at {quoted(common)}; name that as the base, "
-        "or a tip on the branch of the base."
+        f"{quoted(base)} and {quoted(tip)} are on two branches that separate at {quoted(common)}; name that link as "
+        "the base, or a tip on the branch of the base."
     )
 
 
@@ -350,7 +355,10 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
         if not robot.links:
             raise InputError("it has no <link>; name the URDF of a robot.")
         if not roots:
-            raise InputError("every link has a joint before it, in a circle; a URDF is a tree, so correct it.")
+            raise InputError(
+                "every link has a joint before it, so the joints form a loop; a URDF must be a tree, so correct the "
+                "joints."
+            )
         if len(roots) > 1:
             raise InputError(f"it has {len(roots)} roots, {_listed(roots)}; name the base (base= or --base).")
         base = roots[0]

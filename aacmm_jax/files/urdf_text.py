@@ -91,7 +91,7 @@ class Element(NamedTuple):
         if not value:
             raise InputError(f"{self.where} has no {name}; add it.")
         if any(map(is_control, value)):
-            raise InputError(f"{self.where} has a control character in its {name}; take it out.")
+            raise InputError(f"{self.where} has a control character in its {name}; remove the character.")
         return value
 
     def numbers(self, name: str, default: tuple[float, ...]) -> Float[np.ndarray, " k"]:
@@ -116,8 +116,8 @@ class Element(NamedTuple):
             angles = origin.numbers("rpy", _ZERO)
             if np.any(np.abs(angles) > _LARGEST_ANGLE):
                 raise InputError(
-                    f"{origin.where} has rpy = {quoted(origin.attributes['rpy'])}, more than a revolution, as if in "
-                    "degrees; a URDF is in rad, so convert it."
+                    f"{origin.where} has rpy = {quoted(origin.attributes['rpy'])}, more than a revolution, so it is "
+                    "probably in degrees; a URDF uses rad, so convert the angles."
                 )
             transform[:3, :3] = roll_pitch_yaw_matrix(angles)
             transform[:3, 3] = _METRE * origin.numbers("xyz", _ZERO)
@@ -193,18 +193,18 @@ def parse_urdf(text: str) -> Robot:
         items, read = (joints, _joint) if element.name == "joint" else (links, _link)
         name = element.text("name")
         if name in items:
-            raise InputError(f"{element.where} is there twice; rename one.")
+            raise InputError(f"{element.where} occurs twice; rename one of the two.")
         items[name] = read(element)
     for joint in joints.values():
         for link in (joint.parent, joint.child):
             if link not in links:
                 raise InputError(
-                    f"joint {quoted(joint.name)} names the link {quoted(link)}, which is not there; add it."
+                    f"joint {quoted(joint.name)} names the link {quoted(link)}, which does not exist; add this link."
                 )
         if joint.child in before:
             raise InputError(
                 f"link {quoted(joint.child)} is the child of two joints, {quoted(before[joint.child].name)} and "
-                f"{quoted(joint.name)}; a URDF is a tree, so take one of them out."
+                f"{quoted(joint.name)}; a URDF must be a tree, so remove one of the two joints."
             )
         before[joint.child] = joint
     return Robot(joints, links, before, end)
@@ -273,7 +273,7 @@ def _shape(element: Element, origin: Transform) -> UrdfShape:
     missing = _ZERO if element.name == "box" else (0.0,)
     size = np.concatenate([_METRE * element.numbers(name, missing) for name in names])
     if not np.all(size > 0):
-        raise InputError(f"{element.where} has no size above 0; give its {' and '.join(names)}.")
+        raise InputError(f"{element.where} has no positive size; give its {' and '.join(names)}.")
     return UrdfShape(element.name, origin, tuple(size.tolist()), "")
 
 
@@ -313,7 +313,7 @@ def edited(text: str, origins: Mapping[str, Mapping[str, str]], robot: Robot, ad
 def _parsed(text: str) -> tuple[Element, int]:
     """The root element, and where its end tag begins."""
     if len(text) > _MOST_CHARACTERS:
-        raise InputError(f"it has {len(text):,} characters, and {_MOST_CHARACTERS:,} are the most; name a URDF file.")
+        raise InputError(f"it has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; name a URDF file.")
     content = text.encode()
     parser = expat.ParserCreate("utf-8")
     stack: list[Element | None] = []  # None: not read
@@ -325,7 +325,7 @@ def _parsed(text: str) -> tuple[Element, int]:
         if name.startswith("xacro:"):
             raise InputError(f"line {line} has <{quoted(name)[1:-1]}>, {_EXPAND}")
         if len(stack) > _DEEPEST:
-            raise InputError(f"line {line} nests elements too deeply; no URDF has more than {_DEEPEST} levels.")
+            raise InputError(f"line {line} nests elements too deeply; at most {_DEEPEST} levels are allowed.")
         parent = stack[-1] if stack else None
         if not stack and name != "robot":
             raise InputError(
@@ -355,19 +355,21 @@ def _parsed(text: str) -> tuple[Element, int]:
     def text_between(data: str) -> None:
         if data.strip() and stack[-1] is not None:
             raise InputError(
-                f"line {parser.CurrentLineNumber}: {stack[-1].words} holds the text {quoted(data.strip())}, which "
-                "belongs to no element; correct it."
+                f"line {parser.CurrentLineNumber}: {stack[-1].words} contains the text {quoted(data.strip())}, which "
+                "is not allowed there; remove it."
             )
 
     def refuse_entities(name: str, *_: object) -> None:
-        raise InputError(f"it has a document type, {quoted(name)}, as no URDF needs; leave it out.")
+        raise InputError(
+            f"it has a document type, {quoted(name)}, which a URDF does not need; remove the document type."
+        )
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = text_between, refuse_entities
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        raise InputError(f"it is not valid XML: {error}; correct it there.") from error
+        raise InputError(f"it is not valid XML: {error}; correct the file there.") from error
     return root[0], ends[-1]
 
 
@@ -379,13 +381,13 @@ def _is_read(name: str, parent: Element, line: int) -> bool:
         earlier = parent.child(name)
         if name in once and earlier is not None:
             raise InputError(
-                f"{parent.where} has a second <{name}>, after that of line {earlier.line}; take one of them out."
+                f"{parent.where} has a second <{name}>, after that of line {earlier.line}; remove one of the two."
             )
         if parent.name == "geometry" and parent.children:
             raise InputError(f"{parent.where} has two shapes; give each a <collision> of its own.")
         return name in _NAMES
     if name in _NAMES:
-        raise InputError(f"{parent.where} holds <{name}>, which does not belong there; move it.")
+        raise InputError(f"{parent.where} contains <{name}>, which does not belong there; move it.")
     if ":" not in name:
         parent.check_name("element", name, [*once, *often])
     return False

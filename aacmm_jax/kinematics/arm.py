@@ -110,7 +110,10 @@ class Arm(eqx.Module):
             np.broadcast_shapes(*batches)
         except ValueError as error:
             shapes = ", ".join(map(str, batches))
-            raise InputError(f"the parameters have the batch shapes {shapes}; make them alike.") from error
+            raise InputError(
+                f"the parameters have the batch shapes {shapes}, which do not match; give all parameters the same "
+                "batch shape."
+            ) from error
         numbers = checked(prismatic, Sequence[Annotated[int, Range(1, self.joints)]], "prismatic")
         self.prismatic = tuple(sorted({int(number) for number in numbers}))
         self.limits = None if limits is None else checked_limits(limits, self.joints, self.prismatic)
@@ -188,7 +191,8 @@ def checked_readings(arm: Arm, q: Numbers, like: AnyArray | None = None) -> Floa
     if array.shape[-1:] not in ((joints,), (joints + arm.thermometer,)):
         other = ", and a thermometer" if arm.thermometer else ""
         raise InputError(
-            f"q has shape {array.shape}, but the arm has {joints} joints{other}; the last axis is the joint."
+            f"q has shape {array.shape}, but the arm has {joints} joints{other}; the last axis must run over the "
+            "joints."
         )
     return array
 
@@ -197,12 +201,12 @@ def check_columns(arm: Arm, columns: int) -> None:
     """Raise `InputError` where readings of a capture have not the columns of an arm; without temperatures it was at
     20 C."""
     if columns not in (arm.joints, arm.columns):
-        temperature = ", and the temperature last" if arm.thermometer else ""
+        temperature = ", and the temperature in the last column" if arm.thermometer else ""
         if columns == arm.joints + 1:
-            temperature = ", or, with the temperature in the last one, an arm with thermometer=True"
+            temperature = ", or use an arm with thermometer=True if the last column is the temperature"
         raise InputError(
-            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column a joint"
-            f"{temperature}."
+            f"the capture has {columns} columns, but the arm has {arm.joints} joints; give one column per "
+            f"joint{temperature}."
         )
 
 
@@ -213,12 +217,15 @@ def checked_limits(limits: Limits, joints: int, prismatic: tuple[int, ...] = ())
     except (TypeError, ValueError):
         rows = []  # no rows of numbers
     if len(rows) != joints or any(len(row) != 2 for row in rows):
-        units = "rad, of prismatic joints in mm" if prismatic else "rad"
+        units = "rad (prismatic joints: mm)" if prismatic else "rad"
         raise InputError(f"limits must be {pluralise(joints, 'row')} of (lowest, highest) in {units}, one per joint.")
     for i, (low, high) in enumerate(rows, start=1):
         if not -math.inf < low < high < math.inf:
             reading = f"{low:g} to {high:g} {'mm' if i in prismatic else 'rad'}"
-            raise InputError(f"limits of joint {i} are {reading}; they must be finite, and the lower below the upper.")
+            raise InputError(
+                f"limits of joint {i} are {reading}; both limits must be finite, and the lower limit below the "
+                "upper limit."
+            )
     return tuple((low, high) for low, high in rows)
 
 
@@ -229,8 +236,8 @@ def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
     if rows is None:
         if arm.prismatic:
             raise InputError(
-                f"joint {arm.prismatic[0]} is prismatic, and nothing says how far it slides; give the arm limits "
-                "(limits=, or limits_mm in its file)."
+                f"joint {arm.prismatic[0]} is prismatic, but the arm has no limits that state how far this joint "
+                "slides; give the arm limits (limits=, or limits_mm in its file)."
             )
         rows = [(-math.pi, math.pi)] * arm.joints
     return np.asarray(checked_limits(rows, arm.joints, arm.prismatic))

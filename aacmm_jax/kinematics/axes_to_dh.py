@@ -92,8 +92,8 @@ def geometry_of(arm: Arm) -> Geometry:
     """The parameters of an arm as NumPy arrays, or `InputError` for joint corrections: for formats without these."""
     if arm.corrections is not None:
         raise InputError(
-            "the arm has joint corrections, which this format cannot hold; write TOML, the joint zero offsets alone "
-            "(--format offsets), or correct the commanded poses (aacmm correct)."
+            "the arm has joint corrections, which this format cannot store; write TOML, write only the joint zero "
+            "offsets (--format offsets), or correct the commanded poses (aacmm correct)."
         )
     return jax.tree.map(np.asarray, arm.geometry)
 

@@ -153,7 +153,7 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     if size > 2 * tool + _SHORTEST:
         rows.append(("probe", n, base, n, probe * (1 - 2 * tool / size), tool, size))
     if not rows:
-        raise InputError("the arm has no link that is longer than 0, so it has no body; give its URDF.")
+        raise InputError("every link of the arm has the length 0, so the arm has no body; give its URDF.")
     names, *columns, lengths = zip(*rows, strict=True)
     start_frame, start, end_frame, end, widths = map(np.array, columns)
     first, second = np.triu_indices(len(rows), 1)
@@ -294,7 +294,7 @@ def checked_cell(arm: Arm, cell: Cell, limits: JointLimits) -> Cell:
     for obstacle in cell.obstacles:
         check_obstacle(obstacle)
         if names.count(obstacle.name) > 1:
-            raise InputError(f"two obstacles have the name '{obstacle.name}'; give each one of its own.")
+            raise InputError(f"two obstacles have the name '{obstacle.name}'; give them different names.")
     checked(cell.clearance, Annotated[float, Range(least=0, unit="mm")], "the clearance")
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
     names, distances = _distances(cell._replace(unchecked=()), to_numpy(arm), q)

@@ -48,14 +48,14 @@ def with_corrections(
         12 ('cos1_6', 'sin1_6')
     """
     if not is_single(arm):
-        raise InputError("corrections are for one arm, but this is a batch; take one of it first.")
+        raise InputError("corrections need a single arm, but this is a batch; select one arm of the batch.")
     plain: Arm = to_numpy(without_corrections(arm))
     down = checked(gravity, Float[np.ndarray, "3"], "gravity")
     if not np.any(down):
         raise InputError("gravity has the length 0; give its direction in the base frame.")
     down, loads, sizes = down / np.linalg.norm(down), None, {"links": plain.joints}
     if (mass is None) != (centre is None):
-        raise InputError("masses and centres of mass go together; give both mass and centre.")
+        raise InputError("masses need centres of mass, and centres need masses; give both mass and centre.")
     if mass is not None:
         masses = checked(mass, Float[np.ndarray, " links"], "mass", sizes)
         centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)
@@ -66,7 +66,7 @@ def with_corrections(
         by_name = {name: term_of(name, plain.joints, loads) for name in checked(model, Iterable[str], "model")}
         for name, term in by_name.items():
             if term is None:
-                raise InputError(f"'{name}' is not the name of a coefficient; write one such as cos1_2, or a model.")
+                raise InputError(f"'{name}' is not the name of a coefficient; give a name such as cos1_2, or a model.")
         terms = tuple(dict.fromkeys(term for term in by_name.values() if term is not None))
     if not terms:
         return plain

@@ -82,7 +82,7 @@ class AbstractCorrection(abc.ABC):
 
     def wrong(self, term: "Term", joints: int) -> str:
         """What is wrong with a term of this kind for an arm of so many joints, in a few words; empty if nothing is."""
-        return "has a number, and takes none" if term.number else ""
+        return "has a number, but takes none" if term.number else ""
 
     def usual(self, terms: Sequence["Term"]) -> dict[str, float]:
         """The groups of the default prior with their standard deviations, for an arm with these terms of this kind."""
@@ -116,7 +116,7 @@ class Term(NamedTuple):
     def wrong(self, joints: int) -> str:
         """What is wrong with it for an arm of so many joints, in a few words; empty if nothing is."""
         if not (0 if self.kind.of_arm else 1) <= self.joint <= joints:
-            return f"is of a joint from 1 to {joints}"
+            return f"must name a joint from 1 to {joints}"
         return self.kind.wrong(self, joints)
 
 
@@ -156,7 +156,7 @@ class Harmonics(AbstractCorrection):
         orders = self.orders_of(option or "1+2")
         if orders is None:
             raise InputError(
-                f"harmonics={option} has no orders from 1 to {_HIGHEST}; write harmonics=1, harmonics=1+2 or "
+                f"harmonics={option} does not name orders from 1 to {_HIGHEST}; write harmonics=1, harmonics=1+2 or "
                 "harmonics=1-31."
             )
         numbers = range(1, joints + 1)
@@ -224,7 +224,10 @@ class Coupling(AbstractCorrection):
             return tuple(Term(self, "coupled", joint - 1, joint) for joint in range(2, joints + 1))
         pairs = [re.fullmatch(r"([1-9]\d*)-([1-9]\d*)", pair) for pair in option.split("+")]
         if not all(pairs):
-            raise InputError(f"coupled={option} names no joints; coupled=2-3 lets the reading of joint 2 move joint 3.")
+            raise InputError(
+                f"coupled={option} does not name pairs of joints; write coupled=2-3, for example, if the reading of "
+                "joint 2 moves joint 3."
+            )
         return tuple(Term(self, "coupled", int(pair[1]), int(pair[2])) for pair in pairs if pair)
 
     def option_of(self, terms: Sequence[Term]) -> str:
@@ -232,8 +235,8 @@ class Coupling(AbstractCorrection):
 
     def wrong(self, term: Term, joints: int) -> str:
         if not 1 <= term.number <= joints:
-            return f"is of the reading of another joint from 1 to {joints}, as coupled2_3 is"
-        return "is of its own reading, which gear is" if term.number == term.joint else ""
+            return f"must name the reading of another joint from 1 to {joints}, as in coupled2_3"
+        return "names the joint's own reading, which is what gear does" if term.number == term.joint else ""
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         return q[np.array([term.number - 1 for term in terms])]
@@ -267,7 +270,7 @@ class Gravity(AbstractCorrection):
 
     def wrong(self, term: Term, joints: int) -> str:
         i, beyond = term.joint, term.number and not term.joint <= term.number <= joints
-        return f"is of a link from {i} to {joints}, as compliance{i}_{i} is" if beyond else ""
+        return f"must name a link from {i} to {joints}, as in compliance{i}_{i}" if beyond else ""
 
     def usual(self, terms: Sequence[Term]) -> dict[str, float]:
         # With masses, 1 mrad for 100 N m.
@@ -310,7 +313,7 @@ class Expansion(AbstractCorrection):
         return (Term(self, "expansion", 0, 0),)
 
     def wrong(self, term: Term, joints: int) -> str:
-        return "is of the whole arm and has no number" if term.number or term.joint else ""
+        return "applies to the whole arm and takes no number" if term.number or term.joint else ""
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         measured = q.shape[0] > len(forward.x)
@@ -367,7 +370,7 @@ def term_of(name: str, joints: int, loads: Loads | None = None) -> Term | None:
     if term is None:
         return None
     if wrong := term.wrong(joints):
-        raise InputError(f"the coefficient '{name}' {wrong}; correct its name.")
+        raise InputError(f"the coefficient '{name}' {wrong}; correct the name.")
     return term._replace(loads=loads) if term.kind.rows == 3 and not term.number else term
 
 
@@ -384,7 +387,7 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
         part = _SHORT_FORMS.get(given.strip(), given.strip())
         name, _, option = part.partition("=")
         if name in seen:
-            raise InputError(f"the model names '{name}' twice; name it once, as in dh,gravity,harmonics=1+2.")
+            raise InputError(f"the model names '{name}' twice; name every part once, as in dh,gravity,harmonics=1+2.")
         seen.add(name)
         if name == "dh":
             continue
@@ -392,9 +395,9 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
         if kind is None:
             raise InputError(f"unknown model '{name}'{nearest(name, ['dh', *KINDS, *_SHORT_FORMS])}")
         if option and not kind.has_options:
-            raise InputError(f"{name} takes no option such as '{option}'; write {name} alone.")
+            raise InputError(f"{name} takes no options, but '{option}' is given; write only {name}.")
         for term in kind.terms(joints, option, loads):
             if wrong := term.wrong(joints):
-                raise InputError(f"{part} {wrong}; correct it.")
+                raise InputError(f"{part} {wrong}; correct the model.")
             terms[term] = None
     return tuple(terms)

@@ -245,7 +245,7 @@ class TradeOff(NamedTuple):
         if others:
             pairs = list(zip(self.amounts[1:], others, strict=True))[:_PARTNERS_NAMED]
             imitation = listed(f"{amount:.2g} {_step(name)} of {name}" for amount, name in pairs)
-            text = f"{first} and {others[0]} trade off: 1 {step} of {first} is imitated by {imitation}"
+            text = f"{first} and {others[0]} trade off: 1 {step} of {first} has the same effect as {imitation}"
             text += f" to within {movement}"
         if np.isfinite(self.u):  # half-widths are known where the noise is
             text += f" (u = {self.u:.3g} {step}, bounds +-{self.half_width:.3g} {step})"

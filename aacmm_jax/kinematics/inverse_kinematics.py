@@ -186,8 +186,8 @@ def random_configurations(
     point = ", ".join(f"{round(float(x)):.6g}" for x in np.asarray(targets[missing[0]]))
     what = labels[missing[0]] if labels else "the target"
     raise InputError(
-        f"{what} at ({point}) mm cannot be reached within the joint limits (the links together measure "
-        f"{round(links):.6g} mm); move it closer or widen the limits."
+        f"{what} at ({point}) mm cannot be reached within the joint limits (total length of the links: "
+        f"{round(links):.6g} mm); move {what} closer or widen the limits."
     )
 
 
@@ -268,7 +268,9 @@ def corrected_readings(nominal: Arm, calibrated: Arm, q: Numbers, limits: Limits
         -0.0010 rad True
     """
     if nominal.joints != calibrated.joints:
-        raise InputError(f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with as many.")
+        raise InputError(
+            f"the arms have {nominal.joints} and {calibrated.joints} joints; give arms with the same number of joints."
+        )
     q = as_array(q, "q", like=calibrated.alpha)
     wanted = nominal.pose(q[..., : nominal.joints])
     return readings_at_poses(calibrated, q, wanted, nominal.limits if limits is None else limits)
@@ -299,12 +301,12 @@ def readings_at_poses(
         True True
     """
     if not is_single(arm):
-        raise InputError("poses are reached by one arm, but this is a batch; use jax.vmap, or take one of it.")
+        raise InputError("a single arm is needed, but this is a batch; use jax.vmap, or select one arm of the batch.")
     q, n = as_array(q, "q", like=arm.alpha), arm.joints
     if q.shape[-1:] not in ((n,), (arm.columns,)) or poses.shape != (*q.shape[:-1], 4, 4):
         raise InputError(
-            f"q has shape {q.shape}, poses {poses.shape} and the arm {n} joints; give (..., n) and (..., 4, 4) with a "
-            "pose for each configuration."
+            f"q has shape {q.shape}, poses has shape {poses.shape}, and the arm has {n} joints; give q as (..., n) "
+            "and poses as (..., 4, 4), with one pose per configuration."
         )
     allowed = np.tile([-np.inf, np.inf], (n, 1))
     if limits is not None:

@@ -89,13 +89,15 @@ class Parameters(eqx.Module):
         held = _unique_names(arm, held, "held")
         for name in free:
             if name in held:
-                raise InputError(f"parameter '{name}' is named as held and as free; name it once.")
+                raise InputError(
+                    f"parameter '{name}' is named both as held and as free; name it in only one of the two."
+                )
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
         usual = [name for name in parameter_names(arm) if name in free or not name.startswith(("beta_", "gravity_"))]
         wanted = tuple(name for name in usual if name not in held)
         if not wanted:
-            raise InputError("every parameter is held, so nothing is left to identify; hold fewer.")
+            raise InputError("every parameter is held, so nothing is left to identify; hold fewer parameters.")
         return cls(base=arm, names=wanted)
 
     @classmethod
@@ -116,7 +118,7 @@ class Parameters(eqx.Module):
         """
         base, names = independent_names(arm, generic_poses(arm) if capture is None else capture)
         if not names:
-            raise InputError("the capture determines no parameter at all; record more poses in its sockets.")
+            raise InputError("the capture does not determine any parameter; record more poses in its sockets.")
         return cls(base=base, names=tuple(name for name in parameter_names(base) if name in names))
 
     @property
@@ -143,7 +145,8 @@ class Parameters(eqx.Module):
         if name not in self.names:
             locate(self.base, name)
             raise InputError(
-                f"parameter '{name}' is held, not free; free it, or name a free one, such as '{self.names[0]}'."
+                f"parameter '{name}' is held, not free; free this parameter, or name a free parameter such as "
+                f"'{self.names[0]}'."
             )
         return self.names.index(name)
 
@@ -153,8 +156,8 @@ class Parameters(eqx.Module):
         arm = self.base if arm is None else arm
         if arm.joints != self.base.joints:
             raise InputError(
-                f"the arm has {arm.joints} joints, but these are parameters of an arm with {self.base.joints}; "
-                "choose the free parameters of this arm (Parameters.free_of)."
+                f"the arm has {arm.joints} joints, but these are parameters of an arm with {self.base.joints} "
+                "joints; choose the free parameters of this arm (Parameters.free_of)."
             )
         # Where values are known by NumPy, since every operation of JAX outside jit is a program to compile.
         tools: Any = np if is_concrete(*jax.tree.leaves(arm.geometry)) else jnp
@@ -175,7 +178,8 @@ class Parameters(eqx.Module):
         array = as_array(vector, what, like=self.base)
         if array.shape[-1:] != (len(self.names),):
             raise InputError(
-                f"{what} has shape {array.shape}, but {len(self.names)} parameters are free; give one value each."
+                f"{what} has shape {array.shape}, but {len(self.names)} parameters are free; give one value per "
+                "free parameter."
             )
         return array
 
@@ -197,7 +201,7 @@ def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     _located(arm.joints, correction_names(arm), names)
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise InputError(f"parameter '{name}' is named twice in {what}; name it once.")
+            raise InputError(f"parameter '{name}' is named twice in {what}; name each parameter once.")
     return names
 
 
@@ -231,8 +235,8 @@ class Bounds(eqx.Module):
             for index in np.argwhere(~(low <= high))[:1]:  # also where one is NaN
                 at = tuple(index)
                 raise InputError(
-                    f"bounds of {space.names[at[-1]]} are {low[at]:g} to {high[at]:g}; the lower must be a number not "
-                    "above the upper."
+                    f"bounds of {space.names[at[-1]]} are {low[at]:g} to {high[at]:g}; the lower bound must be a "
+                    "number not above the upper bound."
                 )
 
     @classmethod
@@ -331,7 +335,7 @@ class ArmSpecification(NamedTuple):
 def single(arm: Arm) -> Arm:
     """The same arm; raises `InputError` for a batch of arms, since a file holds one."""
     if not is_single(arm):
-        raise InputError("a file holds one arm, but this is a batch; take one of it first.")
+        raise InputError("a file contains one arm, but this is a batch; select one arm of the batch.")
     return arm
 
 

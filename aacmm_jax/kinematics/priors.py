@@ -85,7 +85,7 @@ class Prior(eqx.Module):
                 corrections = (kind for kind in KINDS if any(is_of_group(kind, name) for name in names))
                 stems = (name.rsplit("_", 1)[0] for name in names)
                 hint = nearest(group, dict.fromkeys(["all", "lengths", "angles", *corrections, *stems, *names]))
-                raise InputError(f"the prior is of '{group}', and the arm has no such parameter{hint}")
+                raise InputError(f"the prior names '{group}', but the arm has no such parameter{hint}")
 
     def of(self, names: tuple[str, ...], nominal: Float[AnyArray, " p"]) -> "ParameterPrior | None":
         """The prior of the named parameters, mm and rad; None where it says nothing of any of them."""

@@ -119,17 +119,18 @@ def fix_scale(
     """
     if not capture.lengths:
         raise InputError(
-            "the capture holds no reference length, so the scale cannot be fixed; add one between two of its sockets."
+            "the capture contains no reference length, so the scale cannot be fixed; add a reference length "
+            "between two of its sockets."
         )
     check_finite(arm=arm, capture=capture)
     if not is_single(arm):
-        raise InputError("the arm is a batch, but one scale is fixed here; map over its arms with jax.vmap.")
+        raise InputError("the arm is a batch, but fix_scale takes a single arm; use jax.vmap.")
     check_one_capture(capture)
     if capture.observations:
         names = shorten([observation.name for observation in capture.observations])
         raise InputError(
             f"fix_scale takes sockets and reference lengths only, but the capture has other observations ({names}); "
-            "make a capture without them."
+            "give a capture without these observations."
         )
     check_readings(capture, arm)
     arm, capture = to_numpy((arm, capture))

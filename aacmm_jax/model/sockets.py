@@ -140,7 +140,9 @@ def repeatability(
     """
     sizes = tuple(sizes)
     if not sizes or tips.shape[0] != sum(sizes):
-        raise InputError(f"tips has shape {tips.shape}, but sizes add up to {sum(sizes)}; give ({sum(sizes)}, 3).")
+        raise InputError(
+            f"tips has shape {tips.shape}, but sizes add up to {sum(sizes)}; give tips of shape ({sum(sizes)}, 3)."
+        )
     counts, rows, xp = np.asarray(sizes), tips.T, namespace(tips)
     centroids = means_over_sockets(rows, sizes)
     squared = xp.sum((rows - to_poses(centroids, sizes)) ** 2, axis=0)

@@ -96,7 +96,10 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     """
     chosen = CaptureOptions(**options)
     if chosen.leave_out and not chosen.cross_validate:
-        raise InputError("--leave-out (leave_out) says what --cross-validate (cross_validate) leaves out; give both.")
+        raise InputError(
+            "--leave-out (leave_out) names the groups that --cross-validate (cross_validate) leaves out; give both "
+            "options."
+        )
     others = None
     if chosen.only_poses is not None:
         part, others = draw_poses(recording.capture, chosen.only_poses, chosen.seed)
@@ -112,10 +115,11 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         if chosen.scale == "measured":
             return calibrate(bounds.space.base, capture, bounds, **solving._asdict())
         if chosen.method is not None or chosen.strict:
-            raise InputError("--scale nominal is stage 1 alone; leave out --method and --strict.")
+            raise InputError("--scale nominal calibrates with stage 1 only; omit --method and --strict.")
         if any(observation.fixes_scale for observation in capture.observations):
             raise InputError(
-                "--scale nominal is for captures without a scale, but these observations fix it; leave it out."
+                "--scale nominal is for captures that do not fix the scale, but these observations fix the scale; "
+                "omit --scale nominal."
             )
         return identify(bounds.space.base, capture, bounds, **solving.solving._asdict())
 
@@ -127,7 +131,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             record = chosen.stage("Comparing groups", lambda: remove_contradicting(record, solved))
         if _to_cross_validate(record.recording, solving, chosen):
             if chosen.scale != "measured":
-                raise InputError("--cross-validate needs a calibrated scale; leave out --scale nominal (scale).")
+                raise InputError("--cross-validate needs a calibrated scale; omit --scale nominal (scale).")
             groups, capture = chosen.leave_out or None, record.recording.capture
             run = partial(cross_validate, bounds.space.base, capture, bounds, groups=groups, **solving._asdict())
             record = record._replace(validation=chosen.stage("Cross-validating", run))
@@ -135,7 +139,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             result = solved(record.recording.capture) if record.removed else result
             if not isinstance(result, Calibration) or chosen.robust is not None:
                 raise InputError(
-                    "--monte-carlo is for calibrations without --robust and --scale nominal; leave it out."
+                    "--monte-carlo cannot be combined with --robust or --scale nominal; omit --monte-carlo."
                 )
             sampled = chosen.stage("Drawing trials", lambda: monte_carlo(result, record.recording.capture))
             record = record._replace(sampled=sampled.table(), sampled_says=" ".join(sampled.sentences()))
@@ -180,7 +184,9 @@ def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = F
         arms = [jax.tree.leaves(other.nominal.arm) for other in (first, recording)]
         same = jax.tree.structure(first.nominal.arm) == jax.tree.structure(recording.nominal.arm)
         if not same or not all(map(np.array_equal, *arms)):
-            raise InputError(f"'{name}' has another nominal arm than the first session; import both with the same arm.")
+            raise InputError(
+                f"'{name}' has a different nominal arm from the first session; import both sessions with the same arm."
+            )
     capture = join_sessions(
         {name: recording.capture for name, recording in recordings.items()}, own_probe=not same_probe
     )

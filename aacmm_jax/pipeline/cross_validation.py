@@ -157,17 +157,17 @@ def cross_validate(
         for pattern, (rest, _, _) in zip(patterns, parts, strict=True):
             if not _determines(rest, count):
                 raise InputError(
-                    f"without '{pattern}' nothing fixes the scale, or too few poses are left for the parameters; leave "
-                    "out less."
+                    f"without '{pattern}', no data fix the scale, or too few poses are left for the parameters; "
+                    "leave out less."
                 )
     elif can_cross_validate(capture, count):
         parts = _parts_of(capture)
     else:
         raise InputError(
-            "cross-validation leaves sockets out with their reference lengths, so it needs two groups of sockets that "
-            "each hold a length (or observations that fix the scale), and without the largest of them poses enough for "
-            "the parameters; place the reference length somewhere else too, or leave cross-validation out "
-            "(--no-cross-validate)."
+            "cross-validation holds out sockets together with their reference lengths, so at least two groups of "
+            "sockets must each contain a reference length (or observations that fix the scale), and the poses "
+            "without the largest group must be enough for the parameters; measure the reference length in another "
+            "place too, or turn cross-validation off (--no-cross-validate)."
         )
     left_out = []
     for rest, left, names in parts:
@@ -182,7 +182,7 @@ def cross_validate(
 
 def _check_some_left(pattern: str, some: bool) -> None:
     if not some:
-        raise InputError(f"nothing is left without '{pattern}', so nothing can be calibrated; leave out less.")
+        raise InputError(f"'{pattern}' leaves out all data, so no data are left to calibrate from; leave out less.")
 
 
 Region = Bool[np.ndarray, " M"]  # poses that are left out together; of all, sockets first
@@ -222,7 +222,8 @@ def regions_of(capture: Capture, patterns: Iterable[str] | None = None, joints: 
     regions = {label: poses for label, poses in regions.items() if _POSES <= poses.sum() <= len(owner) - _POSES}
     if len(regions) < 2:
         raise InputError(
-            "models are compared by regions that they have not seen, and these poses make fewer than two; record more."
+            "models are compared on regions that are held out, but these poses form fewer than two regions; record "
+            "more poses."
         )
     return regions
 

@@ -184,9 +184,11 @@ def compare_models(
     """
     named = default_models(arm, capture) if models is None else items_of(models, "models")
     if not named or not all(isinstance(model, str) and model.strip() for model in named):
-        raise InputError("models names no model; give some, from simple to rich, such as 'dh' and 'dh,gravity'.")
+        raise InputError(
+            "models is empty; give models from the simplest to the richest, such as 'dh' and 'dh,gravity'."
+        )
     if len(set(named)) < len(named):
-        raise InputError(f"models names '{max(named, key=named.count)}' twice; name each once.")
+        raise InputError(f"models names '{max(named, key=named.count)}' twice; name each model once.")
     plain = without_corrections(arm)
     bounds = default_bounds(plain, capture) if bounds is None else bounds
     left_out = regions_of(to_numpy(capture), regions, arm.joints)

@@ -133,7 +133,8 @@ def _check_single(arm: Arm, capture: Capture, bounds: Bounds, many: str) -> None
     is_batch = {"arm": not is_single(arm), "capture": capture.q.ndim > 2, "bounds": wide}
     if batches := [what for what, batch in is_batch.items() if batch]:
         raise InputError(
-            f"the {' and the '.join(batches)} given are a batch, but one problem is solved here; use {many}."
+            f"the given {' and the '.join(batches)} must not be a batch, because this function solves a single "
+            f"problem; use {many}."
         )
 
 
@@ -196,8 +197,8 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         check_finite(arm=arm, capture=capture, noise=given.noise)
     elif given.hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
-            "hold=None needs an arm with known values in calibrate; where the arm itself is traced, name the length to "
-            "hold."
+            "hold=None needs an arm with known values in calibrate; if the arm itself is traced, name the length "
+            "to hold."
         )
     first = None if at_once else _stage1_task("calibrate_many", arm, capture, bounds, given.solving)
     task = task_of(arm, capture, bounds, given.solving._replace(hold=None))
@@ -205,9 +206,14 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         _check_identifiable(capture, task.bounds, prior, given.undetermined == "raise")
     set_by = first.anchor.set_by if method == "two-stage" and first is not None and not inside_trace() else ()
     if set_by:  # a division by k changes nothing
-        says = f"{scale_set_by_clause(set_by)}, so the reference lengths change nothing"
+        says = f"{scale_set_by_clause(set_by)}, so the reference lengths have no effect"
         other_way = "" if arm.prismatic else "free one of these lengths, or "
-        warnings.warn(f"{says}; {other_way}use both with method='joint'.", IdentifiabilityWarning, stacklevel=3)
+        warnings.warn(
+            f"{says}; {other_way}use {'the readings' if arm.prismatic else 'the fixed'} and the reference lengths "
+            "together with method='joint'.",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
     first, task, capture = to_numpy((first, task, capture))
     if namespace((first, task, capture)) is not np:
         return to_jax(_traced(first, task, capture, method))

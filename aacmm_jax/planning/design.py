@@ -120,7 +120,10 @@ def plan(
         names = [chr(ord("A") + i) if sockets <= 26 else f"S{i + 1}" for i in range(sockets)]
         placement = None
         if lengths:
-            raise InputError("lengths are between sockets that are given; with a number of sockets, give length and u.")
+            raise InputError(
+                "lengths must be between sockets with given positions; if only the number of sockets is given, use "
+                "length and u."
+            )
     problem = problem.within(cones=_cones(cone, names, problem.options.tool_axis))
     if placement is None:
         span = (length, length) if isinstance(length, int | float) else length
@@ -158,7 +161,9 @@ def plan(
     )
     unseen = observability(problem.arm, planned.capture(), problem.space)
     if unseen.rank < len(problem.space.names):
-        raise InputError(f"no {poses} poses in these sockets determine the parameters. {' '.join(unseen.sentences())}")
+        raise InputError(
+            f"no choice of {poses} poses in these sockets determines the parameters. {' '.join(unseen.sentences())}"
+        )
     if problem.options.unconstrained:
         free = problem.within(cones=None, cell=None)
         _, q, owner = _chosen(free, placement, names, poses)

@@ -174,7 +174,8 @@ def _best(
         improvement = np.trace(np.linalg.solve(inner, outer), axis1=1, axis2=2)
     if not (allowed.any() and np.all(np.isfinite(improvement))):
         raise InputError(
-            "there are fewer candidate poses than poses to choose, or they add no information; give more candidates."
+            "there are fewer candidate poses than poses to choose, or the candidates add no information; give more "
+            "candidates."
         )
     return int(np.argmax(np.where(allowed, improvement, -np.inf)))
 

@@ -62,8 +62,8 @@ def determined_by(arm: Arm) -> dict[str, Observability]:
     kinds = {
         "sockets": Capture(sockets),
         "sockets and a reference length": Capture(sockets, length),
-        "a tracker, of the probe": Capture({}, observations=points),
-        "a tracker, of a target at an unknown place": Capture({}, observations=target),
+        "a tracker that measures the probe": Capture({}, observations=points),
+        "a tracker that measures a target at an unknown place": Capture({}, observations=target),
     }
     return {data: observability(arm, capture, every) for data, capture in kinds.items()}
 

@@ -101,7 +101,8 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
     least = least_poses(pool)
     if poses < least.sum():
         raise InputError(
-            f"{poses} poses are too few for this kit; give {least.sum()} at least, or leave something out."
+            f"{poses} poses are too few for this kit; give at least {least.sum()} poses, or remove something from the "
+            "kit."
         )
     chosen, motions = _in_order(problem, things, _chosen(problem, things, pool, poses, least))
     unseen = observability(problem.arm, Capture({}, (), chosen), problem.space)
@@ -137,15 +138,19 @@ def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
     for item in items:
         if not isinstance(item.simulated, AbstractSimulated):
             raise InputError(
-                f"{item.simulated!r} cannot be planned; give one of aj.data.observations, such as SimulatedArtefact."
+                f"{item.simulated!r} cannot be planned; give an object of aj.data.observations, such as "
+                "SimulatedArtefact."
             )
         cones_of([Cone(item.half_angle, item.normal)])  # refuses what is no cone
         if item.places < 0:
-            raise InputError(f"'{item.simulated.name}' has {item.places} places; give 0, which leaves it, or more.")
+            raise InputError(
+                f"'{item.simulated.name}' has {item.places} places; give a positive number, or 0 to leave it where it "
+                "is."
+            )
     names = [item.simulated.name for item in items]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise InputError(f"two things of the kit have the name '{twice[0]}'; give each a name of its own.")
+        raise InputError(f"two items of the kit have the name '{twice[0]}'; give each item a different name.")
     return items
 
 

@@ -163,7 +163,7 @@ def place(problem: DesignProblem, items: Sequence[KitItem], poses: int) -> list[
     for item in items:
         name = item.simulated.name
         if item.places and item.simulated.placed(name, np.zeros(6)) is None:
-            raise InputError(f"'{name}' is an instrument and has no placements; remove its number of places.")
+            raise InputError(f"'{name}' is an instrument, so the plan does not place it; remove its number of places.")
         names = [f"{name}/{i + 1}" for i in range(item.places)] if item.places > 1 else [name]
         things += [Thing(item, item.simulated.changed(name=name)) for name in names]
     if not any(item.places for item in items):
@@ -184,8 +184,8 @@ def place(problem: DesignProblem, items: Sequence[KitItem], poses: int) -> list[
             scored.append((value(pools, 0), number, layout))
     if not scored:
         raise InputError(
-            "no placement of the kit was found that can be reached well; give a region nearer to the arm, fewer "
-            "places, or wider cones."
+            "no placement of the kit was found in which the arm reaches all of it well; give a region nearer to the "
+            "arm, fewer places, or wider cones."
         )
     return best_layout(
         [layout for _, _, layout in sorted(scored)[:_DESIGNED]],
@@ -232,7 +232,7 @@ def _random_frame(problem: DesignProblem, item: KitItem) -> Frame:
         frame = _frame_within(problem, item, turn, middle)
         if frame is not None:
             return frame
-    raise InputError(f"'{item.simulated.name}' does not fit into the region; widen it.")
+    raise InputError(f"'{item.simulated.name}' does not fit into the region; widen the region.")
 
 
 def _neighbour(problem: DesignProblem, layout: Sequence[Thing]) -> list[Thing] | None:

@@ -58,13 +58,14 @@ def check_counts(sockets: int | Mapping, poses: int, parameters: int, u: float, 
     number = len(sockets) if isinstance(sockets, Mapping) else sockets
     if number < 1 or poses < LEAST_POSES * number:
         raise InputError(
-            f"{poses} poses are too few for {number} sockets; give one socket or more, and {LEAST_POSES} poses in each."
+            f"{poses} poses are too few for {number} sockets; give at least one socket, and at least {LEAST_POSES} "
+            "poses per socket."
         )
     unknowns = parameters + 3 * number - (len(lengths) if isinstance(sockets, Mapping) else number // 2)
     if 3 * poses < unknowns:
         raise InputError(
-            f"{poses} poses in {number} sockets give fewer equations than the {unknowns} unknowns; take "
-            f"{-(-unknowns // 3)} at least."
+            f"{poses} poses in {number} sockets give fewer equations than the {unknowns} unknowns; plan at least "
+            f"{-(-unknowns // 3)} poses."
         )
 
 
@@ -81,13 +82,17 @@ def given_placement(
                     f"reference length {pair[0]}, {pair[1]} names the unknown socket '{end}'{nearest(end, names)}"
                 )
     if len({frozenset(pair[:2]) for pair in lengths}) < len(lengths):
-        raise InputError("a reference length is named twice; its certified value counts once, so name it once.")
+        raise InputError(
+            "a reference length is named twice; its certified value can be used only once, so name it once."
+        )
     if any(len(set(pair[:2])) < 2 for pair in lengths):
         raise InputError("a reference length joins a socket to itself; name two different sockets.")
     for i, name in enumerate(names):
         for other in names[:i]:
             if np.linalg.norm(points[name] - points[other]) < 1:
-                raise InputError(f"sockets '{other}' and '{name}' are in the same position; move one, or leave it out.")
+                raise InputError(
+                    f"sockets '{other}' and '{name}' are at the same position; move or remove one of the two."
+                )
     ends = tuple((names.index(pair[0]), names.index(pair[1])) for pair in lengths)
     each_u = tuple(float(pair[2]) if len(pair) > 2 else u for pair in lengths)
     return names, FixturePlacement(np.array(list(points.values())), ends, each_u)
@@ -152,7 +157,8 @@ def best_placement(
     low, high = length
     if not 0 < low <= high < 2 * total_link_length(problem.arm):
         raise InputError(
-            f"a reference length of {low:g} to {high:g} mm does not fit this arm; give one shorter than its reach."
+            f"a reference length of {low:g} to {high:g} mm does not fit this arm; give a length shorter than the "
+            "reach of the arm."
         )
 
     def report(fraction: float) -> None:
@@ -168,7 +174,7 @@ def best_placement(
         limited = problem.region.cell is not None or (problem.region.cones is not None and problem.region.cones.any)
         wider = ", wider cones, or fewer obstacles" if limited else ""
         raise InputError(
-            "no placement was found that can be reached well; give a region nearer to the arm, or a shorter "
+            "no placement was found that the arm reaches well; give a region nearer to the arm, or a shorter "
             f"length{wider}."
         )
     starts = _STARTS // sockets

@@ -139,7 +139,7 @@ class DesignProblem(NamedTuple):
             InputError: The arm is a batch or reaches no volume, or an option is out of range.
         """
         if not is_single(arm):
-            raise InputError("plans are for one arm, not a batch; give one of its arms.")
+            raise InputError("a plan is for one arm, not for a batch; give one arm of the batch.")
         options = checked_fields(options)
         space = Parameters.free_of(arm) if options.space is None else options.space
         # Plans are at 20 C, so they say nothing of thermal expansion.
@@ -148,16 +148,21 @@ class DesignProblem(NamedTuple):
             arm = arm.replace(beta=np.zeros(arm.joints))
         length = default_length(arm) if options.check_length is None else options.check_length
         if arm.joints < 3 or total_link_length(arm) == 0:
-            raise InputError("this arm reaches no volume: it needs three joints and a link; there is nothing to plan.")
+            raise InputError(
+                "this arm does not reach a volume, so there is nothing to plan; give an arm with at least three "
+                "joints and one link."
+            )
         noise = small_arm_noise() if options.noise is None else options.noise
         noise.check(arm.joints)
         for axis, (low, high) in options.ranges.items():
             if not low < high:
                 raise InputError(
-                    f"the region's {axis} is {low:g} to {high:g} mm, which is no range; give the lower number first."
+                    f"the region's {axis} is {low:g} to {high:g} mm, which is not a range; give the lower number first."
                 )
             if axis not in ("x", "y", "z", "distance"):
-                raise InputError(f"the region has no '{axis}'; give ranges of x, y, z and distance, in mm.")
+                raise InputError(
+                    f"the region has the unknown key '{axis}'; give ranges of x, y, z and distance, in mm."
+                )
         cell, seed, arm = options.cell, options.seed, to_numpy(arm)
         if cell is not None and np.isfinite(options.above) and TABLE not in [item.name for item in cell.obstacles]:
             table = HalfSpace(TABLE, (0.0, 0.0, 1.0), (0.0, 0.0, options.above))

@@ -136,5 +136,5 @@ def _axes_in_space(axes: Any) -> Any:
     if axes is None:
         return new_figure((6, 5.4)).add_subplot(projection="3d")
     if getattr(axes, "name", "") != "3d":
-        raise InputError("an arm is drawn in space; give axes made with projection='3d'.")
+        raise InputError("an arm is drawn in three dimensions; give axes made with projection='3d'.")
     return axes

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.text import pluralise
 from ..drift.results import Drift, Trend, in_words
 from ..summaries.result_tables import listed_apart
 from .charts import SERIES, Axis, Marks, Plot, histogram, linear, names
@@ -59,7 +60,7 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
         form = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
         dates = [f"{date:{form}}{'*' if file else ''}" for date, file in zip(trend.dates, by_file, strict=True)]
         title = "calibration" + (", evenly spaced" if even else "")
-        title += " (*: when its file was made; the manifest states no date)" if any(by_file) else ""
+        title += " (*: date of its file; the manifest states no date)" if any(by_file) else ""
         ticks = tuple(zip(positions.tolist(), dates, strict=True))
         x = linear(title, positions, margin=0.03)._replace(ticks=ticks, named=True)
         # The dates stand below the lower axes alone.
@@ -89,8 +90,8 @@ def _changes_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
         marks.append(Marks(name, positions, ratio[:, i], joined=True, **style))
     title = (
         f"Change of {len(trend.names)} parameters from the first calibration; band: expanded uncertainty "
-        f"({100 * drift.level:g} %)\nnamed: beyond the band at the end (at most {len(SERIES)}); "
-        "open circles: other values beyond it"
+        f"({100 * drift.level:g} %)\nnamed: beyond the band at the last date (at most {len(SERIES)}); "
+        "open circles: other values beyond the band"
     )
     return Plot(x, _ratio_axis(ratio), tuple(marks), title + _not_shown(drift))
 
@@ -101,7 +102,7 @@ def _lengths_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
     rows = (
         ("largest", [abs(length.largest) for length in lengths], "triangle", "soft"),
         ("RMS", [length.rms for length in lengths], "square", "main"),
-        ("RMS by the uncertainties alone", [length.rms_by_chance for length in lengths], "ring", "accent"),
+        ("RMS expected from the uncertainties alone", [length.rms_by_chance for length in lengths], "ring", "accent"),
     )
     marks = tuple(
         Marks(name, positions[1:], 1e3 * np.where(np.isfinite(values), values, np.nan), symbol, tone, joined=True)
@@ -131,8 +132,8 @@ def _changes_of_two(drift: Drift) -> Plot:
         Marks("", x[moved], ratio[moved], "square", size=7),
     )
     title = (
-        f"New less old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band, "
-        f"their expanded uncertainty ({100 * drift.level:g} %)"
+        f"New minus old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band "
+        f"(their expanded uncertainty, {100 * drift.level:g} %)"
     )
     return Plot(axis, _ratio_axis(ratio), marks, title + _not_shown(drift))
 
@@ -142,7 +143,7 @@ def _lengths_of_two(drift: Drift) -> Plot:
     counts, edges = np.histogram(1e3 * lengths.change, bins=40)
     marks = [histogram(counts, edges)]
     for name, rms, symbol, tone in (
-        ("RMS by the uncertainties alone", lengths.rms_by_chance, "dashed", "accent"),
+        ("RMS expected from the uncertainties alone", lengths.rms_by_chance, "dashed", "accent"),
         ("RMS of the changes", lengths.rms, "line", "main"),
     ):
         if np.isfinite(rms):
@@ -172,4 +173,4 @@ def _within(x: Axis) -> Marks:
 
 def _not_shown(drift: Drift) -> str:
     without = len(drift.names) - drift.reasons.count("")
-    return f"\nnot shown: {without} without an uncertainty of change" if without else ""
+    return f"\nnot shown: {pluralise(without, 'change')} without an uncertainty" if without else ""

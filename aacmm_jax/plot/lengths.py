@@ -48,7 +48,7 @@ def by_placement(between: Sequence[tuple[str, str]]) -> tuple[np.ndarray, Axis, 
 
 def _errors_plot(axis: Axis, edges: np.ndarray, marks: Sequence[Marks]) -> Plot:
     ends = [end for part in marks for end in (part.y, part.low, part.high) if end is not None]
-    return Plot(axis, linear("measured − value [mm]", *ends, [0.0]), (*marks, borders(edges), level(0.0)))
+    return Plot(axis, linear("measured − calibrated [mm]", *ends, [0.0]), (*marks, borders(edges), level(0.0)))
 
 
 def length_chart(rows: Sequence[Mapping[str, Any]], earlier: Mapping[str, np.ndarray]) -> Chart:
@@ -88,7 +88,7 @@ def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
     name = "single readings" + (", with U" if np.any(bars > 0) else "")
     marks = [Marks(name, x, values, "dot", "main", words, values - bars, values + bars, size=5)]
     limits = np.array([np.nan if part.limit is None else part.limit for part in metric.values])
-    description = "Errors of the reference lengths, reading by reading, by the calibrated arm"
+    description = "Errors of single readings of the reference lengths with the calibrated arm"
     if np.any(np.isfinite(limits)):
         order = np.argsort(x)
         marks += [Marks("MPE", x[order], side * limits[order], "dashed", "ink") for side in (1, -1)]
@@ -124,8 +124,8 @@ def metrics_chart(tests: Sequence[AcceptanceTest]) -> Chart:
         metrics, y, lines, title = limited, "|value| / MPE", [1.0], "Metrics against their limits"
         divisors = np.array([max(metric.worst.limit or 0.0, _LEAST) for metric in metrics])
         description = (
-            "The value of each metric, divided by its limit, with U. The decisions are in the tables: they follow the "
-            "rule stated above, whose guard band may be less than U."
+            "The value of each metric divided by its limit, with U. The decisions are in the tables. They follow the "
+            "decision rule stated above; its guard band may be smaller than U."
         )
     values = np.array([abs(metric.value) for metric in metrics]) / divisors
     bars = np.array([metric.worst.expanded for metric in metrics]) / divisors
@@ -153,7 +153,7 @@ def acceptance_metrics(tests: Sequence[AcceptanceTest], axes: Any = None) -> Any
         >>> aj.plot.acceptance_metrics(tests).figure.savefig("acceptance.svg")
     """
     if not any(metric.worst.limit for test in tests for metric in test.metrics):
-        raise InputError("no metric has a limit to be drawn against; give limits to accept.")
+        raise InputError("no metric has a limit to compare with; give limits to acceptance.run.")
     return draw(metrics_chart(tests).plots[0], axes)
 
 
@@ -174,7 +174,7 @@ def volume_chart(volume: VolumetricUncertainty) -> Chart:
     said = [f"U = {format_number(u, decimals_for(u))} mm" for u in expanded.tolist()]
     marks = _section(volume.start[finite], (shade, limits if np.any(finite) else ()), said, name, unit="mm")
     axes = linear(_ACROSS, np.hypot(volume.start[:, 0], volume.start[:, 1]), [0.0]), linear(_UP, volume.start[:, 2])
-    description = "The larger the mark, the more uncertain; height against distance from the first axis."
+    description = "Height against distance from the first axis; the larger the mark, the larger U."
     return Chart("volume", f"{name} over the volume", description, (Plot(*axes, (marks,), height=380),))
 
 
@@ -192,7 +192,7 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) 
         >>> axes = aj.plot.volumetric_uncertainty_map(volume)
     """
     if not np.any(np.isfinite(volume.expanded_length)):
-        raise InputError("no length over the volume is determined, so there is no uncertainty to draw.")
+        raise InputError("the data determine no length over the volume, so there is no uncertainty to draw.")
     return draw(volume_chart(volume).plots[0], axes)
 
 
@@ -201,7 +201,7 @@ def tried_chart(volume: VolumetricUncertainty, tips: np.ndarray, poses: TriedPos
     of the calibration, mm."""
     ratio = poses.distance / max(poses.spacing, 1e-12)
     said = [
-        f"{distance / DEG:.0f} deg from the nearest pose, {times:.1f} times their spacing"
+        f"{distance / DEG:.0f} deg from the nearest calibration pose, {times:.1f} times the spacing of these poses"
         for distance, times in zip(poses.distance.tolist(), ratio.tolist(), strict=True)
     ]
     tips = tips[thinned(len(tips), _TIPS)]
@@ -211,8 +211,9 @@ def tried_chart(volume: VolumetricUncertainty, tips: np.ndarray, poses: TriedPos
     axes = linear(_ACROSS, random.x, across, [0.0]), linear(_UP, volume.start[:, 2], tips[:, 2])
     plot = Plot(*axes, marks, height=380)
     description = (
-        "Random poses all over the volume by their distance in joint space from the nearest pose of the calibration, "
-        "in multiples of the spacing of its own poses: up to 1 it was tried there; the larger the mark, the less."
+        "Random poses over the whole volume. The size of a mark shows the distance in joint space from the nearest "
+        "calibration pose, in multiples of the spacing of the calibration poses. Random poses with a distance of up to "
+        "1 are covered by the calibration."
     )
     return Chart("tried", "Coverage of the working volume", description, (plot,))
 

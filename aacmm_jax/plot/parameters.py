@@ -7,6 +7,7 @@ import numpy as np
 
 from ..calibration.record import CalibrationRecord, function_of_joint, uncertainty_of
 from ..core.errors import InputError
+from ..core.text import pluralise
 from ..core.units import DEG, people_read
 from ..diagnostics.pose_residuals import observation_residuals
 from ..kinematics.arm import is_length, parameter_unit
@@ -46,12 +47,12 @@ def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
     axis = linear(f"calibrated − nominal [{label}]", *ends, [0.0])
     if not np.all(finite):
         at = np.clip(change[~finite], axis.low, axis.high)
-        name = "only determined with others, or on a bound"
+        name = "determined only with others, or on a bound"
         marks.append(Marks(name, x[~finite], at, "cross", "accent", words[~finite].tolist()))
     plot = Plot(names("", [row["parameter"] for row in parameters]), axis, (*marks, level(0.0)), height=260)
-    description = "Calibrated minus nominal; bars are U, and smaller than the mark where none is visible."
+    description = "Calibrated minus nominal value. Bars show U; where no bar is visible, U is smaller than the mark."
     if outside := int(np.sum((change < axis.low) | (change > axis.high))):
-        description += f" At the edge: {outside} without U, whose values (in the table) lie outside."
+        description += f" At the edge: {pluralise(outside, 'value')} without U that would lie outside; see the table."
     kind = "length" if unit == "mm" else "angle"
     return Chart(f"change-{unit}", f"Change of {kind} parameters", description, (plot,))
 
@@ -100,7 +101,7 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 def error_plot(record: CalibrationRecord) -> Plot:
     """Errors of the length parameters of a simulated arm, by stage."""
     if record.recording.true is None:
-        raise InputError("the calibration is not of a simulation, so no true arm is known to draw errors against.")
+        raise InputError("the calibration is not of a simulated arm, so the true arm and the errors are not known.")
     vectors, chosen = record.vectors(), [i for i, name in enumerate(record.names) if is_length(name)]
     stages = {"nominal": ("nominal", "dot", "soft"), "stage 1": ("stage1", "triangle", "accent"),
               "calibrated": ("calibrated", "square", "main")}  # fmt: skip
@@ -110,7 +111,7 @@ def error_plot(record: CalibrationRecord) -> Plot:
         for name, (stage, symbol, tone) in stages.items()
         if stage != "stage1" or record.stage1_apart
     )  # fmt: skip
-    y = logarithmic("error against the true arm [mm]", *(mark.y for mark in marks))
+    y = logarithmic("difference from the true arm [mm]", *(mark.y for mark in marks))
     return Plot(names("", [record.names[i] for i in chosen]), y, marks)
 
 
@@ -125,8 +126,8 @@ def bounds_chart(labels: Sequence[str], positions: np.ndarray, on_bound: np.ndar
         marks.append(Marks("on a bound", x[on_bound], edge, "diamond", "accent", words[on_bound].tolist()))
     y = Axis("position within bounds", -1.15, 1.15, ((-1.0, "lower"), (0.0, "middle"), (1.0, "upper")), named=True)
     plot = Plot(names("", labels), y, (*marks, level(-1.0, 1.0)), height=220)
-    description = "Diamonds are on a bound." if np.any(on_bound) else "None is on a bound."
-    description += f" Not drawn: {left_out} coefficients of harmonics within theirs." if left_out else ""
+    description = "Diamonds: on a bound." if np.any(on_bound) else "No parameter is on a bound."
+    description += f" Not drawn: {left_out} coefficients of harmonics within their bounds." if left_out else ""
     return Chart("bounds", "Position of every parameter within its bounds", description, (plot,))
 
 
@@ -155,14 +156,14 @@ def correlation_plot(labels: list[str], table: np.ndarray, title: str = "") -> P
 def correlation_chart(uncertainty: Uncertainty) -> Chart:
     """Correlations of the parameters; of very many, of those that are correlated most."""
     labels, chosen = list(uncertainty.names), uncertainty.most_correlated()
-    most = f"the {len(chosen)} parameters of {len(labels)} that are correlated most"
+    most = f"the {len(chosen)} of {len(labels)} parameters with the strongest correlations"
     part = np.asarray(uncertainty.correlation)[np.ix_(chosen, chosen)]
     plot = correlation_plot([labels[i] for i in chosen], part, most if len(chosen) < len(labels) else "")
     return Chart(
         "correlations",
         "Correlation of the parameters",
-        "The colour is the size of the correlation; its sign is written from 0.5 on. Strongly correlated "
-        "parameters are determined better in combination than one by one.",
+        "The colour shows the size of the correlation; the sign is printed where the size is 0.5 or more. The data "
+        "determine combinations of strongly correlated parameters better than each of these parameters.",
         (plot,),
     )
 
@@ -193,7 +194,7 @@ def singular_chart(observed: Observability) -> Chart:
     if rank < len(values):
         marks.append(Marks("not determined", order[rank:], values[rank:], "cross", "accent", words[rank:]))
     plot = Plot(linear("number", order), logarithmic("singular value", values), tuple(marks), height=240)
-    what = "Sensitivity of the data to each independent direction of the parameters, in steps of 1 mm and 1 mrad."
+    what = "Sensitivity of the data to each independent combination of parameters, in steps of 1 mm and 1 mrad."
     return Chart("singular", "Singular values", what, (plot,))
 
 
@@ -227,7 +228,7 @@ def models_chart(summary: Mapping[str, Any]) -> Chart:
     )
     named = [f"{label} (recommended)" if label == summary["recommended"] else label for label in labels]
     y = linear("RMS distance from the geometry [mm]", inside, outside, high, [0.0], zero=True)
-    description = "The RMS distance of poses from their geometry, from the simplest model to the richest."
+    description = "RMS distance of poses from their geometry, from the simplest model to the most complex."
     return Chart("models", "Errors by model", description, (Plot(names("", named), y, marks, height=260),))
 
 
@@ -258,12 +259,12 @@ def functions_chart(record: CalibrationRecord) -> Chart | None:
     words = [dict.fromkeys(kind.description for kind in kinds if kind.of_own_reading is by) for by in (True, False)]
     drawn, others = map(", ".join, words)
     description = (
-        f"The curve: corrections of each joint by its own reading ({drawn}), less their mean"
-        + (f"; without {others}" if others else "")
-        + ". Marks: the curve and what the residuals of neighbouring poses ask besides, with twice its standard error. "
-        "Dashed lines are the ends of the travel that was measured."
+        f"Curve: the corrections of each joint that depend on its own reading ({drawn}), minus their mean"
+        + (f"; not included: {others}" if others else "")
+        + ". Marks: the curve plus the further change that the residuals of neighbouring poses suggest, with twice its "
+        "standard error. Dashed lines: ends of the measured travel."
     )
-    return Chart("functions", "What the joints do besides their readings", description, tuple(plots))
+    return Chart("functions", "Non-geometric errors of the joints", description, tuple(plots))
 
 
 def joint_function(

@@ -107,7 +107,7 @@ def pose_chart(
     last_arm, last = list(arms.items())[-1]
     finite, marked = np.flatnonzero(np.isfinite(last)), np.asarray(far[1], dtype=int)
     if not len(finite):
-        return Chart(id, title, "Every socket has one pose only, so there is no scatter to show.", ())
+        return Chart(id, title, "Every socket has only one pose, so there is no scatter to show.", ())
     drawn = np.union1d(finite[thinned(len(finite), most or len(finite))], marked)
     labels, kind = groups.labels, np.asarray(groups.kinds)[groups.owner]
     # Said of each mark, in the key, residuals, poses, and how they are drawn.
@@ -139,7 +139,7 @@ def pose_chart(
     )
     median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
     description = f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
-    description += " The only pose of a socket has no distance." if len(finite) < len(last) else ""
+    description += " A pose that is alone in its socket has no distance." if len(finite) < len(last) else ""
     description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
     return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
 
@@ -149,7 +149,7 @@ def _pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked) -
     chosen, caption = np.arange(len(residuals)), "Every pose"
     if len(chosen) > _LISTED:
         chosen = np.argsort(-np.nan_to_num(residuals))[:_LISTED]
-        caption = f"The {_LISTED} farthest of {len(residuals)} poses"
+        caption = f"The {_LISTED} poses with the largest residuals, of {len(residuals)}"
     owner, says = groups.owner, Cell(far[0], None, "outlier")
     columns = {
         groups.word: [groups.names[i] for i in owner[chosen]],
@@ -275,7 +275,9 @@ def residual_patterns(record: CalibrationRecord) -> Any:
     """
     residuals = signed_residuals(record)
     if residuals is None:
-        raise InputError("no pose has a residual with a direction, as no socket has several poses; record more poses.")
+        raise InputError(
+            "no residual has a direction, because no socket has several poses; record several poses per socket."
+        )
     charts = _pattern_charts(record, residuals, len(residuals.poses))
     return draw_all([plot for chart in charts for plot in chart.plots], 4)
 
@@ -309,21 +311,22 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
         (
             "by-joint",
             "Residuals against the readings",
-            "The component of each residual along which the joint would move the tip, mm, against its reading. A wave "
-            "is an eccentric encoder or a bending link, a slope a wrong gear ratio or zero.",
+            "The component of each residual, mm, along the direction in which the joint moves the tip, against the "
+            "reading of the joint. A wave indicates an eccentric encoder or a bending link; a slope indicates a wrong "
+            "gear ratio or zero.",
             _patterns(by_reading, most),
         ),
         (
             "by-order",
             "Residuals along x, y and z",
-            "The residual in the base frame, mm, pose after pose as the capture holds them. A step between sockets or "
-            "placements, or a slope, is something that moved, warmed or wore meanwhile.",
+            "The residual of each pose in the base frame, mm, in the order of the capture. A step between sockets or "
+            "placements, or a slope, shows that something moved, warmed up or wore during the recording.",
             _patterns(by_order, most),
         ),
         (
             "histogram",
             "Histogram of the residuals",
-            "All coordinates of all poses; those beyond 4.5 standard deviations stand in the outermost boxes.",
+            "All coordinates of all poses; the outermost boxes include all residuals beyond 4.5 standard deviations.",
             (Plot(x, linear("coordinates", counts, normal, zero=True), marks, height=220),),
         ),
     )
@@ -346,7 +349,7 @@ def _patterns(panels: Sequence[tuple[np.ndarray, str, np.ndarray, str]], most: i
             parts = np.array_split(finite[np.argsort(x[finite], kind="stable")], bins)
             middle, mean = (np.array([values[part].mean() for part in parts]) for values in (x, y))
             twice = np.array([2 * y[part].std(ddof=1) / math.sqrt(len(part)) for part in parts])
-            name = "mean of neighbours, ± 2 of its u"
+            name = "mean of neighbouring poses, ± 2 u"
             marks.append(Marks(name, middle, mean, "band", low=mean - twice, high=mean + twice))
             marks.append(Marks("", middle, mean, "line"))
         y_axis = linear("residual [mm]", [-limit, limit], margin=0.0)

@@ -20,7 +20,7 @@ from .parameters import correlation_plot
 
 _MOST_PLOTS = 12  # of a metric, each with a combination of factors
 _WIDE = 20  # times: positive values over a wider range need a logarithmic axis
-_SCALE_ERROR = "error of the scale of stage 1 [parts in a million]"
+_SCALE_ERROR = "error of the scale of stage 1 [parts per million]"
 # A name, a metric, and the cells at each level of the factor, whose trials are pooled.
 _Series = tuple[str, str, Sequence[Sequence[int]]]
 
@@ -38,7 +38,7 @@ def study_metric(results: Results, metric: str = "length_error", axes: Any = Non
         >>> aj.plot.study_metric(results, "de_stage1").figure.savefig("figure.svg")
     """
     if metric not in METRICS:
-        raise InputError(f"a study has no metric '{metric}'; choose one of {', '.join(METRICS)}.")
+        raise InputError(f"'{metric}' is not a metric of a study; choose one of {', '.join(METRICS)}.")
     return draw(metric_plots(results, metric, together=True)[0], axes)
 
 
@@ -101,7 +101,7 @@ def save_study_figures(results: Results, folder: Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{folder} cannot be made: {reason}; choose another folder.") from error
+        raise InputError(f"the folder {folder} cannot be created: {reason}; choose another folder.") from error
     figures: dict[str, Callable[[], Any]] = {"convergence": lambda: study_convergence(results)}
     factors = results.study.factors
     if any(np.any(results.column("converged", cell) == 1) for cell in range(len(results.study.cells))):

@@ -35,7 +35,7 @@ _METHODS = {
     REPEATABILITY: "Identification with the scale of the nominal arm",
 }
 _MOST_KINDS = 3  # among the facts at the beginning
-_OBSERVED = "Joint least squares of everything observed"
+_OBSERVED = "Joint least squares of all observations"
 
 
 def calibration_report(record: CalibrationRecord) -> Report:
@@ -117,7 +117,7 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         f"Fixed at their nominal values: {', '.join(record.held) or 'none'}."
     )
     if record.hold and record.method == REPEATABILITY:
-        introduction += f" {record.hold} sets the scale, since nothing that was observed does."
+        introduction += f" {record.hold} sets the scale, since no observation does."
     elif record.hold:
         introduction += f" {record.hold} was the scale anchor of stage 1, since poses alone do not determine the scale."
     blocks: list[Block] = [introduction]
@@ -140,16 +140,16 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     sources = summary["scale_from"]
     start = "Measurements of the arm are"
     if not sources:
-        traceable = f"{start} not traceable to the metre by this calibration: nothing that was measured set its scale."
+        traceable = f"{start} not traceable to the metre by this calibration: no measurement set the scale of the arm."
     elif sources == ["the reference lengths"]:
         traceable = (
-            f"{start} traceable to the metre through these reference lengths alone, as far as their calibration "
-            "certificates are."
+            f"{start} traceable to the metre through these reference lengths alone, as far as the calibration "
+            "certificates of the lengths are."
         )
     else:
         traceable = (
-            f"{start} traceable to the metre as far as the calibration certificates are of what sets its scale: "
-            f"{', '.join(sources)}."
+            f"The scale comes from {', '.join(sources)}. {start} traceable to the metre as far as the calibration "
+            "certificates of these sources are."
         )
     return Section("data", "What was calibrated, and from which data", [*blocks, *removed_tables(record), traceable])
 
@@ -158,9 +158,9 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
     stages = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
     if not record.stage1_apart:
         del stages["stage1"]  # which is the calibrated arm
-    introduction = "The nominal and the calibrated arm on the poses used for identification."
+    introduction = "The nominal and the calibrated arm, compared on the poses used for identification."
     if record.robust:
-        introduction += " Root mean squares count every pose in full, those too that lost weight."
+        introduction += " RMS values count every pose in full, including poses whose weight the robust loss reduced."
     blocks: list[Block] = [introduction]
     if summary["cross_validation"] is not None:
         blocks += result_tables.validation_tables(summary["cross_validation"])
@@ -189,9 +189,9 @@ def _scale(record: CalibrationRecord, summary: dict[str, Any], evaluations: dict
     if not summary["lengths"]:
         return Section("scale", "Scale", [introduction])
     introduction += (
-        " The only length fixed the scale, so its own error is zero by construction and is not shown."
+        " The only reference length fixed the scale, so its error is zero by construction and is not shown."
         if single
-        else " U of a length contains the uncertainty of its certificate and the scatter of the poses at its ends."
+        else " U of a length includes the uncertainty of its certificate and the scatter of the poses at its ends."
     )
     stage1 = {"stage 1": np.asarray(evaluations["stage1"].error)} if record.stage1_apart else {}
     rows, before = summary["lengths"], {"nominal": np.asarray(evaluations["nominal"].error)} | stage1
@@ -205,23 +205,26 @@ def _scale_sentence(record: CalibrationRecord, summary: dict[str, Any]) -> str:
     k, u = record.k, record.u_k
     k_shown, u_of_k = f"{k:.{decimals_for(u, 8)}f}", f"u(k)\u00a0=\u00a0{two_digits(u)}"
     if record.method == REPEATABILITY:
-        return "The scale is that of the nominal arm: nothing that was measured set it." + (
-            f" By the reference lengths, which took no part, k = {k_shown}." if math.isfinite(k) else ""
+        return "The scale is that of the nominal arm: no measurement set the scale." + (
+            f" The reference lengths, which the calibration did not use, give k = {k_shown}."
+            if math.isfinite(k)
+            else ""
         )
     if math.isnan(k):
-        return f"Fitted with all else at once, the scale comes from {', '.join(summary['scale_from'])}."
+        return f"The scale was fitted together with everything else; it comes from {', '.join(summary['scale_from'])}."
     if record.final_method == "joint":
         against = shorten(record.against_division)
         why = f", since the division by k was not possible because of {against}" if against else ""
         return (
-            f"Poses and reference lengths were fitted together{why}. The arm that poses alone give "
-            f"measures the lengths as k = {k_shown} times their calibrated value, with {u_of_k}."
+            f"Poses and reference lengths were fitted together{why}. With the parameters that the "
+            f"poses alone give, the arm measures k = {k_shown} times the calibrated value of the lengths, with "
+            f"{u_of_k}."
         )
     expanded = 1000 * (summary["scale_expanded"] or math.nan)
     decimals = decimals_for(expanded)
     return (
-        "Repeatability does not determine the size of an arm; the reference lengths do. The arm of stage 1 "
-        f"measures them as k = {k_shown} times their calibrated value, with {u_of_k}. The lengths of the arm "
-        f"were divided by k: {abs(k - 1) * 1000:.{decimals}f} mm in a metre, known to "
-        f"±\u00a0{expanded:.{decimals}f} mm in a metre (95 %)."
+        "Repeatability does not determine the size of an arm; the reference lengths do. With the parameters of "
+        f"stage 1, the arm measures k = {k_shown} times the calibrated value of the reference lengths, with {u_of_k}. "
+        f"The lengths of the arm were divided by k, a change of {abs(k - 1) * 1000:.{decimals}f} mm per metre, known "
+        f"to ±\u00a0{expanded:.{decimals}f} mm per metre (95 %)."
     )

@@ -43,10 +43,10 @@ from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_
 
 _INDICES = {
     "O1": "geometric mean of the singular values (Menq, Borm)",
-    "O2": "smallest over largest (Driels, Pathre)",
-    "O3": "smallest (Nahvi)",
-    "O4": "smallest squared over largest (Nahvi, Hollerbach)",
-    "O5": "harmonic sum (Sun, Hollerbach)",
+    "O2": "smallest singular value divided by the largest (Driels, Pathre)",
+    "O3": "smallest singular value (Nahvi)",
+    "O4": "square of the smallest singular value divided by the largest (Nahvi, Hollerbach)",
+    "O5": "harmonic sum of the singular values (Sun, Hollerbach)",
 }
 _TRAVELLED = 400  # most readings of a joint that are drawn
 _FULL_TURN = 360.0
@@ -57,7 +57,7 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     others, harmonics = listed_apart(summary["parameters"])
     introduction = (
         "U is the expanded uncertainty (95 %), with the coverage factor of each parameter's own degrees of freedom. A "
-        "parameter on a bound, or one that the data determine only together with others, has none of its own."
+        "parameter on a bound, or one that the data determine only together with others, has no U of its own."
     )
     by_unit = {unit: [row for row in others if row["unit"] == unit] for unit in ("mm", "rad")}
     functions = functions_chart(record)
@@ -69,8 +69,8 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     ]
     if harmonics:
         blocks += [
-            f"The {len(harmonics)} coefficients of harmonics are not printed: they are in the table below on screen, "
-            "and in the calibration's file (aacmm export --format csv).",
+            f"The {len(harmonics)} coefficients of harmonics are not printed. On screen, the table below lists them; "
+            "aacmm export --format csv writes them from the calibration's file.",
             harmonics_table(harmonics),
             parameter_table("Coefficients of harmonics", harmonics)._replace(folded=True),
         ]
@@ -83,28 +83,28 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
     capture = record.recording.capture
     if record.sockets_alone:
         introduction = (
-            "The distance of each pose's tip from the centroid of its socket, by the calibrated arm. Poses more than "
-            "eight times as far as the median are marked: check how the tip was seated there."
+            "The distance of each pose's tip from the centroid of its socket, computed with the calibrated arm. Poses "
+            "with more than eight times the median distance are marked: check how the tip was seated in these poses."
         )
         blocks = [introduction, socket_table(capture, evaluation), residual_chart(capture, evaluation)]
         return [Section("residuals", "Residuals by socket and pose", blocks)]
     parts, groups = observation_residuals(record), Groups.of(capture)
     introduction = (
-        "The distance of each pose's tip from the geometry of its observation, by the calibrated arm, in mm and in "
-        "standard deviations of what was measured and of the arm's own scatter together (the root mean square over the "
-        "coordinates of a pose, about 1). "
+        "The distance of each pose's tip from the geometry of its observation, computed with the calibrated arm, in mm "
+        "and in standard deviations. A standard deviation includes the uncertainty of the measured values and the "
+        "arm's own scatter; the root mean square over the coordinates of a pose should be about 1. "
     )
     normalised = np.concatenate([part.normalised for part in parts])
     far = None  # those that lost weight
     if not summary["robust"]:
-        introduction += "Poses more than eight times as far, in standard deviations, as the median are marked."
+        introduction += "Poses with more than eight times the median distance, in standard deviations, are marked."
         far = "far from its geometry", pose_outliers(normalised, groups.sizes)[0]
     charts = (kinds_chart(record, unit, far, DRAWN) for unit in ("mm", "standard deviations", "deg"))
     blocks = [introduction, *([weights_table(summary)] if summary["robust"] else []), *filter(None, charts)]
     introduction = (
-        "The geometry that was unknown, as determined with the parameters: positions and frames in the base frame, "
-        "rotations as vectors along their axis; offsets and orientations of targets in the last frame; placements on "
-        "an indexed platform in the platform's frame."
+        "The unknown geometry was determined together with the parameters. Positions and frames are given in "
+        "the base frame, rotations as vectors along their axis. Offsets and orientations of targets are given in the "
+        "last frame, placements on an indexed platform in the platform's frame."
     )
     factor = summary["uncertainty"]["coverage_factor_geometry_95"]
     return [
@@ -117,9 +117,9 @@ def patterns(record: CalibrationRecord) -> list[Section]:
     """Residuals with their sign."""
     charts = pattern_charts(record)
     introduction = (
-        "Residuals that scatter evenly about zero are noise; what the model lacks shows as a pattern. The band is the "
-        "mean of neighbouring poses with twice its standard error: where it leaves zero, the residuals follow what is "
-        "drawn along the axis."
+        "Residuals that scatter evenly about zero are noise; errors that the model does not describe show as a "
+        "pattern. The band is the mean of neighbouring poses with twice its standard error. Where the band does not "
+        "include zero, the residuals depend on the quantity along the horizontal axis."
     )
     return [Section("patterns", "Patterns in the residuals", [introduction, *charts])] if charts else []
 
@@ -139,14 +139,14 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     ends = zip("xyz", volume.start.min(axis=0), volume.start.max(axis=0), strict=True)
     box = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends).replace("-", "−")
     introduction = (
-        f"At {len(volume.start)} positions that random poses within the joint limits reach ({box} mm), "
-        f"expanded to 95 % ({factor_words(statistics)})."
+        f"Expanded uncertainty at {len(volume.start)} positions that random poses within the joint limits reach "
+        f"({box} mm), for a coverage of 95 % ({factor_words(statistics)})."
     )
     positions = {f"{axis} [mm]": numbers(volume.start[:, k], 0) for k, axis in enumerate("xyz")}
     for name, u in (
         ("U of the tip [mm]", volume.expanded_tip),
         (f"U of a {volume.length:g} mm length [mm]", volume.expanded_length),
-        ("with readings [mm]", volume.expanded_length_reading),
+        ("with noise of both readings [mm]", volume.expanded_length_reading),
     ):
         positions[name] = [with_u_digits(float(value)) for value in u]
     blocks = [
@@ -170,7 +170,7 @@ def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[S
     medians = [float(np.median(volume.expanded_tip[part])) for part in (poses.tried, ~poses.tried) if np.any(part)]
     if len(medians) == 2 and all(map(math.isfinite, medians)):
         near, far = map(two_digits, medians)
-        sentence += f" The median U of a tip is {near} mm where it was tried and {far} mm elsewhere."
+        sentence += f" The median U of a tip is {near} mm in the covered part and {far} mm outside."
     return [Section("tried", "Coverage of the working volume", [sentence, chart, _travel(record, readings)])]
 
 
@@ -192,7 +192,7 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
         "highest limit": numbers(limits[:, 1], 1),
         "lowest reading": numbers(shown.min(axis=0), 1),
         "highest reading": numbers(shown.max(axis=0), 1),
-        "travel tried [%]": numbers(100 * np.array(used), 0),
+        "travel covered [%]": numbers(100 * np.array(used), 0),
     }
     drawn = shown[thinned(len(shown), _TRAVELLED)]
     marks = (
@@ -201,7 +201,7 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     )
     axis = linear("reading [deg]" + (" or [mm]" if any(slides) else ""), limits, shown)
     plot = Plot(names("", [f"joint {i + 1}" for i in x]), axis, marks, height=260)
-    description = "The travel of each joint within its limits, and the readings of the calibration in it."
+    description = "The travel of each joint within its limits, and the readings of the calibration."
     return Chart("travel", "Travel of the joints", description, (plot,), by_columns("Travel by joint", columns))
 
 
@@ -227,7 +227,7 @@ def correlations(uncertainty: Uncertainty) -> Section:
         "with": lambda pair: pair[1],
         "correlation": lambda pair: number(pair[2], 3, signed=True),
     }
-    pairs = listed("Pairs correlated by 0.5 or more", uncertainty.correlated(0.5), columns)
+    pairs = listed("Pairs with a correlation of 0.5 or more", uncertainty.correlated(0.5), columns)
     return Section("correlations", "Correlations", [correlation_chart(uncertainty)._replace(table=pairs)])
 
 
@@ -237,11 +237,12 @@ def observability(observability: Observability) -> Section:
     determined = f"These data determine all {count} parameters."
     if rank < count:
         determined = (
-            f"These data determine {rank} directions of the {count} parameters; with their priors, all are determined."
+            f"These data determine {rank} independent combinations of the {count} parameters. Together with the "
+            "priors, they determine all parameters."
         )
     rows = [
-        ("rank", f"{rank} of {count}", "number of directions that are determined"),
-        ("condition", f"{observability.condition:.3g}", "of what is determined, columns scaled"),
+        ("rank", f"{rank} of {count}", "number of independent combinations of parameters that the data determine"),
+        ("condition", f"{observability.condition:.3g}", "of the determined combinations, with scaled columns"),
         *((name, f"{x:.3g}", f"{_INDICES[name]}; larger is better") for name, x in observability.indices.items()),
     ]
     metrics = by_columns("Metrics", dict(zip(("", "value", "meaning"), zip(*rows, strict=True), strict=True)))
@@ -281,7 +282,7 @@ def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     }
     introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
     if record.final_method == "two-stage":
-        introduction += " Bounds are those of stage 1; the scale fix comes after it."
+        introduction += " The bounds apply to stage 1; the scale fix comes after stage 1."
     width = upper - lower
     with np.errstate(invalid="ignore", divide="ignore"):
         within = np.where(np.isfinite(width) & (width > 0), 2 * (vector - lower) / width - 1, math.nan)[index]

@@ -112,8 +112,7 @@ def view_of_arm(
     return ArmView(
         "scene",
         f"The calibrated arm{points} and its poses",
-        "Drag, or use the arrow keys, to rotate the view; plus and minus change its size. The slider goes through the "
-        "poses.",
+        "Drag, or use the arrow keys, to rotate the view; plus and minus change its size. The slider selects the pose.",
         data,
     )
 
@@ -184,13 +183,13 @@ def observation_tables(record: CalibrationRecord) -> list[Table]:
         "tip": lambda row: row["target"] or "own probe",
         "poses": "poses",
         "unknown geometry": lambda row: ", ".join(row["unknowns"]),
-        "u of what was measured [mm]": lambda row: number(u[row["observation"]] or None),
+        "u of measured values [mm]": lambda row: number(u[row["observation"]] or None),
         "stated": lambda row: "; ".join(f"{quantity['quantity']} {_words(quantity)}" for quantity in row["stated"]),
     }
     if not any(row["stated"] for row in rows):
         del columns["stated"]
     if not any(u[row["observation"]] for row in rows):
-        del columns["u of what was measured [mm]"]
+        del columns["u of measured values [mm]"]
     of_certified = {
         "observation": "observation",
         "quantity": "quantity",
@@ -210,11 +209,11 @@ def removed_tables(record: CalibrationRecord) -> list[Table]:
         "F": lambda left_out: number(left_out.ratio, 1),
         "degrees of freedom": lambda left_out: "{} and {}".format(*left_out.degrees_of_freedom),
         "p": lambda left_out: left_out.probability if left_out.probability >= 1e-4 else "< 0.0001",
-        "RMS of the rest, with it [mm]": lambda left_out: left_out.rms_with,
-        "without it [mm]": lambda left_out: left_out.rms_without,
-        "changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
+        "RMS of the rest, with the group [mm]": lambda left_out: left_out.rms_with,
+        "without the group [mm]": lambda left_out: left_out.rms_without,
+        "parameter changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
     }
-    caption = "Left out, because it contradicts the rest"
+    caption = "Data left out, because they contradict the rest"
     return [listed(caption, record.removed, columns)] if record.removed else []
 
 

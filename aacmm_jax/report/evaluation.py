@@ -57,7 +57,7 @@ def evaluation_report(record: EvaluationRecord) -> Report:
         warnings=[
             *summary["warnings"],
             *(f"Over the limit: {sentence}" for sentence in summary["failed"]),
-            *(f"Of the calibration: {sentence}" for sentence in record.calibration_warnings),
+            *(f"About the calibration: {sentence}" for sentence in record.calibration_warnings),
         ],
         facts=_facts(summary),
         sections=[
@@ -128,29 +128,30 @@ def _acceptance(
     rows, artefacts, u_test = summary["acceptance"], _artefacts(lengths, spheres), summary["u_test_mm"]
     if not rows:
         return [Section("artefacts", "Artefacts", artefacts)] if artefacts else []
-    stated = "nothing was stated for seat, fixture and temperature"
+    stated = "no uncertainty was stated for seat, fixture and temperature"
     if u_test:
         u = format_number(1000 * u_test, 1)
-        stated = f"{u} µm of standard uncertainty were stated for seat, fixture and temperature"
+        stated = f"a standard uncertainty of {u} µm was stated for seat, fixture and temperature"
     blocks: list[Block] = [
-        "Every metric is of single readings. U, with coverage factor 2, is what the tester contributes: the artefacts' "
-        f"uncertainty; {stated}. The arm's own scatter is what is tested (ISO 14253-5). What standards allow about "
-        "repeating a reading is not applied. A test that lacks something its standard requires is called 'after' it. "
-        "Requirements and formulas follow secondary sources of the editions named.",
+        "Every metric is computed from single readings. U (coverage factor 2) is the contribution of the tester: it "
+        f"includes the uncertainty of the artefacts; {stated}. The arm's own scatter is what is tested, so U does not "
+        "include it (ISO 14253-5). The standards' permission to repeat a reading is not applied. A test that lacks "
+        "something its standard requires is labelled 'based on' the standard. Requirements and formulas are taken from "
+        "secondary sources on the editions named.",
     ]
     metrics = [metric for test in rows for metric in test["figures"]]
     limited = any(metric["limit_mm"] is not None for metric in metrics)
     nominal = any(metric["as_found_mm"] is not None for metric in metrics)
     if limited:
-        used = dict.fromkeys(f"{test['standard']}: {test['rule']}" for test in rows if test["decision"])
-        blocks.append(f"Decision rules: {'; '.join(used)}. What no rule decides is undecided.")
+        used = dict.fromkeys(f"{test['rule']} (for {test['standard']})" for test in rows if test["decision"])
+        blocks.append(f"Decision rules: {'; '.join(used)}. What a rule does not decide is undecided.")
     for test, metrics_of_test in zip(rows, result_tables.acceptance_tables(rows), strict=True):
         blocks.append(metrics_of_test)
         if test["missing"]:
-            blocks.append(f"This was not the full procedure. {' '.join(test['missing'])}")
+            blocks.append(f"The full procedure was not carried out. {' '.join(test['missing'])}")
     parts = [(part, metric, test) for test in tests for metric in test.metrics for part in metric.values]
     every = listed(
-        f"Every part of every metric{' with a limit' if limited else ''} [mm]",
+        f"Every value of every metric{' with a limit' if limited else ''} [mm]",
         [row for row in parts if not limited or row[0].limit is not None],
         {
             "at": lambda row: row[0].where,
@@ -172,7 +173,7 @@ def _artefacts(lengths: Sequence[ReferenceLength], spheres: Sequence[ProbedSpher
     for sphere in spheres:
         name = f"sphere '{sphere.name}' for {sphere.test.replace('-', ' ')}"
         touches = "+".join(str(len(group)) for group in sphere.groups)
-        use = f"touched {touches} times by a ball of {sphere.stylus:g} mm; form error {format_number(sphere.form)} mm"
+        use = f"touched {touches} times with a ball of {sphere.stylus:g} mm; form error {format_number(sphere.form)} mm"
         rows.append((name, sphere.diameter, sphere.u, use))
     columns = {
         "artefact": lambda row: row[0],
@@ -215,7 +216,7 @@ def _lengths(
     caption, before = "Lengths between the mean points of their sockets [mm]", np.asarray(evaluations["nominal"].error)
     means = length_table(caption, rows, {"nominal": before}, record.length_that_fixed_scale())
     note = (
-        "Means of all poses, for comparison; no acceptance test uses them. Their U (factor 2) also contains the "
-        "scatter of the poses at both ends."
+        "These lengths use the means of all poses and are given for comparison; no acceptance test uses them. U "
+        "(coverage factor 2) also includes the scatter of the poses at both ends."
     )
     return [Section("lengths", "Lengths", [*([] if chart is None else [chart]), means, note])]

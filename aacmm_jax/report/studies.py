@@ -20,12 +20,12 @@ _SHOWN = (
     *("length_error_stage1", "angle_error_stage1", "de_stage1", "deltam_stage1", "k"),
 )
 _NAMED = 6
-_PERCENTILES = "Marks are medians, bars reach from the 5th to the 95th percentile of the converged trials."
+_PERCENTILES = "Marks are medians; bars reach from the 5th to the 95th percentile of the converged trials."
 _MODELS = (
-    "Each model was calibrated with all poses (inside), and without each region in turn, which it then predicted "
-    "(outside). Neighbouring poses have similar errors, so that only regions that were left out whole show how a model "
-    "extrapolates. Of the model that is best outside, and simpler ones that regions cannot tell from it, the "
-    "simplest that makes the measurement about as probable (evidence) is recommended."
+    "Each model was calibrated with all poses (inside), and once without each region, which the model then predicted "
+    "(outside). Neighbouring poses have similar errors, so only whole regions that were left out show how a model "
+    "extrapolates. Candidates are the model that is best outside and the simpler models that the regions cannot tell "
+    "from the best one. The simplest candidate that makes the measurement about as probable (evidence) is recommended."
 )
 
 
@@ -65,11 +65,12 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
     warnings = []
     if not summary["finished"]:
         warnings.append(
-            "The study is not finished; the same command continues it. Metrics are of the trials that were run."
+            "The study is not finished; the same command continues the study. Metrics are computed from the trials run "
+            "so far."
         )
     for key, least, says in (
-        ("converged", 0.99, "Not all trials converged, and metrics are of those that did"),
-        ("truth_inside", 1.0, "The true arm lies within the bounds in some of the trials only"),
+        ("converged", 0.99, "Not all trials converged; metrics are computed from the converged trials"),
+        ("truth_inside", 1.0, "The true arm lies within the bounds in only some of the trials"),
     ):
         shares = [(cell, cell[key]["value"] or 0.0) for cell in summary["results"] if cell["trials_run"]]
         named = [f"{label(summary, cell)} ({100 * share:.3g} %)" for cell, share in shares if share < least]
@@ -95,9 +96,12 @@ def models_report(summary: dict[str, Any]) -> Report:
         marks = Marks("", np.arange(len(errors)), errors, "dot", tone, words, size=7)
         plots.append(Plot(*axes, (marks,), title=row["model"], height=170))
     title = "Errors by region"
-    says = "The RMS error of each region, predicted from all the others; the recommended model in the other colour."
+    says = (
+        "The RMS error in each region when the model is fitted to all the other regions; the recommended model is "
+        "highlighted."
+    )
     return Report(
-        title=f"Models of the joints compared, {summary['arm'] or 'an arm'}",
+        title=f"Comparison of joint models, {summary['arm'] or 'an arm'}",
         subtitle=f"{pluralise(len(models), 'model')} on {pluralise(summary['poses'], 'pose')}; "
         f"{pluralise(len(regions), 'region')} left out one by one",
         verdict=" ".join(summary["findings"]),
@@ -105,8 +109,8 @@ def models_report(summary: dict[str, Any]) -> Report:
         warnings=list(summary["warnings"]),
         facts=[
             ("Recommended model", chosen["model"]),
-            ("Its RMS error in unseen regions", f"{format_number(chosen['rms_outside'])}\u00a0mm"),
-            ("(error / predicted standard deviation)², mean outside", number(chosen["ratio"], 2).text),
+            ("Its RMS error in regions left out", f"{format_number(chosen['rms_outside'])}\u00a0mm"),
+            ("Mean of (error / predicted standard deviation)² outside", number(chosen["ratio"], 2).text),
         ],
         sections=[
             Section("models", "Errors inside and outside", [_MODELS, models_chart(summary), by_name, MODELS_MEANING]),

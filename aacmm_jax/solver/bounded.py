@@ -141,7 +141,7 @@ def least_squares(
     check_x64()
     y0 = jax.tree.map(lambda leaf: jnp.asarray(as_array(leaf, "the start")), y0)
     if not sum(leaf.size for leaf in jax.tree.leaves(y0)):
-        raise InputError("the start holds no number, so nothing is unknown; give at least one.")
+        raise InputError("the start contains no number, so there are no unknowns; give at least one number.")
     checked(max_steps, Count, "max_steps")
     options = {"lower": lower, "upper": upper, "scale": scale}
     box = _box(y0, options)
@@ -150,7 +150,7 @@ def least_squares(
         for i in np.flatnonzero(~(low <= high))[:1]:
             raise InputError(
                 f"lower bound {low[i]:g} of unknown {i + 1} is above its upper bound {high[i]:g}; exchange or widen "
-                "them."
+                "the bounds."
             )
     solution = _minimum(fn, y0, args, box, normal, solver, max_steps)
     if not throw:
@@ -185,7 +185,9 @@ def _flat(y: PyTree[Array], given: PyTree, absent: float, what: str) -> Flat:
     try:
         return ravel_pytree(jax.tree.map(leaf_of, y, given))[0]
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what} does not fit the start; give a number, or a PyTree like it ({error}).") from error
+        raise InputError(
+            f"{what} does not match the start; give a number, or a PyTree like the start ({error})."
+        ) from error
 
 
 @eqx.filter_jit
@@ -204,7 +206,9 @@ def _minimum(
     def residual(point: Array, args: PyTree) -> Float[Array, " r"]:
         value = ravel_pytree(fn(unravel(point), args))[0]
         if not value.size or jnp.iscomplexobj(value):
-            raise InputError("the residual must be real numbers, at least one; look at what the function returns.")
+            raise InputError(
+                "the residual must consist of real numbers and contain at least one; check what the function returns."
+            )
         return value
 
     # What the function closes over becomes an argument, so that derivatives by it pass too.

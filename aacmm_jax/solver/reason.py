@@ -18,7 +18,7 @@ class Reason(eqx.Enumeration):
         Converged: the projected gradient is zero to the tolerance.
     """
 
-    running = "It has not ended."
+    running = "The solve has not ended."
     gradient = "Converged: the projected gradient is zero to the tolerance."
     step = "Converged: the last step is below the tolerance."
     rounding = "Converged: no step can lower the cost by more than rounding error."

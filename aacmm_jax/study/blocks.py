@@ -58,7 +58,7 @@ class Variable(NamedTuple):
 METRICS = {
     "k": Variable("1", "k, measured / nominal"),
     "scale": Variable("1", "scale after stage 1, found / true"),
-    "scale_error": Variable("1", "scale after the fix, found / true - 1"),
+    "scale_error": Variable("1", "scale error after the scale fix, found / true - 1"),
     "de_stage1": Variable("mm", "DE before the scale fix"),
     "deltam_stage1": Variable("mm", "Deltam before the scale fix"),
     "length_error_stage1": Variable("mm", "largest length error before the scale fix"),
@@ -69,13 +69,13 @@ METRICS = {
     "angle_error": Variable("rad", "largest angle error after the scale fix"),
 }
 VARIABLES = {
-    "converged": Variable("1", "1 where every solve ended at a minimum, 0 where not, -1 not yet run", "i1", -1),
-    "reason": Variable("1", "why the last solve ended, see attribute reasons", "i1", -1),
+    "converged": Variable("1", "1 if every solve ended at a minimum, 0 if not, -1 if not yet run", "i1", -1),
+    "reason": Variable("1", "why the last solve ended (see the attribute reasons)", "i1", -1),
     "steps": Variable("1", "evaluations of all solves", "i4", -1),
     **METRICS,
-    "truth_inside": Variable("1", "1 where the true arm lies inside the bounds", "i1", -1),
-    "active": Variable("1", "-1 on the lower bound, +1 on the upper, 0 inside, -128 not yet run", "i1", -128, True),
-    "estimate": Variable("mm or rad", "identified parameters, at the end", by_parameter=True),
+    "truth_inside": Variable("1", "1 if the true arm lies inside the bounds", "i1", -1),
+    "active": Variable("1", "-1 on the lower bound, +1 on the upper, 0 inside, -128 if not yet run", "i1", -128, True),
+    "estimate": Variable("mm or rad", "identified parameters at the end of the solve", by_parameter=True),
     "true": Variable("mm or rad", "parameters of the true arm", by_parameter=True),
 }
 
@@ -110,8 +110,8 @@ def blocks_of(study: Study, chunk: int) -> list[Block]:
     cells, trials = len(study.cells), study.trials
     if cells * -(-trials // chunk) > MOST_BLOCKS:
         raise InputError(
-            f"chunks of {chunk} cut {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} blocks; "
-            "give a larger chunk."
+            f"chunks of {chunk} trials divide {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} "
+            "blocks; give a larger chunk."
         )
 
     def of_one_setting(count: int) -> bool:
@@ -150,6 +150,6 @@ def check_same(begun: str, where: str, advice: str) -> None:
         before, now = (f"{name}{sign}{side[name]}" if name in side else f"no {name}" for side in (then, here))
         if before != now:
             raise InputError(
-                f"{where} was begun with {before}, and here is {now}, which can change the numbers; make it the same, "
-                f"or {advice}."
+                f"{where} was begun with {before}, but this process has {now}, which can change the numbers; use the "
+                f"same environment, or {advice}."
             )

@@ -149,7 +149,7 @@ def _out_of_reach(fixture: Fixture) -> InputError:
         points = " and ".join("(" + ", ".join(f"{x:g}" for x in point) + ")" for point in fixture.points)
         what += f" at {points} mm"
     return InputError(
-        f"{what} cannot be reached in enough poses within the joint limits; move it, or widen them "
+        f"{what} cannot be reached in enough poses within the joint limits; move it, or widen the joint limits "
         "(capture.joint_limits_deg)."
     )
 
@@ -218,7 +218,8 @@ def _placements(arm: Arm, fixture: Fixture, limits: Array, key: Array, count: in
             return np.array(placements[:count])
     kind = "socket" if fixture.length is None else f"reference length of {fixture.length:g} mm"
     raise InputError(
-        f"a {kind} has no placement in its region within reach and joint limits of the arm; widen or move the region."
+        f"a {kind} has no placement in its region within the reach and the joint limits of the arm; widen or move the "
+        "region."
     )
 
 

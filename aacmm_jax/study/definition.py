@@ -250,9 +250,10 @@ class Study:
             possible = "joint" if scaled else "stage1"
             if asked not in (None, possible):
                 raise InputError(
-                    f"identification.method is '{asked}', but captures with observations besides sockets are solved at "
-                    f"once, {'as they fix the scale' if scaled else 'and these leave the scale open'}; use "
-                    f"'{possible}'."
+                    f"identification.method is '{asked}', but captures with observations other than sockets are "
+                    "solved in one step, "
+                    f"{'because they fix the scale' if scaled else 'and these observations do not fix the scale'}; "
+                    f"use '{possible}'."
                 )
             return possible
         if asked == "two-stage" and prior is not None:
@@ -319,7 +320,7 @@ class Study:
         """Refuse everything that can be known to be wrong before work starts, but for what cannot be reached."""
         capture = self.capture
         if capture is not None and self.specification.reference is not None:
-            raise InputError("the capture file brings its reference lengths; leave [reference] out.")
+            raise InputError("the capture file already contains its reference lengths; remove [reference].")
         if capture is not None and capture.columns not in (self.nominal.arm.joints, self.nominal.arm.columns):
             raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
         deviations = self.specification.deviation
@@ -338,13 +339,13 @@ class Study:
                 pool, (placements, poses) = self.specification.capture.pool, self.pool_capacity(fixture)
                 if fixture.points is None and placements < 2:
                     raise InputError(
-                        f"a capture.pool of {pool} poses holds fewer than two placements of {fixture.poses} poses in "
-                        f"each of its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
+                        f"a capture.pool of {pool} poses contains fewer than two placements of {fixture.poses} poses "
+                        f"in each of its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
                     )
                 if fixture.poses > poses:
                     raise InputError(
-                        f"{fixture.poses} poses are more than the pool has for a socket ({poses}); give a larger "
-                        f"capture.pool than {pool}."
+                        f"{fixture.poses} poses are more than the pool has per socket ({poses}); give a capture.pool "
+                        f"larger than {pool}."
                     )
         _ = self.cell_values  # its checks
 

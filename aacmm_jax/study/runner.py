@@ -171,7 +171,7 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
         connected: Any = distributed.Client(**target, timeout=5)
     except Exception as error:  # of a dozen types: no such file or host, no answer, not a scheduler's file
         raise InputError(
-            f"no Dask scheduler answers at {address}; start one, or leave --dask out to use this machine's cores."
+            f"no Dask scheduler answers at {address}; start one, or omit --dask to use this machine's cores."
         ) from error
     with connected as client:
         count = len(client.scheduler_info(n_workers=-1)["workers"])
@@ -196,15 +196,14 @@ def use_compilation_cache() -> None:
 def _check_arguments(executor: Any, **numbers: Any) -> None:
     for what, number in numbers.items():
         if number is not None and (not isinstance(number, int) or number < 1):
-            raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or leave it out.")
+            raise InputError(f"{what} is {number!r}; give a whole number of at least 1, or omit it.")
     if executor is not None and not isinstance(executor, Executor):
-        raise InputError(
-            f"executor is a {type(executor).__name__}; give a concurrent.futures.Executor, or leave it out."
-        )
+        raise InputError(f"executor is a {type(executor).__name__}; give a concurrent.futures.Executor, or omit it.")
     context = getattr(executor, "_mp_context", None)
     if context is not None and context.get_start_method() == "fork":
         raise InputError(
-            "the executor forks, which JAX does not survive; give it mp_context=multiprocessing.get_context('spawn')."
+            "the executor forks its processes, which does not work with JAX; create it with "
+            "mp_context=multiprocessing.get_context('spawn')."
         )
 
 
@@ -226,10 +225,10 @@ def _opened(study: Study, path: Path, chunk: int | None, executor: Executor | No
     results = read(path)
     if results.study != study:
         raise InputError(
-            f"{path} holds another study ({_difference(results.study, study)}); choose another output path."
+            f"{path} contains another study ({_difference(results.study, study)}); choose another output path."
         )
     if not results.finished and chunk not in (None, results.chunk):
-        raise InputError(f"{path} was begun with chunks of {results.chunk} trials; leave the chunk out to continue.")
+        raise InputError(f"{path} was begun with chunks of {results.chunk} trials; omit the chunk size to continue.")
     if not results.finished and executor is None:
         check_same(results.computed_with, str(path), "choose another output path")
     return results
@@ -314,7 +313,7 @@ def _result(future: Future, what: object) -> Any:
         raise
     except Exception as error:
         raise RuntimeError(
-            f"{what} failed on its worker ({type(error).__name__}: {error}); finished blocks are kept, run "
+            f"{what} failed on its worker ({type(error).__name__}: {error}); finished blocks are kept; run the study "
             "again to continue"
         ) from error
 
@@ -352,7 +351,7 @@ def _locked(output: OutputFile) -> Iterator[None]:
             lock.acquire(timeout=0)
         except Timeout as error:
             raise InputError(
-                f"{output.named} is being written by another process; wait for it, or stop it first."
+                f"{output.named} is being written by another process; wait until that process ends, or stop it."
             ) from error
     try:
         yield

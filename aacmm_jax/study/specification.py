@@ -32,7 +32,7 @@ def _levels_of(natural: int) -> BeforeValidator:
 def _different(levels: list) -> list:
     for i, level in enumerate(levels):
         if level in levels[:i]:
-            raise ValueError(f"the level {_label(level)} is given twice; give each once.")
+            raise ValueError(f"the level {_label(level)} is given twice; give each level once.")
     return levels
 
 
@@ -137,14 +137,15 @@ class CaptureTable(_Table):
     @model_validator(mode="after")
     def _one(self) -> "CaptureTable":
         if sum(given is not None for given in (self.file, self.kit, self.positions_mm, self.sockets)) != 1:
-            raise ValueError("give one of positions_mm, sockets (with a region), file and kit.")
+            raise ValueError("give exactly one of positions_mm, sockets (with a region), file and kit.")
         if self.sockets is not None and self.region is None:
-            raise ValueError("sockets at random need a region.")
+            raise ValueError("sockets at random places need a region.")
         generated = {"poses", "region", "joint_limits_deg", "pool"} & self.model_fields_set
         if self.recorded and generated:
             source = "kit" if self.file is None else "file"
             raise ValueError(
-                f"{min(generated)} is for generated poses, but {source} gives them; leave one of the two out."
+                f"{min(generated)} applies to generated poses, but {source} already states the poses; remove one of "
+                "the two."
             )
         return self
 
@@ -197,12 +198,12 @@ class ReferenceTable(_Table):
     @model_validator(mode="after")
     def _one(self) -> "ReferenceTable":
         if (self.length_mm is None) == (self.ends_mm is None):
-            raise ValueError("give either length_mm, for lengths at random in the region, or ends_mm.")
+            raise ValueError("give either length_mm (for random places in the region) or ends_mm.")
         if self.ends_mm is not None and "positions" in self.model_fields_set:
-            raise ValueError("ends_mm determines the number of positions; leave positions out.")
+            raise ValueError("ends_mm determines the number of positions; remove positions.")
         for start, end in itertools.chain(*(self.ends_mm or [])):
             if start == end:
-                raise ValueError("ends_mm has two ends at the same position; move one of them.")
+                raise ValueError("ends_mm has two ends at the same position; move one of the ends.")
         return self
 
 
@@ -254,7 +255,9 @@ class Specification(_Table):
             )
         at_random = reference is not None and reference.length_mm is not None and reference.region is None
         if at_random and self.capture.region is None:
-            raise ValueError("a reference length at random needs a region; give it in [reference], or give ends_mm.")
+            raise ValueError(
+                "a reference length at a random place needs a region; give the region in [reference], or give ends_mm."
+            )
         return self
 
     def content(self) -> str:

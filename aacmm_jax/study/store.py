@@ -37,7 +37,7 @@ from .blocks import DIMENSIONS, VARIABLES, Block, blocks_of
 from .definition import POOL_PARTS, Study
 from .specification import Specification, unit
 
-_ADVICE = "free some space there, then run the same command again: what is finished is kept"
+_ADVICE = "free some space there, then run the same command again: finished blocks are kept"
 _TRIALS_IN_MEMORY = 50_000
 _LARGEST = 1e20  # mm, rad, or a factor
 _BY_TRIAL = tuple(name for name, kind in VARIABLES.items() if not kind.by_parameter)
@@ -93,7 +93,7 @@ class Results:
             with opened(results.path, ("study",), verify=False) as file:
                 arrays = {name: file["trials"][name] for name in VARIABLES}
                 shapes = any(array.shape != results.empty(name).shape for name, array in arrays.items())
-                check_sense(results.path, {"its results have other shapes than its study": shapes})
+                check_sense(results.path, {"the shapes of its results do not match its study": shapes})
                 ran = (arrays["converged"][()] != VARIABLES["converged"].fill).all()
                 check_sense(results.path, {"it has trials that did not run": not ran})
         return results
@@ -136,7 +136,7 @@ class Results:
         with undamaged(file), np.load(io.BytesIO(InputFile(file).content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in VARIABLES}
             shapes = any(array.shape != self.empty(name, *block.shape).shape for name, array in arrays.items())
-            check_sense(file, {"it is another block": str(archive["block"]) != file.name or shapes})
+            check_sense(file, {"it contains another block": str(archive["block"]) != file.name or shapes})
             return arrays
 
     def is_readable(self, block: Block) -> bool:
@@ -181,9 +181,9 @@ class Results:
                 infinite = any(np.any(np.isinf(x)) for x in converged.values())
                 missing = any(np.any(np.isnan(x)) for x in parameters)
                 problems = {
-                    "a result is larger than any can be": large,
+                    "a result is impossibly large": large,
                     "a trial that converged has an infinite result": infinite,
-                    "a trial that converged has a parameter without a number": missing,
+                    "a trial that converged has a parameter whose value is not a number": missing,
                 }
                 check_sense(self.path, problems)
                 yield trials, rows
@@ -307,7 +307,9 @@ def read(path: Path) -> Results:
             f"{path} was renamed, but its results are in {parts}; rename it back to {parts.removesuffix('.parts')}."
         )
     if not parts_of(path).is_dir():
-        raise InputError(f"{path} has its results in the folder {parts}, which is missing; put it next to the file.")
+        raise InputError(
+            f"{path} has its results in the folder {parts}, which is missing; put that folder next to the file."
+        )
     check_owners(path, reading=True)
     return results
 
@@ -325,8 +327,8 @@ def check_owners(path: Path, *, reading: bool = False) -> None:
             _refuse(item, f"{item} belongs to {user}, so its results are not continued; choose another output path.")
         elif status.st_uid != (owner := os.stat(path).st_uid):
             raise InputError(
-                f"{folder} belongs to {user}, but {path.name} to {user_name(owner)}, so its blocks are not read; have "
-                "one user own both."
+                f"{folder} belongs to {user}, but {path.name} belongs to {user_name(owner)}, so the blocks are not "
+                "read; make one user the owner of both."
             )
     status = _status(folder)
     if status is None:
@@ -338,8 +340,8 @@ def check_owners(path: Path, *, reading: bool = False) -> None:
     if others_may_write(status):
         _refuse(
             folder,
-            f"others may write to {folder} (mode {stat.S_IMODE(status.st_mode):04o}), so the blocks in it are not "
-            f"read; if they are yours, run chmod go-w '{folder}', otherwise remove it.",
+            f"other users may write to {folder} (mode {stat.S_IMODE(status.st_mode):04o}), so the blocks in it are "
+            f"not read; if the blocks are yours, run chmod go-w '{folder}', otherwise remove the folder.",
         )
 
 
@@ -360,8 +362,8 @@ def _refuse(path: Path, sentence: str) -> None:
     if keeps_owners(path.parent):
         raise InputError(sentence)
     warnings.warn(
-        f"the file system of {path.parent} does not keep who owns a file, so nothing shows whether somebody else wrote "
-        "the blocks of this study.",
+        f"the file system of {path.parent} does not record who owns a file, so it cannot be checked whether somebody "
+        "else wrote the blocks of this study.",
         UserWarning,
         stacklevel=3,
     )

@@ -19,7 +19,7 @@ _FACTORS = {
     "bounds.angle_shift_deg": "shift of the centre, angles [deg]",
     "identification.hold": "scale anchor",
     "identification.model": "model of the joints",
-    "deviation.model": "what the true joints do",
+    "deviation.model": "model of the true joints",
     "deviation.harmonics_arcsec": "encoder harmonics [arcsec]",
     "deviation.gear_ppm": "errors of gear ratios [ppm]",
     "deviation.coupled_ppm": "couplings of joints [ppm]",
@@ -28,7 +28,7 @@ _FACTORS = {
     "noise.encoder_arcsec": "encoder noise [arcsec]",
     "noise.linear_encoder_mm": "noise of linear encoders [mm]",
     "noise.seating_mm": "seating noise [mm]",
-    "capture.poses": "poses in a socket",
+    "capture.poses": "poses per socket",
     "reference.positions": "positions of the reference length",
 }
 

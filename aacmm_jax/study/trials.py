@@ -73,7 +73,7 @@ def draw_trials(study: Study, cell: int, trials: Numbers) -> tuple[DrawnTrials, 
         (2,)
     """
     if not 0 <= cell < len(study.settings):
-        raise InputError(f"cell is {cell}, but the study has {len(study.settings)} cells; count them from 0.")
+        raise InputError(f"cell is {cell}, but the study has {len(study.settings)} cells, numbered from 0.")
     setting, numbers = study.settings[cell], np.atleast_1d(np.asarray(trials))
     return _drawn(study, setting, np.full(len(numbers), cell), numbers, jax.local_devices()[0])
 

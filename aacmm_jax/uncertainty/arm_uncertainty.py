@@ -228,12 +228,12 @@ class Uncertainty(eqx.Module):
             np.broadcast_shapes(start.shape, end.shape)
         except ValueError as error:
             raise InputError(
-                f"the poses have shapes {start.shape} and {end.shape}; give as many ends as starts."
+                f"the poses have shapes {start.shape} and {end.shape}; give the same number of ends as of starts."
             ) from error
         between = self.arm.position(end) - self.arm.position(start)
         if is_concrete(between) and np.any(np.linalg.norm(between, axis=-1) < 1e-6):
             raise InputError(
-                "both poses put the tip in the same place, so there is no length between them; give others."
+                "both poses put the tip at the same point, so the length between them is zero; give other poses."
             )
         direction, whole = between / xp.linalg.norm(between, axis=-1, keepdims=True), self.complete
         derivatives = whole.derivatives(end) - whole.derivatives(start)

@@ -101,25 +101,29 @@ class Observability(NamedTuple):
         always, now = ([text for text, never in pairs if never == wanted] for wanted in (True, False))
         if always:
             sentences.append(
-                f"No measurement of this kind can separate: {'; '.join(always)}. Fix one of each (--held)."
+                f"No measurement of this kind can separate: {'; '.join(always)}. Fix one parameter of each "
+                "combination (--held)."
             )
         if now:
-            remedy = self.remedy or "Fix one of each (--held)."
+            remedy = self.remedy or "Fix one parameter of each combination (--held)."
             sentences.append(f"Not determined by these data: {_first(now)}. {remedy}")
         if self.by_prior:
-            sentences.append(f"Determined by the prior and not, or hardly, by these data: {_first(self.by_prior)}.")
+            sentences.append(
+                f"Determined by the prior, and little or not at all by these data: {_first(self.by_prior)}."
+            )
         if self.trade_offs:
             texts = _first([trade_off.text for trade_off in self.trade_offs])
             first = ", ".join(trade_off.names[0] for trade_off in self.trade_offs)
             sentences.append(
-                f"Hardly determined by these data: {texts}. Fix one of each, such as {first} (--held); wider bounds do "
-                "not help."
+                f"Hardly determined by these data: {texts}. Fix one parameter of each combination, such as {first} "
+                "(--held); wider bounds do not help."
             )
         sentences += self.corrections
         for i in self.parallel:
             sentences.append(
-                f"Axes {i} and {i + 1} are nearly parallel, where d_{i} and d_{i + 1} trade off and a small tilt has "
-                f"no D-H parameters: fix d_{i} and free beta_{i} (--free beta_{i})."
+                f"Axes {i} and {i + 1} are nearly parallel, so d_{i} and d_{i + 1} trade off, and the D-H "
+                f"parameters cannot describe a small tilt between the axes: fix d_{i} and free beta_{i} (--free "
+                f"beta_{i})."
             )
         return sentences
 
@@ -160,8 +164,10 @@ def observability(
         >>> found = aj.observability(arm, one_socket, space)
         >>> print(found.rank, "of", len(found.names))
         20 of 21
-        >>> print(found.sentences()[0])
-        Not determined by these data: all lengths together: the scale. A reference length would determine them.
+        >>> print(found.undetermined[0])
+        all lengths together: the scale
+        >>> print(found.remedy)
+        A reference length would determine these parameters.
     """
     if space is None:
         space = Parameters.free_of(arm) if bounds is None else bounds.space
@@ -358,7 +364,7 @@ class _Spectrum(NamedTuple):
         determined = [name for name in names if name not in left]
         if not determined:
             return ()
-        return (f"Poses in more sockets, over all of the workspace, would determine {listed(determined)}.",)
+        return (f"Poses in more sockets, distributed over the whole workspace, would determine {listed(determined)}.",)
 
     def remedy(self, left: int) -> str:
         """Which further data would leave so many directions open: one after the other, the least effort first."""
@@ -387,5 +393,5 @@ class _Spectrum(NamedTuple):
             (f"More poses in a socket, and {length},", more_poses | more_sockets, lengths[:1]),
         ):
             if sockets and self.with_more(sockets, added).null.shape[1] <= left:
-                return f"{text} would determine them."
+                return f"{text} would determine these parameters."
         return ""

@@ -201,12 +201,20 @@ _ZERO = 1e-9  # of what the function is elsewhere
 # over 20 deg, and 0.4 % beside a straight line over 60 deg.
 _NEARLY = 0.06
 _SENTENCES = {
-    "zero": "{names}: the function is 0 in all {poses}, as the moment of gravity about a vertical axis is; leave it "
-    "out, or let other joints move.",
-    "constant": "Over the {travel} that joint {joint} moves, {names} cannot be told from its zero offset, as the "
-    "function is nearly constant: let the arm move farther, and record poses in more sockets.",
-    "line": "Over the {travel} that joint {joint} moves, {names} cannot be told apart, from its zero offset or from "
-    "other parameters, as a straight line is nearly all of them: let it move farther.",
+    "zero": (
+        "{names}: the correction function is 0 in all {poses}, like the moment of gravity about a vertical axis; "
+        "omit the coefficient, or let other joints move."
+    ),
+    "constant": (
+        "Over the {travel} that joint {joint} moves, {names} cannot be separated from the zero offset of this "
+        "joint, because the correction function is nearly constant: let the joint move farther, and record poses "
+        "in more sockets."
+    ),
+    "line": (
+        "Over the {travel} that joint {joint} moves, {names} cannot be separated from each other, from the zero "
+        "offset of this joint or from other parameters, because their functions are nearly a straight line: let "
+        "the joint move farther."
+    ),
 }
 
 

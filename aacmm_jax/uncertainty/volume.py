@@ -129,7 +129,7 @@ def sample_lengths(
         [300. 300. 300. 300. 300.]
     """
     if length is not None and not 0 < length < 2 * total_link_length(arm):
-        raise InputError(f"a length of {length:g} mm does not fit into the volume of this arm; give a shorter one.")
+        raise InputError(f"a length of {length:g} mm does not fit into the volume of this arm; give a shorter length.")
     if count < 1:
         raise InputError(f"points is {count}; give at least one.")
     random = random_generator(seed)
@@ -152,6 +152,4 @@ def sample_lengths(
         ends.append(other[arrived])
         if sum(map(len, starts)) >= count:
             return np.concatenate(starts)[:count], np.concatenate(ends)[:count]
-    raise InputError(
-        f"lengths of {length:g} mm cannot be reached by this arm within its joint limits; give a shorter one."
-    )
+    raise InputError(f"this arm cannot reach lengths of {length:g} mm within its joint limits; give a shorter length.")

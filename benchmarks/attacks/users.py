@@ -72,10 +72,10 @@ def against_the_cache(folder: Path) -> Iterator[Attempt]:
     offered.rmdir()
     above = folder / "above"
     for what, reason in {
-        "a group may write to the folder above": f"others may write to {above}",
-        "an entry of another user": "others can have written planted-cache in it",
-        "a link": "others can have written planted-cache in it",
-        "an entry that others may write to": "others can have written planted-cache in it",
+        "a group may write to the folder above": f"other users may write to {above}",
+        "an entry of another user": "other users may have written planted-cache in this folder",
+        "a link": "other users may have written planted-cache in this folder",
+        "an entry that others may write to": "other users may have written planted-cache in this folder",
     }.items():
         cache = above / "aacmm_jax"
         cache.mkdir(parents=True, mode=0o700)

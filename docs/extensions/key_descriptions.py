@@ -12,7 +12,7 @@ DESCRIPTIONS = {
     "value": "Certified length, mm.",
     "u": "Standard uncertainty (k = 1), mm.",
     "u_expansion": "Standard uncertainty of `expansion`, 1/K.",
-    "test": "The acceptance test that the sphere was touched for.",
+    "test": "The acceptance test for which the sphere was touched.",
     "diameter": "Certified diameter, mm.",
     "stylus": "Diameter of the probe's ball, mm.",
     "form": "Certified form error of the sphere, mm.",

@@ -133,7 +133,7 @@ def test_articulated_location_by_hand():
     "points", [np.zeros((4, 3)), np.eye(3), np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0.0]])]
 )
 def test_points_that_fix_no_sphere_are_refused(points):
-    assert_refused(lambda: fit_sphere(points), "sphere", "touch it")
+    assert_refused(lambda: fit_sphere(points), "sphere", "touch the sphere")
 
 
 # --- Decisions ---
@@ -394,7 +394,7 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
 @pytest.mark.parametrize(
     ("sockets", "lengths", "reach", "missing"),
     [
-        ({"A": 10}, [], None, {"single-point articulation": ["reach of the arm", "elbow", "measuring range"]}),
+        ({"A": 10}, [], None, {"single-point articulation": ["reach and the shoulder", "elbow", "measuring range"]}),
         (
             {"A": 10, "B": 1, "C": 1},
             [("B", "C", 100.0)],
@@ -402,19 +402,19 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
             {
                 "single-point articulation": ["at 0 to 20 % of the reach (0 to 200 mm", "elbow", "measuring range"],
                 "volumetric": [
-                    "Two bars are required, no fewer",
+                    "Exactly two bars are required",
                     "500 to 750 mm) and one of 120 to 150 % of the reach (1200 to 1500 mm",
                     "20 different positions are required (1 given)",
                     "not in one plane",
-                    "scatter by 0.0 % of it",
+                    "scatter by 0.0 % of its size",
                     "measuring range",
                 ],
                 "length error": [
                     "5 different lengths are required (1 given)",
                     "7 different positions of every length are required (one has 1)",
-                    "3 readings in each position are required (a position has 1)",
+                    "3 readings in each position are required (one position has 1)",
                     "not in one plane",
-                    "10 % are required",
+                    "at least 10 % is required",
                     "measuring range",
                 ],
             },
@@ -460,14 +460,14 @@ def test_metrics_that_could_not_fail_are_left_out(test):
 
 def test_a_limit_without_data_is_refused():
     sockets = {"A": PLACE + np.eye(3)}
-    assert_refused(lambda: run(Measured(sockets), {"P_Size": Limit(0.1)}), "P_Size", "nothing to measure it on")
+    assert_refused(lambda: run(Measured(sockets), {"P_Size": Limit(0.1)}), "P_Size", "no data for this metric")
 
 
 # --- Files ---
 
 
 def test_readings_taken_by_the_plan_come_back_through_its_manifest(procedure, recorded, cheng, tmp_path):
-    """As in a laboratory: plan, record a file for each socket and group of touches, import."""
+    """As in a laboratory: plan, record one file per socket and per group of touches, import."""
     (tmp_path / "acceptance.toml").write_text(plan_manifest(procedure, "cheng2018-simulation"))
     files: dict[str, list[str]] = {}
     for row in csv.DictReader(plan_csv(procedure).splitlines()):
@@ -543,7 +543,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
         (
             ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
-            "target, session and temperature_C are for",
+            "target, session and temperature_C apply to",
         ),
     ],
 )
@@ -665,7 +665,7 @@ def test_bars_at_hand_are_planned_for(cheng):
     for start, end, value in procedure.lengths:
         ends = [next(item for item in procedure.sockets if item.name == name).points[0] for name in (start, end)]
         assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(value, abs=1e-5)
-    assert_refused(lambda: plan_procedure(cheng.arm, "iso", bars=[500.0]), "takes 5")
+    assert_refused(lambda: plan_procedure(cheng.arm, "iso", bars=[500.0]), "needs 5")
 
 
 def test_an_arm_that_cannot_take_a_zone_goes_without_it():

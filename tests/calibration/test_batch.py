@@ -93,11 +93,11 @@ def test_bounds_of_a_space_equal_arrays(paper_arm, noisy_capture, box, starts):
 def test_bounds_and_what_they_hold_already(paper_arm, noisy_capture, box, starts):
     bounds = aj.Bounds(aj.Parameters.free_of(paper_arm), *box)
     for many in (aj.identify_many, aj.calibrate_many):
-        with pytest.raises(aj.InputError, match=r"Bounds are given, and upper bounds as well, .* start=\.\.\."):
+        with pytest.raises(aj.InputError, match=r"a Bounds object and upper bounds are both given, .* start=\.\.\."):
             many(paper_arm, noisy_capture, bounds, starts)
-        with pytest.raises(aj.InputError, match="Bounds are given, and a space as well"):
+        with pytest.raises(aj.InputError, match="a Bounds object and a space are both given"):
             many(paper_arm, noisy_capture, bounds, start=starts, space=bounds.space)
-        with pytest.raises(aj.InputError, match="without upper ones"):
+        with pytest.raises(aj.InputError, match="without upper bounds"):
             many(paper_arm, noisy_capture, box[0], start=starts)
 
 
@@ -119,9 +119,9 @@ def test_failure_is_data(paper_arm, noisy_capture, box, starts):
     ("change", "message"),
     [
         ({"start": np.zeros((5, 20))}, r"start has shape \(5, 20\); give \(21,\) or \(batch, 21\)"),
-        ({"start": None}, "nothing is a batch"),
+        ({"start": None}, "no argument is a batch"),
         ({"start": np.zeros((0, 21))}, "the batch is empty"),
-        ({"lower": np.full((BATCH + 1, 21), -1e9)}, "batches of 50 and 51 problems do not fit together"),
+        ({"lower": np.full((BATCH + 1, 21), -1e9)}, "batches of 50 and 51 problems cannot be combined"),
         ({"upper": np.full(21, -1e9)}, "lower bound of alpha_1 is above its upper bound"),
         ({"chunk": 0}, "chunk is 0; it must be at least 1"),
         ({"slots": -1}, "slots is -1; it must be at least 1"),

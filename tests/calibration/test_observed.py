@@ -276,9 +276,9 @@ def test_stage_1_of_spheres_of_unknown_size_keeps_an_anchor(paper_arm, true, spa
     ("observation", "message"),
     [
         (lambda q: kinds.MeasuredPoints("T", q, np.outer(np.arange(len(q)), [1.0, 2.0, 3.0])), "on one line"),
-        (lambda q: kinds.MeasuredPoints("T", q[:2], np.eye(3)[:2]), "needs three"),
+        (lambda q: kinds.MeasuredPoints("T", q[:2], np.eye(3)[:2]), "needs at least three"),
         (lambda q: kinds.Sphere("s", q[:3]), "4 unknowns"),
-        (lambda q: kinds.Distances("d", q[:3], np.ones(3)), "needs four"),
+        (lambda q: kinds.Distances("d", q[:3], np.ones(3)), "needs at least four"),
         (lambda q: kinds.Sphere("s", q[:5], diameter=50), "give 5 equations"),
     ],
 )

@@ -39,31 +39,32 @@ def one_orientation(arm, target):
 
 
 SAME_PLACE = (
-    "the observations give 20 equations, but 24 numbers are unknown (21 parameters and 3 of the unknown geometry)"
+    "the observations give 20 equations, but there are 24 unknowns (21 parameters and 3 coordinates of the geometry)"
 )
 COLLINEAR = (
-    "the points of observation 'T' are on one line, about which its frame can turn; measure points beside the line."
+    "the points of observation 'T' lie on one line, so the rotation of its frame about this line is undetermined; "
+    "measure points off the line."
 )
 REFUSED = {
     "fewer equations than unknowns": (
         lambda arm: kinds.Sphere("s", reaching(arm, on_cap(90)), diameter=50),
-        f"{SAME_PLACE}; record more poses, fix more parameters, or give a prior of them together with the noise.",
+        f"{SAME_PLACE}; record more poses, fix more parameters, or give both a prior of the parameters and the noise.",
     ),
     "fewer touches than unknowns": (
         lambda arm: kinds.Sphere("s", Q[:3]),
-        "sphere 's' has 3 touches, but 4 unknowns; touch it more often.",
+        "sphere 's' has 3 touches, but there are 4 unknowns; record more touches.",
     ),
     "fewer points than a frame needs": (
         lambda arm: kinds.MeasuredPoints("T", Q[:2], POINTS[:2]),
-        "observation 'T' has 2 points, but its frame needs three at least; measure more.",
+        "observation 'T' has 2 points, but its frame needs at least three; measure more points.",
     ),
     "fewer distances than unknowns": (
         lambda arm: kinds.Distances("d", Q[:3], np.ones(3)),
-        "observation 'd' has 3 distances, but its pivot needs four; measure more.",
+        "observation 'd' has 3 distances, but its pivot needs at least four; measure more distances.",
     ),
     "a bar of unknown zero": (
         lambda arm: kinds.Distances("d", Q[:4], np.ones(4), constant=True),
-        "observation 'd' has 4 distances, but its pivot and constant need five; measure more.",
+        "observation 'd' has 4 distances, but its pivot and constant need at least five; measure more distances.",
     ),
     "collinear points": (
         lambda arm: kinds.MeasuredPoints("T", Q, LINE),
@@ -75,16 +76,16 @@ REFUSED = {
     ),
     "one orientation": (
         lambda arm: one_orientation(arm, "SMR"),
-        "target 'SMR' was seen from one orientation of the last frame, in which its place cannot be told from that of "
-        "the instrument; take poses with the wrist turned.",
+        "target 'SMR' was seen in only one orientation of the last frame, so the position of the target cannot be "
+        "distinguished from that of the instrument; record poses with the wrist turned.",
     ),
     "a plane touched in one line": (
         lambda arm: kinds.Plane("wall", reaching(arm, np.array([400, -100, 200]) + 2 * LINE)),
-        "the touches of plane 'wall' hardly determine where it is; touch it in places that are not on one line.",
+        "the touches hardly determine the geometry of plane 'wall'; record touches that are not on one line.",
     ),
     "a plane touched twice": (
         lambda arm: kinds.Plane("wall", Q[:2]),
-        "plane 'wall' has 2 touches, but 3 unknowns; touch it more often.",
+        "plane 'wall' has 2 touches, but there are 3 unknowns; record more touches.",
     ),
     "two planes touched in one line": (
         lambda arm: kinds.ParallelPlanes(
@@ -93,16 +94,17 @@ REFUSED = {
             reaching(arm, np.array([450, -100, 200]) + LINE[:15]),
             50.0,
         ),
-        "the touches of planes 'block' hardly determine where it is; touch it in places that are not on one line.",
+        "the touches hardly determine the geometry of planes 'block'; record touches that are not on one line.",
     ),
     "a small cap": (
         lambda arm: kinds.Sphere("s", reaching(arm, on_cap(10))),
-        "the touches of sphere 's' hardly determine where it is; touch it all over, or give its diameter.",
+        "the touches hardly determine the geometry of sphere 's'; distribute the touches over the sphere, or give its "
+        "diameter.",
     ),
     "a bore touched in one ring": (
         lambda arm: kinds.Cylinder("bore", reaching(arm, ring(25.0)), diameter=50.0),
-        "the touches of cylinder 'bore' hardly determine where it is; touch it all round at two heights, or give its "
-        "diameter.",
+        "the touches hardly determine the geometry of cylinder 'bore'; distribute the touches around the cylinder at "
+        "two heights, or give its diameter.",
     ),
     "a covariance that is not positive": (
         lambda arm: kinds.MeasuredPoints("T", Q, POINTS, covariance=np.diag([1.0, 1.0, -0.1])),
@@ -121,7 +123,7 @@ REFUSED = {
     ),
     "a name given twice": (
         lambda arm: [kinds.MeasuredPoints("T", Q, POINTS), kinds.MeasuredPoints("T", Q[:9], POINTS[:9])],
-        "two observations have the name 'T'; give each a name of its own.",
+        "two observations have the name 'T'; give them different names.",
     ),
 }
 
@@ -142,8 +144,8 @@ def test_refused_in_one_sentence(paper_arm, what):
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ('units = { points = "m" }', ["says mm, but the manifest m", "correct one of them"]),
-        ('[[points]]\nname = "a"\nfile = "b.csv"', ["two observations have the name 'a'", "a name of its own"]),
+        ('units = { points = "m" }', ["says mm, but the manifest m", "correct one of the two"]),
+        ('[[points]]\nname = "a"\nfile = "b.csv"', ["two observations have the name 'a'", "give them different names"]),
         ('target = "a\\nb"', ["target of observation 'a' has the name", "a name of one line"]),
     ],
 )

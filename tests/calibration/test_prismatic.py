@@ -72,7 +72,7 @@ def test_a_linear_axis_that_stands_still_says_nothing():
     capture = aj.Capture({socket: np.insert(q, 0, 200.0, axis=1) for socket, q in part.sockets.items()})
     anchor = scale_anchor(space, space.base, "longest", None, capture)
     assert (anchor.hold, anchor.set_by) == ("a_3", ())
-    with pytest.raises(aj.InputError, match="holds no reference length"):
+    with pytest.raises(aj.InputError, match="contains no reference length"):
         aj.calibrate(space.base, capture, aj.Bounds.around(space.base, space))
 
 

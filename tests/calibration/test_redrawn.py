@@ -113,21 +113,21 @@ def test_what_cannot_be_drawn(paper_arm, bounds, mixed):
     capture, result = mixed
     plate = [SIMULATED["plate"][0].changed(poses=1)]
     singles, of_singles = calibrated(paper_arm, bounds, plate)
-    with pytest.raises(aj.InputError, match="one pose in each point"):
+    with pytest.raises(aj.InputError, match="one pose per point"):
         aj.bootstrap(of_singles, singles)
-    with pytest.raises(aj.InputError, match="does not have the placement plate"):
+    with pytest.raises(aj.InputError, match="does not contain the placement plate"):
         aj.monte_carlo(result, singles)
     points = capture.observations[0]
     twice = kinds.MeasuredPoints("again", points.q, points.points + 0.01, u=0.01)
     both = aj.Capture({}, (), [points, twice])
-    with pytest.raises(aj.InputError, match="exactly the readings of others"):
+    with pytest.raises(aj.InputError, match="exactly the same readings"):
         aj.bootstrap(aj.calibrate(paper_arm, both, bounds, noise=NOISE), both)
 
 
 def test_a_robust_loss_is_for_the_bootstrap(paper_arm, bounds, mixed):
     capture, _ = mixed
     result = aj.calibrate(paper_arm, capture, bounds, noise=NOISE, robust="tukey")
-    with pytest.raises(aj.InputError, match="took weight from poses"):
+    with pytest.raises(aj.InputError, match="reduced the weight of poses"):
         aj.monte_carlo(result, capture)
-    with pytest.raises(aj.InputError, match="took weight from poses"):
+    with pytest.raises(aj.InputError, match="reduced the weight of poses"):
         aj.bootstrap(result, capture)

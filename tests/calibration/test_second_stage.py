@@ -334,7 +334,7 @@ BATCHES = {
 @pytest.mark.parametrize("function", ["identify", "calibrate"])
 def test_a_batch_is_refused_in_one_sentence(paper_arm, capture, cut, what, function):
     given = BATCHES[what](paper_arm, capture, cut)
-    with pytest.raises(aj.InputError, match=f"the {what} given are a batch.*use {function}_many") as refused:
+    with pytest.raises(aj.InputError, match=f"the given {what} must not be a batch.*use {function}_many") as refused:
         getattr(aj, function)(*given)
     assert str(refused.value).count(".") == 1
 
@@ -363,8 +363,8 @@ def test_a_residual_that_no_arm_has_is_not_plausible(paper_arm, capture, cut):
         sentences(findings_of(aj.calibration.record_of(result, aj.Recording(data, nominal))))
         for result, data in ((good, capture), (bad, wrong))
     ]
-    assert "data and arm do not belong together" in " ".join(said[1])
-    assert "data and arm do not belong together" not in " ".join(said[0])
+    assert "the data do not match the arm" in " ".join(said[1])
+    assert "the data do not match the arm" not in " ".join(said[0])
 
 
 def test_results_of_one_and_of_many_have_the_same_fields(paper_arm, capture, cut):

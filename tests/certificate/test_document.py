@@ -368,7 +368,9 @@ def test_acceptance_results_have_their_conformity_beside_them(evaluation, certif
     # D_Eff has no limit, so that nothing is said of its conformity.
     assert {name for name, _ in said} <= {"Conformity of Deltam", "Conformity of E_Uni"}
     lacking = [text for text in contents(certificates["all stated"], ".//dcc:result/dcc:description")]
-    assert any("Not the full procedure." in text and "30 different positions" in text for text in lacking)
+    assert any(
+        "The full procedure was not carried out." in text and "30 different positions" in text for text in lacking
+    )
     assert not [key for key in parse_dcc(certificates["nothing stated"]) if key[0].startswith("Acceptance")]
 
 
@@ -393,10 +395,10 @@ def test_a_conformity_rests_on_results(record, full, evaluation):
         stated = full.model_copy(update={"conformity": full.conformity.model_copy(update={"verdict": verdict})})
         return lambda: dcc_xml(record, stated, created=CREATED, evaluation=tested)
 
-    assert_refused(certificate(None, "pass"), "conformity", "--evaluation", "leave [conformity] out")
+    assert_refused(certificate(None, "pass"), "conformity", "--evaluation", "remove [conformity]")
     assert_refused(certificate(evaluation._replace(limits={}), "conditionalPass"), "no limit was given")
     failing = evaluation._replace(limits={"Deltam": aj.acceptance.Limit(1e-4)})
-    assert_refused(certificate(failing, "pass"), "a limit is not kept")
+    assert_refused(certificate(failing, "pass"), "a limit is not met")
     simulated = evaluation._replace(recording=evaluation.recording._replace(true=record.calibrated))
     assert_refused(certificate(simulated, "pass"), "simulated")
     text = dcc_xml(record, AdministrativeData(), created=CREATED, evaluation=simulated)
@@ -444,7 +446,7 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
     assert ("Calibrated parameters", "Observations", "3: tracker", "RMS residual of the orientation") in values
     assert ("Calibrated parameters", "Scale", "k") not in values
     said = " ".join(contents(text, "*/dcc:statements"))
-    assert "comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact):" in said
+    assert "comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact)." in said
     assert "robust loss 'tukey'" in text
 
 
@@ -502,11 +504,11 @@ def test_priors_and_joint_corrections_are_stated(record):
     text = dcc_xml(aj.calibration.record_of(found, aj.Recording(capture, named)), AdministrativeData(), created=CREATED)
     assert dcc_model.faults(text) == []
     stated = " ".join(contents(text, ".//dcc:usedMethod/dcc:description"))
-    assert "what was known of the parameters beforehand" in stated
+    assert "prior knowledge of the parameters" in stated
     assert "lengths: given, 0.5 mm; " in stated
     assert "harmonics: learned" in stated
     assert "Denavit-Hartenberg model with the joint corrections below does not describe" in stated
-    assert "each joint correction adds its coefficient" in text
+    assert "Each joint correction adds its coefficient" in text
 
 
 def test_a_fixed_length_says_so(record):
@@ -595,10 +597,10 @@ def test_what_was_left_out_is_stated(record):
     assert dcc_model.faults(text) == []
     (said,) = [one for one in contents(text, "*/dcc:statements") if "T2" in one]
     assert said.startswith(
-        "Left out: station T2, which contradicts the rest (F = 45.6 with 6 and 60 degrees of freedom"
+        "Left out: station T2, which contradicts the other data (F = 45.6 with 6 and 60 degrees of freedom"
     )
     assert said.endswith("Sockets and observations left out: T2/day, T2/night.")
-    assert sum("rest by an F test: station T2;" in one for one in contents(text, ".//dcc:usedMethods")) == 2
+    assert sum("they contradict the rest: station T2;" in one for one in contents(text, ".//dcc:usedMethods")) == 2
     hostile = record._replace(removed=(removed._replace(members=("A\x1b",)),))
     assert_refused(lambda: dcc_xml(hostile, AdministrativeData(), created=CREATED), r"A\x1b", "U+001B")
 
@@ -608,12 +610,12 @@ def test_warnings_and_simulations_are_stated(record):
     given = aj.Noise(encoder_arcsec=2.0 / 3, seating=0.005 / 3)
     simulated = record._replace(recording=recording._replace(true=recording.nominal), reduced_chi=3.0, noise=given)
     warnings = sentences(findings_of(simulated))
-    assert any("times what the given noise predicts" in sentence for sentence in warnings)
+    assert any("times as large as the given noise predicts" in sentence for sentence in warnings)
     text = dcc_xml(simulated, AdministrativeData(), created=CREATED)
     assert dcc_model.faults(text) == []
     said = contents(text, "*/dcc:statements")
     assert set(warnings) <= set(said)
-    assert "The readings are simulated, so this is no certificate of a real arm." in said
+    assert "The readings are simulated, so this is not a certificate of a real arm." in said
 
 
 @pytest.mark.parametrize(
@@ -690,10 +692,10 @@ def test_any_text_survives_or_is_refused(text):
             {},
             ["too few steps", "calibrate again"],
         ),
-        ({"k": 25.4}, {}, ["25.4", "correct the lengths"]),
+        ({"k": 25.4}, {}, ["25.4", "correct the reference lengths"]),
         ({"method": "repeatability"}, {}, ["traceable", "--scale nominal", "another observation"]),
         ({}, {"created": "yesterday"}, ["yesterday", "ISO 8601"]),
-        ({}, {"sources": ["a\x07.h5"]}, [r"'a\x07.h5' in the certificate", "U+0007", "take it out"]),
+        ({}, {"sources": ["a\x07.h5"]}, [r"'a\x07.h5' in the certificate", "U+0007", "remove the character"]),
         ({}, {"command": "aacmm \x00"}, [r"'\x00'", "U+0000"]),
     ],
 )
@@ -741,8 +743,8 @@ def test_dates_that_contradict_the_calibration_are_refused(record, stated, part)
         ('[person]\nname = "Ada"', ["[[person]]"]),
         ('[certificate]\nplace = "moon"', ["certificate.place", "laboratory", "'moon'"]),
         ('[certificate]\nbegin = "soon"', ["certificate.begin", "'soon'"]),
-        ("[certificate]\nbegin = 2026-02-02\nend = 2026-02-01", ["begin is 2026-02-02", "after end"]),
-        ("[certificate]\nreceived = 2026-02-02\nissued = 2026-02-01", ["received is 2026-02-02", "after issued"]),
+        ("[certificate]\nbegin = 2026-02-02\nend = 2026-02-01", ["begin (2026-02-02)", "is after end"]),
+        ("[certificate]\nreceived = 2026-02-02\nissued = 2026-02-01", ["received (2026-02-02)", "is after issued"]),
         ("[certificate]\ntemperature_u_celsius = 0.1", ["temperature_celsius", "give both"]),
         ("[certificate]\ntemperature_celsius = 20.0\ntemperature_u_celsius = inf", ["temperature_u_celsius", "finite"]),
         ("[certificate]\ntemperature_celsius = 20.0\ntemperature_u_celsius = -1.0", ["temperature_u_celsius"]),
@@ -777,7 +779,7 @@ def test_everything_about_a_certificate_is_optional(tmp_path, full):
         ("<a>\x00</a>", ["not valid XML"]),
         ("\ud800", ["not valid XML"]),
         ("<a/>", ["'a'", "give a DCC"]),
-        ('<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/hostname">]><a>&x;</a>', ["document type", "leave it out"]),
+        ('<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/hostname">]><a>&x;</a>', ["document type", "remove it"]),
         ('<!DOCTYPE a SYSTEM "http://localhost/a.dtd"><a/>', ["document type"]),
     ],
 )
@@ -791,7 +793,9 @@ def test_a_certificate_whose_number_was_edited_is_refused(record):
     numbers = (f"<si:value>{number}</si:value>" for number in ("1_0", "\u0663", "NaN", "INF", "1e300", "9" * 5001))
     for edited in (k.replace(".", ","), "", *numbers):
         assert_refused(
-            lambda edited=edited: parse_dcc(text.replace(k, edited)), "'Calibrated parameters / Scale / k'", "no number"
+            lambda edited=edited: parse_dcc(text.replace(k, edited)),
+            "'Calibrated parameters / Scale / k'",
+            "not a number",
         )
 
 

@@ -77,7 +77,7 @@ def test_a_table_of_known_positions(aacmm, tmp_path, few):
     header = [*(f"q_{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"]
     write(tmp_path / "poses.csv", header, np.hstack([np.rad2deg(columns), np.asarray(arm.position(Q)) / 1000]))
     said = aacmm("arm", "cheng2018-simulation", "--check", "poses.csv").stdout
-    assert said.startswith("Columns 4 and 5 are exchanged; column 3 runs the other way. Correcting it")
+    assert said.startswith("Columns 4 and 5 are exchanged; column 3 has the opposite sign. Correcting this")
     angles = tomllib.loads(said[said.index("[angles]") : said.index("12 poses")])["angles"]
     assert angles == {"unit": "deg", "columns": [1, 2, 3, 5, 4, 6], "sign": [1, 1, -1, 1, 1, 1]}
 
@@ -91,7 +91,7 @@ def test_positions_in_metres_are_no_matter_of_the_angles(aacmm, tmp_path, few, m
     tables = '[[points]]\nfile = "p.csv"\ncolumns = { points = "p*_m" }\n'
     (tmp_path / "m.toml").write_text(f'arm = "cheng2018-simulation"\nangles = {{ unit = "rad" }}\n{tables}')
     said = aacmm("arm", "cheng2018-simulation", "--check", "m.toml").stdout
-    assert said.startswith("The positions are in m, and were taken for mm. Correcting it")
+    assert said.startswith("The positions are in m, but were read as mm. Correcting this")
     assert 'units = { points = "m" }' in said
     assert "[angles]" not in said
     arm = aj.load_arm("cheng2018-simulation")
@@ -214,5 +214,5 @@ def test_import_checks_the_readings(aacmm, tmp_path, few, paper_arm, paper_captu
     assert sorted(tmp_path.iterdir()) == before
     assert "The readings fit as they are" in shown
     assert "Joint 5 stands still (0.1 deg over 60 poses): alpha_5, a_5, d_5 and theta_5 cannot be identified;" in shown
-    assert "the manifest takes the better: the measured ones leave" in shown
+    assert "the manifest uses those that fit better: a calibration with the measured readings leaves" in shown
     assert "--check" in aacmm("import", "m.toml", expect=2).stderr

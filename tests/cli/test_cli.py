@@ -360,13 +360,13 @@ def test_a_command_imports_and_compiles_no_more_than_it_needs(panda_files, tmp_p
 @pytest.mark.parametrize(
     ("mistake", "cause"),
     [
-        (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 read with the wrong sign."),
+        (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 was read with the wrong sign."),
         pytest.param(
             lambda q: q[:, [0, 2, 1, 3, 4, 5]],
             "the columns of joints 2 and 3 are exchanged.",
             marks=pytest.mark.slow,
         ),
-        pytest.param(lambda q: q / 0.9, "readings in gon are taken for degrees.", marks=pytest.mark.slow),
+        pytest.param(lambda q: q / 0.9, "readings are in gon, but were read as degrees.", marks=pytest.mark.slow),
     ],
     ids=["sign", "order", "gon"],
 )

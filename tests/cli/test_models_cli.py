@@ -46,7 +46,7 @@ def test_models_are_compared(aacmm, folder):
         (("--models", "dh;;gravity"), "names an empty model"),
         (("--models", "dh;dh"), "names 'dh' twice"),
         (("--models", "dh;grvity"), "did you mean 'gravity'"),
-        (("--leave-out", "T"), "nothing is left without 'T'"),
+        (("--leave-out", "T"), "'T' leaves out all data"),
         (("--leave-out", "U"), "U"),
     ],
 )

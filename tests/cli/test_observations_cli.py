@@ -257,16 +257,16 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
     ("command", "parts"),
     [
         ("calibrate tracker.h5 -o x.h5 --method two-stage", ["method='two-stage' is for sockets"]),
-        ("calibrate tracker.h5 -o x.h5 --scale nominal", ["--scale nominal is for captures without a scale"]),
-        ("calibrate free.h5 -o x.h5 --scale nominal --method joint", ["stage 1 alone; leave out --method"]),
+        ("calibrate tracker.h5 -o x.h5 --scale nominal", ["--scale nominal is for captures that do not fix the scale"]),
+        ("calibrate free.h5 -o x.h5 --scale nominal --method joint", ["stage 1 only; omit --method"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --cross-validate", ["needs a calibrated scale"]),
         (
             "calibrate bad.h5 -o x.h5 --robust huber --monte-carlo",
-            ["--monte-carlo is for calibrations without --robust"],
+            ["--monte-carlo cannot be combined with --robust"],
         ),
         ("calibrate monday.h5 -o x.h5 --leave-out A", ["give both"]),
-        ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out '*'", ["nothing is left without '*'"]),
-        ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out [AC]", ["without '[AC]' nothing fixes the scale"]),
+        ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out '*'", ["'*' leaves out all data"]),
+        ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out [AC]", ["without '[AC]', no data fix the scale"]),
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe is for several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the name 'monday'"]),
         ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be drawn", "1 to 79"]),
@@ -324,7 +324,7 @@ def test_an_evaluation_stands_beside_its_prediction(aacmm, folder, calibrated, t
     (warning,) = moved["warnings"]
     assert "disagree with it by more than chance" in warning
     assert "E (" in warning
-    assert "the tip was remounted, or is another one" in warning
+    assert "the tip was remounted or exchanged" in warning
     assert moved["held_out"]["predicted"]["poses"]["probability"] < 1e-6
 
 
@@ -334,7 +334,7 @@ def test_poses_that_a_calibration_did_not_use_are_held_out(aacmm, folder):
     found = json.loads(aacmm("evaluate", "c.h5", folder / "tracker.h5", "--json").stdout)
     unseen, seen = (found[group]["observations"] for group in ("held_out", "identified_from"))
     assert sum(row["poses"] for row in unseen) == 25
-    assert {row["observation"] for row in unseen} == {f"{row['observation']}, unseen" for row in seen}
+    assert {row["observation"] for row in unseen} == {f"{row['observation']}, held out" for row in seen}
     assert found["warnings"] == []
 
 
@@ -347,7 +347,7 @@ def test_a_robust_cross_validation_names_the_group(aacmm, folder):
     assert (first["members"], second["members"]) == (["C", "D"], ["A", "B"])
     assert first["disagrees"]
     assert first["rms_mm"] > 5 * first["rms_predicted_mm"]
-    assert any("Held out one after the other" in text and "C, D (" in text for text in found["warnings"])
+    assert any("When each group is held out in turn" in text and "C, D (" in text for text in found["warnings"])
 
 
 @pytest.mark.slow

@@ -195,7 +195,10 @@ def test_the_robot_of_the_user_is_not_replaced(aacmm, tmp_path):
     before = (tmp_path / "robot.urdf").read_bytes()
     aacmm("import", "tracker.toml", "-o", "c.h5")
     aacmm("calibrate", "c.h5", "-o", "y.h5")
-    assert "robot.urdf is the original" in aacmm("export", "y.h5", "-o", "robot.urdf", expect=2).stderr
+    assert (
+        "robot.urdf is the file from which the arm was read"
+        in aacmm("export", "y.h5", "-o", "robot.urdf", expect=2).stderr
+    )
     assert (tmp_path / "robot.urdf").read_bytes() == before
     for _ in range(2):
         aacmm("export", "y.h5", "-o", "calibrated.urdf")

@@ -54,7 +54,7 @@ def test_a_robot_by_default(aacmm):
         "by way of approach points 50 mm above the sockets",
         "the arm's body against itself and obstacles (table)",
         "Not checked, since they touch wherever the arm is: offset d_1 and table.",
-        "Note: links are taken as 60 mm in radius",
+        "Note: each link is assumed to have a radius of 60 mm",
     ):
         assert text in printed
     assert "60" in printed.split("largest tilt [deg]")[1].split("Reference")[0]

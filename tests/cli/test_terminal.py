@@ -144,7 +144,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     record = aj.calibration.record_of(result, aj.Recording(capture, nominal))
     assert record.implausible_residual
     summary = calibration_summary(record)
-    assert any("mm that are plausible for this arm" in warning for warning in summary["warnings"])
+    assert any("mm is plausible for this arm" in warning for warning in summary["warnings"])
     assert not summary["residual_plausible"]
     assert not any("determine" in warning for warning in summary["warnings"])
 
@@ -242,7 +242,7 @@ SAME = [
 
 
 REFUSED = [
-    (("calibrate", "there.h5", "-o", "x.h5", "--figure", "x.txt"), "x.txt is no figure that can be drawn"),
+    (("calibrate", "there.h5", "-o", "x.h5", "--figure", "x.txt"), "a figure cannot be written as x.txt"),
     (("export", "there.h5", "--format", "csv", "--arm", "true"), "--arm is for --format toml"),
     (
         ("evaluate", "there.h5", "there.h5", "--mpe", "zzz=1"),

@@ -66,10 +66,10 @@ def test_folder(tmp_path, case, imports):
 @pytest.mark.parametrize(
     ("mode", "above", "settings", "reason"),
     [
-        (0o777, 0o700, {}, "others may write to it (mode 0777)"),
-        (0o720, 0o700, {}, "others may write to it (mode 0720)"),
+        (0o777, 0o700, {}, "other users may write to it (mode 0777)"),
+        (0o720, 0o700, {}, "other users may write to it (mode 0720)"),
         (0o700, 0o777, {}, "(mode 0777)"),
-        (0o777, 0o700, {"JAX_COMPILATION_CACHE_DIR": "{home}/aacmm_jax"}, "others may write to it (mode 0777)"),
+        (0o777, 0o700, {"JAX_COMPILATION_CACHE_DIR": "{home}/aacmm_jax"}, "other users may write to it (mode 0777)"),
         (0o700, 0o700, {"XDG_CACHE_HOME": "."}, "its path is relative"),
         (0o700, 0o700, {"XDG_CACHE_HOME": "", "HOME": "."}, "its path is relative"),
         (0o700, 0o700, {"JAX_COMPILATION_CACHE_DIR": "aacmm_jax"}, "its path is relative"),
@@ -106,19 +106,22 @@ root = pytest.mark.skipif(
 # What is done to the cache's folder and the entry in it, and why it is not used then.
 PLANTED = {
     "folder": (lambda folder, entry: os.chown(folder, 65534, 65534), "it belongs to another user"),
-    "entry": (lambda folder, entry: os.chown(entry, 65534, 65534), "others can have written x-cache in it"),
+    "entry": (
+        lambda folder, entry: os.chown(entry, 65534, 65534),
+        "other users may have written x-cache in this folder",
+    ),
     "open entry": (
         lambda folder, entry: (folder.chmod(0o755), entry.chmod(0o666)),
-        "others can have written x-cache in it",
+        "other users may have written x-cache in this folder",
     ),
     "open entry that nobody else reaches": (lambda folder, entry: entry.chmod(0o666), ""),
     "link": (
         lambda folder, entry: entry.with_name("y-cache").symlink_to(entry),
-        "others can have written y-cache in it",
+        "other users may have written y-cache in this folder",
     ),
     "group above": (
         lambda folder, entry: (os.chown(folder.parent, 0, 65534), folder.parent.chmod(0o770)),
-        "others may write to {above} (mode 0770)",
+        "other users may write to {above} (mode 0770)",
     ),
     "private group above": (lambda folder, entry: folder.parent.chmod(0o770), ""),
 }

@@ -13,7 +13,13 @@ from aacmm_jax.core.rotations import rotation_matrix
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.data.observations.geometry import distances_from_axis, fitted_cylinder, placed
 from aacmm_jax.data.observations.held import platform_frames
-from aacmm_jax.data.observations.observation import Tips, certified_quantities, stated_quantities
+from aacmm_jax.data.observations.observation import (
+    AbstractObservation,
+    AbstractSimulated,
+    Tips,
+    certified_quantities,
+    stated_quantities,
+)
 from aacmm_jax.data.observations.observation import kinds as known_kinds
 
 RANDOM = np.random.default_rng(1)
@@ -46,6 +52,18 @@ ALL = {
     "distances": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), u=0.1),
     "distances with a constant": kinds.Distances("d", Q, np.linalg.norm(TIPS.position, axis=0), constant=True),
 }
+
+
+def test_every_kind_and_its_simulation_are_public():
+    public = {getattr(kinds, name) for name in dir(kinds)}
+    for base in (AbstractObservation, AbstractSimulated):
+        for kind in subclasses(base):
+            if kind.__module__.startswith("aacmm_jax") and not kind.__name__.startswith("Abstract"):
+                assert kind in public, f"add {kind.__name__} to data/observations/__init__.pyi"
+
+
+def subclasses(base):
+    return [inner for kind in base.__subclasses__() for inner in (kind, *subclasses(kind))]
 
 
 def unknowns_of(observation):
@@ -252,11 +270,14 @@ def test_a_plane_is_read_by_its_normal():
         (lambda: kinds.MeasuredPoints("p", Q, POINTS, u=1, covariance=np.eye(3)), "both given"),
         (lambda: kinds.MeasuredPoints("p", Q, POINTS, covariance=-np.eye(3)), "not symmetric and positive"),
         (lambda: kinds.MeasuredPoints("", Q, POINTS), "name of one line"),
-        (lambda: kinds.MeasuredTransforms("p", Q, POINTS, 2 * MEASURED, u_angle=1e-3), "no rotation"),
+        (lambda: kinds.MeasuredTransforms("p", Q, POINTS, 2 * MEASURED, u_angle=1e-3), "not a rotation"),
         (lambda: kinds.MeasuredTransforms("p", Q, POINTS, MEASURED, u_angle=0.0), "must be positive"),
         (lambda: kinds.Sphere("s", Q, diameter=0), "must be positive"),
         (lambda: kinds.Cylinder("c", Q, diameter=0), "must be positive"),
-        (lambda: kinds.Cylinder("c", Q, diameter=5, stylus=6, inside=True), "a stylus of 6 mm inside a diameter of 5"),
+        (
+            lambda: kinds.Cylinder("c", Q, diameter=5, stylus=6, inside=True),
+            "a stylus of 6 mm does not fit into a diameter of 5",
+        ),
         (lambda: kinds.ParallelPlanes("f", Q, Q[:, :5], 10.0), "6 and 5 columns"),
         (lambda: kinds.ParallelPlanes("f", Q, Q, 0.0), "must be positive"),
         (lambda: kinds.Artefact("t", CORNERS, {"d": Q}), "has no coordinates"),
@@ -303,17 +324,17 @@ def test_a_cylinder_is_fitted_under_jit_too():
 @pytest.mark.parametrize(
     ("observation", "tips", "message"),
     [
-        (kinds.Cylinder("c", Q), touches(0, 330, [0, 20], 4), "4 touches, but 5 unknowns"),
-        (kinds.Cylinder("c", Q, diameter=40), touches(0, 330, [0, 20], 3), "3 touches, but 4 unknowns"),
-        (kinds.Cylinder("c", Q), touches(0, 330, [0]), "hardly determine where it is"),
-        (kinds.Cylinder("c", Q), touches(0, 20, [0, 10, 20, 30, 40], 25), "hardly determine where it is"),
-        (kinds.Cylinder("c", Q, diameter=40), touches(0, 0.1, [0, 20]), "hardly determine where it is"),
+        (kinds.Cylinder("c", Q), touches(0, 330, [0, 20], 4), "4 touches, but there are 5 unknowns"),
+        (kinds.Cylinder("c", Q, diameter=40), touches(0, 330, [0, 20], 3), "3 touches, but there are 4 unknowns"),
+        (kinds.Cylinder("c", Q), touches(0, 330, [0]), "hardly determine the geometry"),
+        (kinds.Cylinder("c", Q), touches(0, 20, [0, 10, 20, 30, 40], 25), "hardly determine the geometry"),
+        (kinds.Cylinder("c", Q, diameter=40), touches(0, 0.1, [0, 20]), "hardly determine the geometry"),
     ],
 )
 def test_touches_that_leave_a_geometry_open(observation, tips, message):
     with pytest.raises(aj.InputError, match=message) as caught:
         observation.check_determined(tips)
-    assert "touch it" in str(caught.value)
+    assert "touches" in str(caught.value)
 
 
 def test_the_example_of_the_package_runs():

@@ -30,7 +30,7 @@ def test_copies_change_nothing(paper_arm, noisy_capture, copied):
     bounds = aj.kinematics.ArmSpecification(paper_arm, "test").bounds()
     for method in ("two-stage", "joint"):
         once = aj.calibrate(paper_arm, noisy_capture, bounds, method=method)
-        with pytest.warns(aj.IdentifiabilityWarning, match="Counted once"):
+        with pytest.warns(aj.IdentifiabilityWarning, match="Duplicates ignored"):
             again = aj.calibrate(paper_arm, copied, bounds, method=method)
         assert again.degrees_of_freedom == once.degrees_of_freedom
         for one, other in zip(numbers_of(once), numbers_of(again), strict=True):
@@ -38,7 +38,7 @@ def test_copies_change_nothing(paper_arm, noisy_capture, copied):
     specification = aj.kinematics.ArmSpecification(paper_arm, "test")
     record = aj.calibration.record_of(once, aj.Recording(noisy_capture, specification))
     evaluated = aj.acceptance.evaluation_of(record, aj.Recording(copied, specification))
-    assert sum(warning.startswith("Counted once") for warning in evaluated.warnings) == 2
+    assert sum(warning.startswith("Duplicates ignored") for warning in evaluated.warnings) == 2
     pairs = ((aj.evaluate(paper_arm, c), aj.fix_scale(paper_arm, c)) for c in (noisy_capture, copied))
     for one, other in zip(*map(numbers_of, pairs), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -52,12 +52,12 @@ def test_what_was_left_out_is_reported_and_kept(paper_arm, noisy_capture, copied
     counts = ", ".join(f"{name} ({count})" for name, count in zip(noisy_capture.names, poses, strict=True))
     for found in (recording, aj.files.load_capture(tmp_path / "c.h5")):
         said = sentences(of_recording(found))
-        assert f"of another pose of the same socket or observation: {counts};" in said[0]
-        assert said[1].startswith("Counted once: reference lengths given again")
+        assert f"of another pose of the same socket or observation: {counts}." in said[0]
+        assert said[1].startswith("Duplicates ignored: reference lengths given more than once")
         assert f"{length[::-1]}, {length}; delete" in said[1]
     only = copied.select(only="A")
     assert only.repeated == (copied.repeated.poses[:1], ())
-    assert not any("once" in text for text in sentences(of_recording(aj.Recording(noisy_capture, specification))))
+    assert not any("Duplicates" in text for text in sentences(of_recording(aj.Recording(noisy_capture, specification))))
 
 
 def test_only_copies_are_left_out():
@@ -117,7 +117,7 @@ def test_copies_within_observations_count_once(paper_arm, tmp_path):
 @pytest.mark.parametrize(
     ("sockets", "observations", "message"),
     [
-        ({}, [observed(), observed("U")], "observations 'T' and 'U' have exactly the same poses; is one file"),
+        ({}, [observed(), observed("U")], "observations 'T' and 'U' have exactly the same poses; was one file"),
         ({"A": observed().q}, [kinds.Socket("B", observed().q)], "sockets 'A' and 'B' have exactly the same poses"),
         ({"T": observed().q}, [observed()], "a socket and an observation have the name 'T'"),
     ],

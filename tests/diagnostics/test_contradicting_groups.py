@@ -62,7 +62,7 @@ def test_of_two_sockets_either_may_be_wrong(paper_arm):
     assert contradictions(calibrated(paper_arm, right)) == []
     wrong = {"A": right.sockets["A"], "B": right.sockets["B"] + [0, 0, 0.002, 0, 0, 0]}
     (said,) = contradictions(calibrated(paper_arm, aj.Capture(wrong, lengths)))
-    assert said.startswith("Some sockets contradict each other, and the data do not show which of these is wrong")
+    assert said.startswith("Some sockets contradict each other, and the data do not show which of them is wrong")
     assert "--without 'A'" in said
     assert "--without 'B'" in said
 

@@ -25,11 +25,13 @@ def test_the_placement_that_disagrees_is_named():
     assert said(*others, group("last")) == ""
     text = said(*others, group("high", 0.38))
     assert "some groups disagree with the others by more than predicted: high (0.38 mm RMS, 3.8 times" in text
-    assert "the other 8 agree" in text
+    assert "the remaining 8 agree" in text
     text = said(group("a"), group("b"), group("place_1", error=0.05))
     assert "place_1 (lengths off by 0.05 mm, 5.0 times their u)" in text
     # Where most of them do, the model is at fault and not a placement.
-    assert "placements have larger errors than predicted" in said(*(group(f"place_{i}", 0.2) for i in range(3)))
+    assert "each placement is held out in turn, the errors are larger than predicted" in said(
+        *(group(f"place_{i}", 0.2) for i in range(3))
+    )
 
 
 def test_few_degrees_of_freedom_allow_more():
@@ -62,7 +64,7 @@ def test_a_remounted_probe_is_named():
     """Where most of the excess is gone once the place of the probe is fitted, and only there."""
     bad = agreement(0.25, 90, 180.0)
     (text,) = sentences(surprise(bad, NOTHING, {}, lambda: agreement(0.1)))
-    assert "With the probe's place in the last frame fitted to them, they are 0.1 mm RMS: the tip was remounted" in text
+    assert "fitted to these data, the poses are 0.1 mm RMS from their geometry: the tip was remounted" in text
     (text,) = sentences(surprise(bad, NOTHING, {}, lambda: agreement(0.2)))
     assert "the tip was remounted" not in text
     assert "a remounted tip" in text
@@ -76,7 +78,7 @@ def test_unseen_data_that_scatter_more_than_predicted():
     assert "reference lengths" not in text
     assert surprise(agreement(0.11), agreement(0.11), parts, unknown) == []
     (text,) = sentences(surprise(agreement(0.1), agreement(0.3, 5, 5.0), parts, unknown))
-    assert "reference lengths err by 3.0 times their" in text
+    assert "the errors of the reference lengths are 3.0 times their" in text
     assert surprise(NOTHING, NOTHING, {}, unknown) == []
 
 

@@ -26,15 +26,15 @@ SIMULATED = {
     ("mistake", "cause"),
     [
         (lambda q: q, ""),
-        (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 read with the wrong sign"),
-        (lambda q: q * [1, -1, 1, 1, -1, 1], "joints 2 and 5 read with the wrong sign"),
+        (lambda q: q * [1, 1, -1, 1, 1, 1], "joint 3 was read with the wrong sign"),
+        (lambda q: q * [1, -1, 1, 1, -1, 1], "joints 2 and 5 were read with the wrong sign"),
         (lambda q: q[:, [0, 1, 3, 2, 4, 5]], "the columns of joints 3 and 4 are exchanged"),
         (lambda q: q[:, ::-1], "the columns are in reverse order"),
-        (lambda q: np.roll(q, 1, axis=1), "the columns begin with that of the last joint"),
-        (lambda q: np.roll(q, -1, axis=1), "the columns end with that of the first joint"),
-        (lambda q: q / 0.9, "readings in gon are taken for degrees"),
-        (np.deg2rad, "readings in radians are taken for degrees"),
-        (np.rad2deg, "readings in degrees are taken for radians"),
+        (lambda q: np.roll(q, 1, axis=1), "the column of the last joint comes first"),
+        (lambda q: np.roll(q, -1, axis=1), "the column of the first joint comes last"),
+        (lambda q: q / 0.9, "readings are in gon, but were read as degrees"),
+        (np.deg2rad, "readings are in radians, but were read as degrees"),
+        (np.rad2deg, "readings are in degrees, but were read as radians"),
         (lambda q: np.random.default_rng(0).uniform(-2, 2, q.shape), ""),
     ],
 )
@@ -71,25 +71,30 @@ def captures(paper_arm):
 
 
 LEFT_HANDED = "measured coordinates are left-handed: two columns are exchanged, or one has the wrong sign (points)"
-METRES = "measured values in m are taken for mm"
+METRES = "measured values are in m, but were read as mm"
 MISTAKES = [
     ("points", "points", lambda x: x / 1000, f"{METRES} (points)"),
-    ("points", "points", lambda x: x / 25.4, "measured values in inches are taken for mm (points)"),
-    ("points", "points", lambda x: x * 1000, "measured values in um are taken for mm, or those in mm for m (points)"),
+    ("points", "points", lambda x: x / 25.4, "measured values are in inches, but were read as mm (points)"),
+    (
+        "points",
+        "points",
+        lambda x: x * 1000,
+        "measured values are in um, but were read as mm (or are in mm, but were read as m) (points)",
+    ),
     ("points", "points", lambda x: x[:, [1, 0, 2]], LEFT_HANDED),
     ("points", "points", lambda x: x * [1, -1, 1], LEFT_HANDED),
-    ("points", "q", lambda q: q * [-1, 1, 1, 1, 1, 1], "joint 1 read with the wrong sign"),
+    ("points", "q", lambda q: q * [-1, 1, 1, 1, 1, 1], "joint 1 was read with the wrong sign"),
     ("points", "q", lambda q: q[:, [1, 0, 2, 3, 4, 5]], "the columns of joints 1 and 2 are exchanged"),
-    ("points", "q", np.deg2rad, "readings in radians are taken for degrees"),
+    ("points", "q", np.deg2rad, "readings are in radians, but were read as degrees"),
     ("transforms", "points", lambda x: x[:, [1, 2, 0]], "the columns of positions are y z x (six)"),
     ("transforms", "points", lambda x: x * [-1, 1, 1], "the columns of positions are -x y z (six)"),
     (
         *("transforms", "rotations", requaternioned("wxyz", "xyzw")),
-        "quaternions in the order x y z w are taken for w x y z (six)",
+        "quaternions are in the order x y z w, but were read as w x y z (six)",
     ),
     (
         *("transforms", "rotations", requaternioned("xyzw", "wxyz")),
-        "quaternions in the order w x y z are taken for x y z w (six)",
+        "quaternions are in the order w x y z, but were read as x y z w (six)",
     ),
     (
         *("transforms", "rotations", lambda rotations: rotations.swapaxes(1, 2)),

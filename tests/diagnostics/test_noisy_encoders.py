@@ -126,4 +126,4 @@ def test_file_summary_and_warning(paper_arm, captured, tmp_path):
     assert (row["joint"], row["unit"], row["expected"]) == (3, "arcsec", pytest.approx(2.0))
     (said,) = (text for text in summary["warnings"] if text.startswith("Readings of joint 3"))
     assert "times as much as given" in said
-    assert not any("larger the more" in text for text in summary["warnings"])  # it is explained
+    assert not any("Residuals are larger where" in text for text in summary["warnings"])  # it is explained

@@ -25,11 +25,11 @@ SIX = tuple(range(6))
             (1, 1, -1, 1, 1, 1),
             (0, math.pi / 2, 0, 0, 0, 0),
             (1, 1),
-            "columns 5 and 6 are exchanged; column 3 runs the other way; the zero of joint 2 is 90 deg off",
+            "columns 5 and 6 are exchanged; column 3 has the opposite sign; the zero of joint 2 is 90 deg off",
         ),
         # The sign of a column that was moved is that of the column.
-        ((0, 1, 2, 3, 5, 4), (1, 1, 1, 1, 1, -1), (0,) * 6, (1, 1), "columns 5 and 6 are exchanged; column 5 runs"),
-        (SIX, (-1, 1, -1, 1, -1, 1), (0,) * 6, (1, 1), "columns 1, 3 and 5 run the other way"),
+        ((0, 1, 2, 3, 5, 4), (1, 1, 1, 1, 1, -1), (0,) * 6, (1, 1), "columns 5 and 6 are exchanged; column 5 has"),
+        (SIX, (-1, 1, -1, 1, -1, 1), (0,) * 6, (1, 1), "columns 1, 3 and 5 have the opposite sign"),
         ((5, 4, 3, 2, 1, 0), (1,) * 6, (0,) * 6, (1, 1), "the columns are in reverse order"),
         (
             (1, 0, 3, 2, 4, 5),
@@ -46,8 +46,8 @@ SIX = tuple(range(6))
             (1, 1),
             "joint 3 is 180 deg off; the zero of joint 5 is -90",
         ),
-        (SIX, (1,) * 6, (0,) * 6, (DEG, 1), "the readings are in degrees, and were taken for radians"),
-        (SIX, (1,) * 6, (0,) * 6, (1 / DEG, 1000.0), "in radians, and were taken for degrees; the positions are in m"),
+        (SIX, (1,) * 6, (0,) * 6, (DEG, 1), "the readings are in degrees, but were read as radians"),
+        (SIX, (1,) * 6, (0,) * 6, (1 / DEG, 1000.0), "in radians, but were read as degrees; the positions are in m"),
     ],
 )
 def test_words(order, signs, offsets, units, words):
@@ -66,7 +66,7 @@ def test_a_capture_of_a_tracker_and_what_cannot_be_checked(paper_arm, monkeypatc
     found = check_capture(paper_arm, aj.Capture({}, observations=parts))
     assert found.poses == 20
     summary = reading_check_summary(found, "paper's")
-    assert summary["sentence"].startswith("Column 4 runs the other way. Correcting it")
+    assert summary["sentence"].startswith("Column 4 has the opposite sign. Correcting this")
     assert summary["found"]["signs"] == [1, 1, 1, -1, 1, 1]
     assert summary["tip"] == ""
     with pytest.raises(aj.InputError, match="at least two"):
@@ -74,7 +74,8 @@ def test_a_capture_of_a_tracker_and_what_cannot_be_checked(paper_arm, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("target", "part"), [("reflector", "A calibration finds its place"), ("", 'write target = "reflector"')]
+    ("target", "part"),
+    [("reflector", "A calibration identifies the position of the target"), ("", 'write target = "reflector"')],
 )
 def test_an_offset_of_the_target_is_named(paper_arm, monkeypatch, target, part):
     monkeypatch.setattr(reading_search, "_MOST", 2000)
@@ -93,5 +94,5 @@ def test_an_offset_of_the_target_is_named(paper_arm, monkeypatch, target, part):
 @pytest.mark.parametrize(("taken", "length", "unit"), [("mm", 1000, "m"), ("m", 1e-3, "mm"), ("inch", 1 / 25.4, "mm")])
 def test_the_unit_found_depends_on_the_unit_taken(taken, length, unit):
     one = Explanation(SIX, (1,) * 6, (0,) * 6, 1.0, length, 1.0, 1.0, 0)
-    assert explanation_words(one, taken) == f"the positions are in {unit}, and were taken for {taken}"
+    assert explanation_words(one, taken) == f"the positions are in {unit}, but were read as {taken}"
     assert units_toml(one, taken) == f'units = {{ points = "{unit}" }}\n'

@@ -43,7 +43,9 @@ def test_temperatures_are_no_distance(paper_arm):
 
 
 def test_one_pose_has_no_distance(paper_arm):
-    assert_refused(lambda: tried_poses(paper_arm, np.zeros((1, 6)), np.zeros((1, 6))), "has no distance from another")
+    assert_refused(
+        lambda: tried_poses(paper_arm, np.zeros((1, 6)), np.zeros((1, 6))), "needs at least two poses, but there are 1"
+    )
 
 
 def test_a_calibration_tried_its_own_poses_and_says_how_much_else(paper_arm):

@@ -31,7 +31,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
 # Parts of sentences, by their beginning, and what is no warning.
 PARTS = (
     "Converged",
-    "It has not ended",
+    "The solve has not ended",
     "... mm RMS, ... times",
     "... (... times)",
     "... (... mm, ... times)",
@@ -47,7 +47,7 @@ PARTS = (
     "... is not a plausible scale",
     "k = ... is not a plausible scale",
     "No Reason",
-    "Fix one of each (--held).",
+    "Fix one parameter of each combination (--held).",
 )
 
 

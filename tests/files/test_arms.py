@@ -172,17 +172,17 @@ def test_saved_arm_reads_back_the_same_numbers(tmp_path):
         ('"standard"', '"denavit"', ["'convention' must be 'standard' or 'craig', not 'denavit'"]),
         ('length_unit = "mm"', "", ["'length_unit' is missing; add it"]),
         ("a = 400.0, ", "", ["'joint 2.a' is missing; add it"]),
-        (", limits = [-101.0, 10.0]", "", ["limits are given for some joints only", "for all or for none"]),
+        (", limits = [-101.0, 10.0]", "", ["limits are given for some joints only", "for all joints or for none"]),
         ("[-101.0, 10.0]", "[10.0]", ["'joint 2.limits' has 1 entries", "give at least 2"]),
-        ("[-101.0, 10.0]", "[10.0, -101.0]", ["joint 2: the limits are 10 to -101", "lower must be below"]),
+        ("[-101.0, 10.0]", "[10.0, -101.0]", ["joint 2: the limits are 10 to -101", "lower limit must be below"]),
         ("45.0", '"forty-five"', ["'joint 2.alpha' must be a valid number, not 'forty-five'"]),
         ("45.0", '"45.0"', ["'joint 2.alpha' must be a valid number, not '45.0'"]),
-        ("45.0", "1e300", ["'joint 2.alpha' is larger than any number that is meant"]),
-        ('"deg"', '"rad"', ["joint 1 has alpha = ", "rad, more than a revolution; is it in degrees?"]),
+        ("45.0", "1e300", ["'joint 2.alpha' is implausibly large"]),
+        ('"deg"', '"rad"', ["joint 1 has alpha = ", "rad, more than a revolution; is alpha in degrees?"]),
         ("45.0", "nan", ["'joint 2.alpha' must be a finite number, not nan"]),
         ("45.0", "", ["not valid TOML", "line 10"]),
         ("130.0]", "]", ["'probe' has 2 entries", "give at least 3"]),
-        ('"standard"', '"craig"', ["joint 1 has a twist or a length", "alpha_0", "choose the base frame"]),
+        ('"standard"', '"craig"', ["joint 1 has a twist or a length", "alpha_0", "place the base frame"]),
         ("probe_z = 60.0", "probe_q = 60.0", ["unknown parameter 'probe_q' of a 2-joint arm", "did you mean 'probe_"]),
         ("probe_z = 60.0", "d_1 = 60.0", ["'d_1' is held, not free"]),
         ("probe_z = 60.0", "probe_z = -60.0", ["'identification.override.probe_z' must be greater than 0, not -60.0"]),
@@ -208,7 +208,7 @@ def test_radians_stated_as_degrees(tmp_path):
     rows = "{{ alpha = {}, a = 0, d = 99 }}, {{ alpha = 0, a = 9, d = 0 }}, {{ alpha = {}, a = 0, d = 9 }}]"
     for twists in ((-1.5708, 1.5708), (1.570796326794897, 3.141592653589793)):
         path = written(tmp_path, head + rows.format(*twists))
-        assert_refused(lambda path=path: aj.load_arm(path), path, "multiple of pi/2", "is it in rad?")
+        assert_refused(lambda path=path: aj.load_arm(path), path, "multiple of pi/2", "are the angles in rad?")
     for twists in ((-90, 1.5708), (0.01, -0.02), (1.5, -1.5)):
         aj.load_arm(written(tmp_path, head + rows.format(*twists)))
 
@@ -217,7 +217,7 @@ def test_radians_stated_as_degrees(tmp_path):
 def test_lengths_in_the_other_unit(tmp_path, stated, meant, length):
     row = f"{{ alpha = 0, a = {length}, d = 0 }}"
     path = written(tmp_path, f'length_unit = "{stated}"\nangle_unit = "deg"\njoint = [{row}, {row}]')
-    assert_refused(lambda: aj.load_arm(path), path, f"are they in {meant}?", "length_unit")
+    assert_refused(lambda: aj.load_arm(path), path, f"are the lengths in {meant}?", "length_unit")
 
 
 def test_what_is_not_an_arm_file(tmp_path):
@@ -226,17 +226,17 @@ def test_what_is_not_an_arm_file(tmp_path):
     craig = (
         'convention = "craig"\nlength_unit = "mm"\nangle_unit = "deg"\njoint = [{ alpha = 0, a = 0, d = 1, beta = 1 }]'
     )
-    assert_refused(lambda: aj.load_arm(written(tmp_path, craig)), "beta", "standard form", "leave it out")
+    assert_refused(lambda: aj.load_arm(written(tmp_path, craig)), "beta", "standard convention", "remove beta")
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
     assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125", "ur5e.")
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")
     assert_refused(lambda: aj.load_arm(tmp_path / "folder.toml"), tmp_path, "is a folder", "name a file")
-    assert_refused(lambda: aj.load_arm(tmp_path / "binary.toml"), tmp_path, "not text in UTF-8")
+    assert_refused(lambda: aj.load_arm(tmp_path / "binary.toml"), tmp_path, "not UTF-8 text")
 
 
 def test_a_batch_of_arms_has_no_file(tmp_path):
     batch = aj.Arm(alpha=np.zeros((2, 3)), a=np.zeros(3), d=np.zeros(3))
-    assert_refused(lambda: aj.files.save_arm(batch, tmp_path / "arm.toml"), "one arm", "take one of it first")
+    assert_refused(lambda: aj.files.save_arm(batch, tmp_path / "arm.toml"), "one arm", "select one arm of the batch")
 
 
 ROBOT = """

@@ -103,7 +103,7 @@ def test_a_cell_of_a_file(tmp_path):
     assert set(found.cell.body.radius[:-1]) == {50.0}
     assert found.notes == ()
     slender = load_cell("panda", radius=None)
-    assert "5 % of their length" in slender.notes[0]
+    assert "5 % of the total length of the links" in slender.notes[0]
     assert set(load_cell("panda", tmp_path / "cell.toml", radius=33.0).cell.body.radius[:-1]) == {33.0}
 
 
@@ -148,14 +148,16 @@ def test_meshes_that_are_not_at_hand(tmp_path):
     """The links' other shapes stand for them, or capsules about the D-H row; both are said."""
     path = written(tmp_path, "two.dae")
     found = load_cell(path)
-    assert found.notes == ("meshes of two are not at hand as STL or OBJ; their joints' other shapes are used alone.",)
+    assert found.notes == (
+        "the meshes of two are not available as STL or OBJ; only the other shapes of their joints are used.",
+    )
     assert found.cell.body.names == ("base", "one", "two/2")
     path.write_text(path.read_text().replace('<sphere radius="0.03"/>', "<ellipsoid/>"))
     found = load_cell(path)
-    assert "capsules about their D-H rows" in found.notes[0]
+    assert "capsules along their D-H rows" in found.notes[0]
     assert found.cell.body.names[-1] != "two"
     (path.parent / "plain.urdf").write_text(LINKS.replace("collision", "visual"))
-    assert "5 % of their length" in load_cell(path.parent / "plain.urdf").notes[0]
+    assert "5 % of the total length of the links" in load_cell(path.parent / "plain.urdf").notes[0]
 
 
 @pytest.mark.parametrize(
@@ -183,7 +185,7 @@ def test_refused(tmp_path, change, text):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (('size="0.4 0.06 0.08"', 'size="0.4 0 0.08"'), "<box> of link 'one' has no size above 0"),
+        (('size="0.4 0.06 0.08"', 'size="0.4 0 0.08"'), "<box> of link 'one' has no positive size"),
         (('radius="0.05" length="0.2"', 'radius="0.05"'), "give its radius and length"),
         (('<sphere radius="0.03"/>', '<sphere radius="x"/>'), "<sphere> of link 'two' has radius = 'x'"),
     ],

@@ -70,7 +70,7 @@ CHANGES = {
 def test_changed_content_is_refused(path, change):
     changed(path, change)
     for read in (read_tables, read_summary):
-        assert_refused(lambda read=read: read(path, KIND), path, "written to by another program", "make it again")
+        assert_refused(lambda read=read: read(path, KIND), path, "changed by another program", "make it again")
 
 
 def test_files_of_other_versions_are_refused_by_name(path):
@@ -119,9 +119,9 @@ HOSTILE = {
         replaced(data=np.zeros(2**21), compression="gzip", chunks=(2**21,)),
         "far more than the file contains",
     ),
-    "compound": (replaced((3,), [("a", "f8"), ("b", "i4")]), "of a type that no file of aacmm has"),
-    "reference": (replaced((3,), h5py.ref_dtype), "of a type that no file of aacmm has"),
-    "lists": (replaced((3,), h5py.vlen_dtype("f8")), "of a type that no file of aacmm has"),
+    "compound": (replaced((3,), [("a", "f8"), ("b", "i4")]), "of a type that does not occur in files of aacmm"),
+    "reference": (replaced((3,), h5py.ref_dtype), "of a type that does not occur in files of aacmm"),
+    "lists": (replaced((3,), h5py.vlen_dtype("f8")), "of a type that does not occur in files of aacmm"),
     "texts": (replaced(data=[["a", "b"]], dtype=h5py.string_dtype()), "a table of texts in several dimensions"),
     "group": (lambda file: (file.pop("t/x"), file.create_group("t/x")), "is not an array"),
     "itself": (lambda file: file.__setitem__("t/t", file["t"]), "is not an array"),
@@ -168,7 +168,7 @@ def test_only_ordinary_files_of_limited_size(path, tmp_path, monkeypatch):
     with open(tmp_path / "long", "wb") as file:
         file.truncate(3 * 2**20)
     monkeypatch.setenv(LARGEST_FILE, "2")
-    assert_refused(lambda: InputFile(tmp_path / "long"), "has 3 MiB, more than the 2 MiB", LARGEST_FILE)
+    assert_refused(lambda: InputFile(tmp_path / "long"), "has 3 MiB, more than the limit of 2 MiB", LARGEST_FILE)
     assert_refused(lambda: aj.files.load_capture(tmp_path / "long"), LARGEST_FILE)
     for wrong in ("much", "0", "-1", ""):
         monkeypatch.setenv(LARGEST_FILE, wrong)

@@ -74,9 +74,9 @@ def test_a_model_in_an_arm_file(tmp_path):
     for text, sentence in {
         'model = "gear"\ncoefficients = {gear_1 = 1e-3}': "give either model",
         'model = "gears"': "unknown model 'gears'; did you mean 'gear'",
-        "coefficients = {gear_4 = 1e-3}": "'gear_4' is of a joint from 1 to 3",
+        "coefficients = {gear_4 = 1e-3}": "'gear_4' must name a joint from 1 to 3",
         'model = "gravity"\nmass = [1, 2, 3]': "give both mass and centre",
-        "coefficients = {gear_1 = 1e-3}\nnominal = {alfa = [1, 2, 3]}": "nominal has no 'alfa'",
+        "coefficients = {gear_1 = 1e-3}\nnominal = {alfa = [1, 2, 3]}": "nominal has the unknown key 'alfa'",
     }.items():
         file.write_text(f"{plain}\n[corrections]\n{text}\n")
         with pytest.raises(aj.InputError, match=sentence):
@@ -98,5 +98,5 @@ def test_expansion_of_an_arm_file_is_free_at_several_temperatures(tmp_path):
 
 
 def test_formats_without_a_place_for_corrections_refuse_them():
-    with pytest.raises(aj.InputError, match="joint corrections, which this format cannot hold"):
+    with pytest.raises(aj.InputError, match="joint corrections, which this format cannot store"):
         python_program(corrected(), title="")

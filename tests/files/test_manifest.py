@@ -58,7 +58,7 @@ def test_temperatures(tmp_path, motion):
             SMALL + "temperature_C = 22\n" + SOCKET.replace("a.csv", "b.csv"),
             "b.csv has no temperatures, but .*a.csv has",
         ),
-        (SMALL.replace("a.csv", "warm.csv") + "temperature_C = 22\n", "is stated besides; give one of them"),
+        (SMALL.replace("a.csv", "warm.csv") + "temperature_C = 22\n", "but the manifest also states temperature_C"),
         (HEAD + ANGLES + '[[socket]]\nname = "A"\nfiles = ["b.csv", "warm.csv"]\n', "b.csv has no temperatures, but"),
         (HEAD + ANGLES + "columns = [1, 2, 3, 4, 5, 6]\n" + SOCKET.replace("a.csv", "warm.csv"), "column 3 is"),
         (
@@ -81,7 +81,7 @@ def test_visits_of_sessions_and_targets(tmp_path, motion):
     assert read(tmp_path, HEAD + ANGLES + socket.format("A")).visits == (0, 0, 0, 0, 1, 1, 1, 1)
     text = HEAD + ANGLES + socket.format("day/A") + 'session = "day"\n' + other + 'session = "day"\n'
     assert read(tmp_path, text).visits == (0, 0, 0, 0, 1, 1, 1, 1, -1, -1, -1, -1)
-    with pytest.raises(aj.InputError, match="leave out visits of a socket with a target"):
+    with pytest.raises(aj.InputError, match="remove visits from a socket with a target"):
         read(tmp_path, HEAD + ANGLES + socket.format("A") + 'target = "ball"\n' + other)
 
 
@@ -206,8 +206,8 @@ def test_what_a_field_matches(tmp_path, motion, name, file, exclude, expected):
 @pytest.mark.parametrize(
     ("file", "exclude", "parts"),
     [
-        ("hole_{hole}.csv", [], ["but nearly 'hole_0_pose.csv', 'hole_1_pose.csv'", "letters, digits and '-' only"]),
-        ("{hole}_pose.csv", ["*_pose.csv"], ["but 'hole_0_pose.csv'", "which exclude leaves out; change exclude"]),
+        ("hole_{hole}.csv", [], ["Nearest: 'hole_0_pose.csv', 'hole_1_pose.csv'.", "letters, digits and '-' only"]),
+        ("{hole}_pose.csv", ["*_pose.csv"], ["except 'hole_0_pose.csv'", "rules out; change exclude"]),
         ("hole_{hole}_poze.csv", [], ["there is 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
         ("plate/{hole}.csv", [], ["no file matches 'plate/{hole}.csv'", "check the path"]),
     ],
@@ -254,7 +254,10 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + LENGTH.replace("from", "form"), ["unknown key 'length 1.form'", "did you mean 'from'?"]),
         (SMALL.replace("[[socket]]", "[socket]"), ["'socket' must be a valid list, not a table", "write [[socket]]"]),
         (SMALL + 'name = "{place}"', ["name '{place}'", "file 'a.csv' has no field", "use the same fields"]),
-        (SMALL + 'exclude = ["b*"]', ["exclude is for files with a field in braces", "'a.csv' has none; leave it out"]),
+        (
+            SMALL + 'exclude = ["b*"]',
+            ["exclude applies to file names with a field in braces", "'a.csv' has none; remove exclude"],
+        ),
         (SMALL + 'files = ["a.csv"]', ["socket 1", "either file or files"]),
         (HEAD + ANGLES + '[[socket]]\nfiles = ["a.csv"]', ["socket 1", "needs a name"]),
         (HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = []', ["'socket 1.files' has no entries", "give at least 1"]),
@@ -271,8 +274,8 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
             ["socket 1.files: 'a.csv' is given twice"],
         ),
         (SMALL.replace('"a.csv"', '"a.csv"\nname = ""'), ["a socket has the name ''"]),
-        (SMALL.replace("rad", "counts"), ["angles", "give counts_per_turn with unit = 'counts'"]),
-        (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "only with it"]),
+        (SMALL.replace("rad", "counts"), ["angles", "counts_per_turn and unit = 'counts' must be given together"]),
+        (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "must be given together"]),
         (
             SMALL.replace('"rad"', '"counts"\ncounts_per_turn = [9, 9]'),
             ["angles.counts_per_turn has 2 values", "6 joints"],
@@ -293,14 +296,17 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         ),
         (SMALL.replace('"rad"', '"rad"\nsign = 2'), ["'angles.sign' must be 1 or -1, not 2"]),
         (SMALL.replace('"rad"', '"rad"\nsign = [1, 1, 0, 1, 1, 1]'), ["'angles.sign 3' must be 1 or -1, not 0"]),
-        (SMALL.replace('"rad"', '"rad"\noffset = [1, 2]'), ["angles.offset has 2 values", "give one, or one a joint"]),
+        (
+            SMALL.replace('"rad"', '"rad"\noffset = [1, 2]'),
+            ["angles.offset has 2 values", "give one value, or one value per joint"],
+        ),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3]'),
-            ["3 columns are picked", "6 joints", "pick one a joint"],
+            ["3 columns are picked", "6 joints", "pick one column per joint"],
         ),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3, 4, 5, 9]'),
-            ["a.csv has no column '9'; it has 6 columns without names: pick others"],
+            ["a.csv has no column '9'; it has 6 columns without names: pick other columns"],
         ),
         (SMALL.replace('"rad"', '"rad"\ncolumns = [0, 2, 3, 4, 5, 6]'), ["'angles.columns 1' must be greater than 0"]),
         (HEAD + ANGLES + PATTERN.replace(".csv", ".txt"), ["no file matches '{place}.txt'", "check the path"]),
@@ -321,21 +327,24 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
             ["a.csv has no column '1'; it has 6 columns without names"],
         ),
         (SMALL.replace('"rad"', '"rad"\noffset = true'), ["angles.offset: expected a number, but it is true or false"]),
-        (SMALL + LENGTH.replace("200.0", "1e300"), ["'length 1.value' is larger than any number that is meant"]),
+        (SMALL + LENGTH.replace("200.0", "1e300"), ["'length 1.value' is implausibly large"]),
         (SMALL + LENGTH + "u = inf", ["'length 1.u' must be a finite number"]),
-        (SMALL + LENGTH.replace("200.0", "9" * 5001), ["holds a number of thousands of digits"]),
+        (SMALL + LENGTH.replace("200.0", "9" * 5001), ["contains a number with thousands of digits"]),
         (
             SMALL.replace('"a.csv"', '"a.csv"\nname = "a\\u0000b"'),
-            ["'socket 1.name' holds the control character U+0000"],
+            ["'socket 1.name' contains the control character U+0000"],
         ),
-        (SMALL.replace('"a.csv"', '"a.csv"\nname = "a\\u001b[2J"'), ["control character U+001B; take it out"]),
+        (SMALL.replace('"a.csv"', '"a.csv"\nname = "a\\u001b[2J"'), ["control character U+001B; remove the character"]),
         (SMALL + '"\\u001b" = 1', ["control character U+001B"]),
         (SMALL + "x = " + "[" * 900 + "]" * 900, ["nests tables or lists too deeply"]),
-        (SMALL + "x = " + "[" * 90 + "]" * 90, ["nests tables or lists too deeply; no such file has more than 16"]),
+        (SMALL + "x = " + "[" * 90 + "]" * 90, ["nests tables or lists too deeply; at most 16 levels are allowed"]),
         (SMALL + ".".join(["a"] * 20_000) + " = 1", ["line 6 has a key of more than 16 parts"]),
         (SMALL + "[" + ' . "a" . '.join(["x"] * 20_000) + "]", ["line 6 has a key of more than 16 parts"]),
-        (SMALL + "#" * 5_000_000, ["has 5,000,", "characters, over 4,000,000"]),
-        (HEAD + ANGLES + PATTERN.replace("place", "1"), ["the field {1} in '{1}' has no name; begin it with a letter"]),
+        (SMALL + "#" * 5_000_000, ["has 5,000,", "characters, more than 4,000,000"]),
+        (
+            HEAD + ANGLES + PATTERN.replace("place", "1"),
+            ["the field {1} in '{1}' has no valid name; begin the name with a letter"],
+        ),
         (HEAD + ANGLES + PATTERN.replace("{place}", "{a}{b}"), ["two fields with nothing between them"]),
         (HEAD + ANGLES + PATTERN.replace("{place}", "/".join(f"{{f{i}}}" for i in range(9))), ["more than 8 fields"]),
     ],
@@ -414,24 +423,24 @@ def test_bad_manifest(tmp_path, motion, text, parts):
 @pytest.mark.parametrize(
     ("content", "parts"),
     [
-        (b"1,2,3,4,5.5\n", ["has 5 columns", "the arm's 6 joints", "one column a joint", "columns = [...]"]),
-        (b"1,2,3,4,5.5,6\n1,2,3,4,5.5\n", ["line 2 has 5 columns", "before it 6", "give all the same"]),
+        (b"1,2,3,4,5.5\n", ["has 5 columns", "the arm's 6 joints", "one column per joint", "columns = [...]"]),
+        (b"1,2,3,4,5.5,6\n1,2,3,4,5.5\n", ["line 2 has 5 columns", "before it have 6", "give all lines the same"]),
         (b"q\n1,2,3,4,5.5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "write it"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,1_0\n", ["line 2 column 6", "'1_0' is not a number"]),
         (b"1,2,3,4,5.5,\n", ["has 5 columns without names", "the arm's 6 joints"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,\n", ["line 2 column 6", "'' is not a number"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "correct it"]),
-        (b"q1,q2,q3,q4,q5,q6\n", ["holds no numbers", "one line a pose"]),
-        (b"", ["holds no numbers", "one line a pose"]),
+        (b"q1,q2,q3,q4,q5,q6\n", ["contains no numbers", "one line per pose"]),
+        (b"", ["contains no numbers", "one line per pose"]),
         (b"0,5;1,5;2,5;0,5;1,5;2,5\n", ["line 1 column 1: '0,5' is not a number", 'or add decimal = ","']),
         (
             b"1,2,3,4,5,6\n",
             [
-                "line 1 is 1 to 6, which are numbers of columns",
-                "add skip = 1 and columns = [1, 2, 3, 4, 5, 6], or write it with",
+                "line 1 contains the column numbers 1 to 6;",
+                "add skip = 1 and columns = [1, 2, 3, 4, 5, 6], or write the numbers with",
             ],
         ),
-        (b"0 1 2 3 4 5\n", ["line 1 is 0 to 5, which are numbers of columns"]),
+        (b"0 1 2 3 4 5\n", ["line 1 contains the column numbers 0 to 5;"]),
         (b"0.1x,0.2x,a,b,c,d\n1,2,3,4,5.5,6\n", ["line 1 column 1: '0.1x' is not a number"]),
         (b'"0.1,0.2,0.3,0.4,0.5,0.6\n1,2,3,4,5.5,6\n', ["line 1 column 1: '\"0.1' is not a number", "without quotes"]),
         (b"1,2,3,4,5.5,'6'\n", ["line 1 column 6: ''6'' is not a number", "without quotes"]),
@@ -442,11 +451,11 @@ def test_bad_manifest(tmp_path, motion, text, parts):
         ),
         (b"True,2,3,4,5.5,6\n", ["line 1 column 1: 'True' is not a number"]),
         (b"1,2,3,4,5.5,0x6\n", ["line 1 column 6: '0x6' is not a number"]),
-        (b"1,2,3,4,5.5,1e300\n", ["'1e300' is not finite, or larger than anything that is measured"]),
+        (b"1,2,3,4,5.5,1e300\n", ["'1e300' is not finite, or is implausibly large"]),
         (b"1,2,3,4,5.5," + b"9" * 5001 + b"\n", ["line 1 column 6: '999", "...' is not finite"]),
         (b"1,2,3,4,5.5,6\x1b[2J\n", ["line 1 column 6: '6\\x1b[2J' is not a number"]),
         (b"1,2,3,4,5.5\x1c,6\n", ["line 1 column 5: '5.5\\x1c' is not a number"]),
-        (b"q1,q2,q3,q4,q5,q1\n1,2,3,4,5.5,6\n", ["'q5', 'q1'; add columns = [1, 6, 2, 3, 4, 5]", "each once"]),
+        (b"q1,q2,q3,q4,q5,q1\n1,2,3,4,5.5,6\n", ["'q5', 'q1'; add columns = [1, 6, 2, 3, 4, 5]", "each column once"]),
         (
             b"1,2,3,4,2,6\n2,3,4,5,3,7\n0,0,0,1,0,1\n",
             ["has the same numbers in columns 2 and 5", "give each column once"],

@@ -245,22 +245,22 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         (ALL.replace('"x"', '"y"'), ["one column is picked twice"]),
         (ALL.replace('"q?"', '"q[1-3]"'), ["3 columns are picked for the readings", "6 joints"]),
         (ALL.replace("points =", "point ="), ["no 'point'", "did you mean 'points'?"]),
-        (ALL.replace(', "z"]', "]"), ["points is in 3 columns, but 2 are picked"]),
+        (ALL.replace(', "z"]', "]"), ["points needs 3 columns, but 2 are picked"]),
         ('columns = { q = "q?" }', ["no 'points' (measured point)", "pick its columns"]),
         (ALL + 'units = { points = "cm" }', ["the points are in 'cm'", "mm, m, um, inch"]),
         # Mixed units: in one header, or in header and manifest.
         (
             ALL.replace('"x", "y"', '"x [m]", "y [mm]"'),
-            ["mixes units: 'x [m]' is in m, 'y [mm]' is in mm", "convert one of them"],
+            ["mixes units: 'x [m]' is in m, 'y [mm]' is in mm", "convert one of the columns"],
         ),
         (
             ALL.replace('"x", "y"', '"y", "y_mm"') + 'units = { points = "inch" }',
-            ["the header of the points says mm, but the manifest inch"],
+            ["the header of the points says mm, but the manifest says inch"],
         ),
         (ALL.replace('"x", "y", "z"', '"a", "b", "c"'), ["the points are in 'cm'", "one of mm, m, um, inch"]),
-        (ALL.replace('"q?"', '"p?"'), ["the header of the readings says deg, but the manifest rad"]),
+        (ALL.replace('"q?"', '"p?"'), ["the header of the readings says deg, but the manifest says rad"]),
         (ALL + 'units = { q = "degrees" }', ["the readings are in 'degrees'", "rad, deg"]),
-        (ALL + "u = 0.1", ["u is given and also in columns"]),
+        (ALL + "u = 0.1", ["u is given both as a key and in columns"]),
         (ALL + 'readings = "short.csv"', ["5 rows of 'points'", "2 readings"]),
         (ALL + 'files = ["a.csv"]', ["needs either file or files"]),
         (ALL + "group = 99", ["no column '99'"]),
@@ -285,10 +285,10 @@ def test_bad_columns(tmp_path, text, parts):
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ('rotation = "euler"', ["'euler' is not a convention of rotations", "XYZ (moving axes"]),
-        ("", ["does not say how its rotations are written"]),
+        ('rotation = "euler"', ["'euler' is not a convention for rotations", "XYZ (moving axes"]),
+        ("", ["does not state the convention of its rotations"]),
         ('rotation = "XYZ"', ["angles without a unit", "rotations = 'deg'"]),
-        ('rotation = "quaternion wxyz"', ["rotations is in 4 columns, but 3 are picked"]),
+        ('rotation = "quaternion wxyz"', ["rotations needs 4 columns, but 3 are picked"]),
     ],
 )
 def test_bad_rotations(tmp_path, text, parts):
@@ -302,8 +302,8 @@ def test_bad_rotations(tmp_path, text, parts):
     ("header", "parts"),
     [
         (NAMES[:11], ["no column 'q?'; it has 12 columns, but its header 11 names: pick"]),
-        (None, ["no column 'q?'; it has 12 columns without names: pick others"]),
-        ([*NAMES[:9], "u_x", "U95 Y", "U(95) Z"], ["no column 'U*95* X', but columns U*95* Y, U*95* Z; correct its"]),
+        (None, ["no column 'q?'; it has 12 columns without names: pick other columns"]),
+        ([*NAMES[:9], "u_x", "U95 Y", "U(95) Z"], ["no column 'U*95* X', but the columns U*95* Y, U*95* Z; correct"]),
     ],
 )
 def test_bad_headers(tmp_path, header, parts):
@@ -323,7 +323,7 @@ def test_bad_cells(tmp_path):
     write(tmp_path / "a.csv", rows, delimiter=";")
     assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "line 4 column 8", 'decimal = ","')
     (tmp_path / "a.csv").write_text("q1,q2\n")
-    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "a.csv holds no numbers")
+    assert_refused(lambda: read(tmp_path, f'[[points]]\nfile = "a.csv"\n{ALL}'), "a.csv contains no numbers")
 
 
 @pytest.mark.slow
@@ -379,11 +379,11 @@ value = 50.0
     ("text", "parts"),
     [
         ('[[points]]\nfile = "a.csv"\n[[points]]\nname = "b"\nfile = "a.csv"\nsession = "x"\n', ["a has no session"]),
-        ('[sessions]\nprobe = "same"\n[[points]]\nfile = "a.csv"\n', ["[sessions] is for tables with a session"]),
+        ('[sessions]\nprobe = "same"\n[[points]]\nfile = "a.csv"\n', ["[sessions] applies to tables with a session"]),
         ('[[points]]\nfile = "a.csv"\nsession = "{day}"\n', ["session uses the unknown field day"]),
         (
             '[[points]]\nfile = "a.csv"\nsession = "x"\ncolumns = { session = "x" }\n',
-            ["session is given and also in columns"],
+            ["session is given both as a key and in columns"],
         ),
     ],
 )

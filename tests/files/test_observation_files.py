@@ -116,8 +116,8 @@ def test_xarray_reads_the_table(tmp_path):
     [
         (lambda group: group.attrs.modify("kind", "rope"), ["unknown kind 'rope'", "update"]),
         (lambda group: group.attrs.modify("u_mm", -1.0), ["u of sphere 's'", "zero or positive"]),
-        (lambda group: group.pop("q"), ["lacks the entry 'q'"]),
-        (lambda group: group.attrs.pop("name"), ["lacks the attribute 'name'"]),
+        (lambda group: group.pop("q"), ["has no entry 'q'"]),
+        (lambda group: group.attrs.pop("name"), ["has no attribute 'name'"]),
     ],
 )
 def test_a_damaged_table(tmp_path, change, parts):

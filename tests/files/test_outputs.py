@@ -39,4 +39,4 @@ def test_what_is_no_ordinary_file_is_refused(tmp_path):
 @pytest.mark.parametrize("path", [2.5, 1, [1.0], b"arm.toml", None], ids=repr)
 def test_what_is_no_path_is_refused(path):
     """A number would name an open file, such as standard output."""
-    assert_refused(lambda: as_path(path), f"a file is named by a {type(path).__name__}", "as text")
+    assert_refused(lambda: as_path(path), f"the path of a file is of type {type(path).__name__}", "as text")

@@ -81,7 +81,7 @@ def test_no_prior(paper_arm):
     [
         ("length=0.5", "not of the form"),
         ("length=0.5deg", r"unit \(mm, um, m\)"),
-        ("all=1mm", "groups of their own"),
+        ("all=1mm", "need separate groups"),
         ("alpha=learn,alpha=1deg", "twice"),
         ("d_9=1mm", "did you mean"),
         ("alpha", "not of the form"),

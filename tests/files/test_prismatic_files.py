@@ -53,7 +53,7 @@ joint = [
     np.testing.assert_allclose(arm.position([500.0, 0.0]), (400, 0, 600), atol=1e-12)
     for old, new, said in (
         (", limits = [0, 1.5]", "", "limits are given for some joints only"),
-        ("prismatic = [1]", "prismatic = [3]", "prismatic names joint 3, but there are 2 joints"),
+        ("prismatic = [1]", "prismatic = [3]", "prismatic names joint 3, but the arm has 2 joints"),
         ("prismatic = [1]", "prismatic = [1, 1]", "prismatic"),
     ):
         (tmp_path / "wrong.toml").write_text(text.replace(old, new))

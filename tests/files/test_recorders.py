@@ -271,12 +271,12 @@ def test_units_that_contradict_the_manifest(tmp_path, header):
 @pytest.mark.parametrize(
     ("header", "unit", "parts"),
     [
-        (["X [inch]", "Y [inch]", "Z [inch]"], "mm", ["the header of the points says inch, but the manifest mm"]),
-        (["x_m", "y_m", "z_m"], "mm", ["says m, but the manifest mm"]),
+        (["X [inch]", "Y [inch]", "Z [inch]"], "mm", ["the header of the points says inch, but the manifest says mm"]),
+        (["x_m", "y_m", "z_m"], "mm", ["says m, but the manifest says mm"]),
         (["X [deg]", "Y [deg]", "Z [deg]"], None, ["points are in 'deg'", "mm, m, um, inch"]),
-        (["X", "Y", "Z"], None, ["does not say the unit of its points", 'add unit = "mm" to [points]']),
+        (["X", "Y", "Z"], None, ["does not state the unit of its points", 'add unit = "mm" to [points]']),
         (["P3", "P2", "P1"], "mm", ["in the order 'P3', 'P2', 'P1'; add columns = [3, 2, 1]"]),
-        (["n", "X", "Y", "W"], "mm", ["has no column 'z', but columns x, y"]),
+        (["n", "X", "Y", "W"], "mm", ["has no column 'z', but the columns x, y"]),
         (["t", "a", "b", "c"], "mm", ["the columns 1 't', 2 'a'", "add columns = [2, 3, 4] with these three"]),
         (["Z [mm]", "Y [mm]", "X [mm]", "Hole"], None, None),
     ],
@@ -311,15 +311,15 @@ SIX = ",".join(f"{x}" for x in Q[0, :6]) + "\n"
         (JOINTS + ",".join(["radiants"] * 6) + "\n" + SIX, "", ["states 'radiants' for readings"]),
         (JOINTS + "deg,deg,deg,dge,deg,deg\n" + SIX, "", ["mixes units: 'J6 [deg]' is in deg, 'J4 [dge]' is in dge"]),
         (",".join(["meter"] + ["deg"] * 5) + "\n" + JOINTS + SIX, "", ["mixes units: 'J1 [meter]' is in m"]),
-        (",".join(["rads"] * 6) + "\n" + JOINTS + SIX, "", ["says rad, but the manifest deg"]),
+        (",".join(["rads"] * 6) + "\n" + JOINTS + SIX, "", ["says rad, but the manifest says deg"]),
         ("Base,Arm,Elbow,R,P,Y\n" + ",".join(["int"] * 6) + "\n" + SIX, "",
-         ["in lines 1 ('Base, Arm, Elbow and 3 more') and 2 ('int", "add skip = 1 if line 2 names the columns"]),
+         ["in both line 1 ('Base, Arm, Elbow and 3 more') and line 2", "add skip = 1 if line 2 names the columns"]),
         ("# J6,J5,J4,J3,J2,J1\n# by hand\n" + SIX, "", ["in the order 'J6'"]),
-        ("F,E,D,C,B,A\n" + SIX, "", ["add columns = [1, 2, 3, 4, 5, 6] if these are the joints in their order"]),
-        *((",".join(numbered(name)) + "\n" + SIX, "", ["says rad, but the manifest deg"])
+        ("F,E,D,C,B,A\n" + SIX, "", ["add columns = [1, 2, 3, 4, 5, 6] if these columns are the joints in order"]),
+        *((",".join(numbered(name)) + "\n" + SIX, "", ["says rad, but the manifest says deg"])
           for name in ("J{}_radians", "q_rad_{}", "J{} (rad) raw", "J{}.rad")),
         (",".join(numbered("J{}_mdeg")) + "\n" + SIX, "", ["states 'mdeg' for readings of revolute joints"]),
-        (",".join(numbered("J{} [Grad]")) + "\n" + SIX, 'units = { q = "rad" }\n', ["grad is deg in German and gon"]),
+        (",".join(numbered("J{} [Grad]")) + "\n" + SIX, 'units = { q = "rad" }\n', ["grad means deg in German"]),
         (JOINTS + SIX + "#" + SIX, "", ["line 3 begins with #", "write its first cell without #"]),
         (JOINTS + "#N/A" + SIX[SIX.index(","):] + SIX, "", ["line 2 begins with #"]),
         ("J1,J2,J3,J4,J5,J6,Load\n" + SIX.replace("\n", ",1\n"), 'group = "J1"\n',
@@ -339,7 +339,7 @@ def test_headers_that_are_not_ignored(tmp_path, content, stated, parts):
 @pytest.mark.parametrize(
     ("names", "stated", "part"),
     [
-        ("z_mm,y_mm,x_mm", 'columns = { points = "[xyz]_mm" }', "pick them as a list, [9, 8, 7], in that of the axes"),
+        ("z_mm,y_mm,x_mm", 'columns = { points = "[xyz]_mm" }', "in the order of the axes: [9, 8, 7]"),
         ("z_mm,y_mm,x_mm", 'preset = "csv"', None),
         ("z_mm,y_mm,x_mm", 'preset = "ipa"', None),
         ("z_cm,y_cm,x_cm", 'columns = { points = ["x_cm", "y_cm", "z_cm"] }', "the points are in 'cm'"),
@@ -363,29 +363,38 @@ NUMBERS = "0.12345,1.12345,2.12345,3.12345,4.12345,-2.12345\n"
     ("content", "parts"),
     [
         (3 * NUMBERS + NUMBERS[:-3], ["line 4: the last number, '-2.123', has fewer digits", "end that line if it is"]),
-        (3 * NUMBERS.replace("\n", "e-05\n") + NUMBERS[:-1] + "e-0", ["line 4: the last number", "copy it again"]),
+        (
+            3 * NUMBERS.replace("\n", "e-05\n") + NUMBERS[:-1] + "e-0",
+            ["line 4: the last number", "copy the file again"],
+        ),
         (3 * NUMBERS.replace("\n", "e-05\n") + NUMBERS[:-1] + "e-", ["'-2.12345e-', has fewer digits"]),
-        (3 * NUMBERS + NUMBERS[:30], ["line 4 has 4 columns", "copy the file again if it is cut there"]),
-        ("J1,J2,J3,J4,J5,J6\n" + 6 * "0,5,1,5" + "\n", ["but its header 6 names", "where decimal commas are"]),
+        (3 * NUMBERS + NUMBERS[:30], ["line 4 has 4 columns", "copy the file again if it is incomplete"]),
+        (
+            "J1,J2,J3,J4,J5,J6\n" + 6 * "0,5,1,5" + "\n",
+            ["but its header 6 names", "if it is confused with decimal commas"],
+        ),
         (
             "J1,J2,J3,J4,J5,J6,J7\n0.5," + NUMBERS,
-            ["7 'J7', and it is not clear", "pick one column a joint with"],
+            ["7 'J7', but it is not clear", "pick one column per joint with"],
         ),
-        ("6,5,4,3,2,1\n" + NUMBERS, ["line 1 is 6 to 1", "add skip = 1 and columns = [6, 5, 4, 3, 2, 1]"]),
+        (
+            "6,5,4,3,2,1\n" + NUMBERS,
+            ["line 1 contains the column numbers 6 to 1", "add skip = 1 and columns = [6, 5, 4, 3, 2, 1]"],
+        ),
         ("q1,q2,q3,q4,q5,q7\n" + NUMBERS, ["the columns 1 'q1'", "add columns = [1, 2, 3, 4, 5, 6] if"]),
-        ("x,y,z,rx,ry,rz\n" + NUMBERS, ["6 'rz', and it is not clear which of them", "add columns = [1, 2"]),
+        ("x,y,z,rx,ry,rz\n" + NUMBERS, ["6 'rz', but it is not clear which columns", "add columns = [1, 2"]),
         ("x,".replace("x", "n" * 10**5) * 6 + "\n" + "0.5,1,2,3,4,5,6\n", ["1 'nnnnnnnnnnnnnnnnnnnnn', 2"]),
         (",".join(f"s {i}" for i in range(2000)) + "\n" + ",".join(["0.5"] * 2000), ["1 's 0'", "1988 more"]),
         ("0.5,1,2,3,4," + "x" * 10**4, ["line 1 column 6: 'xxx", "...' is not a number"]),
         (
             "0.5;1;2;3;4;1.234,5\n",
-            ["column 6: '1.234,5' is not a number", "without quotes and separators of thousands"],
+            ["column 6: '1.234,5' is not a number", "without quotes and thousands separators"],
         ),
         (bytes(10**6), ["cannot be read as text; save it as text in UTF-8"]),
         (NUMBERS.encode("utf-16-le"), ["cannot be read as text"]),
         (NUMBERS.encode("utf-32"), ["cannot be read as text"]),
         ("\u0394,".encode("cp1253") * 6 + b"\n", ["cannot be read as text; save it as text in UTF-8"]),
-        (b"0\n" * 2_000_001, ["has more than the 2,000,000 lines that a text table may have; divide it"]),
+        (b"0\n" * 2_000_001, ["has more than the 2,000,000 lines that a text table may have; split the table"]),
         (NUMBERS + "0.5," * 300_000, ["line 2 is longer than 1 MiB", "not a row of a table"]),
     ],
 )
@@ -411,7 +420,7 @@ def test_large_files_are_refused_before_they_are_read(tmp_path, monkeypatch):
     monkeypatch.setenv("AACMM_LARGEST_FILE_MB", "8")
     with open(tmp_path / "a.csv", "wb") as stream:
         stream.truncate(2**21)
-    sentence = "has 2 MiB, more than the 1 MiB that are read"
+    sentence = "has 2 MiB, more than the limit of 1 MiB"
     assert_refused(lambda: TextTable(tmp_path / "a.csv"), sentence, "AACMM_LARGEST_FILE_MB")
     (tmp_path / "m.toml").write_text(f'arm = "panda"\n{RADIANS}{SOCKET}')
     assert_refused(lambda: aj.files.read_manifest(tmp_path / "m.toml"), sentence)

@@ -24,16 +24,16 @@ def files(tmp_path_factory, paper_arm, noisy_capture):
 @pytest.mark.parametrize(
     ("kind", "name", "value", "said"),
     [
-        ("calibration", "k", 2.0, "the scale k is not that of its lengths"),
+        ("calibration", "k", 2.0, "the scale k does not agree with its lengths"),
         ("calibration", "u_k", -1.0, "u_k (standard uncertainty of k) is below 0"),
-        ("calibration", "u_k", 1e-9, "its summary is not that of its values"),
+        ("calibration", "u_k", 1e-9, "its summary does not agree with its values"),
         ("calibration", "method", "guess", "method (method) is not one of two-stage, joint, repeatability"),
         ("calibration", "steps", -1, "steps (number of evaluations) is below 0"),
-        ("calibration", "steps", 1.5, "steps (number of evaluations) is of another type"),
+        ("calibration", "steps", 1.5, "steps (number of evaluations) has the wrong type"),
         ("calibration", "degrees_of_freedom", -1.0, "is below 0"),
         ("calibration", "measured", "soon", "the day of measurement is not a date"),
         ("capture", "measured", "soon", "the day of measurement is not a date"),
-        ("capture", "seed", 1.5, "seed (seed of a simulated capture) is of another type"),
+        ("capture", "seed", 1.5, "seed (seed of a simulated capture) has the wrong type"),
     ],
 )
 def test_show_refuses_what_makes_no_sense(aacmm, files, tmp_path, kind, name, value, said):

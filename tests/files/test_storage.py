@@ -106,10 +106,10 @@ BAD = {
     "newer": (set_attribute("format_version", 7), ["format version 7, newer", "(6)", "update aacmm_jax"]),
     "older": (set_attribute("format_version", 5), ["format version 5, older", "(6)", "make it again"]),
     "no version": (edit(lambda file: file.attrs.pop("format_version")), ["damaged", "make it again"]),
-    "other kind": (set_attribute("kind", "study"), ["holds a study", "name a "]),
-    "no table": (remove("capture"), ["lacks the table 'capture'", "make it again"]),
-    "no arm": (remove("nominal_arm"), ["lacks the table 'nominal_arm'", "make it again"]),
-    "no entry": (remove("capture/angle"), ["lacks the entry 'angle'", "make it again"]),
+    "other kind": (set_attribute("kind", "study"), ["contains a study", "name a "]),
+    "no table": (remove("capture"), ["has no table 'capture'", "make it again"]),
+    "no arm": (remove("nominal_arm"), ["has no table 'nominal_arm'", "make it again"]),
+    "no entry": (remove("capture/angle"), ["has no entry 'angle'", "make it again"]),
     "short entry": (replace("capture/angle", np.zeros((2, 3))), ["damaged", "make it again"]),
     "text for numbers": (replace("reference/value", "long"), ["damaged", "make it again"]),
     "group for numbers": (
@@ -131,13 +131,13 @@ def test_bad_file(tmp_path, good, kind, make, parts):
 
 def test_a_capture_is_no_calibration(tmp_path, good):
     path = good.files["capture"]
-    assert_refused(lambda: aj.files.load_calibration(path), path, "holds a capture", "name a calibration file")
+    assert_refused(lambda: aj.files.load_calibration(path), path, "contains a capture", "name a calibration file")
     # The other way round is meant: a calibration holds its capture.
     assert aj.files.load_capture(good.files["calibration"]).capture.names == ("A", "B")
     for name in ("stage1_arm", "parameters", "observed"):
         remove(name)(tmp_path / "bad.h5", good.files["calibration"])
         assert_refused(
-            lambda: aj.files.load_calibration(tmp_path / "bad.h5"), f"lacks the table '{name}'", "make it again"
+            lambda: aj.files.load_calibration(tmp_path / "bad.h5"), f"has no table '{name}'", "make it again"
         )
     path = good.files["capture"] / "below.h5"
     assert_refused(lambda: aj.files.load_capture(path), path, "cannot be read: not a directory", "name another")
@@ -427,7 +427,7 @@ def test_round_trip_of_an_arm(tmp_path_factory, drawn):
     try:
         read = aj.files.load_specification(path)
     except aj.InputError as error:
-        if "are they in m" in str(error):  # mm that can only be m, and the reverse
+        if "are the lengths in m" in str(error):  # mm that can only be m, and the reverse
             return
         raise
     assert plain(read) == plain(specification)

@@ -64,7 +64,7 @@ def test_such_a_table_is_calibrated_and_exported(tmp_path):
     assert bool(result.converged)
     assert np.sqrt(np.mean(errors**2)) < 0.02  # mm; 0.007 of the noise, and some 0.1 with frames 400 m away
     text = aj.files.ur_kinematics_yaml(result.arm)
-    tool = np.array([float(x) for x in text.split("TCP: ")[1].split()[:3]]) * 1000
+    tool = np.array([float(x) for x in text.split("controller: ")[1].split()[:3]]) * 1000
     again = aj.load_arm(file(tmp_path, text, "kinematics.yaml"), probe=tool)
     np.testing.assert_allclose(again.pose(Q), result.arm.pose(Q), rtol=0, atol=1e-9)
 
@@ -102,7 +102,7 @@ def test_origins_of_a_published_table(tmp_path):
         (PARAMETERS.replace("439.140974079901", "four"), ["'dh_d' is", "six finite numbers"]),
         (PARAMETERS.replace("439.140974079901", ""), ["'dh_d' is", "give six finite numbers"]),
         (PARAMETERS.replace("439.140974079901", "1e300"), ["'dh_d' is", "below 100000"]),
-        (PARAMETERS + PARAMETERS, ["'dh_theta' is there twice"]),
+        (PARAMETERS + PARAMETERS, ["'dh_theta' occurs twice"]),
         ("kinematics: [1, 2\nx y\n", ["line 2 is not of the form 'key: value'"]),
         ("", ["is missing"]),
     ],

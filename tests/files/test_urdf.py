@@ -173,8 +173,8 @@ def test_manifest_and_arm_file_name_a_urdf(tmp_path, nominal):
     stated = aj.files.load_specification(arm)
     assert (stated.held, stated.urdf.tip, stated.name) == (("d_1",), "tool0", "arm")
     np.testing.assert_array_equal(stated.arm.probe, found.arm.probe)
-    assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is not a URDF", "leave out base and tip")
-    assert_refused(lambda: aj.load_arm("panda", probe=(0, 0, 1)), "states the probe itself")
+    assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is not a URDF", "omit base and tip")
+    assert_refused(lambda: aj.load_arm("panda", probe=(0, 0, 1)), "already states the probe")
     both = written(tmp_path, head + "joint = [{alpha = 0, a = 1, d = 0}]\n", "both.toml")
     assert_refused(lambda: aj.load_arm(both), "either joint", "or urdf")
 
@@ -194,7 +194,7 @@ BACK = '<child link="base_link"/></joint><joint name="back" type="fixed"><parent
 REFUSED = {
     "several tips": (None, {"tip": None}, ["'upper_cover', 'tool0', 'left_finger'", "name the tip"]),
     "unknown tip": (None, {"tip": "tool9"}, ["no link 'tool9'", "its links are 'world'"]),
-    "branches": (None, {"base": "upper_cover"}, ["two branches", "part at 'upper'"]),
+    "branches": (None, {"base": "upper_cover"}, ["two branches", "separate at 'upper'"]),
     "exchanged": (None, {"base": "tool0", "tip": "world"}, ["comes after", "exchange base and tip"]),
     "same": (None, {"base": "tool0"}, ["same link"]),
     "nothing moves": (None, {"tip": "base_link"}, ["no joint moves between 'world' and 'base_link'"]),
@@ -213,11 +213,11 @@ REFUSED = {
     "angles in degrees": (('rpy="0 -1.5708 0"', 'rpy="0 -90 0"'), {}, ["of joint", "rpy = '0 -90 0'", "in degrees"]),
     "no root": (('<child link="base_link"/>', BACK), {"tip": None}, ["every link has a joint before it", "a tree"]),
     "not finite": (('xyz="0.35 0 0.03"', 'xyz="nan 0 0"'), {}, ["'nan 0 0'", "3 numbers"]),
-    "millimetres": (('xyz="0.35 0 0.03"', 'xyz="350 0 30"'), {}, ["352 m long", "divide them by 1000"]),
+    "millimetres": (('xyz="0.35 0 0.03"', 'xyz="350 0 30"'), {}, ["352 m long", "divide the lengths by 1000"]),
     "two parents": (('<child link="upper_cover"/>', '<child link="forearm"/>'), {}, ["child of two joints"]),
-    "circle": (('<child link="base_link"/>', BACK), {"base": "base_link"}, ["form a circle"]),
-    "no such link": (('<link name="wrist_2"/>', ""), {}, ["names the link 'wrist_2', which is not there"]),
-    "twice": (('<link name="wrist_2"/>', '<link name="wrist_2"/><link name="wrist_2"/>'), {}, ["is there twice"]),
+    "circle": (('<child link="base_link"/>', BACK), {"base": "base_link"}, ["form a loop"]),
+    "no such link": (('<link name="wrist_2"/>', ""), {}, ["names the link 'wrist_2', which does not exist"]),
+    "twice": (('<link name="wrist_2"/>', '<link name="wrist_2"/><link name="wrist_2"/>'), {}, ["occurs twice"]),
     "no chain": (ISLAND, {"base": "island"}, ["no chain of joints from 'island' to 'tool0'"]),
     "roots": (ISLAND, {"tip": None}, ["2 roots, 'world', 'island'"]),
     "numbers": (('xyz="0.35 0 0.03"', 'xyz="0.35 0"'), {}, ["line ", "joint 'joint_4'", "'0.35 0'", "3 numbers"]),
@@ -229,7 +229,7 @@ REFUSED = {
     "no name": (('<link name="wrist_2"/>', "<link/>"), {}, ["a link has no name"]),
     "xacro": (('<link name="wrist_2"/>', '<xacro:arm name="x"/>'), {}, ["xacro FILE.xacro > FILE.urdf"]),
     "xacro value": (('xyz="0.35 0 0.03"', 'xyz="${length} 0 0"'), {}, ["xacro FILE.xacro > FILE.urdf"]),
-    "no XML": (("</robot>", ""), {}, ["not valid XML", "correct it there"]),
+    "no XML": (("</robot>", ""), {}, ["not valid XML", "correct the file there"]),
     "another format": (("<robot", "<model"), {}, ["root element is <model>"]),
     "misspelt origin": (
         ('<origin xyz="0.35', '<orign xyz="0.35'), {}, ["line 50: joint 'joint_4'", "<orign>; did you mean '<origin>'?"]
@@ -248,13 +248,13 @@ REFUSED = {
     "misspelt mass": (('<mass value="3"/>', '<mas value="3"/>'), {}, ["<inertial> of link 'upper'", "<mas>"]),
     "mass outside": (
         ('<inertial><origin xyz="0 0 0.2"/><mass value="3"/>', '<mass value="3"/><inertial>'), {},
-        ["link 'upper' holds <mass>, which does not belong there"],
+        ["link 'upper' contains <mass>, which does not belong there"],
     ),
     "inside an origin": (
         ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"><axis xyz="0 0 1"/></origin>'), {},
-        ["holds <axis>, which does not belong there; move it"],
+        ["contains <axis>, which does not belong there; move it"],
     ),
-    "text": (('<origin xyz="0.35 0 0.03"', 'origin xyz="0.35" <origin'), {}, ["holds the text 'origin xyz=\"0.35\"'"]),
+    "text": (('<origin xyz="0.35 0 0.03"', 'origin xyz="0.35" <origin'), {}, ["'origin xyz=\"0.35\"'"]),
     "quaternion": (('rpy="0 1.5708 0"', 'quat_xyzw="0 1 0 0"'), {}, ["quat_xyzw", "as rpy"]),
     "two shapes": (
         ('<link name="wrist_2"/>', '<link name="wrist_2"><collision><geometry><sphere radius="1"/><box size="1 1 1"/>'
@@ -299,7 +299,7 @@ BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&
         (b"<robot>" + 100 * b"<a>" + 100 * b"</a>" + b"</robot>", "too deeply"),
         (b"<sdf/>", "root element is <sdf>"),
         (b"", "not valid XML"),
-        (b"\xff\xfe\x00", "not text in UTF-8"),
+        (b"\xff\xfe\x00", "not UTF-8 text"),
         (b"<robot name='\x00'/>", "not valid XML"),
         (b"<robot><link name='a'/></robot>", "no joint after 'a' moves"),
         (b"<robot/>", "no <link>"),
@@ -318,4 +318,4 @@ def test_export_needs_the_urdf(paper_arm, nominal):
         "a URDF cannot be exported",
         "--format toml",
     )
-    assert_refused(lambda: urdf_of(aj.load_arm("panda"), nominal), "has 7 joints, but the URDF 6")
+    assert_refused(lambda: urdf_of(aj.load_arm("panda"), nominal), "has 7 joints, but the URDF has 6")

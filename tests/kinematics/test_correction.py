@@ -129,7 +129,7 @@ def test_refusals():
     panda, paper = ARMS["panda"], ARMS["cheng2018-simulation"]
     q, correct = np.zeros(6), aj.kinematics.corrected_readings
     assert_refused(lambda: correct(panda, paper, np.zeros(7)), "7 and 6 joints")
-    assert_refused(lambda: aj.kinematics.readings_at_poses(paper, q, np.eye(4)[None]), "a pose for each")
+    assert_refused(lambda: aj.kinematics.readings_at_poses(paper, q, np.eye(4)[None]), "one pose per configuration")
     assert_refused(lambda: correct(paper, paper, q, [(0.0, 1.0)]), "6 rows")
     batch = paper.replace(d_1=np.array([1.0, 2.0]))
     assert_refused(lambda: aj.kinematics.readings_at_poses(batch, q, np.eye(4)), "a batch")

@@ -169,18 +169,18 @@ def test_the_nominal_arm_decides_the_functions(elbow):
     [
         ("harmonic", "unknown model 'harmonic'; did you mean 'harmonics'"),
         ("gear,gear", "the model names 'gear' twice"),
-        ("harmonics=0", "has no orders from 1 to 99"),
-        ("harmonics=3-1", "has no orders from 1 to 99"),
-        ("harmonics=1-100", "has no orders from 1 to 99"),
+        ("harmonics=0", "does not name orders from 1 to 99"),
+        ("harmonics=3-1", "does not name orders from 1 to 99"),
+        ("harmonics=1-100", "does not name orders from 1 to 99"),
         ("functions,harmonics=1", "the model names 'harmonics' twice"),
         ("gear=2", "gear takes no option"),
         ("expansion=2", "expansion takes no option"),
-        (["expansion_1"], "is of the whole arm and has no number"),
-        (["cos1"], "is of a joint from 1 to 7"),
-        ("coupled=2", "names no joints"),
-        ("coupled=2-9", "is of a joint from 1 to 7"),
-        (["cos1_9"], "is of a joint from 1 to 7"),
-        (["compliance1_2"], "is of a link from 2 to 7"),
+        (["expansion_1"], "applies to the whole arm and takes no number"),
+        (["cos1"], "must name a joint from 1 to 7"),
+        ("coupled=2", "does not name pairs of joints"),
+        ("coupled=2-9", "must name a joint from 1 to 7"),
+        (["cos1_9"], "must name a joint from 1 to 7"),
+        (["compliance1_2"], "must name a link from 2 to 7"),
         (["d_3"], "'d_3' is not the name of a coefficient"),
     ],
 )
@@ -222,7 +222,7 @@ def test_expansion_at_one_temperature_is_a_scale():
     seen = aj.observability(bounds.space.base, capture, bounds.space)
     assert seen.null.shape[1] == 1
     assert set(bounds.space.names[i] for i in np.argsort(-np.abs(seen.null[:, 0]))[:3]) == {"d_3", "d_5", "expansion"}
-    assert seen.remedy == "Poses in the same sockets at other temperatures would determine them."
+    assert seen.remedy == "Poses in the same sockets at other temperatures would determine these parameters."
 
 
 def test_redrawn_readings_keep_their_temperature():

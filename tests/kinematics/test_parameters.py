@@ -37,8 +37,8 @@ def test_replaced_parameters_under_transformations(panda):
     ("changes", "parts"),
     [
         ({"d_8": 1.0}, ("unknown parameter 'd_8' of a 7-joint arm", "did you mean 'd_")),
-        ({"d_3": np.nan}, ("d_3 holds a value that is not finite",)),
-        ({"d_3": None}, ("d_3 holds a value that is not finite",)),
+        ({"d_3": np.nan}, ("d_3 contains a value that is not finite",)),
+        ({"d_3": None}, ("d_3 contains a value that is not finite",)),
         ({"d": np.zeros(6)}, ("d has shape (6,); give (..., joints) with 7 joints",)),
     ],
 )

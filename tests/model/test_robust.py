@@ -6,11 +6,17 @@ import pytest
 from scipy import stats
 
 from aacmm_jax.model.loss_names import LOSSES
-from aacmm_jax.model.robust import Loss, bounded_square, median_square, tuning_constant
-
+from aacmm_jax.model.robust import _SHAPES, Loss, bounded_square, median_square, tuning_constant
 
 # Holland and Welsch 1977, table 1.
-@pytest.mark.parametrize(("name", "constant"), [("huber", 1.345), ("cauchy", 2.385), ("tukey", 4.685)])
+PUBLISHED = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685}
+
+
+def test_every_loss_has_a_name_functions_and_a_published_constant():
+    assert set(LOSSES) == set(_SHAPES) == set(PUBLISHED)
+
+
+@pytest.mark.parametrize(("name", "constant"), PUBLISHED.items())
 def test_tuning_constants_of_one_row_are_the_published_ones(name, constant):
     assert tuning_constant(name, 1) == constant
 

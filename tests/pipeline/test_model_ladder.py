@@ -141,7 +141,7 @@ def test_placements_are_the_regions_where_there_are_several(paper_arm, space):
     assert [*regions_of(capture)] == ["A, B", "C", "D"]
     assert [*regions_of(capture, ["A", "[BC]"])] == ["A", "[BC]"]
     assert regions_of(capture, ["A", "[BC]"])["[BC]"].sum() == 28
-    with pytest.raises(aj.InputError, match="nothing is left without"):
+    with pytest.raises(aj.InputError, match="no data are left to calibrate from"):
         regions_of(capture, ["*"])
     with pytest.raises(aj.InputError, match="fewer than two"):
         regions_of(capture, ["A"])
@@ -194,7 +194,7 @@ def test_the_evidence_is_that_of_a_gaussian(paper_arm, space, bounds):
 
 
 def test_refused(paper_arm, space, bounds):
-    with pytest.raises(aj.InputError, match="names no model"):
+    with pytest.raises(aj.InputError, match="models is empty"):
         compare_models(paper_arm, sockets(paper_arm, space), bounds, models=[])
     with pytest.raises(aj.InputError, match="unknown model 'grvity'"):
         compare_models(paper_arm, sockets(paper_arm, space), bounds, models=["dh,grvity"])

@@ -178,11 +178,11 @@ def test_least_poses():
     ("kit", "options", "text"),
     [
         ([], {}, "the kit is empty"),
-        ([EVERYTHING[3], EVERYTHING[3]], {}, "two things of the kit have the name 'ball'"),
-        ([KitItem(EVERYTHING[1], places=2)], {}, "'tracker' is an instrument and has no placements"),
+        ([EVERYTHING[3], EVERYTHING[3]], {}, "two items of the kit have the name 'ball'"),
+        ([KitItem(EVERYTHING[1], places=2)], {}, "'tracker' is an instrument, so the plan does not place it"),
         ([kinds.SimulatedSphere("far", (5000, 0, 0), 50.0, 5)], {}, "'far' at .* cannot be reached"),
-        ([EVERYTHING[1]], {"poses": 2}, "2 poses are too few for this kit; give 3"),
-        ([EVERYTHING[3]], {"region": {"w": (0, 1)}}, "no 'w'"),
+        ([EVERYTHING[1]], {"poses": 2}, "2 poses are too few for this kit; give at least 3"),
+        ([EVERYTHING[3]], {"region": {"w": (0, 1)}}, "unknown key 'w'"),
     ],
 )
 def test_refused(paper_arm, space, kit, options, text):

@@ -225,13 +225,13 @@ def test_readings_taken_by_the_plan_come_back_through_its_manifest(paper_arm, gi
 
 REFUSED = {
     "too few": ({"poses": 5}, "too few for 4 sockets"),
-    "equations": ({"poses": 9, "sockets": 4}, "take 11 at least"),
+    "equations": ({"poses": 9, "sockets": 4}, "plan at least 11"),
     "criterion": ({"criterion": "B"}, "criterion is 'B'; known are length, A, D, E"),
     "margin": ({"margin": 4.0}, "no range within its limits"),
     "u": ({"u": 0.0}, "u of a reference length is 0 mm"),
     "length": ({"length": 9000.0}, "does not fit this arm"),
     "range": ({"length": (500.0, 300.0)}, "does not fit this arm"),
-    "region": ({"region": {"r": (0.0, 1.0)}}, "no 'r'"),
+    "region": ({"region": {"r": (0.0, 1.0)}}, "unknown key 'r'"),
     "far region": ({"region": {"x": (5000.0, 6000.0)}}, "no placement of the sockets"),
     "far socket": ({"sockets": {"A": (5000, 0, 0), "B": (400, 200, 300)}}, "cannot be reached"),
     "two coordinates": ({"sockets": {"A": (400, 200), "B": (400, 300, 300)}}, "give its three coordinates"),
@@ -249,17 +249,17 @@ REFUSED = {
     ),
     "same position": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 200, 300)}, "lengths": [("A", "B")]},
-        "in the same position",
+        "at the same position",
     ),
     "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; it must be"),
-    "no range": ({"region": {"z": (10.0, 0.0)}}, "which is no range"),
-    "under the table": ({"above": 2000.0}, "can be reached well"),
-    "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "determine the parameters.*the scale"),
+    "no range": ({"region": {"z": (10.0, 0.0)}}, "which is not a range"),
+    "under the table": ({"above": 2000.0}, "reaches well"),
+    "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "determines the parameters.*the scale"),
     "unknown end": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "C")]},
         "unknown socket 'C'",
     ),
-    "lengths without sockets": ({"lengths": [("A", "B")]}, "between sockets that are given"),
+    "lengths without sockets": ({"lengths": [("A", "B")]}, "between sockets with given positions"),
 }
 
 

@@ -130,7 +130,7 @@ def test_patterns_in_the_residuals(record):
     np.testing.assert_allclose(drawn[inside, 1], found.along_joint[inside, 2])
     single = aj.Capture({name: q[:1] for name, q in record.recording.capture.sockets.items()})
     alone = record._replace(recording=record.recording._replace(capture=single))
-    assert_refused(lambda: aj.plot.residual_patterns(alone), "no pose has a residual with a direction")
+    assert_refused(lambda: aj.plot.residual_patterns(alone), "no residual has a direction")
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_an_arm_is_drawn_in_space(record):
             lambda record: aj.plot.length_parameter_errors(
                 record._replace(recording=record.recording._replace(true=None))
             ),
-            "simulation",
+            "simulated arm",
         ),
     ],
 )

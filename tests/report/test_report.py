@@ -127,7 +127,7 @@ def test_text_of_people_never_becomes_markup(page):
     assert not [attributes for _, attributes in page.elements if any(name.startswith("on") for name in attributes)]
     if page.kind == "evaluation":
         assert f"Beware of {HOSTILE}" in page.text
-        assert f"Of the calibration: Not {HOSTILE}" in page.text
+        assert f"About the calibration: Not {HOSTILE}" in page.text
     if page.kind != "study":  # a study knows its arm by the name that its maker gave in Python: none
         assert HOSTILE in page.text
     for name in ("points", "scenes"):
@@ -331,7 +331,7 @@ def test_a_report_says_where_the_scale_comes_from(observed_record, observed_repo
     found = aj.identify(recording.nominal.arm, alone.capture, recording.nominal.bounds())
     said = text_of(calibration_report(aj.calibration.record_of(found, alone)))
     assert "with the scale of the nominal arm" in said
-    assert "The scale is that of the nominal arm: nothing that was measured set it." in said
+    assert "The scale is that of the nominal arm: no measurement set the scale." in said
     assert "not traceable" in said
 
 
@@ -408,7 +408,7 @@ def test_a_statement_that_the_file_contradicts_is_refused(written, tmp_path):
         )
     measured = aj.acceptance.Measured({"A": np.array([[0, 0, 0], [0.1, 0, 0]])})
     save_evaluation(tmp_path / "fails.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.04)}, 0.001))
-    assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not kept")
+    assert_refused(lambda: write_report(tmp_path / "fails.h5", tmp_path / "r.html", stated), "a limit is not met")
     save_evaluation(tmp_path / "passes.h5", PointsRecord(measured, {"Deltam": aj.acceptance.Limit(0.06)}, 0.001))
     write_report(tmp_path / "passes.h5", tmp_path / "r.html", stated)
     assert "pass: a specification; a rule" in (tmp_path / "r.html").read_text(encoding="utf-8")
@@ -430,7 +430,7 @@ def test_an_evaluation_report_decides(written):
     assert "✗ fails" in text  # E_Uni of 0.1 um
     assert "✓ conforms" in text  # Deltam of 5 mm
     assert "Fails: E_Uni is over its limit." in text
-    assert "This was not the full procedure" in text
+    assert "The full procedure was not carried out" in text
     assert "based on ISO 10360-12:2016" in text
 
 
@@ -570,7 +570,9 @@ def test_lengths_stand_placement_by_placement():
 
 def test_what_cannot_be_reported_is_refused(written, tmp_path):
     aj.files.save_capture(tmp_path / "capture.h5", written.record.recording)
-    assert_refused(lambda: write_report(tmp_path / "capture.h5", tmp_path / "r.html"), "capture.h5", "holds a capture")
+    assert_refused(
+        lambda: write_report(tmp_path / "capture.h5", tmp_path / "r.html"), "capture.h5", "contains a capture"
+    )
     assert_refused(lambda: write_report(tmp_path / "none.h5", tmp_path / "r.html"), "does not exist")
     calibration = written.folder / "calibration.h5"
     assert_refused(lambda: write_report(calibration, calibration), "choose another output")

@@ -282,7 +282,7 @@ def test_bounds_in_trees_with_none():
 
 def test_bounds_that_do_not_fit_are_refused():
     for lower in ({"a": 0.0}, [0.0, 1.0], "low"):
-        with pytest.raises(aj.InputError, match="lower does not fit the start"):
+        with pytest.raises(aj.InputError, match="lower does not match the start"):
             aj.least_squares(lambda y, _: y, jnp.zeros(3), lower=lower)
 
 

@@ -36,10 +36,10 @@ def test_flags_are_a_set(case, monkeypatch):
 
 
 DIFFERENT = {
-    "jax": ({"jax": "0.1"}, r"with jax 0\.1, and here is jax .*; make it the same, or choose"),
-    "platform": ({"platform": "gpu"}, r"with platform gpu, and here is platform cpu, "),
-    "set then": ({"XLA_FLAGS": "--xla_a=1"}, r"with XLA_FLAGS=--xla_a=1, and here is no XLA_FLAGS, "),
-    "set now": ({"JAX_DISABLE_JIT": None}, r"with no JAX_DISABLE_JIT, and here is JAX_DISABLE_JIT=True, "),
+    "jax": ({"jax": "0.1"}, r"with jax 0\.1, but this process has jax .*; use the same environment, or choose"),
+    "platform": ({"platform": "gpu"}, r"with platform gpu, but this process has platform cpu, "),
+    "set then": ({"XLA_FLAGS": "--xla_a=1"}, r"with XLA_FLAGS=--xla_a=1, but this process has no XLA_FLAGS, "),
+    "set now": ({"JAX_DISABLE_JIT": None}, r"with no JAX_DISABLE_JIT, but this process has JAX_DISABLE_JIT=True, "),
 }
 
 
@@ -55,7 +55,7 @@ def test_the_difference_is_named(case):
 
 def test_what_was_begun_otherwise_is_read_but_not_continued(study, tmp_path):
     settings = json.dumps(json.loads(computed_with()) | {"XLA_FLAGS": "--xla_a=1"}, sort_keys=True)
-    message = r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, and here is no XLA_FLAGS"
+    message = r"s\.h5 was begun with XLA_FLAGS=--xla_a=1, but this process has no XLA_FLAGS"
     stored = begun(tmp_path / "s.h5", study, 16, settings)
     with pytest.raises(aj.InputError, match=message):
         aj.study.run_study(study, tmp_path / "s.h5")
@@ -75,7 +75,7 @@ def test_a_worker_with_other_settings_computes_nothing(study, monkeypatch):
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Nehalem")
     monkeypatch.setattr(runner, "run_block", lambda *_, **__: pytest.fail("computed"))
     with pytest.raises(
-        aj.InputError, match=r"on the worker .*: the study was begun with no OPENBLAS_CORETYPE, and her"
+        aj.InputError, match=r"on the worker .*: the study was begun with no OPENBLAS_CORETYPE, but this process"
     ):
         runner._run(study, settings, block, None)
 

@@ -77,9 +77,13 @@ def test_arm_files_with_corrections_and_priors(tmp_path, paper_arm):
 MESSAGES = {
     "unknown model": ({}, {"model": "harmonic"}, "identification.model: unknown model 'harmonic'; did you mean"),
     "unknown truth": (FAULT | {"model": "grvity"}, {}, "deviation.model: unknown model 'grvity'"),
-    "no such coefficient": ({"gear_ppm": 100}, {"model": "harmonics=1"}, "deviation.gear_ppm is of coefficients that"),
+    "no such coefficient": (
+        {"gear_ppm": 100},
+        {"model": "harmonics=1"},
+        "deviation.gear_ppm applies to coefficients that",
+    ),
     "two stages": ({}, {"model": "gear", "method": "two-stage"}, "identification.method is 'two-stage', which ignores"),
-    "prior": ({}, {"prior": "lenghts=1mm"}, "identification.prior: the prior is of 'lenghts'"),
+    "prior": ({}, {"prior": "lenghts=1mm"}, "identification.prior: the prior names 'lenghts'"),
     "empty": ({}, {"model": " "}, "identification.model: a model is empty"),
 }
 

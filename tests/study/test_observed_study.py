@@ -131,8 +131,14 @@ def test_a_study_with_a_kit(paper_arm, held, tmp_path):
 @pytest.mark.parametrize(
     ("tables", "text"),
     [
-        ({"identification": {"method": "two-stage"}}, "are solved at once, as they fix the scale; use 'joint'"),
-        ({"reference": {"length_mm": 300, "region": {"distance_mm": [300, 900]}}}, "brings its reference lengths"),
+        (
+            {"identification": {"method": "two-stage"}},
+            "are solved in one step, because they fix the scale; use 'joint'",
+        ),
+        (
+            {"reference": {"length_mm": 300, "region": {"distance_mm": [300, 900]}}},
+            "already contains its reference lengths",
+        ),
         ({"identification": {}}, "15 equations|more poses"),
     ],
 )
@@ -143,5 +149,5 @@ def test_refused(paper_arm, held, capture, tables, text):
 
 def test_a_kit_brings_its_poses(paper_arm, tmp_path):
     (tmp_path / "kit.toml").write_text(KIT)
-    with pytest.raises(aj.InputError, match="poses is for generated poses, but kit gives them"):
+    with pytest.raises(aj.InputError, match="poses applies to generated poses, but kit already states the poses"):
         aj.study.make_study(arm=paper_arm, trials=4, capture={"kit": str(tmp_path / "kit.toml"), "poses": 3})

@@ -46,13 +46,12 @@ PLANTED = {
     "a link to a block": (link_block, *[r"cell.*\.npz is a link, so it is not read; remove it"] * 2),
     "an open folder": (
         lambda path: parts_of(path).chmod(0o777),
-        *[r"others may write to .*s\.h5\.parts \(mode 0777\), .*; if they are yours, run chmod go-w '.*s\.h5\.parts'"]
-        * 2,
+        *[r"other users may write to .*s\.h5\.parts \(mode 0777\), .* yours, run chmod go-w '.*\.parts'"] * 2,
     ),
     "a folder": (
         lambda path: give(parts_of(path)),
         FOLDER + r"so its results are not continued; choose another output path",
-        FOLDER + r"but s\.h5 to root, so its blocks are not read; have one user own both",
+        FOLDER + r"but s\.h5 belongs to root, so the blocks are not read; make one user the owner of both",
     ),
     "a block": (lambda path: give(min(parts_of(path).iterdir())), BLOCK, BLOCK),
     "a colleague's": (colleague, r"s\.h5 belongs to nobody, so its results are not continued", None),
@@ -102,9 +101,9 @@ def test_a_file_system_without_owners_is_a_warning(home, study, tmp_path, monkey
     written_in_blocks(home, study, path, 16)
     parts_of(path).chmod(0o777)
     monkeypatch.setattr("aacmm_jax.study.store.keeps_owners", lambda folder: False)
-    with pytest.warns(UserWarning, match="does not keep who owns a file"):
+    with pytest.warns(UserWarning, match="does not record who owns a file"):
         check_owners(path)
-    with pytest.warns(UserWarning, match="does not keep who owns a file"):
+    with pytest.warns(UserWarning, match="does not record who owns a file"):
         aj.study.Results.of(path)
 
 

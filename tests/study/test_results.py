@@ -36,10 +36,10 @@ def path(tmp_path_factory):
 @pytest.mark.parametrize(
     ("value", "names", "says"),
     [
-        (1e300, ("scale", "estimate"), "larger than any can be"),
+        (1e300, ("scale", "estimate"), "impossibly large"),
         (np.inf, ("scale", "estimate"), "a trial that converged has an infinite result"),
         (-np.inf, ("scale", "true"), "a trial that converged has an infinite result"),
-        (np.nan, ("estimate",), "a trial that converged has a parameter without a number"),
+        (np.nan, ("estimate",), "a trial that converged has a parameter whose value is not a number"),
     ],
 )
 def test_results_that_no_trial_has_are_refused(path, monkeypatch, value, names, says):
@@ -147,7 +147,7 @@ def test_boxes_say_what_is_pooled(path):
     ("name", "level", "text"),
     [
         ("bounds.length_mm", 10.0, "half-width of lengths 10 mm"),
-        ("capture.poses", 20, "poses in a socket 20"),
+        ("capture.poses", 20, "poses per socket 20"),
         ("noise.encoder_arcsec", 2.0, "encoder noise 2 arcsec"),
         ("deviation.angle_deg", 0.1, "deviation of angle 0.1 deg"),
         ("identification.method", "joint", "method joint"),

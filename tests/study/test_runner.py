@@ -116,7 +116,7 @@ def test_any_executor(home, study, tmp_path):
 def test_an_executor_that_forks_is_refused(study, tmp_path):
     with (
         ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool,
-        pytest.raises(aj.InputError, match="the executor forks, which JAX does not survive"),
+        pytest.raises(aj.InputError, match="the executor forks its processes, which does not work with JAX"),
     ):
         aj.study.run_study(study, tmp_path / "t.h5", executor=pool)
 
@@ -127,4 +127,4 @@ def test_nobody_answers(aacmm, home, monkeypatch):
     monkeypatch.setattr(distributed, "Client", lambda **given: client(**given | {"timeout": given["timeout"] / 10}))
     done = aacmm("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
     assert done.stderr.count("\n") == 1
-    assert "no Dask scheduler answers at tcp://127.0.0.1:1; start one, or leave --dask out" in done.stderr
+    assert "no Dask scheduler answers at tcp://127.0.0.1:1; start one, or omit --dask" in done.stderr

@@ -96,8 +96,8 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"trials": 0}, "'trials' must be greater than or equal to 1, not 0"),
         ({"trials": 10**8, "bounds": {"length_mm": list(range(101))}}, "101 cells of 100,000,000 trials are more than"),
         ({"seed": -1}, "'seed' must be greater than or equal to 0"),
-        ({"capture": {}}, "give one of positions_mm, sockets .* file and kit"),
-        ({"capture": {"sockets": 2}}, "sockets at random need a region"),
+        ({"capture": {}}, "give exactly one of positions_mm, sockets .* file and kit"),
+        ({"capture": {"sockets": 2}}, "sockets at random places need a region"),
         ({"capture": {"sockets": 2, "region": {"x_mm": [0, 1]}}}, "a region needs distance_mm, or x_mm, y_mm and z_mm"),
         ({"capture": {"sockets": 2, "region": {"distance_mm": [2, 1]}}}, "2 to 1 is not a range"),
         (
@@ -108,7 +108,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"capture": CAPTURE | {"poses": 3000}}, "3000 poses are more than the pool has"),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "holds fewer than two placements of 100 poses .* give at least 8192",
+            "contains fewer than two placements of 100 poses .* give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "'capture.pool' must be less than or equal to 16777216"),
@@ -119,8 +119,8 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
             "joint_limits_deg has 1 rows, but the arm has 6 joints",
         ),
         ({"capture": {"file": "a.h5", "poses": 5}}, "a.h5 does not exist"),
-        ({"reference": {"u_mm": 0.1}}, "give either length_mm, .* or ends_mm"),
-        ({"reference": {"length_mm": 300}}, "a reference length at random needs a region"),
+        ({"reference": {"u_mm": 0.1}}, "give either length_mm .* or ends_mm"),
+        ({"reference": {"length_mm": 300}}, "a reference length at a random place needs a region"),
         ({"reference": {"ends_mm": [[[0, 0, 0], [0, 0, 0]]]}}, "two ends at the same position"),
         ({"identification": {"method": "joint"}}, "needs a reference length"),
         (
@@ -166,7 +166,7 @@ def test_a_narrow_region_is_found(tmp_path):
         ),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "holds fewer than two placements of 100 poses .* give at least 8192",
+            "contains fewer than two placements of 100 poses .* give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "'capture.pool' must be less than or equal to 16777216"),

@@ -86,7 +86,7 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
 
     def second(_):
         if not refused:
-            with pytest.raises(aj.InputError, match=r"s\.h5 is being written by another process; wait for it"):
+            with pytest.raises(aj.InputError, match=r"s\.h5 is being written by another process; wait until"):
                 aj.study.run_study(study, tmp_path / "s.h5")
             refused.append(True)
 
@@ -98,11 +98,14 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": 6}, "s.h5 holds another study .seed differs.; choose another output"),
-        ({"trials": 61}, "holds another study .trials differs."),
-        ({"chunk": 20}, "was begun with chunks of 16 trials; leave the chunk out"),
+        ({"seed": 6}, "s.h5 contains another study .seed differs.; choose another output"),
+        ({"trials": 61}, "contains another study .trials differs."),
+        ({"chunk": 20}, "was begun with chunks of 16 trials; omit the chunk size"),
         ({"chunk": 0}, "chunk is 0; give a whole number of at least 1"),
-        ({"version": "9.9"}, "was begun with aacmm_jax .*, and here is aacmm_jax 9.9, which can change the numbers"),
+        (
+            {"version": "9.9"},
+            "was begun with aacmm_jax .*, but this process has aacmm_jax 9.9, which can change the numbers",
+        ),
     ],
     ids=str,
 )
@@ -124,7 +127,7 @@ def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
     aj.files.save_capture(
         tmp_path / "c.h5", aj.Recording(noisy_capture, aj.files.load_specification("cheng2018-simulation"))
     )
-    with pytest.raises(aj.InputError, match=r"c\.h5 holds a capture; name a study file"):
+    with pytest.raises(aj.InputError, match=r"c\.h5 contains a capture; name a study file"):
         aj.study.run_study(study, tmp_path / "c.h5")
     aj.files.load_capture(tmp_path / "c.h5")
 
@@ -142,7 +145,8 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
     shutil.rmtree(parts_of(path))
     for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
         with pytest.raises(
-            aj.InputError, match=r"results in the folder s\.h5\.parts, which is missing; put it next to the file"
+            aj.InputError,
+            match=r"results in the folder s\.h5\.parts, which is missing; put that folder next to the file",
         ):
             use(path)
     with pytest.raises(aj.InputError, match="does not exist"):

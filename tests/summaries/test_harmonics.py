@@ -69,11 +69,11 @@ def test_the_report_shows_functions_and_folds_coefficients(record):
     assert not any(name.startswith("cos") for name in names)
     assert blocks["Coefficients of harmonics"].folded
     assert len(blocks["Coefficients of harmonics"].rows) == 62
-    assert len(blocks["What the joints do besides their readings"].plots) == 1
+    assert len(blocks["Non-geometric errors of the joints"].plots) == 1
     assert len(blocks["Position of every parameter within its bounds"].table.rows) == len(names)
     observability = next(section for section in report.sections if section.id == "observability")
     if summary["uncertainty"]["rank"] < len(summary["parameters"]):
-        assert "with their priors, all are determined" in observability.blocks[0]
+        assert "Together with the priors, they determine all parameters" in observability.blocks[0]
 
 
 @pytest.mark.slow

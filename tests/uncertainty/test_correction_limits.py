@@ -14,12 +14,12 @@ ALONE = RANDOM * np.array([1, 0, 0, 0, 0, 0])  # joint 1 alone, which does not c
 
 CASES = {
     "vertical": ("compliance3_1", RANDOM, (), "the moment of gravity about a vertical axis"),
-    "lever": ("compliance2_2", RANDOM, (), "compliance2_2: the function is 0 in all 40 poses"),
-    "zero": ("coupled2_3", STILL, (), "coupled2_3: the function is 0 in all 40 poses"),
-    "constant": ("cos2_2", SHORT * 0.5, ("theta_2",), "cannot be told from its zero offset"),
-    "line": ("sin1_2", SHORT, ("theta_2", "gear_2"), "as a straight line is nearly all of them"),
+    "lever": ("compliance2_2", RANDOM, (), "compliance2_2: the correction function is 0 in all 40 poses"),
+    "zero": ("coupled2_3", STILL, (), "coupled2_3: the correction function is 0 in all 40 poses"),
+    "constant": ("cos2_2", SHORT * 0.5, ("theta_2",), "cannot be separated from the zero offset"),
+    "line": ("sin1_2", SHORT, ("theta_2", "gear_2"), "their functions are nearly a straight line"),
     "gear beside a harmonic": ("gear_2", SHORT, ("sin1_2",), "Over the 8 deg that joint 2 moves, gear_2 cannot"),
-    "moment": ("compliance6_2", ALONE, ("theta_2",), "let the arm move farther, and record poses in more sockets"),
+    "moment": ("compliance6_2", ALONE, ("theta_2",), "let the joint move farther, and record poses in more sockets"),
 }
 
 
@@ -55,7 +55,7 @@ def test_short_travel_of_a_capture(paper_arm):
     capture = aj.simulate(paper_arm, points, poses=40, lengths=[("A", "B", 0.002)], limits=limits)
     space = aj.Parameters(arm, (*aj.Parameters.independent(paper_arm).names, *names))
     (sentence,) = aj.observability(arm, capture, space).corrections
-    assert "Over the 10 deg that joint 2 moves, cos1_2 cannot be told from its zero offset" in sentence
+    assert "Over the 10 deg that joint 2 moves, cos1_2 cannot be separated from the zero offset" in sentence
     # With a prior of the coefficients there is nothing to be said of them.
     assert not aj.observability(arm, capture, space, known=names).corrections
 
@@ -69,5 +69,5 @@ def test_more_sockets():
     names = (*free, *(name for name in aj.kinematics.parameter_names(arm) if name.startswith("compliance")))
     capture = aj.simulate(panda, {"A": (450, 100, 300)}, poses=120)
     sentences = aj.observability(arm, capture, aj.Parameters(arm, names)).sentences()
-    assert "Poses in more sockets, over all of the workspace, would determine compliance3_3." in sentences
+    assert "Poses in more sockets, distributed over the whole workspace, would determine compliance3_3." in sentences
     assert any("1 mrad/m of compliance3_3" in sentence for sentence in sentences)

@@ -61,7 +61,7 @@ def test_rank_and_null_space_of_the_paper(paper_arm, single, paper_capture, case
     assert not any("scale" in text for text in structural)
     assert len(structural) == len(directions) - ("all lengths together: the scale" in directions)
     if not lengths:
-        assert seen.remedy == "A reference length would determine them."
+        assert seen.remedy == "A reference length would determine these parameters."
 
 
 def test_directions_move_nothing(paper_arm, single):

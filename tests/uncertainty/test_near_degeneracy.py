@@ -32,7 +32,7 @@ def test_a_probe_nearly_on_the_last_axis(panda, capture):
     assert seen.rank == len(seen.names)  # ranks alone call everything determined
     assert described(seen.trade_offs) == {("theta_6", "a_6"), ("alpha_6", "d_6")}
     (sentence,) = seen.sentences()
-    assert "theta_6 and a_6 trade off: 1 mrad of theta_6 is imitated by 0.24 mm of a_6" in sentence
+    assert "theta_6 and a_6 trade off: 1 mrad of theta_6 has the same effect as 0.24 mm of a_6" in sentence
     assert "wider bounds do not help" in sentence
 
 
@@ -101,6 +101,6 @@ def test_a_bound_that_ends_such_a_direction_is_part_of_u(panda, capture, method)
     specification = aj.kinematics.ArmSpecification(nominal, "test", held=REDUNDANT)
     record = aj.calibration.record_of(result, aj.Recording(capture, specification))
     text = " ".join(sentences(findings_of(record)))
-    assert "On a bound because the data hardly determine them: theta_6" in text
+    assert "On a bound because the data hardly determine these parameters: theta_6" in text
     assert "do not widen the bounds" in text
     assert "widen the bounds unless they are known limits" not in text

@@ -76,7 +76,7 @@ def test_what_a_kind_alone_determines(paper_arm, case, noise):
     assert seen.rank == (21 if has_scale else 20)
     structural = {text for text, never in zip(seen.undetermined, seen.structural, strict=True) if never}
     assert structural == rigid | LAST
-    assert seen.remedy == ("" if has_scale else "A reference length would determine them.")
+    assert seen.remedy == ("" if has_scale else "A reference length would determine these parameters.")
     assert seen.poses == sum(observation.q.shape[0] for observation in capture.observations)
 
 

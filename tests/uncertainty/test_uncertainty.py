@@ -290,7 +290,7 @@ REFUSED = {
     "not finite": (lambda arm, capture, bounds: aj.Noise(seating=np.inf), "finite numbers"),
     "nothing": (
         lambda arm, capture, bounds: aj.calibrate(arm, capture, bounds, noise=aj.Noise()),
-        "noise is zero everywhere",
+        "every standard deviation of the noise is zero",
     ),
     "another unit": (
         lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=aj.Noise(encoder_arcsec=1e5)),

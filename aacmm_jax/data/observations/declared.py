@@ -218,7 +218,7 @@ def _spread(array: AnyArray, shape: tuple[int, ...], fewest: int, what: str) -> 
         given = " or ".join(str(alternative) if alternative else "one number" for alternative in shapes)
         raise InputError(f"{what} has shape {array.shape}; give {given}.")
     if not fewest and is_concrete(array) and np.any(np.asarray(array) < 0):
-        raise InputError(f"{what} is negative; a standard uncertainty must be zero or positive.")
+        raise InputError(f"{what} is negative, but a standard uncertainty must be zero or positive.")
     return numpy_if_known(lambda values: namespace(values).broadcast_to(values, shape))(array)
 
 

@@ -95,13 +95,15 @@ class Artefact(AbstractObservation):
     u: Float[AnyArray, ""] = declared(
         "standard uncertainty of a coordinate", "mm", default=0.0, more="its error is the same in every placement"
     )
-    artefact: str = declared("name of the artefact", default=NAME, more="observations of one share its errors")
+    artefact: str = declared(
+        "name of the artefact", default=NAME, more="all observations of one artefact share its errors"
+    )
     placement: str = declared(
-        "name of its placement", default=NAME, of_session=True, more="those of one share its frame"
+        "name of its placement", default=NAME, of_session=True, more="all observations of one placement share its frame"
     )
     index: str | None = declared(
         "index of the platform that carries it", default=None, of_session=True,
-        more="the placement is then one on the platform, which has a frame for each index",
+        more="the placement is then relative to the platform, and the platform has one frame per index",
     )  # fmt: skip
     derived = ("free",)  # whether the coordinates are unknowns with certified values
     frame = Part("placement {placement}", *FRAME)
@@ -113,18 +115,25 @@ class Artefact(AbstractObservation):
     def __init__(self, name: str, points: Mapping[str, Numbers], q: Mapping[str, Numbers], **options: Any):
         where = f"artefact '{name}'"
         if not isinstance(points, Mapping) or not isinstance(q, Mapping) or not points or not q:
-            raise InputError(f"{where} needs two dictionaries: its points' coordinates, and the readings in them.")
+            raise InputError(
+                f"{where} needs two dictionaries: the coordinates of its points, and the readings at these points."
+            )
         blocks = {point: checked_readings(f"{where} point '{point}'", readings) for point, readings in q.items()}
         widths = {block.shape[1] for block in blocks.values()}
         if len(widths) > 1:
-            raise InputError(f"{where} has readings of {sorted(widths)} columns; give one column a joint.")
+            raise InputError(
+                f"{where} has readings with {' and '.join(map(str, sorted(widths)))} columns; give one column per "
+                "joint."
+            )
         readings = namespace(*blocks.values()).concatenate(list(blocks.values()))
         held = [point for point, block in blocks.items() for _ in range(block.shape[0])]
         super().__init__(name, readings, held, list(points), list(points.values()), **options)
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if len(self.names) != len(self.coordinates):
-            raise InputError(f"{where} has {len(self.names)} names of {len(self.coordinates)} points; give one each.")
+            raise InputError(
+                f"{where} has {len(self.names)} names for {len(self.coordinates)} points; give one name per point."
+            )
         for point in dict.fromkeys(self.point):
             if point not in self.names:
                 raise InputError(
@@ -277,7 +286,7 @@ class SimulatedArtefact(AbstractSimulated):
         "its frame in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6, moves="frame"
     )
     errors: Float[np.ndarray, "c 3"] | None = declared(
-        "errors of the certified coordinates", "mm", default=None, more="all placements share them"
+        "errors of the certified coordinates", "mm", default=None, more="all placements have the same errors"
     )
     u: float = declared("their standard uncertainty", "mm", default=0.0)
     artefact: str = declared("name of the artefact", default=NAME)

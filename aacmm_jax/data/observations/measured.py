@@ -64,14 +64,17 @@ class MeasuredPoints(AbstractObservation):
     points: Float[AnyArray, "m 3"] = declared("measured point", "mm", "pose", "axis")
     u: AnyArray | None = declared(
         "standard uncertainty of a coordinate", "mm", "pose", "axis", default=None, spread=0,
-        more="k = 1: one number, one for each coordinate, or one for each of all ``(m, 3)``",
+        more="k = 1: one number, one number per coordinate, or one number per point and coordinate ``(m, 3)``",
     )  # fmt: skip
     covariance: Float[AnyArray, "m 3 3"] = declared(
         "covariance of a point", "mm^2", "pose", "axis", "axis_2", default=None, spread=2,
-        more="instead of u: of all points ``(3, 3)``, or of each ``(m, 3, 3)``",
+        more="instead of u: one covariance for all points ``(3, 3)``, or one per point ``(m, 3, 3)``",
     )  # fmt: skip
     station: str = declared(
-        "station of the instrument", default=NAME, of_session=True, more="observations of one station share its frame"
+        "station of the instrument",
+        default=NAME,
+        of_session=True,
+        more="all observations of one station share its frame",
     )
     frame = Part("frame of {station}", *FRAME)
     fixes_scale = True
@@ -93,13 +96,15 @@ class MeasuredPoints(AbstractObservation):
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
         where, points = f"observation '{self.name}'", np.asarray(self.points)
         if len(points) < 3:
-            raise InputError(f"{where} has {len(points)} points, but its frame needs three at least; measure more.")
+            raise InputError(
+                f"{where} has {len(points)} points, but its frame needs at least three; measure more points."
+            )
         sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         # The rotation of the frame is of no consequence where all points are one, such as a socket.
         if sizes[0] >= _SAME and sizes[1] <= _FLAT * sizes[0]:
             raise InputError(
-                f"the points of {where} are on one line, about which its frame can turn; measure points beside the "
-                "line."
+                f"the points of {where} lie on one line, so the rotation of its frame about this line is "
+                "undetermined; measure points off the line."
             )
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
@@ -146,7 +151,9 @@ class MeasuredTransforms(MeasuredPoints):
             matrices = np.asarray(self.rotations)
             orthogonal = np.allclose(matrices @ matrices.swapaxes(-1, -2), np.eye(3), atol=1e-6)
             if not orthogonal or np.any(np.linalg.det(matrices) < 0):
-                raise InputError(f"{where} has a matrix that is no rotation; give right-handed unit axes as columns.")
+                raise InputError(
+                    f"{where} has a matrix that is not a rotation; give right-handed unit axes as columns."
+                )
         return super().completed(where)
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
@@ -199,11 +206,16 @@ class Distances(AbstractObservation):
     kind, table, rows = "distances", "distances", 1
     values: Float[AnyArray, " m"] = declared("measured distance from the pivot", "mm", "pose")
     u: Float[AnyArray, " m"] = declared(
-        "standard uncertainty of a distance", "mm", "pose", default=0.0, spread=0, more="one number, or one each"
+        "standard uncertainty of a distance",
+        "mm",
+        "pose",
+        default=0.0,
+        spread=0,
+        more="one number, or one number per distance",
     )
     constant: bool = declared(
         "whether an unknown constant is added to all distances", default=False,
-        more="as to those of a bar of unknown zero",
+        more="as for a bar whose zero is unknown",
     )  # fmt: skip
     pivot = Part("pivot of {name}", *POINT)
     zero = Part("constant of {name}", "mm", when="constant")
@@ -211,7 +223,9 @@ class Distances(AbstractObservation):
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if not self.constant and is_concrete(self.values) and np.any(np.asarray(self.values) <= 0):
-            raise InputError(f"{where} has a distance that is not positive; give distances in mm, or constant=True.")
+            raise InputError(
+                f"{where} has a distance that is not positive; give positive distances in mm, or constant=True."
+            )
         return {}
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
@@ -228,9 +242,11 @@ class Distances(AbstractObservation):
         return Rows((distance - values)[None], towards[None], by_unknowns, variances(self.u, m))
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:
-        needs = "pivot and constant need five" if self.constant else "pivot needs four"
+        needs = "pivot and constant need at least five" if self.constant else "pivot needs at least four"
         if tips.shape[1] < 4 + self.constant:
-            raise InputError(f"observation '{self.name}' has {tips.shape[1]} distances, but its {needs}; measure more.")
+            raise InputError(
+                f"observation '{self.name}' has {tips.shape[1]} distances, but its {needs}; measure more distances."
+            )
 
 
 class AbstractInBox(AbstractSimulated):

@@ -324,7 +324,7 @@ class AbstractOfTarget(AbstractSimulated):
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if bool(self.target) != (self.place is not None):
-            raise InputError(f"{where} needs both, a target and its place in the last frame, or neither.")
+            raise InputError(f"{where} needs either both a target and its place in the last frame, or neither.")
         return {"offset": self.place}
 
 

@@ -83,14 +83,14 @@ class AbstractTouched(AbstractObservation):
         if size is not None and is_concrete(size) and float(size) <= 0:
             value, stylus = float(getattr(self, self.certificate)), float(self.stylus)
             raise InputError(
-                f"{where}: a stylus of {stylus:g} mm inside a {self.certificate} of {value:g} mm; give the "
-                f"{self.certificate} of the artefact and the diameter of a ball that fits into it, in mm."
+                f"{where}: a stylus of {stylus:g} mm does not fit into a {self.certificate} of {value:g} mm; give "
+                f"the {self.certificate} of the artefact, and the diameter of a stylus that fits, both in mm."
             )
         return {"free": size is None or not is_exact(self.u)} if self.certificate else {}
 
     @property
     def certified_size(self) -> Float[AnyArray, "*batch"] | None:
-        """Certified distance of the tip's centre from the geometry, mm; None where it is unknown."""
+        """Certified distance of the tip's centre from the geometry, mm; None if the diameter is unknown."""
         value = getattr(self, self.certificate) if self.certificate else None
         if value is None:
             return None
@@ -141,9 +141,11 @@ class AbstractTouched(AbstractObservation):
             rows = np.concatenate([rows, self.sides(values)[None]])
         where = f"{self.noun} '{self.name}'"
         if tips.shape[1] < len(rows):
-            raise InputError(f"{where} has {tips.shape[1]} touches, but {len(rows)} unknowns; touch it more often.")
+            raise InputError(
+                f"{where} has {tips.shape[1]} touches, but there are {len(rows)} unknowns; record more touches."
+            )
         if np.linalg.svd(rows, compute_uv=False)[-1] < _LEAST_SINGULAR * np.sqrt(tips.shape[1]):
-            raise InputError(f"the touches of {where} hardly determine where it is; {self.advice}.")
+            raise InputError(f"the touches hardly determine the geometry of {where}; {self.advice}.")
 
 
 class AbstractRound(AbstractTouched):
@@ -151,12 +153,15 @@ class AbstractRound(AbstractTouched):
 
     certificate, share = "diameter", 0.5
     diameter: Float[AnyArray, ""] | None = declared(
-        "certified diameter", "mm", default=None, uncertainty="u", positive=True, more="None where it is unknown"
+        "certified diameter", "mm", default=None, uncertainty="u", positive=True, more="None if the diameter is unknown"
     )
     u: Float[AnyArray, ""] = declared("standard uncertainty of the diameter", "mm", default=0.0)
     stylus: Float[AnyArray, ""] = declared(
         "diameter of the tip's ball", "mm", default=0.0,
-        more="0 where the tip itself is on the surface, or where the diameter is unknown, which then includes it",
+        more=(
+            "0 if the tip itself touches the surface, or if the diameter is unknown (the fitted diameter then "
+            "includes the stylus)"
+        ),
     )  # fmt: skip
     derived = ("free",)
 
@@ -181,7 +186,7 @@ class Sphere(AbstractRound):
     kind, table, noun = "sphere", "touched_sphere", "sphere"
     geometry = Part("centre of {name}", *POINT)
     size = Part("radius of {name}", "mm", when="free")
-    advice = "touch it all over, or give its diameter"
+    advice = "distribute the touches over the sphere, or give its diameter"
     distances, closest = staticmethod(distances_from_point), staticmethod(fitted_sphere)
 
 
@@ -206,7 +211,7 @@ class Cylinder(AbstractRound):
     form: Float[AnyArray, ""] = declared("standard deviation of the surface about its cylinder", "mm", default=0.0)
     geometry = Part("axis of {name}", *AXIS)
     size = Part("radius of {name}", "mm", when="free")
-    advice = "touch it all round at two heights, or give its diameter"
+    advice = "distribute the touches around the cylinder at two heights, or give its diameter"
     distances, closest = staticmethod(distances_from_axis), staticmethod(fitted_cylinder)
 
 
@@ -227,7 +232,7 @@ class Plane(AbstractTouched):
     kind, table, noun = "plane", "plane", "plane"
     form: Float[AnyArray, ""] = declared("standard deviation of the surface about its plane", "mm", default=0.0)
     geometry = Part("plane {name}", *PLANE)
-    advice = "touch it in places that are not on one line"
+    advice = "record touches that are not on one line"
     distances, closest = staticmethod(heights), staticmethod(fitted_plane)
 
 
@@ -266,15 +271,15 @@ class ParallelPlanes(Plane):
         readings = [checked_readings(f"planes '{name}', side {side},", q) for side, q in given]
         widths = [q.shape[1] for q in readings]
         if widths[0] != widths[1]:
-            raise InputError(f"planes '{name}' have {widths[0]} and {widths[1]} columns; give one a joint.")
+            raise InputError(f"planes '{name}' have {widths[0]} and {widths[1]} columns; give one column per joint.")
         sides = np.repeat(SIDES, [len(q) for q in readings]).tolist()
         super().__init__(name, namespace(*readings).concatenate(readings), sides, distance, **options)
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if unknown := sorted(set(self.side) - set(SIDES)):
-            raise InputError(f"{where} have the side '{unknown[0]}'; the sides are one and other.")
+            raise InputError(f"{where} have the side '{unknown[0]}'; the sides are named 'one' and 'other'.")
         if missing := set(SIDES) - set(self.side):
-            raise InputError(f"{where} have no poses on the side '{missing.pop()}'; record some.")
+            raise InputError(f"{where} have no poses on the side '{missing.pop()}'; record poses on this side.")
         return super().completed(where)
 
     def sides(self, distances: Float[AnyArray, " m"]) -> Float[AnyArray, " m"]:
@@ -380,7 +385,7 @@ class SimulatedPlanes(AbstractSimulated):
     poses: int = declared("number of poses")
     distance: float | None = declared(
         "true distance to the second plane", "mm", default=None,
-        more="along the cross product of the sides; None for one",
+        more="along the cross product of the sides; None for a single plane",
     )  # fmt: skip
     u: float = declared("standard uncertainty of the certified distance", "mm", default=0.0)
 
