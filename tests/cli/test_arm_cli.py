@@ -42,8 +42,8 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
         "sockets and a reference length",
         "enough",
         "Record",
-        "of encoders of 2 arcsec and a seat of 0.005 mm (class measuring arm: ",  # as aacmm plan assumes it
-        "reference lengths of u = 0.002 mm",
+        "for encoders with 2 arcsec and a seat with 0.005 mm (class measuring arm: ",  # as aacmm plan assumes it
+        "reference lengths with u = 0.002 mm",
     ):
         assert part in printed, part
 
@@ -171,10 +171,10 @@ def test_readings_that_nothing_explains(aacmm, tmp_path, few):
     [
         ((), "name an arm"),
         (("panda", "--new", "x.toml"), "leave out the arm"),
-        (("panda", "--joints", 6), "give it with --new"),
+        (("panda", "--joints", 6), "give --new too"),
         (("panda", "--unit", "deg"), "--check"),
         (("panda", "--check", "x.csv", "--figure", "a.png"), "leave out --figure"),
-        (("panda", "--check", "x.toml", "--unit", "deg"), "says the unit"),
+        (("panda", "--check", "x.toml", "--unit", "deg"), "states the unit"),
         (("panda", "--check", "none.csv"), "none.csv"),
         (("panda", "--figure", "a.gif"), ".png, .svg or .pdf"),
         (("panda", "--probe", "1,2"), "--probe"),

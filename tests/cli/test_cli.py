@@ -250,7 +250,7 @@ def test_uncertainties_are_printed(aacmm):
     assert summary["cross_validation"]["groups"] == 2
     assert summary["cross_validation"]["excess"] < 2.5
     shown = " ".join(aacmm("show", "c.h5").stdout.split())
-    assert shown.index("Cross-validated") < shown.index("On the poses it was identified from")
+    assert shown.index("Cross-validated") < shown.index("On the poses used for identification")
     assert "Expanded uncertainty U over the working volume (95 %, coverage factor 1.96)" in shown
     assert "Observability: rank 21 of 21" in shown
 
@@ -271,7 +271,7 @@ def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
         (("--sockets", 2, "--socket", "A=1,2,3"), "give one of the two"),
         (("--region", "z=1"), "not of the form AXIS=LOW:HIGH"),
         (("--length-mm", "long"), "not of the form L or L:M"),
-        (("--length", "A,B"), "--length is between sockets of --socket"),
+        (("--length", "A,B"), "--length needs two sockets given with --socket"),
         (("-o", "missing/plan.csv"), "cannot be written"),
         (("--region", "z=0:1", "--region", "z=0:2"), "named twice in --region"),
     ],

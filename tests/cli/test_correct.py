@@ -51,7 +51,7 @@ def test_readings_in_the_columns_and_unit_of_the_table(arms):
     header = ["name", *(f"q_{i}_deg" for i in range(1, 7)), "speed", "temperature_C"]
     write(folder / "in.csv", header, [[f"p{i}", *(q / DEG), 7, 23] for i, q in enumerate(Q)])
     found = json.loads(run(arms, "in.csv", "-o", "out.csv", "--json").stdout)
-    assert any("column temperature_C changes nothing" in text for text in found["warnings"])
+    assert any("column temperature_C has no effect" in text for text in found["warnings"])
     rows = table(folder / "out.csv")
     assert list(rows[0]) == header
     assert [row["name"] for row in rows] == [f"p{i}" for i in range(6)]
@@ -105,7 +105,7 @@ def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
     write(folder / "far.csv", header, np.hstack([poses[:, :3, 3], vectors, Q[:3]]))
     said = run(arms, "far.csv", "-o", "out.csv", expect=1).stdout
     assert "2 of 3 poses reached" in said
-    assert "Not reached" in said
+    assert "Poses that are not reached" in said
     rows = table(folder / "out.csv")
     assert [row["q_1_rad"] == "" for row in rows] == [False, True, False]
     found = json.loads(run(arms, "far.csv", "-o", "out.csv", "--json", expect=1).stdout)
@@ -144,7 +144,7 @@ def test_rows_at_a_singular_wrist_are_named():
     found = corrected_readings(nominal, nominal.replace(d_6=nominal.d[5] + 0.01), q)
     summary = correction_summary(nominal, nominal, q, found, unit="rad", of_readings=True)
     assert summary["singular"] == [2]
-    assert summary["warnings"][0].startswith("In 1 row (row 2) the nominal arm is singular, or nearly so")
+    assert summary["warnings"][0].startswith("In 1 row (row 2) the nominal arm is at a singularity")
 
 
 def test_poses_of_a_urdf_are_in_its_base_link():

@@ -35,7 +35,7 @@ def test_models_are_compared(aacmm, folder):
     assert len(found["regions"]) == 12
     assert found["models"][0]["rms_outside"] > found["models"][2]["rms_outside"]
     shown = aacmm(*command, "gear;dh", "--only-poses", 50).stdout
-    assert "2 models on 50 poses, 12 regions left out one by one" in shown
+    assert "2 models on 50 poses, 12 regions held out in turn" in shown
     assert "Recommended: gear" in shown
     assert "joint 3, upper half" in shown
 
@@ -43,7 +43,7 @@ def test_models_are_compared(aacmm, folder):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--models", "dh;;gravity"), "names an empty model"),
+        (("--models", "dh;;gravity"), "contains an empty model"),
         (("--models", "dh;dh"), "names 'dh' twice"),
         (("--models", "dh;grvity"), "did you mean 'gravity'"),
         (("--leave-out", "T"), "'T' leaves out all data"),
@@ -66,7 +66,7 @@ def test_a_model_has_a_default_prior(aacmm, folder, tmp_path):
     assert not [sentence for sentence in found["warnings"] if "cos" in sentence or "sin" in sentence]
     shown = aacmm("export", tmp_path / "r.h5", "--format", "table")
     assert "# cos1_2 = " in shown.stdout
-    assert "The 36 coefficients of joint corrections stand in comments: by the table alone the tip is" in shown.stderr
+    assert "The table contains the 36 coefficients of joint corrections as comments only. Without these" in shown.stderr
     aacmm("export", tmp_path / "r.h5", "--format", "toml", "-o", tmp_path / "r.toml")
     assert "arcsec" in aacmm("show", tmp_path / "r.toml").stdout
     rows = {

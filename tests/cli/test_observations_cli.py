@@ -219,7 +219,7 @@ def test_sessions_have_a_probe_each(aacmm, folder):
     offsets = re.search(r"probe seems displaced by (\S+), (\S+), (\S+) mm", " ".join(together["warnings"]))
     assert offsets is not None
     np.testing.assert_allclose([float(offset) for offset in offsets.groups()], [0.3, -0.2, 0.1], atol=0.005)
-    assert "Sessions, RMS distance of poses" in " ".join(said.split())
+    assert "Sessions: RMS distance of poses" in " ".join(said.split())
     assert all(row["rms_alone_mm"] < 0.02 < 0.1 < row["rms_mm"] for row in together["sessions"])
 
 
@@ -267,8 +267,8 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate monday.h5 -o x.h5 --leave-out A", ["give both"]),
         ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out '*'", ["'*' leaves out all data"]),
         ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out [AC]", ["without '[AC]', no data fix the scale"]),
-        ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe is for several captures"]),
-        ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the name 'monday'"]),
+        ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe applies to several captures"]),
+        ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the file name 'monday'"]),
         ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be drawn", "1 to 79"]),
         ("calibrate tracker.h5 -o x.h5 --without 'no*'", ["no socket matches"]),
         ("evaluate c.h5 few.h5", ["sphere 'ball' has 2 touches"]),
@@ -398,4 +398,4 @@ def test_a_plan_with_a_kit(aacmm, tmp_path):
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 17
     assert 'a = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()
     refused = aacmm("plan", "cheng2018-simulation", "-o", "p.csv", "--kit", "kit.toml", "--sockets", 3, expect=2)
-    assert "--kit names what is used and where it is, and ignores --sockets" in refused.stderr
+    assert "--kit states what is used and where it is placed, so --sockets" in refused.stderr

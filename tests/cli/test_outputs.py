@@ -104,10 +104,10 @@ def test_one_path_is_not_two_outputs(aacmm, inputs):
 def test_demo_leaves_other_files_alone(aacmm, inputs):
     """Neither a folder of other files, nor one that holds a capture of the same name."""
     before = content(inputs)
-    assert "holds files that are not of a demonstration (A.csv" in aacmm("demo", ".", expect=2).stderr
+    assert "contains files that no demonstration wrote (A.csv" in aacmm("demo", ".", expect=2).stderr
     (inputs / "own").mkdir()
     (inputs / "c.h5").rename(inputs / "own" / "capture.h5")
-    assert "not of a demonstration (capture.h5)" in aacmm("demo", "own", expect=2).stderr
+    assert "no demonstration wrote (capture.h5)" in aacmm("demo", "own", expect=2).stderr
     assert sorted(content(inputs).values()) == sorted(before.values())
 
 
@@ -276,4 +276,4 @@ def test_overwrite_is_an_option_only_before_two_hyphens(aacmm, inputs, before):
 )
 def test_help_of_o_says_what_is_kept(aacmm, command):
     said = " ".join(aacmm(command, "--help").stdout.split())
-    assert "An existing file that aacmm did not write is kept unless --overwrite." in said
+    assert "An existing file that aacmm did not write is replaced only with --overwrite." in said

@@ -51,9 +51,9 @@ def test_a_robot_by_default(aacmm):
     for text in (
         "encoders of 9.04 arcsec",
         "Franka Emika data sheet",
-        "by way of approach points 50 mm above the sockets",
-        "the arm's body against itself and obstacles (table)",
-        "Not checked, since they touch wherever the arm is: offset d_1 and table.",
+        "via approach points 50 mm above the sockets",
+        "the arm's body with itself and with obstacles (table)",
+        "Not checked, because these parts touch in every pose of the arm: offset d_1 and table.",
         "Note: each link is assumed to have a radius of 60 mm",
     ):
         assert text in printed
@@ -88,12 +88,12 @@ def test_refused(aacmm, arguments, text):
         (("--acceptance", "iso", "--collisions"), "ignores --collisions"),
         # The default, stated, is ignored too.
         (("--acceptance", "iso", "--poses", 30, "--candidates", 200), "leave out --poses and --candidates"),
-        (("--acceptance", "iso", "--kit", "kit.toml"), "ignores --kit"),
+        (("--acceptance", "iso", "--kit", "kit.toml"), "so --kit would have no effect"),
         (
             ("--kit", "kit.toml", "--length-mm", 400, "--u-mm", 0.01, "--sockets", 3),
             "leave out --length-mm, --u-mm and --sockets",
         ),
-        (("--sphere-mm", 40), "--sphere-mm is for acceptance tests; give --acceptance too"),
+        (("--sphere-mm", 40), "--sphere-mm applies to acceptance tests only; give --acceptance too"),
         (("--held", "d_9"), "unknown parameter 'd_9'"),
     ],
 )

@@ -153,7 +153,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     ("converged", "plausible", "said", "unsaid"),
     [
         (True, True, ": converged in 3 steps", "no arm has"),
-        (True, False, "ended with a residual that no arm has, in 3 steps", "converged"),
+        (True, False, "ended with residuals too large for this arm, in 3 steps", "converged"),
         (False, False, "did not converge in 3 steps", "no arm has"),
     ],
 )
@@ -243,7 +243,7 @@ SAME = [
 
 REFUSED = [
     (("calibrate", "there.h5", "-o", "x.h5", "--figure", "x.txt"), "a figure cannot be written as x.txt"),
-    (("export", "there.h5", "--format", "csv", "--arm", "true"), "--arm is for --format toml"),
+    (("export", "there.h5", "--format", "csv", "--arm", "true"), "--arm applies to --format toml"),
     (
         ("evaluate", "there.h5", "there.h5", "--mpe", "zzz=1"),
         "names the unknown metric 'zzz'; known are " + ", ".join(aj.acceptance.METRICS),

@@ -25,7 +25,7 @@ def test_urdf_to_calibrated_urdf(aacmm, tmp_path, robot):
     robot.unlink()  # the capture holds it
     aacmm("calibrate", "capture.h5", "-o", "calibration.h5")
     said = aacmm("export", "calibration.h5", "-o", "calibrated.urdf").stdout
-    assert "Joints with another origin: joint_2, joint_3, joint_4, joint_5, joint_6, flange-tool0." in said
+    assert "Joints whose origin changed: joint_2, joint_3, joint_4, joint_5, joint_6, flange-tool0." in said
     record = aj.files.load_calibration(tmp_path / "calibration.h5")
     exported = aj.load_arm(tmp_path / "calibrated.urdf", tip="tool0")
     np.testing.assert_allclose(exported.pose(Q), record.calibrated.arm.pose(Q), rtol=0, atol=1e-9)
@@ -52,13 +52,13 @@ def test_show_and_links(aacmm, robot):
     assert (shown["urdf"]["base"], shown["urdf"]["tip"]) == ("base_link", "tool0")
     np.testing.assert_array_equal(shown["urdf"]["first_frame_in_base_mm"], np.eye(4))
     said = aacmm("show", "robot.urdf", "--tip", "tool0").stdout
-    assert "From a URDF: world to tool0; positions are in the frame of world." in said
+    assert "From a URDF, links world to tool0; positions are in the frame of world." in said
     said = " ".join(aacmm("show", "robot.urdf", "--base", "shoulder", "--tip", "tool0").stdout.split())
     assert "in a frame at (50, 0, 100) mm in shoulder, with its z axis along (0, -1, 0)" in said
     assert "name the tip (tip= or --tip)" in aacmm("show", "robot.urdf", expect=2).stderr
     assert "is not a URDF" in aacmm("show", "panda", "--tip", "tool0", expect=2).stderr
     robot.rename(robot.with_suffix(".h5"))
-    assert "--base and --tip are links of a URDF" in aacmm("show", "robot.h5", "--tip", "x", expect=2).stderr
+    assert "--base and --tip name links of a URDF" in aacmm("show", "robot.h5", "--tip", "x", expect=2).stderr
 
 
 @pytest.mark.slow

@@ -494,7 +494,7 @@ def test_command(run, files, calibrated):
     assert printed.exit_code == 0, printed.exception
     words = " ".join(printed.stdout.split())
     assert words.startswith(
-        "Cheng 2018, simulated arm: c.h5 (2026-03-01) against a.h5 (2026-01-01) Together, the changes of 21"
+        "Cheng 2018, simulated arm: c.h5 (2026-03-01) compared with a.h5 (2026-01-01) Together, the changes of 21"
     )
     assert "Warning" not in words
     assert "* beyond U" in words
@@ -524,8 +524,8 @@ def test_command_on_three_calibrations(run, files):
     assert len((files / "table.csv").read_text().splitlines()) == 1 + 2 * 21
     assert (files / "trend.svg").stat().st_size > 10_000
     printed = " ".join(run("c.h5", "a.h5", "b.h5").stdout.split())
-    assert "Each calibration against the first" in printed
-    assert "The change of every parameter from the first calibration: --csv" in printed
+    assert "Each calibration compared with the first" in printed
+    assert "For the change of every parameter from the first calibration, use --csv" in printed
 
 
 def test_command_refuses(run, files):

@@ -258,7 +258,7 @@ def test_every_figure_is_drawn(path, aacmm, tmp_path):
         (("noise", "-o", "."), "it is a folder"),
         (("noise", "-o", "x" * 300), "name too long"),
         (("--resume", "-o", "x" * 300), "nothing to resume"),
-        (("noise", "-o", "s.h5", "--shards"), "--shards is for the workers of --dask"),
+        (("noise", "-o", "s.h5", "--shards"), "--shards applies to the workers of a Dask cluster only"),
     ],
     ids=str,
 )

@@ -8,9 +8,9 @@ from aacmm_jax.summaries.arm_survey import _left_out
 def test_terms_that_a_model_leaves_out_are_named_with_the_reason(paper_arm):
     model = "gravity,harmonics=1"
     vertical, *_, others = _left_out(with_corrections(paper_arm, model), model)
-    no_moment = "Gravity has no moment about joint {}, whose axis is vertical or meets the load: left out "
+    no_moment = "Gravity has no moment about joint {}, because its axis is vertical or meets the load; left out: "
     assert vertical.startswith(no_moment.format(1))
-    assert others.endswith("constant, or as combinations of other functions of their joint: cos1_2, sin1_2.")
+    assert others.endswith("constant or a combination of other functions of the same joint: cos1_2, sin1_2.")
     found = _left_out(with_corrections(aj.load_arm("panda"), model), model)
     assert f"{no_moment.format(2)}compliance2_2." in found
     assert _left_out(with_corrections(paper_arm, model), None) == []

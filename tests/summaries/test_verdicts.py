@@ -25,7 +25,7 @@ def finding(severity, doubt="", says="Something was found."):
             [],
             HELD_OUT_RMS,
             "good",
-            "Calibrated: U (95 %) of a measured length of 300 mm, 0.020 mm (at worst 0.10 mm); held-out data agree "
+            "Calibrated: U (95 %) of a measured length of 300 mm is 0.020 mm (at worst 0.10 mm); held-out data agree "
             "with it.",
         ),
         ([], None, "neutral", "no held-out data confirm it"),
@@ -47,7 +47,7 @@ def finding(severity, doubt="", says="Something was found."):
             [finding("doubt", "on a bound: a_2")],
             HELD_OUT_RMS,
             "unsure",
-            "on a bound: a_2, so errors may exceed the stated U",
+            "on a bound: a_2, so errors may exceed the stated uncertainty. U",
         ),
     ],
 )
@@ -61,7 +61,10 @@ def test_of_a_simulation_and_of_what_is_not_determined():
     assert calibration_verdict([], VOLUME, None, simulated=True).says.startswith("Calibrated, in simulation: U (95 %)")
     unknown = VOLUME | {"expanded_length_reading_largest_mm": None}
     verdict = calibration_verdict([], unknown, HELD_OUT_RMS, simulated=False)
-    assert verdict == ("unsure", "To be used with care: the data do not determine lengths all over the working volume.")
+    assert verdict == (
+        "unsure",
+        "To be used with care: the data do not determine lengths everywhere in the working volume.",
+    )
 
 
 def evaluated(*decisions, missing=(), found=None, **more):
@@ -100,14 +103,14 @@ def held_out(probability, predicted=0.1):
             evaluated(held_out=held_out(0.001)),
             0,
             "unsure",
-            "Errors on held-out data exceed the prediction (p = 0.001): held-out poses are 0.2 mm",
+            "Errors on held-out data exceed the prediction (p = 0.001): held-out poses deviate by 0.2 mm",
         ),
-        (evaluated(held_out=held_out(0.5)), 0, "unsure", "larger than predicted, but may be so by chance: held-out"),
+        (evaluated(held_out=held_out(0.5)), 0, "unsure", "larger than predicted, but this may be chance: held-out"),
         (
             evaluated(held_out=held_out(0.5, 0.19)),
             0,
             "neutral",
-            "and lengths err by 0.7 times what is predicted. No limit",
+            "and length errors are 0.7 times as large as predicted. No limit",
         ),
         (evaluated(held_out=held_out(0.5, None)), 0, "neutral", "Measured on held-out data"),
     ],
@@ -147,7 +150,11 @@ HELD_OUT = {"left_out": [{"lengths": 1}, {"lengths": 0}], "length_error_rms_mm":
         ),
         (ROWS, HELD_OUT, "1 of them held out; RMS error 0.050 mm, predicted 0.040 mm."),
         (ROWS, HELD_OUT | {"length_error_rms_mm": None}, "none held out; RMS error 0.035 mm"),
-        (ROWS[:1], None, "Lengths tested: none, as the only one (200 mm) fixed the scale. Lengths over 200 mm are"),
+        (
+            ROWS[:1],
+            None,
+            "Lengths tested: none, because the only reference length (200 mm) fixed the scale. Lengths over 200 mm are",
+        ),
     ],
 )
 def test_checked_lengths(lengths, held_out, says):
