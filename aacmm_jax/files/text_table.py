@@ -156,8 +156,8 @@ class TextTable:
                 )
             if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self.header):
                 raise InputError(
-                    f"{self.path} names the columns {shorten([str(i + 1) for i in indices])} all {quoted(column)}; "
-                    "use each name once, or pick the columns by number."
+                    f"{self.path} gives the columns {shorten([str(i + 1) for i in indices])} the same name "
+                    f"{quoted(column)}; use each name once, or pick the columns by number."
                 )
             self.check_ascending(indices)
             picked += indices
@@ -239,7 +239,8 @@ class TextTable:
             mark = 'add decimal = "," to its table' if self._decimal == "." else 'leave out decimal = ","'
             raise InputError(
                 f"{place} is not a number with the decimal mark '{self._decimal}'; write it without quotes and "
-                f"thousands separators, or {mark}, or add skip = {self._lines[row]} if the table begins below."
+                f"thousands separators, or {mark}, or add skip = {self._lines[row]} if the table begins after this "
+                "line."
             )
         value = number(plain)
         if not abs(value) <= _LARGEST:
