@@ -147,7 +147,7 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, in
         if not equals:
             counts = dict.fromkeys(counts, int(count))
         elif name not in counts:
-            raise InputError(f"--poses {text} names an unknown socket, '{name}'; the sockets are {', '.join(counts)}.")
+            raise InputError(f"--poses {text} names the unknown socket '{name}'; the sockets are {', '.join(counts)}.")
         else:
             counts[name] = int(count)
     return counts

@@ -31,7 +31,7 @@ def write(path, header, rows):
 def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, monkeypatch):
     monkeypatch.setattr(first_capture, "_PLACEMENTS", 1)
     assert "Written: my.toml" in aacmm("arm", "--new", "my.toml", "--joints", 4).stdout
-    assert "my.toml exists" in aacmm("arm", "--new", "my.toml", expect=2).stderr
+    assert "my.toml already exists" in aacmm("arm", "--new", "my.toml", expect=2).stderr
     said = aacmm("arm", "my.toml", "--figure", "arm.png")
     assert (tmp_path / "arm.png").read_bytes().startswith(b"\x89PNG")
     printed = " ".join(said.stdout.split())

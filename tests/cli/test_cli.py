@@ -273,7 +273,7 @@ def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
         (("--length-mm", "long"), "not of the form L or L:M"),
         (("--length", "A,B"), "--length needs two sockets given with --socket"),
         (("-o", "missing/plan.csv"), "cannot be written"),
-        (("--region", "z=0:1", "--region", "z=0:2"), "named twice in --region"),
+        (("--region", "z=0:1", "--region", "z=0:2"), "--region names an axis twice"),
     ],
 )
 def test_plan_refuses(aacmm, arguments, text):

@@ -104,7 +104,7 @@ def test_what_is_not_reached_is_named_by_row_and_left_empty(arms):
     vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
     write(folder / "far.csv", header, np.hstack([poses[:, :3, 3], vectors, Q[:3]]))
     said = run(arms, "far.csv", "-o", "out.csv", expect=1).stdout
-    assert "2 of 3 poses reached" in said
+    assert "2 of 3 poses are reached" in said
     assert "Poses that are not reached" in said
     rows = table(folder / "out.csv")
     assert [row["q_1_rad"] == "" for row in rows] == [False, True, False]

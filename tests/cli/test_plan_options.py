@@ -73,7 +73,7 @@ def test_a_robot_by_default(aacmm):
         (("--tool-axis", "w"), "--tool-axis 'w' is not of the form"),
         (("--link-radius-mm", "0"), "radius is 0 mm; it must be positive"),
         (("--cell", "none.toml"), "none.toml"),
-        (("--acceptance", "iso", "--cone-deg", "50"), "and --cone-deg; leave out"),
+        (("--acceptance", "iso", "--cone-deg", "50"), "and --cone-deg would have no effect; leave out"),
         (("--cone-deg", "A=20", "--normal", "A=0,0,-1"), "socket 'A' at (450, 100, 200) mm cannot be reached"),
     ],
 )
@@ -84,8 +84,8 @@ def test_refused(aacmm, arguments, text):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--acceptance", "iso", "--farthest", 0.95), "ignores --farthest; leave out --farthest"),
-        (("--acceptance", "iso", "--collisions"), "ignores --collisions"),
+        (("--acceptance", "iso", "--farthest", 0.95), "so --farthest would have no effect; leave out --farthest"),
+        (("--acceptance", "iso", "--collisions"), "so --collisions would have no effect"),
         # The default, stated, is ignored too.
         (("--acceptance", "iso", "--poses", 30, "--candidates", 200), "leave out --poses and --candidates"),
         (("--acceptance", "iso", "--kit", "kit.toml"), "so --kit would have no effect"),
