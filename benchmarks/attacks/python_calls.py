@@ -4,6 +4,7 @@ Of a call that works, one argument is replaced. Some values are never an argumen
 complex numbers, truth values, objects); a call that takes one is a silent difference.
 """
 
+import inspect
 import random
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -111,7 +112,8 @@ def observed_calls(nominal: aj.Arm, sockets: aj.Capture) -> dict[str, tuple[Call
         "Socket": (observations.Socket, {"name": "A", "q": np.zeros((3, 6)), "target": ""}),
     }
     for simulated in all_kinds():
-        fields = dict(vars(simulated))
+        options = inspect.signature(type(simulated)).parameters
+        fields = {name: value for name, value in vars(simulated).items() if name in options}
         calls[f"{type(simulated).__name__} '{simulated.name}'"] = (type(simulated), fields)
     for one in capture.observations:
         kind, stored = type(one), one.stored()

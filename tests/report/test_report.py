@@ -325,7 +325,7 @@ def test_a_report_says_where_the_scale_comes_from(observed_record, observed_repo
         return report.subtitle + " ".join(blocks)
 
     said = text_of(observed_report)
-    assert "the scale comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact)." in said
+    assert "it comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact)." in said
     recording = observed_record.recording
     alone = recording._replace(capture=aj.Capture(recording.capture.sockets))
     found = aj.identify(recording.nominal.arm, alone.capture, recording.nominal.bounds())
