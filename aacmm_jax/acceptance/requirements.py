@@ -268,7 +268,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     ),
     "range": (
         "the measuring range is the one that the maker states",
-        "The measuring range that the maker states is missing (measuring_range).",
+        "The measuring range stated by the maker is missing (measuring_range).",
         lambda m: "" if m.measuring_range is None else None,
     ),
 }

@@ -302,6 +302,7 @@ def _needed(arm_class: dict[str, Any]) -> View:
         "Two sockets with a reference length are equivalent to a ball bar in one placement."
     )
     yield (
-        "Enough: the number of poses from which on this U is less than that of the noise of the readings themselves, "
+        "Enough: the smallest number of poses for which this U is less than the U that the noise of the readings alone "
+        "causes, "
         f"{formatted(2 * arm_class['u_reading_mm'])} mm."
     )

@@ -225,7 +225,9 @@ def compare_models(
     encoder_arcsec: float | None = options.KNOWN_ENCODER_NOISE,
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     seating_mm: float | None = options.KNOWN_SEATING_NOISE,
-    output: Path | None = output("Comparison to write (HDF5), for show and report.", "FILE.h5", None),
+    output: Path | None = output(
+        "File to write the comparison to (HDF5); aacmm show and aacmm report read it.", "FILE.h5", None
+    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Compare models of the joints on held-out regions.

@@ -167,8 +167,8 @@ REMOVED: Fields = {
     "ratio": number("F: mean square that the group added, divided by that of the rest", "1"),
     "degrees_of_freedom": count("degrees of freedom of numerator and denominator", "fraction"),
     "probability": number("probability of an F this large if nothing is wrong", "1"),
-    "rms_with": number("RMS distance of the rest from its geometry, with the group", "mm"),
-    "rms_without": number("RMS distance of the rest from its geometry, without the group", "mm"),
+    "rms_with": number("RMS distance of the other poses from their geometry, if the group is used", "mm"),
+    "rms_without": number("RMS distance of the other poses from their geometry, without the group", "mm"),
     "changed_most": text("parameter that changed most"),
     "change": number("change of this parameter, in standard uncertainties", "1"),
 }

@@ -195,7 +195,7 @@ def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | 
     yield (
         ("" if tilt is None else f"Largest tilt from a normal: {tilt:.0f} deg. ")
         + f"Joint travel: {summary['travel_deg']:,.0f} deg{by_way} ({summary['unordered_travel_deg']:,.0f} deg "
-        "before ordering; each joint is weighted by what it carries)."
+        "before ordering; each joint is weighted by the length of the arm beyond it)."
     )
     if collisions is None:
         yield (
