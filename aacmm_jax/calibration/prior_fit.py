@@ -260,8 +260,8 @@ class Rounds(NamedTuple):
         # Rounds far from the fixed point say nothing of it, and are forgotten.
         follows = (change < _NEAR) & (self.near > 0)
         of_new, of_residual = (
-            xp.where(follows, xp.concatenate([(now - before)[None], older[:-1]]), 0.0)
-            for now, before, older in ((new, self.new, self.of_new), (residual, self.residual, self.of_residual))
+            xp.where(follows, xp.concatenate([(present - before)[None], older[:-1]]), 0.0)
+            for present, before, older in ((new, self.new, self.of_new), (residual, self.residual, self.of_residual))
         )
         # Where the residual would vanish if it were linear along the rounds, as far as they tell.
         gram = of_residual @ of_residual.T

@@ -1,9 +1,9 @@
 """Captures drawn anew, for Monte Carlo, the bootstrap and studies, about a truth: an arm that meets its data exactly.
 
 Of sockets and lengths (`SocketTruth`), readings are drawn about poses in which the arm holds its sockets. Of other
-observations (`ObservedTruth`), an error of what was measured, or of the seat, changes a residual and hardly its
-derivatives. So the data of a trial are those of the capture with readings drawn anew, and with a constant added to
-every residual that replaces the errors of the capture by others. No kind has to say how it is drawn.
+observations (`ObservedTruth`), an error of what was measured, or of the seat, changes a residual; the change of
+its derivatives is negligible. So the data of a trial are those of the capture with readings drawn anew, and with a
+constant added to every residual that replaces the errors of the capture by others. No kind has to say how it is drawn.
 """
 
 from collections.abc import Callable, Mapping

@@ -4,7 +4,7 @@ Repeatability does not determine the scale of an arm whose lengths are all free:
 where they were times k. That ends where something in mm stays as it is. A fixed length is judged by how far tips move
 under a relative change of it, once the free parameters have adapted. Readings of prismatic joints are judged by how
 well the longest free length is determined without an anchor, which depends on the poses: a linear axis that stands
-still says nothing, and neither does the quill of a SCARA, which has one height in every pose of a socket.
+still determines no length, and neither does the quill of a SCARA, which has one height in every pose of a socket.
 """
 
 import math
@@ -159,7 +159,7 @@ def fixes_scale(capture: Capture) -> bool:
 
 
 def default_method(arm: Arm, general: bool) -> Method:
-    """How an arm is calibrated where nobody says: in two stages, but at once where more than lengths fixes the scale.
+    """The method where none is given: two stages, but one joint solve where more than lengths fixes the scale.
 
     ``general``: whether there are observations besides sockets and lengths, or a robust loss.
     """

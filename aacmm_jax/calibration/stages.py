@@ -47,26 +47,19 @@ class Sensitivities(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        linear: Linearisation,
-        rows: Sequence[AnyArray],
-        lengths: tuple[Linearisation, Sequence[AnyArray]] | None = None,
+        cls, linear: Linearisation, rows: Sequence[AnyArray], of_lengths: Sequence[AnyArray] | None = None
     ) -> "Sensitivities":
-        """Of parameters that follow the whitened rows of every group so, and of lengths, which may follow the rows of
-        another linearisation (that of stage 1)."""
-        tips = _through(linear, rows, [part.by_tip for part in linear.point.rows])
-        joints = _through(linear, rows, [error.by_readings for error in linear.errors])
-        if lengths is None:
-            return cls(tips, joints, tips[:0])
-        first, of_lengths = lengths
-        return cls(tips, joints, _through(first, of_lengths, [part.by_tip for part in first.point.rows]))
+        """Of parameters, and of lengths, that follow the whitened rows of every group so."""
+        by_tips = [part.by_tip for part in linear.point.rows]
 
+        def through(rows: Sequence[AnyArray], by: Sequence[AnyArray]) -> Float[np.ndarray, "q c M"]:
+            # What follows the whitened rows, by what the residuals follow: dy = Y R dr, dr = B dc.
+            groups = zip(rows, linear.whitening.roots, by, strict=False)
+            products = [np.einsum("qam,mab,bcm->qcm", y, np.asarray(root), part) for y, root, part in groups]
+            return np.concatenate(linear.observed.by_observation(products), axis=2)
 
-def _through(linear: Linearisation, rows: Sequence[AnyArray], by: Sequence[AnyArray]) -> Float[np.ndarray, "q c M"]:
-    """What follows the whitened rows so, by what the residuals follow: dy = Y R dr, dr = B dc."""
-    groups = zip(rows, linear.whitening.roots, by, strict=False)
-    products = [np.einsum("qam,mab,bcm->qcm", y, np.asarray(root), part) for y, root, part in groups]
-    return np.concatenate(linear.observed.by_observation(products), axis=2)
+        tips, joints = through(rows, by_tips), through(rows, [error.by_readings for error in linear.errors])
+        return cls(tips, joints, tips[:0] if of_lengths is None else through(of_lengths, by_tips))
 
 
 class MeasuredScale(NamedTuple):
@@ -247,7 +240,6 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
     z = xp.concatenate([vector, task.observed.start(at, vector)])
     weighing: dict[str, Any] = {"noise": task.noise, "sigma": solution.state.sigma, "least": _LEAST_U}
     z = Linearisation.at(task.observed, at, z, **weighing).with_fitted_geometry()
-    linear = Linearisation.at(task.observed, at, z, **weighing)
     state = state_at(task, at, z)
     after = repeatability_of(state, task.observed, state.sigma)
     result = dataclasses.replace(
@@ -259,7 +251,7 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
         active=bounds.active(parameters),
         parameter_covariance=covariance,
         after=after,
-        observed=_divided_metrics(solution, measured, linear),
+        observed=_divided_metrics(solution, measured, Linearisation.at(task.observed, at, z, **weighing)),
     )
 
     def sensitivities() -> Sensitivities:
@@ -269,7 +261,9 @@ def in_two_stages(stage1: Identified, capture: Capture) -> Stages:
         first, observed, p = solution.linear, solution.linear.observed, len(solution.linear.space.names)
         _, pull = observed.distances(np.asarray(first.z)[p:], ends_of(capture))
         of_lengths = rows_of_functions(influence, *observed.by_unknowns(pull, p))
-        return Sensitivities.of(linear, rows, (first, of_lengths))
+        # The whitened rows are those of stage 1, whose arm is k times as large: so are displacements of its tip.
+        of_stage1 = Sensitivities.of(first, rows, of_lengths)
+        return of_stage1._replace(tips=np.asarray(k) * of_stage1.tips)
 
     return Stages(_calibration(task, capture, identification, result, "two-stage", True), sensitivities, against)
 

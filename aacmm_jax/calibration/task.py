@@ -332,7 +332,7 @@ def state_at(
     """The state at a point, whose rows may be known (``point``); ``sigma`` is estimated unless it is given, and
     ``effective`` is how many unknowns the data determine, by default all that are fitted."""
     point = rows_at(space, task.observed, z) if point is None else point
-    # Where a batch needs no weights, nobody asks for errors.
+    # Where a batch needs no weights, errors are not computed.
     errors = linear_propagation.arm_errors(point, task.observed) if isinstance(point.forward, ForwardPass) else []
     if sigma is None:
         xp, spent = namespace(z, effective), task.fitted.sum() if effective is None else effective

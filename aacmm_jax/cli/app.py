@@ -88,7 +88,7 @@ def check_numbers(arguments: Sequence[str]) -> None:
         try:
             finite = math.isfinite(float(value))
         except ValueError:
-            continue  # what is no number to Python either, typer refuses
+            continue  # what Python cannot read as a number, typer refuses
         if option in numeric and not (finite and is_number(value)):
             raise InputError(f"{option} {quoted(value)} is not a finite number; write plain decimal digits.")
 

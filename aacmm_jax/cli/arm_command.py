@@ -280,7 +280,7 @@ def _determined(summary: dict[str, Any]) -> View:
 
     def lost(row: dict[str, Any]) -> str:
         if row["lost"] is None:
-            return "(the tip can then hardly stay in a socket)"
+            return "(too few joints are left to turn the arm about a socket)"
         return ", ".join(row["lost"]) or "-"
 
     yield listed("", summary["still"], {"joint": "joint", "no longer well determined": lost})

@@ -6,7 +6,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 
-# What Python's ``float`` takes besides is no number to people: 1_0, digits of other scripts, blanks around it.
+# Python's ``float`` also accepts what people do not write as a number: 1_0, digits of other scripts, blanks around it.
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 _BEGINS_FORMULA = ("=", "+", "-", "@", "\t")  # in the cell of a spreadsheet
 _LONGEST = 60  # characters of a text that a message quotes

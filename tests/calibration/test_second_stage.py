@@ -17,6 +17,7 @@ from aacmm_jax.core.units import ARCSEC
 from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.kinematics.arm import value_of
 from aacmm_jax.model.scale import divided_arm
+from aacmm_jax.pipeline import single as pipeline
 
 SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300)}
 POSES = {"A": 40, "B": 5}
@@ -399,3 +400,33 @@ def test_coverage_of_a_shipped_arm_with_a_fixed_length_along_the_probe():
     assert found["parameters"][0] >= 87, found["each"]  # 95 % of 100 scatters by 2.2 %: 3.6 of it for the worst of 23
     assert 93 < found["mean"] < 97
     assert found["active"] == 0
+
+
+def test_sensitivities_are_those_of_the_divided_parameters(paper_arm, monkeypatch):
+    """By differences, of an arm that stage 1 makes 5 % too large; a displacement of the tip is in mm of the result."""
+    kept = []
+    divide = pipeline.in_two_stages
+    monkeypatch.setattr(pipeline, "in_two_stages", lambda *given: kept.append(divide(*given)) or kept[-1])
+    larger = {name: 1.05 * np.asarray(getattr(paper_arm, name)) for name in ("a", "d", "probe")}
+    nominal = paper_arm.replace(**larger)
+    bounds = aj.Bounds.around(nominal, aj.Parameters.free_of(nominal), length=100.0, angle=0.05)
+    capture = aj.simulate(paper_arm, SOCKETS, poses=40, lengths=[("A", "B", 0.002)], seed=1)
+    noise = aj.Noise(encoder_arcsec=2.0, seating=0.005)
+
+    def calibrated(q):
+        with_readings = aj.Capture({"A": q, "B": capture.sockets["B"]}, lengths=capture.lengths)
+        return aj.calibrate(nominal, with_readings, bounds, method="two-stage", noise=noise, undetermined="ignore")
+
+    q, step = np.array(capture.sockets["A"]), 1e-5
+    result = calibrated(q)
+    assert result.scale.value == pytest.approx(1.05, rel=1e-3)
+    sensitivities = kept[0].sensitivities()
+    for pose, joint in ((5, 2), (7, 1)):
+        moved = q.copy()
+        moved[pose, joint] += step
+        change = (np.asarray(calibrated(moved).parameters) - np.asarray(result.parameters)) / step
+        expected = sensitivities.joints[:, joint, pose]
+        np.testing.assert_allclose(change, expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+        by_theta = np.asarray(result.arm.jacobian(q[pose], [f"theta_{joint + 1}"]))[:, 0]
+        through_tip = sensitivities.tips[:, :, pose] @ by_theta
+        np.testing.assert_allclose(through_tip, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
