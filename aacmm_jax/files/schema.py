@@ -193,7 +193,8 @@ OTHER_POSES: Fields = {
     "names": text("observation", "observation", name="observation"),
     "poses": count("number of poses that were not used in the calibration", "observation"),
     "rms": number("root mean square distance of these poses from the estimated geometry", "mm", "observation"),
-    "rms_angle": number("root mean square angle of these poses from the estimated geometry", "rad", "observation"),
+    "rms_angle": number("root mean square of their residuals in rad, such as orientations", "rad", "observation"),
+    "rms_px": number("root mean square of their residuals in px", "px", "observation"),
 }
 
 PRIOR: Fields = {
