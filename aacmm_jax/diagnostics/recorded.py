@@ -100,7 +100,8 @@ def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     stated = [(f"[[length]] {length.start} - {length.end}", length.u) for length in capture.lengths]
     for observation in capture.observations:
         stored = observation.stored()
-        u = stored.get("u")
+        in_mm = any(entry.name == "u" and entry.unit == "mm" for entry in observation.entries)
+        u = stored.get("u") if in_mm else None
         if stored.get("covariance") is not None:
             u = np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1))
         if u is not None:
