@@ -57,7 +57,7 @@ def test_short_travel_of_a_capture(paper_arm):
     (sentence,) = aj.observability(arm, capture, space).corrections
     assert "Over the 10 deg that joint 2 moves, cos1_2 cannot be separated from the zero offset" in sentence
     # With a prior of the coefficients there is nothing to be said of them.
-    assert not aj.observability(arm, capture, space, known=names).corrections
+    assert not aj.observability(arm, capture, space, with_prior=names).corrections
 
 
 @pytest.mark.slow
