@@ -12,6 +12,7 @@ from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, correction_names, parameter_names, parameter_unit, value_of
+from ..uncertainty.coverage_level import LEVEL
 from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
@@ -26,7 +27,7 @@ def compare(
     old: CalibrationRecord,
     new: CalibrationRecord,
     *,
-    level: _Level = 0.95,
+    level: _Level = LEVEL,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
@@ -64,7 +65,7 @@ def trend(
     records: Sequence[CalibrationRecord],
     dates: Sequence[datetime.datetime | str],
     *,
-    level: _Level = 0.95,
+    level: _Level = LEVEL,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
