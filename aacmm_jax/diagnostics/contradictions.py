@@ -114,9 +114,9 @@ def _finding(contradiction: Contradiction) -> Finding:
     return Finding(
         "contradiction",
         f"{says}: {changes}.{seems}",
-        advice="Calibrate with a probe for each session (without --same-probe)."
+        advice="Calibrate with a separate probe for each session (omit --same-probe)."
         if remounted
-        else f"Check the readings, and leave the wrong ones out of the calibration ({options}).",
+        else f"Check the readings, and leave what is wrong out of the calibration ({options}).",
         probability=max(suspect.test.probability for suspect in suspects),
         concerns=tuple(name for suspect in suspects for name in suspect.members),
     )

@@ -101,7 +101,7 @@ class Observability(NamedTuple):
         always, now = ([text for text, never in pairs if never == wanted] for wanted in (True, False))
         if always:
             sentences.append(
-                f"No measurement of this kind can separate: {'; '.join(always)}. Fix one parameter of each "
+                f"Not determined by any measurement of this kind: {'; '.join(always)}. Fix one parameter of each "
                 "combination (--held)."
             )
         if now:
@@ -109,7 +109,7 @@ class Observability(NamedTuple):
             sentences.append(f"Not determined by these data: {_first(now)}. {remedy}")
         if self.by_prior:
             sentences.append(
-                f"Determined by the prior, and little or not at all by these data: {_first(self.by_prior)}."
+                f"Determined by the prior, and hardly or not at all by these data: {_first(self.by_prior)}."
             )
         if self.trade_offs:
             texts = _first([trade_off.text for trade_off in self.trade_offs])
@@ -311,7 +311,7 @@ class _Spectrum(NamedTuple):
             parts = [name for name, at in self.agreeing.parts if np.abs(followers[at]).max() > _MOVED * size]
             items = _some(names, _PARAMETERS_NAMED, "more")
             items += _some(parts, _PARTS_NAMED, "more parts of the geometry")
-            alone = f"{items[0]} (changes nothing that is measured)"
+            alone = f"{items[0]} (has no effect on the measurements)"
             texts.append(f"{listed(items)} trade off" if len(items) > 1 else alone)
             directions.append(direction / np.linalg.norm(direction))
         return np.stack(directions, axis=1), tuple(texts)

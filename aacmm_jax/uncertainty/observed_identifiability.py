@@ -206,14 +206,14 @@ _SENTENCES = {
         "omit the coefficient, or let other joints move."
     ),
     "constant": (
-        "Over the {travel} that joint {joint} moves, {names} cannot be separated from the zero offset of this "
-        "joint, because the correction function is nearly constant: let the joint move farther, and record poses "
-        "in more sockets."
+        "{names} cannot be separated from the zero offset of joint {joint}, because the correction function is nearly "
+        "constant over the {travel} that this joint moves; let the joint move farther, and record poses in more "
+        "sockets."
     ),
     "line": (
-        "Over the {travel} that joint {joint} moves, {names} cannot be separated from each other, from the zero "
-        "offset of this joint or from other parameters, because their functions are nearly a straight line: let "
-        "the joint move farther."
+        "{names} cannot be separated from the zero offset of joint {joint} and from other parameters, because the "
+        "correction function is nearly a straight line over the {travel} that this joint moves; let the joint move "
+        "farther."
     ),
 }
 
