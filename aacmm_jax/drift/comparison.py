@@ -12,6 +12,7 @@ from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, parameter_names, parameter_unit, value_of
+from ..uncertainty.coverage_level import LEVEL
 from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
@@ -26,7 +27,7 @@ def compare(
     old: CalibrationRecord,
     new: CalibrationRecord,
     *,
-    level: _Level = 0.95,
+    level: _Level = LEVEL,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
@@ -65,7 +66,7 @@ def trend(
     records: Sequence[CalibrationRecord],
     dates: Sequence[datetime.datetime | str],
     *,
-    level: _Level = 0.95,
+    level: _Level = LEVEL,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
@@ -125,8 +126,8 @@ def _compared(
     for arm, label in zip(arms, labels, strict=True):
         if arm.arm.joints != arms[0].arm.joints:
             raise InputError(
-                f"{labels[0]} is of '{arms[0].name}' with {arms[0].arm.joints} joints, but {label} is of '{arm.name}' "
-                f"with {arm.arm.joints} joints; compare calibrations of one arm."
+                f"{labels[0]} is for the arm '{arms[0].name}' with {arms[0].arm.joints} joints, but {label} is for the "
+                f"arm '{arm.name}' with {arm.arm.joints} joints; compare calibrations of the same arm."
             )
     points, length, seed = volume
     length = default_length(first.calibrated.arm) if length is None else length
@@ -244,6 +245,6 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         if alone := [name for name in record.names if name not in other.names]:
             yield (
-                f"Free in {label} only: {shorten(alone)}. In the other calibration, other parameters may compensate "
-                "for them; lengths can still be compared."
+                f"Parameters free only in {label}: {shorten(alone)}. In the other calibration, the free parameters may "
+                "compensate for the errors of these; lengths can still be compared."
             )
