@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import Expansion, Influences, Limit, Rule, checked_influences
+from ..acceptance.judgement import COVERAGE_FACTOR, Expansion, Influences, Limit, Rule, checked_influences
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord, checked_limits
 from ..acceptance.results import Measured
 from ..core.arguments import checked
@@ -36,11 +36,11 @@ def save_evaluation(
 
     Args:
         path: the file to write.
-        record: the evaluation, from `acceptance.evaluation_of`; or points with their limits.
+        record: the evaluation, from `evaluate_capture`; or points with their limits, from `evaluate_points`.
         summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
     Example:
-        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal))
+        >>> evaluation = aj.evaluate_capture(record, aj.Recording(two_bars, nominal))
         >>> aj.files.save_evaluation("evaluation.h5", evaluation)
         >>> print(aj.files.load_evaluation("evaluation.h5").recording.capture.names)
         ('A', 'B', 'C', 'D')
@@ -67,7 +67,11 @@ def save_evaluation(
         standard=(standards, "", "standard of the test"),
         name=(names, "", "metric"),
         value=(values, "mm", "value of the worst part"),
-        expanded=([part.expanded for part in worst], "mm", "expanded uncertainty, coverage factor 2"),
+        expanded=(
+            [part.expanded for part in worst],
+            "mm",
+            f"expanded uncertainty, coverage factor {COVERAGE_FACTOR:g}",
+        ),
         limit=(limits, "mm", "MPE"),
         decision=(decisions, "", "decision by the rule of the test"),
         where=([part.where for part in worst], "", "what gave the worst part"),
