@@ -224,7 +224,7 @@ def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
     private, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.private, problem.joined))
     observation, by_tip = part.observation, np.asarray(part.by_tip)
     to_mm = np.moveaxis(np.linalg.inv(np.asarray(part.root)), 0, -1)
-    to_mm = np.moveaxis(observation.in_mm(to_mm, by_tip), -1, 0)
+    to_mm = np.moveaxis(np.asarray(observation.in_mm(to_mm, by_tip)), -1, 0)
     has_unit = np.array([unit == observation.other_unit for unit in OTHER_UNITS], dtype=float)
     weights = np.einsum("mca,mcb->mab", to_mm, to_mm)
     common, p = problem.common, len(problem.uncertainty.space.names)

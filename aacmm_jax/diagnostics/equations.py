@@ -264,6 +264,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
         if not in_solve and len(weight) == 1 and np.sum(~among) == 3:
             continue
         to_rows = np.moveaxis(np.linalg.pinv(root), 0, -1)
+        in_mm = np.asarray(part.observation.in_mm(to_rows, np.asarray(part.by_tip)))
         shared = np.zeros((*by.shape[:2], free + len(common)))
         shared[..., :free] = by[..., :free]
         shared[..., free : free + observed.layout.shared] = by[..., p:]
@@ -275,7 +276,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
                 shared,
                 by_private[..., ~among],
                 by[..., columns],
-                np.moveaxis(part.observation.in_mm(to_rows, np.asarray(part.by_tip)), -1, 0),
+                np.moveaxis(in_mm, -1, 0),
                 root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
                 np.arange(part.poses.start, part.poses.stop),
             )

@@ -179,8 +179,10 @@ def observation_tables(record: CalibrationRecord) -> list[Table]:
     if not capture.observations:
         return []
     u = {part.observation.name: part.u for part in observation_residuals(record)}
-    rows = capture_observations(capture)
-    rows = [row | {f"u_{unit}": value or None for unit, value in u[row["observation"]].items()} for row in rows]
+    rows: list[dict[str, Any]] = [
+        row | {f"u_{unit}": value or None for unit, value in u[row["observation"]].items()}
+        for row in capture_observations(capture)
+    ]
     units = [unit for unit in ("mm", *OTHER_RMS) if any(row.get(f"u_{unit}") for row in rows)]
     certified = [{"observation": row["observation"]} | quantity for row in rows for quantity in row["certified"]]
     columns = {
