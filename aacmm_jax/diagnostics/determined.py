@@ -38,9 +38,9 @@ def determined(case: Case) -> Observability:
     space = Parameters(arm, record.names)
     geometry, noise = to_numpy((arm.geometry, record.noise))
     sigma = rms_of_noise(geometry, np.asarray(capture.readings), noise)
-    known = () if record.prior is None else record.prior.known
+    with_prior = () if record.prior is None else record.prior.with_prior
     bounds = Bounds(space, record.lower, record.upper)
-    return observability(arm, capture, space, sigma=sigma, bounds=bounds, known=known)
+    return observability(arm, capture, space, sigma=sigma, bounds=bounds, with_prior=with_prior)
 
 
 def test(case: Case) -> list[Finding]:

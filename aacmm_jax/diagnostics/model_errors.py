@@ -170,8 +170,8 @@ def successive_of(case: Case) -> Successive | None:
         with_terms, relations = case.once(explained)
         left = Residuals.of([*(part.block("") for part in with_terms), *relations])
     product = total = 0.0
-    for part, own in zip(rows, left.slices, strict=False):
-        tips = np.einsum("mrc,mr->mc", part.by_tip, left.values[own].reshape(part.residual.shape))
+    for part, selected in zip(rows, left.slices, strict=False):
+        tips = np.einsum("mrc,mr->mc", part.by_tip, left.values[selected].reshape(part.residual.shape))
         product += float(np.sum(tips[1:] * tips[:-1]))
         total += float(np.sum(tips[1:] ** 2) + np.sum(tips[:-1] ** 2)) / 2
     return Successive(product / total if total else 0.0, form_test(left, kernels, relative=True).probability)

@@ -207,15 +207,15 @@ def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Relat
     kept, p = np.array([name != anchor for name in record.names]), len(record.names)
     linear = linearisation_of(record, record.names, noise=record.noise, lengths=False)
     influence, observed = linear.influence(), linear.observed
-    ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.own, capture)
+    ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.d_inverses, capture)
     error = np.asarray(ends.measured - ends.nominal)
     if np.max(np.abs(error)) < EXACT:
         return None
     # Positions follow the arm as the means of their tips do.
     followers = []
     for name in positions_at_ends(capture):
-        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        followers.append(-influence.follow[of][component, first : first + 3])
+        class_index, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        followers.append(-influence.follow[class_index][component, first : first + 3])
     slopes = np.einsum("lec,ech->lh", ends.by_positions, np.stack(followers))[:, :p]
     scale = None
     if anchor is not None:

@@ -239,7 +239,7 @@ def _check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, s
     space = bounds.space
     stated = prior and prior.of(space.names, space.vector())
     seen = observability(
-        space.base, capture, space, known=tuple(space.names[i] for i in stated.index) if stated else ()
+        space.base, capture, space, with_prior=tuple(space.names[i] for i in stated.index) if stated else ()
     )
     lost = seen._replace(by_prior=()).sentences()
     if lost and strict:

@@ -58,7 +58,7 @@ def test_short_travel_of_a_capture(paper_arm):
     assert sentence.startswith("cos1_2 cannot be separated from the zero offset of joint 2, because")
     assert "nearly constant over the 10 deg that this joint moves" in sentence
     # With a prior of the coefficients there is nothing to be said of them.
-    assert not aj.observability(arm, capture, space, known=names).corrections
+    assert not aj.observability(arm, capture, space, with_prior=names).corrections
 
 
 @pytest.mark.slow
