@@ -1,4 +1,4 @@
-"""Errors that poses share, drawn anew: each kind has the covariance over the poses that it states."""
+"""Shared errors, drawn anew: each kind has the covariance over the poses that it states."""
 
 import numpy as np
 import pytest
