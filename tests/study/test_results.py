@@ -244,7 +244,7 @@ def test_every_figure_is_drawn(path, aacmm, tmp_path):
     ("arguments", "message"),
     [
         (("-o", "s.h5"), "name a specification, or use --resume"),
-        (("--resume", "-o", "s.h5"), "s.h5 does not exist, so there is nothing to resume; leave --resume out"),
+        (("--resume", "-o", "s.h5"), "s.h5 does not exist, so there is nothing to resume; leave out --resume"),
         (
             ("bound-sensitivty", "-o", "s.h5"),
             "neither a file nor a study that ships with the package; did you mean 'bound-sensitivity'",
