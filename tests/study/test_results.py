@@ -224,7 +224,7 @@ def test_the_terminal_shows_all_of_it(path, aacmm):
     assert "probe_z" in one.stdout
     machine = json.loads(aacmm("show", path, "--cell", 1, "--json").stdout)
     assert machine["results"][0]["figures"]["de"]["mean"]["se"] > 0
-    assert "no cell 5; name another" in aacmm("show", path, "--cell", 5, expect=2).stderr
+    assert "no cell 5; choose a cell from 1 to 4" in aacmm("show", path, "--cell", 5, expect=2).stderr
 
 
 @pytest.mark.slow
