@@ -340,7 +340,7 @@ class JointFunction(NamedTuple):
 
     reading: Float[np.ndarray, " points"]  # the travel of the poses and a little beyond, within the joint's limits
     value: Float[np.ndarray, " points"]
-    expanded: Float[np.ndarray, " points"]  # expanded uncertainty, 95 %
+    expanded: Float[np.ndarray, " points"]  # expanded uncertainty U
     at_poses: Float[np.ndarray, " poses"]
 
 

@@ -19,6 +19,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
+from ..uncertainty.coverage_level import LEVEL, in_percent
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
 from .record import uncertainty_of
@@ -86,7 +87,7 @@ class Sampled(NamedTuple):
                 f"{len(self.quantities)} quantities: {', '.join(apart[:8])}{' ...' if len(apart) > 8 else ''}; use "
                 "the Monte Carlo intervals."
             )
-        return [*sentences, f"The linear {100 * self.level:g} % intervals {says}"]
+        return [*sentences, f"The linear {in_percent(self.level)} intervals {says}"]
 
 
 @checked_arguments
@@ -94,7 +95,7 @@ def monte_carlo(
     result: Calibration,
     capture: Capture,
     *,
-    level: Level = 0.95,
+    level: Level = LEVEL,
     digits: Annotated[int, OneOf((1, 2))] = 1,
     most: int = 1_000_000,
     lengths: tuple[np.ndarray, np.ndarray] | None = None,
@@ -175,7 +176,7 @@ def bootstrap(
     capture: Capture,
     *,
     trials: Annotated[int, Range(least=100)] = 2000,
-    level: Level = 0.95,
+    level: Level = LEVEL,
     robust: LossName | None = None,
     seed: int = 0,
 ) -> Sampled:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..calibration.prediction import LEVEL, Agreement, CrossValidation
+from ..calibration.prediction import SIGNIFICANCE, Agreement, CrossValidation
 from ..core.text import shorten
 from .findings import Case, Finding
 
@@ -76,9 +76,11 @@ def surprise(
     agree where the place of the probe is fitted to them: where that removes most of the excess, it is the cause.
     """
     probabilities = [p for p in (poses.probability, lengths.probability) if math.isfinite(p)]
-    texts, worst, level = [], [], LEVEL / max(len(probabilities), 1)
+    texts, worst, level = [], [], SIGNIFICANCE / max(len(probabilities), 1)
     if poses.probability < level:
-        improbable = sorted((p.probability, name) for name, p in parts.items() if p.probability < LEVEL / len(parts))
+        improbable = sorted(
+            (p.probability, name) for name, p in parts.items() if p.probability < SIGNIFICANCE / len(parts)
+        )
         worst = [name for _, name in improbable[:3]]
         most = [
             f"{name} ({parts[name].rms:.3g} mm, {parts[name].rms / parts[name].predicted:.1f} times)" for name in worst
@@ -104,7 +106,7 @@ def surprise(
         probability=min(probabilities),
         concerns=tuple(worst),
     )
-    again = refitted() if poses.probability < LEVEL else None
+    again = refitted() if poses.probability < SIGNIFICANCE else None
     # Most of the excess: more than half of it, in squares.
     if again is not None and poses.rms**2 - again.rms**2 > (poses.rms**2 - poses.predicted**2) / 2:
         says = (

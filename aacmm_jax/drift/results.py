@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from ..core.text import shorten
 from ..core.units import people_read_change
+from ..uncertainty.coverage_level import in_percent
 from .statistics import JointTest, LengthChange, ProbeTest
 
 
@@ -166,7 +167,7 @@ def _of_each(drift: Drift) -> str:
     for i in sorted(map(int, moved), key=lambda i: -abs(drift.change[i]) / drift.expanded[i]):
         name, unit, u = drift.names[i], drift.units[i], float(drift.expanded[i])
         changes.append(f"{name} by {in_words(unit, float(drift.change[i]))} (U = {in_words(unit, u, '')})")
-    start = f"{count} ({100 * drift.level:g} %; {chance} expected by chance)"
+    start = f"{count} ({in_percent(drift.level)}; {chance} expected by chance)"
     return f"{start}: {shorten(changes)}." if changes else f"{start}."
 
 

@@ -133,11 +133,11 @@ def _acceptance(
         u = format_number(1000 * u_test, 1)
         stated = f"a standard uncertainty of {u} µm was stated for seat, fixture and temperature"
     blocks: list[Block] = [
-        "Every metric is computed from single readings. U (coverage factor 2) is the contribution of the tester: it "
-        f"includes the uncertainty of the artefacts; {stated}. The arm's own scatter is what is tested, so U does not "
-        "include it (ISO 14253-5). The standards allow a reading to be repeated; this is not done here. A test that "
-        "lacks something its standard requires is labelled 'based on' the standard. Requirements and formulas are "
-        "taken from secondary sources on the editions named.",
+        f"Every metric is computed from single readings. U (coverage factor {COVERAGE_FACTOR:g}) is the contribution "
+        f"of the tester: it includes the uncertainty of the artefacts; {stated}. The arm's own scatter is what is "
+        "tested, so U does not include it (ISO 14253-5). The standards allow a reading to be repeated; this is not "
+        "done here. A test that lacks something its standard requires is labelled 'based on' the standard. "
+        "Requirements and formulas are taken from secondary sources on the editions named.",
     ]
     metrics = [metric for test in rows for metric in test["figures"]]
     limited = any(metric["limit_mm"] is not None for metric in metrics)
@@ -218,8 +218,8 @@ def _lengths(
     caption, before = "Lengths between the mean points of their sockets [mm]", np.asarray(evaluations["nominal"].error)
     means = length_table(caption, rows, {"nominal": before}, record.length_that_fixed_scale())
     note = (
-        "These lengths are computed from the mean of all poses in each socket. They are given for comparison only and "
-        "are not part of an acceptance test. U (coverage factor 2) also includes the scatter of the poses at both "
-        "ends."
+        "These lengths are computed from the mean of all poses in each socket. They are given for comparison only "
+        f"and are not part of an acceptance test. U (coverage factor {COVERAGE_FACTOR:g}) also includes the scatter "
+        "of the poses at both ends."
     )
     return [Section("lengths", "Lengths", [*([] if chart is None else [chart]), means, note])]

@@ -235,7 +235,11 @@ def test_coefficients_of_corrections_have_their_own_units(old):
 def test_an_arm_without_corrections_is_compared_with_one_that_has_some(old):
     drift = compare(old, corrected(old, gear_2=2e-4))
     i = drift.names.index("gear_2")
-    assert (drift.old[i], drift.new[i], drift.reasons[i]) == (0.0, 2e-4, "fixed in the old calibration")
+    assert (drift.old[i], drift.new[i], drift.reasons[i]) == (
+        0.0,
+        2e-4,
+        "fixed at 0 by the model in the old calibration",
+    )
     assert "Free in the new calibration only: cos1_3, gear_2, compliance3_2" in " ".join(drift.warnings)
 
 
@@ -526,6 +530,38 @@ def test_command_on_three_calibrations(run, files):
     printed = " ".join(run("c.h5", "a.h5", "b.h5").stdout.split())
     assert "Each calibration minus the first" in printed
     assert "For the change of every parameter from the first calibration, use --csv" in printed
+
+
+@pytest.fixture(scope="module")
+def with_gear(calibrated):
+    """A calibration whose model of the joints the others lack."""
+    recording = calibrated[2].recording
+    arm = aj.kinematics.with_corrections(recording.nominal.arm, "gear")
+    options = {"cross_validate": False, "shared_errors": False}
+    return aj.calibrate_capture(recording._replace(nominal=recording.nominal._replace(arm=arm)), **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ["abm", "amb", "mab"])
+def test_command_where_one_of_three_has_a_model_of_its_joints(run, files, calibrated, with_gear, monkeypatch, order):
+    """Coefficients that a model lacks are 0, and the table says so."""
+    records = {"a": calibrated[0], "b": calibrated[1], "m": with_gear}
+    for month, name in enumerate(order, start=1):
+        saved(records[name], files / f"{name}.h5", f"2026-0{month}-01T00:00:00+00:00", monkeypatch)
+    done = run(*(f"{name}.h5" for name in order), "--csv", "table.csv", "--json")
+    assert done.exit_code == 0, done.exception
+    at = with_gear.names.index("gear_2")
+    values = {name: record.vectors()["calibrated"][at] if name == "m" else 0.0 for name, record in records.items()}
+    first, *others = json.loads(done.stdout)["trend"]
+    for calibration in others:
+        row = {row["parameter"]: row for row in calibration["parameters"]}["gear_2"]
+        pair = [found["calibration"].removesuffix(".h5") for found in (first, calibration)]
+        assert [row["old"], row["new"]] == [values[name] for name in pair]
+        lacking = [which for which, name in zip(("old", "new"), pair, strict=True) if name != "m"]
+        where = "both calibrations" if len(lacking) == 2 else f"the {lacking[0]} calibration"
+        assert row["without"] == f"fixed at 0 by the model in {where}"
+        assert (row["unit"], row["u"]) == ("1", None)
+    assert len((files / "table.csv").read_text().splitlines()) == 1 + 2 * (21 + 6)
 
 
 def test_command_refuses(run, files):
