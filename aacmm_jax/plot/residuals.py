@@ -234,7 +234,7 @@ def kinds_chart(
     values = np.concatenate([np.asarray(_UNITS[unit][2](part)) for _, part in parts])
     if far is None or unit == "deg":
         weights = np.concatenate([part.weight for _, part in parts])
-        far = "poses with half of the full weight or less", np.flatnonzero(weights <= 0.5)
+        far = "half of the full weight or less", np.flatnonzero(weights <= 0.5)
     groups = Groups(names, sizes, kinds, word)  # type: ignore
     return pose_chart(*_UNITS[unit][:2], groups, {"calibrated": values}, unit=unit, far=far, most=most)
 

@@ -245,7 +245,7 @@ BROKEN = [
     ("asme", ASME[0], lambda m: spheres(m, "effective-diameter", each_group(cap)), "spread over a hemisphere"),
     ("asme", ASME[0], lambda m: spheres(m, "effective-diameter", each_group(straight_rings)), "at least 22.5 deg"),
     ("asme", ASME[1], without_socket("spat/near"), "at 0 to 20 % of the reach (0 to 270 mm"),
-    ("asme", ASME[1], lambda m: m._replace(reach=None), "zones cannot be determined"),
+    ("asme", ASME[1], lambda m: m._replace(reach=None), "zones of the reach cannot be determined"),
     ("asme", ASME[1], elbow(1.0), "with the elbow on the left"),
     ("asme", ASME[1], elbow(0.0), "with the elbow on the left"),
     ("asme", ASME[1], lambda m: m._replace(postures=None), "side the elbow was"),

@@ -73,7 +73,7 @@ def test_residuals_of_observations(observed_record, unit, count):
         found = observed_record.observed
         expected = found.rms_after if unit == "mm" else found.reduced_chi
         assert np.sqrt(np.mean(lines["sphere"].get_ydata() ** 2)) == pytest.approx(expected[3])
-        assert 5 in lines["poses with half of the full weight or less"].get_xdata()
+        assert 5 in lines["half of the full weight or less"].get_xdata()
         assert [text.get_text() for text in axes.get_xticklabels()] == list(found.names)
     axes.figure.savefig(io.BytesIO())
     assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1

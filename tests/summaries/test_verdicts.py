@@ -96,7 +96,7 @@ def held_out(probability, predicted=0.1):
         (evaluated("conforms", missing=["more bars"]), 0, "unsure", "the procedure of a test was not complete"),
         (evaluated("conforms", "fails", "undecided"), 0, "bad", "Fails: E_1 is over its limit."),
         (evaluated("conforms", failed=["RMS is 2 mm, over."]), 0, "bad", "Fails: RMS is 2 mm, over."),
-        (evaluated("conforms", "undecided"), 0, "unsure", "too uncertain for E_1"),
+        (evaluated("conforms", "undecided"), 0, "unsure", "too uncertain for a decision on E_1"),
         (evaluated(kept=["RMS is 2 mm."]), 0, "good", "Conforms"),
         (evaluated(), 0, "neutral", "Measured; no limit was given."),
         (
