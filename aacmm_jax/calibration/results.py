@@ -256,7 +256,7 @@ class Calibration(AbstractSingleResult):
     # Whether the result is stage 1 divided by k; not where a bound or a fixed length stood against that, and everything
     # was solved at once, as with the method "joint".
     divided: Bool[AnyArray, ""]
-    shared: SharedErrors | None = None  # errors that poses share, which the covariance contains; None: none were found
+    shared: SharedErrors | None = None  # shared errors, which the covariance contains; None: none were found
 
     @property
     def noise_model(self) -> NoiseModel:

@@ -222,7 +222,7 @@ def _law(dimension: str) -> Field:
 
 
 SHARED_ERRORS: Fields = {
-    "kinds": text("kind of error that poses share", "shared_kind", name="shared_kind"),
+    "kinds": text("kind of shared error", "shared_kind", name="shared_kind"),
     "units": text("unit of the standard deviation", "shared_kind"),
     "names": text("coefficient of a function", "coefficient", name="coefficient"),
     "sd": number("standard deviation, learned from the residuals", "mm or rad, see units", "shared_kind"),

@@ -73,7 +73,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         hold: the scale anchor of stage 1, as for `identify`.
         noise: standard deviations of readings and seat, as for `identify`.
         replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
-        shared_errors: add errors that poses share to the covariance, as for `calibrate`.
+        shared_errors: add shared errors to the covariance, as for `calibrate`.
         cross_validate: calibrate without each group, as `cross_validate` does. By default where a real arm was recorded
             in several placements of the reference length, and there is neither a prior nor a robust loss.
         leave_out: groups that cross-validation leaves out, as names or shell patterns.

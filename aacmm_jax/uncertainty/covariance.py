@@ -65,7 +65,8 @@ def inverse_information(
 
 
 class SharedErrors(eqx.Module):
-    """Errors that poses share and the model of a calibration does not have, as its residuals show them.
+    """Shared errors: errors that several poses have in common and that the model of a calibration does not describe, as
+    its residuals show them.
 
     Its covariance contains them. Functions of the readings that joints follow besides the model ("gravity",
     "harmonics=1") move other poses too: a tip errs by J dz + sum of J_joint phi(q) c, with dz = ``follow`` c.
