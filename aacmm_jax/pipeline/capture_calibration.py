@@ -17,6 +17,7 @@ from ..data.capture import Capture, draw_poses, join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.contradictions import remove_contradicting
+from ..diagnostics.findings import case_of
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
 from .cross_validation import can_cross_validate, cross_validate
@@ -127,6 +128,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         result = chosen.stage("Calibrating", lambda: solved(recording.capture))
         record = record_of(result, recording, robust=chosen.robust, others=others)
+        case_of(record)  # takes over what the calibration has computed to test its noise, before others are tested
         if chosen.remove_contradicting:
             record = chosen.stage("Comparing groups", lambda: remove_contradicting(record, solved))
         if _to_cross_validate(record.recording, solving, chosen):
