@@ -199,7 +199,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     "spread of touches": (
         "touches spread over at least a hemisphere: no gap more than 8 degrees wider than in the recommended pattern",
         "The touches must be spread over a hemisphere (not spread: {0}).",
-        # Of groups that are too small, the number of touches speaks.
+        # Groups that are too small are named under the number of touches.
         lambda m, test, points: _groups(
             m, test, lambda group: len(group) >= points and not geometry.covers_hemisphere(group, points)
         ),

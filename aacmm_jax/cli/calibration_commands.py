@@ -89,7 +89,7 @@ def calibrate(
         "--keep-noise", "Do not re-estimate the noise of an encoder found to be noisier than stated."
     ),
     shared_errors: bool = option(
-        "Look for errors that several poses have in common, and include them in the uncertainties.", default=True
+        "Look for errors shared by several poses, and include these errors in the uncertainties.", default=True
     ),
     cross_validate: bool | None = option(
         "Hold out each placement, station or other group of observations in turn, calibrate with the others, and test "

@@ -256,7 +256,7 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
 
 
 def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
-    """Errors that poses share, kind by kind, with their standard deviations in mm, or in the unit of coefficients."""
+    """Shared errors, kind by kind, with their standard deviations in mm, or in the unit of coefficients."""
     return rows_of(kind=shared.kinds, sd=shared.sd, unit=shared.units)
 
 

@@ -275,7 +275,7 @@ def lengths_sentence(row: Mapping[str, Any]) -> str:
 
 
 def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Errors that poses share in words."""
+    """Shared errors in words."""
     words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
 
     def shown(row: Mapping[str, Any]) -> str:
@@ -286,10 +286,7 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
     functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
     parts = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
     parts += [f"functions missing from the model: {', '.join(functions)}"] if functions else []
-    return (
-        "Errors that several poses have in common, included in the uncertainty (standard deviations): "
-        f"{'; '.join(parts)}."
-    )
+    return f"Shared errors of several poses, included in the uncertainty (standard deviations): {'; '.join(parts)}."
 
 
 def tried_sentence(row: Mapping[str, Any]) -> str:
