@@ -188,7 +188,7 @@ class AbstractSingleResult(AbstractResult):
     @property
     def implausible_residual(self) -> bool:
         """Whether the residual is larger than that of an arm of this size with such noise, so that data and arm do not
-        belong together. What is usual for a class of arms only a record knows (`calibration.record_of`)."""
+        belong together. Only a record has what is usual for a class of arms (`calibration.record_of`)."""
         self._check_single()
         return float(self.after.rms) > largest_plausible_residual(self.arm, self.given_noise)
 

@@ -37,7 +37,7 @@ _FACTOR = 1.5  # largest change of a log variance in one round
 _LEAST = 1e-6  # part of the residuals that a variance explains, below which it is 0
 _CLEAR = 1e-4  # probability of a missing term, below which the model is wrong rather than the noise
 _FEWEST = 20  # degrees of freedom below which no variance is estimated by joint
-_FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
+_FAR_MORE = 100.0  # ratio of noise beyond which the number has no meaning
 
 Result = TypeVar("Result", Calibration, Identification)
 

@@ -247,8 +247,8 @@ def noise_sentence(summary: Mapping[str, Any]) -> str:
         "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times as large as this "
         "noise predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (only their combination is well determined).",
-        "common": f"One noise for all poses: {seating} per coordinate.",
-        "robust": "The variance of each pose is taken from its own residual (robust noise model).",
+        "common": f"The same noise for all poses: {seating} per coordinate.",
+        "robust": "The variance of each pose is estimated from the residual of this pose (robust noise model).",
     }[part["form"]]
 
 
@@ -293,6 +293,6 @@ def tried_sentence(row: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
         f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses, which means "
-        f"that a calibration pose is as near as these poses are to each other ({row['spacing_rad'] / DEG:.2g} deg RMS "
-        "over the joints). Elsewhere, U is an extrapolation by the model."
+        f"that the nearest calibration pose is within the spacing of these poses ({row['spacing_rad'] / DEG:.2g} deg "
+        "RMS over the joints). In the rest of the joint space, U is an extrapolation by the model."
     )

@@ -59,8 +59,8 @@ def inverse_information(
     seen, lost = xp.where(informed[None, :], vectors, 0.0), xp.where(informed[None, :], 0.0, vectors)
     inner = seen.T @ information @ seen + xp.diag(xp.where(informed, 0.0, 1.0))
     inverse = seen @ inverse_positive_definite(inner) @ seen.T
-    hardly = xp.where((values > _LEAST_INFORMATION)[None, :] & informed[None, :], 0.0, vectors)
-    determined = fixed | (xp.sum(hardly**2, axis=1) < 1e-6)
+    undetermined = xp.where((values > _LEAST_INFORMATION)[None, :] & informed[None, :], 0.0, vectors)
+    determined = fixed | (xp.sum(undetermined**2, axis=1) < 1e-6)
     return xp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined
 
 
