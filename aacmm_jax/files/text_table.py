@@ -153,8 +153,8 @@ class TextTable:
             indices = self._matching(column)
             if not indices:
                 raise InputError(
-                    f"{self.path} has {self.shown()}, but no column {quoted(str(column))}; pick another column by name "
-                    "or by number, or correct the header."
+                    f"{self.path} has no column {quoted(str(column))}; the table has {self.shown()}; pick another "
+                    "column by name or by number, or correct the header."
                 )
             if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self.header):
                 raise InputError(

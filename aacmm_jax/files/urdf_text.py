@@ -362,7 +362,7 @@ def _parsed(text: str) -> tuple[Element, int]:
 
     def refuse_entities(name: str, *_: object) -> None:
         raise InputError(
-            f"the file declares a document type, {quoted(name)}, which is not allowed in a URDF; remove <!DOCTYPE ...>."
+            f"the file declares a document type, {quoted(name)}, which aacmm does not accept; remove <!DOCTYPE ...>."
         )
 
     parser.StartElementHandler, parser.EndElementHandler = start, end

@@ -538,12 +538,12 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("diameter = 30.98", "diameter = 0"), "diameter"),
         (('file = "sphere/touch.txt"', ""), "either file or files"),
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column '4'"),
-        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "one column is picked twice"),
+        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "pick the same column twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
         (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
         (
             ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
-            "target, session and temperature_C apply to",
+            "target, session and temperature_C apply only to",
         ),
     ],
 )

@@ -57,7 +57,7 @@ checked_sphere = checked_arguments(where="sphere '{name}'")(sphere)
         ({"q": [1, 2]}, "q of sphere 'S' has shape (2,); give (poses, joints)."),
         ({"q": np.zeros((0, 2))}, "give at least one."),
         ({"q": [[0.1, 0.2], [0.3, np.nan]]}, "q of sphere 'S' pose 2 joint 2 is nan; give finite numbers."),
-        ({"q": [["a", "b"]]}, "q of sphere 'S' must be real numbers, but contains text."),
+        ({"q": [["a", "b"]]}, "q of sphere 'S' must contain real numbers, but contains text."),
         ({"u": [1, 2, 3]}, "u of sphere 'S' has shape (3,); give one number, or (poses,) with 2 poses."),
         ({"u": [1, -1]}, "u[1] of sphere 'S' is -1; it must be zero or positive."),
         ({"u": np.inf}, "u of sphere 'S' is inf; give finite numbers."),

@@ -21,7 +21,7 @@ def test_sockets_of_a_batch():
     batch = aj.stack_captures([aj.Capture({"A": rows[:2], "B": rows[2:]}) for rows in q])
     np.testing.assert_array_equal(batch.sockets["A"], q[:, :2])
     np.testing.assert_array_equal(batch.sockets["B"], q[:, 2:])
-    assert_refused(lambda: aj.stack_captures([]), "no capture to stack")
+    assert_refused(lambda: aj.stack_captures([]), "the list of captures is empty")
 
 
 def test_one_reference_length_needs_no_list():

@@ -60,7 +60,9 @@ def test_the_table_pasted_into_the_manifest(tmp_path, header, size, angles, sock
 
     write(f"[angles]\n{angles}" if angles else "", socket)
     printed = angles_toml(explanation(order, ZEROS), None, manifest)
-    assert ("In [[socket]] (a.csv), replace its columns by:" in printed) == ("columns" in socket and order != PLAIN)
+    assert ("In [[socket]] (a.csv), replace the picked columns with:" in printed) == (
+        "columns" in socket and order != PLAIN
+    )
     line = printed.split("\n# columns")[1].strip() if "\n# columns" in printed else socket.removeprefix("columns")
     line = f"columns {line}" if "columns" in socket else socket
     np.testing.assert_allclose(write(printed, line), Q, atol=1e-8)

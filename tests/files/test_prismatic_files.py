@@ -59,7 +59,7 @@ joint = [
         (tmp_path / "wrong.toml").write_text(text.replace(old, new))
         assert_refused(lambda: aj.load_arm(tmp_path / "wrong.toml"), said)
     (tmp_path / "wrong.toml").write_text(text.replace(", limits = [0, 1.5]", "").replace(", limits = [-90, 90]", ""))
-    assert_refused(lambda: aj.load_arm(tmp_path / "wrong.toml"), "joint 1 is prismatic, but its travel is not stated")
+    assert_refused(lambda: aj.load_arm(tmp_path / "wrong.toml"), "joint 1 is prismatic, but has no limits")
 
 
 def test_a_capture_file_gives_back_arms_and_readings(tmp_path):

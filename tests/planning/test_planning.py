@@ -227,7 +227,7 @@ REFUSED = {
     "too few": ({"poses": 5}, "too few for 4 sockets"),
     "equations": ({"poses": 9, "sockets": 4}, "plan at least 11"),
     "criterion": ({"criterion": "B"}, "criterion is 'B'; known are length, A, D, E"),
-    "margin": ({"margin": 4.0}, "no range within its limits"),
+    "margin": ({"margin": 4.0}, "no range of motion between the limits"),
     "u": ({"u": 0.0}, "u of a reference length is 0 mm"),
     "length": ({"length": 9000.0}, "does not fit this arm"),
     "range": ({"length": (500.0, 300.0)}, "does not fit this arm"),

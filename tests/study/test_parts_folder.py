@@ -38,7 +38,7 @@ def colleague(path):
 
 
 FOLDER = r"s\.h5\.parts belongs to nobody, "
-BLOCK = r"cell.*\.npz belongs to nobody, who does not own its folder, so it is not read; remove it"
+BLOCK = r"cell.*\.npz belongs to nobody, who is not the owner of its folder, so the block is not read; remove the file"
 OURS = ("a link to a folder", "a link to a block", "an open folder")  # which need no second user
 # What is done to a study of the user with blocks, and how running it and reading it is refused; None: it is not.
 PLANTED = {
@@ -50,11 +50,11 @@ PLANTED = {
     ),
     "a folder": (
         lambda path: give(parts_of(path)),
-        FOLDER + r"so its results are not continued; choose another output path",
+        FOLDER + r"so its study is not continued; choose another output path",
         FOLDER + r"but s\.h5 belongs to root, so the blocks are not read; make one user the owner of both",
     ),
     "a block": (lambda path: give(min(parts_of(path).iterdir())), BLOCK, BLOCK),
-    "a colleague's": (colleague, r"s\.h5 belongs to nobody, so its results are not continued", None),
+    "a colleague's": (colleague, r"s\.h5 belongs to nobody, so its study is not continued", None),
 }
 
 
