@@ -182,7 +182,8 @@ class ArmFile(Strict):
     def _rows_or_urdf(self) -> "ArmFile":
         if bool(self.joint) == (self.urdf is not None):
             raise ValueError(
-                "exactly one of joint and urdf is needed; give one row of joint per joint, or the name of a URDF file."
+                "exactly one of joint and urdf is needed; give joint (one row per joint) or urdf (the name of a URDF "
+                "file)."
             )
         if self.urdf is None and (self.base is not None or self.tip is not None):
             raise ValueError("base and tip apply only to a URDF, whose links they name; remove both, or give urdf.")
@@ -232,7 +233,7 @@ class ArmFile(Strict):
             )
         if self.convention == "craig" and any(joint.beta for joint in self.joint):
             raise ValueError(
-                "beta (Hayati's angle) can be given only with convention = 'standard', but the convention is 'craig'; "
+                "beta (Hayati's angle) is possible only with convention = 'standard', but the convention is 'craig'; "
                 "remove beta."
             )
         return self

@@ -226,7 +226,9 @@ def test_what_is_not_an_arm_file(tmp_path):
     craig = (
         'convention = "craig"\nlength_unit = "mm"\nangle_unit = "deg"\njoint = [{ alpha = 0, a = 0, d = 1, beta = 1 }]'
     )
-    assert_refused(lambda: aj.load_arm(written(tmp_path, craig)), "beta", "standard convention", "remove beta")
+    assert_refused(
+        lambda: aj.load_arm(written(tmp_path, craig)), "beta", "only with convention = 'standard'", "remove beta"
+    )
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
     assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125", "ur5e.")
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")

@@ -206,9 +206,9 @@ def test_what_a_field_matches(tmp_path, motion, name, file, exclude, expected):
 @pytest.mark.parametrize(
     ("file", "exclude", "parts"),
     [
-        ("hole_{hole}.csv", [], ["Nearest: 'hole_0_pose.csv', 'hole_1_pose.csv'.", "letters, digits and '-' only"]),
+        ("hole_{hole}.csv", [], ["names are 'hole_0_pose.csv', 'hole_1_pose.csv'.", "letters, digits and '-' only"]),
         ("{hole}_pose.csv", ["*_pose.csv"], ["except 'hole_0_pose.csv'", "leaves these files out; change exclude"]),
-        ("hole_{hole}_poze.csv", [], ["there is 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
+        ("hole_{hole}_poze.csv", [], ["similar names: 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
         ("plate/{hole}.csv", [], ["no file matches 'plate/{hole}.csv'", "check the path"]),
     ],
     ids=["longer name", "excluded", "misspelt", "no such folder"],
@@ -248,7 +248,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
             ["'angles.unit' must be 'rad', 'deg', 'arcsec', 'gon', 'mrad' or 'counts', not 'grad'"],
         ),
         (HEAD + SOCKET, ["'angles' is missing", "unit of the readings", "add [angles]"]),
-        (HEAD + ANGLES, ["no [[socket]] and no other observation", "add one"]),
+        (HEAD + ANGLES, ["no [[socket]] and no other observation", "add at least one"]),
         (SMALL.replace("file", "flie"), ["unknown key 'socket 1.flie'", "did you mean 'file'?"]),
         (SMALL.replace("unit", "unti"), ["unknown key 'angles.unti'", "did you mean 'unit'?"]),
         (SMALL + LENGTH.replace("from", "form"), ["unknown key 'length 1.form'", "did you mean 'from'?"]),
@@ -295,7 +295,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = []'), ["'angles.counts_per_turn' has no entries"]),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = [1, 1, 2, 3, 4, 5]'),
-            ["a.csv: 1, 1, 2, 3, 4 and 5 pick the same column twice"],
+            ["a.csv: 1, 1, 2, 3, 4 and 1 more pick the same column twice"],
         ),
         (SMALL.replace('"rad"', '"rad"\nsign = 2'), ["'angles.sign' must be 1 or -1, not 2"]),
         (SMALL.replace('"rad"', '"rad"\nsign = [1, 1, 0, 1, 1, 1]'), ["'angles.sign 3' must be 1 or -1, not 0"]),

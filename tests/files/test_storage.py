@@ -102,11 +102,11 @@ BAD = {
         ["is not an HDF5 file", "give a file written by aacmm"],
     ),
     "empty": (lambda path, source: path.touch(), ["is not an HDF5 file"]),
-    "foreign": (make_foreign, ["was not written by aacmm", "name a "]),
+    "foreign": (make_foreign, ["was not written by aacmm", "give a "]),
     "newer": (set_attribute("format_version", 7), ["format version 7, newer", "(6)", "update aacmm_jax"]),
     "older": (set_attribute("format_version", 5), ["format version 5, older", "(6)", "create it again"]),
     "no version": (edit(lambda file: file.attrs.pop("format_version")), ["damaged", "create it again"]),
-    "other kind": (set_attribute("kind", "study"), ["contains a study", "name a "]),
+    "other kind": (set_attribute("kind", "study"), ["contains a study", "give a "]),
     "no table": (remove("capture"), ["has no table 'capture'", "create it again"]),
     "no arm": (remove("nominal_arm"), ["has no table 'nominal_arm'", "create it again"]),
     "no entry": (remove("capture/angle"), ["has no entry 'angle'", "create it again"]),
@@ -131,7 +131,7 @@ def test_bad_file(tmp_path, good, kind, make, parts):
 
 def test_a_capture_is_no_calibration(tmp_path, good):
     path = good.files["capture"]
-    assert_refused(lambda: aj.files.load_calibration(path), path, "contains a capture", "name a calibration file")
+    assert_refused(lambda: aj.files.load_calibration(path), path, "contains a capture", "give a calibration file")
     # The other way round is meant: a calibration holds its capture.
     assert aj.files.load_capture(good.files["calibration"]).capture.names == ("A", "B")
     for name in ("stage1_arm", "parameters", "observed"):

@@ -176,7 +176,7 @@ def test_manifest_and_arm_file_name_a_urdf(tmp_path, nominal):
     assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is not a URDF", "omit base and tip")
     assert_refused(lambda: aj.load_arm("panda", probe=(0, 0, 1)), "already states the probe")
     both = written(tmp_path, head + "joint = [{alpha = 0, a = 1, d = 0}]\n", "both.toml")
-    assert_refused(lambda: aj.load_arm(both), "either joint", "or urdf")
+    assert_refused(lambda: aj.load_arm(both), "exactly one of joint and urdf", "or urdf")
 
 
 def joint(name: str, **changes: str) -> tuple[str, str]:
@@ -195,9 +195,9 @@ REFUSED = {
     "several tips": (None, {"tip": None}, ["'upper_cover', 'tool0', 'left_finger'", "choose the tip"]),
     "unknown tip": (None, {"tip": "tool9"}, ["no link 'tool9'", "its links are 'world'"]),
     "branches": (None, {"base": "upper_cover"}, ["two branches", "separate at 'upper'"]),
-    "exchanged": (None, {"base": "tool0", "tip": "world"}, ["comes after", "exchange base and tip"]),
+    "exchanged": (None, {"base": "tool0", "tip": "world"}, ["is after the tip 'world'", "exchange base and tip"]),
     "same": (None, {"base": "tool0"}, ["same link"]),
-    "nothing moves": (None, {"tip": "base_link"}, ["no joint moves between 'world' and 'base_link'"]),
+    "nothing moves": (None, {"tip": "base_link"}, ["no moving joint between 'world' and 'base_link'"]),
     "endless slide": (joint("finger_1", limit=""), {"tip": "left_finger"}, ["'finger_1' is prismatic and has no"]),
     "reversed slide": (
         joint("finger_1", limit='<limit lower="0.04" upper="0"/>'), {"tip": "left_finger"}, ["limits 0.04 and 0 m;"]
@@ -219,7 +219,7 @@ REFUSED = {
     "no such link": (('<link name="wrist_2"/>', ""), {}, ["names the link 'wrist_2', which does not exist"]),
     "twice": (('<link name="wrist_2"/>', '<link name="wrist_2"/><link name="wrist_2"/>'), {}, ["occurs twice"]),
     "no chain": (ISLAND, {"base": "island"}, ["no chain of joints from 'island' to 'tool0'"]),
-    "roots": (ISLAND, {"tip": None}, ["2 roots, 'world', 'island'"]),
+    "roots": (ISLAND, {"tip": None}, ["2 root links, 'world', 'island'"]),
     "numbers": (('xyz="0.35 0 0.03"', 'xyz="0.35 0"'), {}, ["line ", "joint 'joint_4'", "'0.35 0'", "3 numbers"]),
     "no number": (('xyz="0.35 0 0.03"', 'xyz="a 0 0"'), {}, ["'a 0 0'"]),
     "huge": (('rpy="0 -1.5708 0"', 'rpy="1e300 0 0"'), {}, ["'1e300 0 0'", "below 1e+06"]),
