@@ -379,7 +379,7 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     return [sentence] if names else []
 
 
-def same_arm(one: Arm, other: Arm) -> bool:
+def same_arm(first: Arm, second: Arm) -> bool:
     """Whether two arms have the same parameters; without beta it is 0. A model of its joints may come
     with a calibration."""
 
@@ -387,4 +387,4 @@ def same_arm(one: Arm, other: Arm) -> bool:
         plain = arm.geometry._replace(coefficients=None, gravity=None, corrections=None)
         return plain._replace(beta=np.zeros(arm.joints) if arm.beta is None else arm.beta)
 
-    return jax.tree.all(jax.tree.map(np.array_equal, parameters(one), parameters(other)))
+    return jax.tree.all(jax.tree.map(np.array_equal, parameters(first), parameters(second)))

@@ -23,6 +23,7 @@ from ..data.observations.held import position_of
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.coverage_level import LEVEL
 from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows
@@ -31,8 +32,8 @@ from .evaluation import POSITION_ROWS, fit_geometry
 from .redrawn import variances_in_places
 from .task import without_lengths
 
-LEVEL = 0.01  # probability below which errors beyond their prediction are not put down to chance
-_HALF = LEVEL / 2  # for single groups of a cross-validation; the other half is for all of them together
+SIGNIFICANCE = 0.01  # probability below which errors beyond their prediction are not put down to chance
+_HALF = SIGNIFICANCE / 2  # for single groups of a cross-validation; the other half is for all of them together
 _NULL = 1e-10  # singular values of the geometry below this, of the largest, are zero
 _LEAST = 1e-4  # smallest standard uncertainty of what is certified, of a tip coordinate's standard deviation
 _LEAST_LENGTH_U = 1e-6  # mm: an error of a millionth of a millimetre is rounding
@@ -88,7 +89,7 @@ class UnseenErrors(NamedTuple):
         """Standard uncertainty of the error of every reference length, mm."""
         return np.sqrt(np.diagonal(self.length_covariance))
 
-    def expanded(self, level: float = 0.95) -> Float[np.ndarray, " l"]:
+    def expanded(self, level: float = LEVEL) -> Float[np.ndarray, " l"]:
         """Its expanded uncertainty, mm."""
         return coverage_factor(level, self.length_parts, self.law) * self.length_u
 
@@ -205,7 +206,7 @@ class _Unseen(NamedTuple):
             if rows is None:
                 private.append(np.zeros((0, *block.white.shape)))
                 continue
-            values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
+            values, vectors = np.linalg.eigh(np.asarray(influence.d_inverses[block.class_index]))
             roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
             private.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
         private, joined = observed.by_observation(private), observed.by_observation(joined)
@@ -257,7 +258,7 @@ def _of_lengths(
     by_head = np.asarray(influence.eliminated(head, components))
     pull = by_head[:, p:] @ problem.basis
     along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
-    pairs = zip(components, influence.own, strict=True)
+    pairs = zip(components, influence.d_inverses, strict=True)
     scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, inverse, part) for part, inverse in pairs], axis=0)
     covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
     error = np.asarray(measured) - np.array([float(length.value) for length in capture.lengths])

@@ -288,7 +288,7 @@ def _reason(calibration: Calibration | Identification) -> str:
     if values[0] >= _CORRELATED or len(leading) < 2:
         return sentence
     together = ", ".join(calibration.space.names[moving[i]] for i in leading)
-    return f"{sentence.partition(';')[0]}; {together} trade off; hold one of these parameters, or give it a prior."
+    return f"{sentence.partition(';')[0]}; {together} trade off; fix one of these parameters, or give it a prior."
 
 
 @checked_arguments
@@ -340,7 +340,7 @@ class JointFunction(NamedTuple):
 
     reading: Float[np.ndarray, " points"]  # the travel of the poses and a little beyond, within the joint's limits
     value: Float[np.ndarray, " points"]
-    expanded: Float[np.ndarray, " points"]  # expanded uncertainty, 95 %
+    expanded: Float[np.ndarray, " points"]  # expanded uncertainty U
     at_poses: Float[np.ndarray, " poses"]
 
 

@@ -17,7 +17,7 @@ from ..kinematics.parameters import Parameters
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.degrees_of_freedom import LEVEL
+from ..uncertainty.coverage_level import LEVEL, LEVEL_IN_PERCENT
 from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
@@ -82,8 +82,8 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
         model += " with the joint corrections below"
     return (
         "Each expanded uncertainty is the standard uncertainty times the coverage factor stated with it. This factor "
-        f"is that of Student's t distribution for a coverage probability of {LEVEL:.0%} and the effective degrees of "
-        "freedom of the quantity, which follow from what each part of its variance rests on. The standard "
+        f"is that of Student's t distribution for a coverage probability of {LEVEL_IN_PERCENT} and the effective "
+        "degrees of freedom of the quantity, which follow from what each part of its variance rests on. The standard "
         f"uncertainties follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and "
         f"from the {sources}. Uncertainties apply to each parameter alone; the covariance matrix gives the "
         "correlations. Expanded uncertainties are rounded to two digits, and values to the same decimal place. "

@@ -14,6 +14,7 @@ from ..files.hdf5 import read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
+from ..uncertainty.coverage_level import LEVEL
 from . import options, views
 from .app import command, show_summary, with_spinner
 from .options import argument, flag, names_option, option, output, seed
@@ -276,7 +277,7 @@ def compare(
         "ordered by date.",
         "OLD.h5 NEW.h5 [MORE.h5 ...]",
     ),
-    level: float = option("Coverage probability of the expanded uncertainties.", "P", default=0.95),
+    level: float = option("Coverage probability of the expanded uncertainties.", "P", default=LEVEL),
     length_mm: float | None = option(
         "Compute the change of lengths of this size all over the volume. Default: 300, or half the reach of a small "
         "arm."

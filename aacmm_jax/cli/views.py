@@ -10,6 +10,7 @@ from ..summaries import result_tables as tables
 from ..summaries import tables as words
 from ..summaries.result_tables import BY_CONSTRUCTION, STAGES, listed_apart
 from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatted, listed, number
+from ..uncertainty.coverage_level import LEVEL_IN_PERCENT, U_AT_LEVEL
 
 _MOST_PARTS = 12  # rows of a table
 _ARMS = {"nominal": "nominal", "calibrated": "calibrated"}
@@ -205,14 +206,14 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
             pairs = list(zip(frame[quantity.format("")], expanded, strict=True))
             rows.append((name, title, *(number(scale * x, decimals_for(u), rounded=True) for x, u in pairs)))
             rows.append(("", "U", *(number(u, decimals_for(u)) for u in expanded)))
-    title = "Base frame in each frame with known coordinates, with U (95 %)"
+    title = f"Base frame in each frame with known coordinates, with {U_AT_LEVEL}"
     return listed(title, rows, ("in", "", "x", "y", "z"))
 
 
 def _uncertainty(summary: dict[str, Any]) -> View:
-    """The expanded uncertainty (95 %) over the volume, the noise that it follows from, and what the data determine."""
+    """The expanded uncertainty over the volume, the noise that it follows from, and what the data determine."""
     part = summary["uncertainty"]
-    factors = ", ".join(filter(None, ("95 %", words.factor_words(part["volume"]))))
+    factors = ", ".join(filter(None, (LEVEL_IN_PERCENT, words.factor_words(part["volume"]))))
     yield tables.volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
     yield (
         "U is propagated from the uncertainties of the parameters to 400 positions, those of random poses within the "
@@ -270,7 +271,7 @@ def lengths(rows: Sequence[Mapping[str, Any]], *, fixed_scale: bool = False, pre
         value = None if fixed_scale else row["error_over_expanded"]
         return number(value, 2, signed=True, mark="bad" if value is not None and abs(value) > 1 else "")
 
-    return listed("Reference lengths [mm]" + ("; U: 95 %" if predicted else ""), rows, {
+    return listed("Reference lengths [mm]" + (f"; U: {LEVEL_IN_PERCENT}" if predicted else ""), rows, {
         "between": lambda row: f"{row['from']} - {row['to']}",
         "value": "value_mm",
         "measured": read("measured_mm"),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import Expansion, Influences, Limit, Rule, checked_influences
+from ..acceptance.judgement import COVERAGE_FACTOR, Expansion, Influences, Limit, Rule, checked_influences
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord, checked_limits
 from ..acceptance.results import Measured
 from ..core.arguments import checked
@@ -67,7 +67,11 @@ def save_evaluation(
         standard=(standards, "", "standard of the test"),
         name=(names, "", "metric"),
         value=(values, "mm", "value of the worst part"),
-        expanded=([part.expanded for part in worst], "mm", "expanded uncertainty, coverage factor 2"),
+        expanded=(
+            [part.expanded for part in worst],
+            "mm",
+            f"expanded uncertainty, coverage factor {COVERAGE_FACTOR:g}",
+        ),
         limit=(limits, "mm", "MPE"),
         decision=(decisions, "", "decision by the rule of the test"),
         where=([part.where for part in worst], "", "what gave the worst part"),

@@ -8,6 +8,7 @@ import numpy as np
 from ..core.text import pluralise
 from ..drift.results import Drift, Trend, in_words
 from ..summaries.result_tables import listed_apart
+from ..uncertainty.coverage_level import in_percent
 from .charts import SERIES, Axis, Marks, Plot, histogram, linear, names
 from .figures import check_format, draw, new_figure, save_figure
 
@@ -90,7 +91,7 @@ def _changes_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
         marks.append(Marks(name, positions, ratio[:, i], joined=True, **style))
     title = (
         f"Change of {len(trend.names)} parameters from the first calibration; band: expanded uncertainty "
-        f"({100 * drift.level:g} %)\nnamed: beyond the band at the last date (at most {len(SERIES)}); "
+        f"({in_percent(drift.level)})\nnamed: beyond the band at the last date (at most {len(SERIES)}); "
         "open circles: other values beyond the band"
     )
     return Plot(x, _ratio_axis(ratio), tuple(marks), title + _not_shown(drift))
@@ -133,7 +134,7 @@ def _changes_of_two(drift: Drift) -> Plot:
     )
     title = (
         f"New minus old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band "
-        f"(their expanded uncertainty, {100 * drift.level:g} %)"
+        f"(their expanded uncertainty, {in_percent(drift.level)})"
     )
     return Plot(axis, _ratio_axis(ratio), marks, title + _not_shown(drift))
 

@@ -12,6 +12,7 @@ from ..core.units import DEG
 from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.calibration import metrics_by_socket_and_length
 from ..summaries.tables import decimals_for, format_number
+from ..uncertainty.coverage_level import U_AT_LEVEL
 from ..uncertainty.volume import VolumetricUncertainty
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, runs, shades, thinned
 from .figures import draw
@@ -65,7 +66,7 @@ def length_chart(rows: Sequence[Mapping[str, Any]], earlier: Mapping[str, np.nda
         for row in rows
     ]
     marks = [Marks(name, x, values, "diamond", "accent") for name, values in earlier.items()]
-    name = "calibrated" + (", with U (95 %)" if np.any(np.isfinite(expanded)) else "")
+    name = "calibrated" + (f", with {U_AT_LEVEL}" if np.any(np.isfinite(expanded)) else "")
     marks.append(Marks(name, x, error, "square", "main", words, error - expanded, error + expanded, size=7))
     description = "Measured minus calibrated value" + (", before and after the scale fix." if earlier else ".")
     return Chart("lengths", "Errors of the reference lengths", description, (_errors_plot(axis, edges, marks),))
@@ -97,7 +98,7 @@ def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
 
 
 def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
-    """Plot the errors of the reference lengths before and after the scale fix, mm, with expanded uncertainty (95 %).
+    """Plot the errors of the reference lengths before and after the scale fix, mm, with expanded uncertainty U.
 
     Args:
         record: The calibration; `InputError` if it has no reference lengths.
@@ -179,7 +180,7 @@ def volume_chart(volume: VolumetricUncertainty) -> Chart:
 
 
 def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) -> Any:
-    """Plot U (95 %) of lengths over the working volume: larger and darker marks are more uncertain.
+    """Plot the expanded uncertainty U of lengths over the working volume: larger and darker marks are more uncertain.
 
     Each length is marked at the height and the distance from the first axis where it starts.
 

@@ -17,6 +17,7 @@ from ..summaries.compared_models import compared_models_summary
 from ..summaries.result_tables import listed_apart
 from ..summaries.tables import decimals_for, format_number, rows_of
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.coverage_level import U_AT_LEVEL
 from ..uncertainty.identifiability import Observability
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, names
 from .figures import TONES, draw
@@ -41,7 +42,7 @@ def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
         u = f"U {format_number(bar, decimals)} {label}" if np.isfinite(bar) else "no uncertainty of its own"
         words.append(f"{row['parameter']}: {format_number(value, decimals, signed=True)} {label}, {u}")
     words, low, high = np.array(words), (change - expanded)[finite], (change + expanded)[finite]
-    marks = [Marks("with U (95 %)", x[finite], change[finite], "dot", "main", words[finite].tolist(), low, high)]
+    marks = [Marks(f"with {U_AT_LEVEL}", x[finite], change[finite], "dot", "main", words[finite].tolist(), low, high)]
     # What has no uncertainty of its own has an arbitrary value: within the range of the others it has a cross.
     ends = (change[finite], low, high) if any(finite) else (change,)
     axis = linear(f"calibrated − nominal [{label}]", *ends, [0.0])
@@ -58,7 +59,7 @@ def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
 
 
 def parameter_changes(record: CalibrationRecord, kind: str = "length", axes: Any = None) -> Any:
-    """Plot the change of each parameter from its nominal value, with its expanded uncertainty (95 %).
+    """Plot the change of each parameter from its nominal value, with its expanded uncertainty U.
 
     Hundreds of coefficients of harmonics are left out: `joint_function` draws them as the function that they are.
 
@@ -274,7 +275,7 @@ def joint_function(
 
     Marks are means over neighbouring poses, with twice their standard error: the change of this joint that alone would
     explain most of their residuals, added to the calibrated function. That function is the curve, with its expanded
-    uncertainty (95 %): harmonics and gear ratio of the arm, less their mean over the poses, which a zero offset takes
+    uncertainty U: harmonics and gear ratio of the arm, less their mean over the poses, which a zero offset takes
     up. It goes a little beyond the travel of the poses (between the dashed lines), within the limits of the joint.
     Marks off the curve, or a pattern of marks without a curve, are errors that the model lacks.
 

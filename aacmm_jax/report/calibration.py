@@ -25,6 +25,7 @@ from ..summaries.tables import (
     shared_sentence,
     two_digits,
 )
+from ..uncertainty.coverage_level import LEVEL_IN_PERCENT
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
 from .elements import DRAWN, Block, Report, Section, length_table, observation_tables, removed_tables
@@ -96,7 +97,7 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     largest, median = (volume[f"expanded_length_reading_{which}_mm"] for which in ("largest", "median"))
     if median is not None and largest is not None:
         typical, worst = (f"{two_digits(u)}\u00a0mm" for u in (median, largest))
-        facts.append((f"{length} (95 %)", f"median {typical}, largest {worst}"))
+        facts.append((f"{length} ({LEVEL_IN_PERCENT})", f"median {typical}, largest {worst}"))
     else:
         facts.append((length, "not determined everywhere"))
     if summary.get("lengths_tested"):
@@ -104,7 +105,8 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if summary["scale_k"] is not None:
         expanded = summary["scale_expanded"] or 0.0
         decimals = decimals_for(expanded, 7)
-        k = f"{summary['scale_k']:.{decimals}f}\u00a0±\u00a0{expanded:.{decimals}f} (95\u00a0%)"
+        level = LEVEL_IN_PERCENT.replace(" ", "\u00a0")
+        k = f"{summary['scale_k']:.{decimals}f}\u00a0±\u00a0{expanded:.{decimals}f} ({level})"
         facts.append(("Scale k of stage 1", k))
     return facts
 
@@ -226,5 +228,5 @@ def _scale_sentence(record: CalibrationRecord, summary: dict[str, Any]) -> str:
         "Repeatability does not determine the size of an arm; the reference lengths do. With the parameters of "
         f"stage 1, the arm measures k = {k_shown} times the calibrated value of the reference lengths, with {u_of_k}. "
         f"The lengths of the arm were divided by k, a change of {abs(k - 1) * 1000:.{decimals}f} mm per metre, known "
-        f"to ±\u00a0{expanded:.{decimals}f} mm per metre (95 %)."
+        f"to ±\u00a0{expanded:.{decimals}f} mm per metre ({LEVEL_IN_PERCENT})."
     )

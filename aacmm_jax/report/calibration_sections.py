@@ -37,6 +37,7 @@ from ..summaries.tables import (
     two_digits,
 )
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.coverage_level import LEVEL_IN_PERCENT
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_of_arm
@@ -56,8 +57,9 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     """Every parameter with its expanded uncertainty; hundreds of coefficients joint by joint, and on demand."""
     others, harmonics = listed_apart(summary["parameters"])
     introduction = (
-        "U is the expanded uncertainty (95 %), with the coverage factor of each parameter's own degrees of freedom. A "
-        "parameter on a bound, or one that the data determine only together with others, has no U of its own."
+        f"U is the expanded uncertainty ({LEVEL_IN_PERCENT}), with the coverage factor of each parameter's own degrees "
+        "of freedom. A parameter on a bound, or one that the data determine only together with others, has no U of its "
+        "own."
     )
     by_unit = {unit: [row for row in others if row["unit"] == unit] for unit in ("mm", "rad")}
     functions = functions_chart(record)
@@ -140,7 +142,7 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     box = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends).replace("-", "−")
     introduction = (
         f"Expanded uncertainty at {len(volume.start)} positions that random poses within the joint limits reach "
-        f"({box} mm), for a coverage of 95 % ({factor_words(statistics)})."
+        f"({box} mm), for a coverage of {LEVEL_IN_PERCENT} ({factor_words(statistics)})."
     )
     positions = {f"{axis} [mm]": numbers(volume.start[:, k], 0) for k, axis in enumerate("xyz")}
     for name, u in (
@@ -216,7 +218,7 @@ def monte_carlo(record: CalibrationRecord) -> list[Section]:
         **{name: numbers(sampled[key], 6) for name, key in keys.items()},
         "agree": ["yes" if agrees else Cell("no", None, "unsure") for agrees in sampled["agrees"]],
     }
-    quantities = by_columns("Quantities, in mm and rad; 95 % coverage intervals", columns)
+    quantities = by_columns("Quantities, in mm and rad; coverage intervals", columns)
     return [Section("monte-carlo", "Monte Carlo (JCGM 101)", [record.sampled_says or "", quantities])]
 
 

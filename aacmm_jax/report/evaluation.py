@@ -133,11 +133,11 @@ def _acceptance(
         u = format_number(1000 * u_test, 1)
         stated = f"a standard uncertainty of {u} µm was stated for seat, fixture and temperature"
     blocks: list[Block] = [
-        "Every metric is computed from single readings. U (coverage factor 2) is the contribution of the tester: it "
-        f"includes the uncertainty of the artefacts; {stated}. The arm's own scatter is what is tested, so U does not "
-        "include it (ISO 14253-5). The standards' permission to repeat a reading is not applied. A test that lacks "
-        "something its standard requires is labelled 'based on' the standard. Requirements and formulas are taken from "
-        "secondary sources on the editions named.",
+        f"Every metric is computed from single readings. U (coverage factor {COVERAGE_FACTOR:g}) is the contribution "
+        f"of the tester: it includes the uncertainty of the artefacts; {stated}. The arm's own scatter is what is "
+        "tested, so U does not include it (ISO 14253-5). The standards' permission to repeat a reading is not applied. "
+        "A test that lacks something its standard requires is labelled 'based on' the standard. Requirements and "
+        "formulas are taken from secondary sources on the editions named.",
     ]
     metrics = [metric for test in rows for metric in test["figures"]]
     limited = any(metric["limit_mm"] is not None for metric in metrics)
@@ -217,6 +217,6 @@ def _lengths(
     means = length_table(caption, rows, {"nominal": before}, record.length_that_fixed_scale())
     note = (
         "These lengths use the means of all poses and are given for comparison; no acceptance test uses them. U "
-        "(coverage factor 2) also includes the scatter of the poses at both ends."
+        f"(coverage factor {COVERAGE_FACTOR:g}) also includes the scatter of the poses at both ends."
     )
     return [Section("lengths", "Lengths", [*([] if chart is None else [chart]), means, note])]

@@ -8,6 +8,7 @@ from ..core.text import csv_text
 from ..core.units import people_read, people_read_change
 from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange
+from ..uncertainty.coverage_level import in_percent
 from . import tables
 from .result_tables import listed_apart
 from .tables import Cell, Styled, View, attributes, decimals_for, listed, number, plain, rows_of
@@ -156,7 +157,7 @@ def _parameters(summary: dict[str, Any]) -> View:
         change = number(fine * row["change"], small, signed=True, rounded=True)
         mark = row["without"] or Cell("* beyond U" if row["moved"] else "", None, "outlier")
         rows.append((row["parameter"], unit, old, new, small_unit, change, number(fine_u, small), mark))
-    title = f"Parameters: change with its expanded uncertainty U ({100 * summary['level']:g} %)"
+    title = f"Parameters: change with its expanded uncertainty U ({in_percent(summary['level'])})"
     yield listed(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
     left_out = len(summary["parameters"]) - len(shown)
     if left_out:

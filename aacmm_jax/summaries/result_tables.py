@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.units import DEG, people_read
+from ..uncertainty.coverage_level import U_AT_LEVEL
 from . import tables
 from .tables import METRICS, Cell, Columns, Table, decimals_for, listed, number
 
@@ -141,7 +142,7 @@ def parameter_table(caption: str, rows: Rows) -> Table:
         "parameter": "parameter",
         "unit": lambda row: people_read(row["unit"])[1],
         "calibrated": lambda row: _value(row, row["calibrated"], row["expanded"]),
-        "U (95 %)": lambda row: _expanded(row, row["expanded"]),
+        U_AT_LEVEL: lambda row: _expanded(row, row["expanded"]),
         "change": lambda row: _value(row, row["calibrated"] - row["nominal"], row["expanded"], signed=True),
         "nominal": lambda row: _value(row, row["nominal"], row["expanded"], least=4),
         "": state,
@@ -267,7 +268,7 @@ def geometry_table(parts: Rows, coverage: float) -> Table:
         "part": "part",
         "quantity": "quantity",
         "value": lambda row: tables.quantity_words(row, u=False, coverage=coverage),
-        "U (95 %)": lambda row: tables.expanded_words(row, coverage),
+        U_AT_LEVEL: lambda row: tables.expanded_words(row, coverage),
         "largest difference from the certified values [mm]": "difference" if certified else None,
     })  # fmt: skip
 

@@ -7,9 +7,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..calibration.prediction import LEVEL
+from ..calibration.prediction import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
+from ..uncertainty.coverage_level import U_AT_LEVEL
 from .tables import two_digits
 
 _LACKING = "the residuals show errors that the model does not describe"  # what tests of residuals doubt
@@ -38,7 +39,7 @@ def calibration_verdict(
         doubts = ["the data do not determine lengths everywhere in the working volume", *doubts]
         return Verdict("unsure", f"To be used with care: {'; '.join(doubts)}.")
     stated = (
-        f"U (95 %) of a measured length of {volume['length_mm']:g} mm is {two_digits(median)} mm (at worst "
+        f"{U_AT_LEVEL} of a measured length of {volume['length_mm']:g} mm is {two_digits(median)} mm (at worst "
         f"{two_digits(largest)} mm)"
     )
     if doubts:
@@ -124,7 +125,7 @@ def _as_predicted(predicted: Mapping[str, Any]) -> Verdict:
     ratio = predicted["lengths"]["normalised_error_rms"]
     if ratio is not None:
         rms += f", and length errors are {ratio:.2g} times as large as predicted"
-    if any(chance < LEVEL / len(chances) for chance in chances):
+    if any(chance < SIGNIFICANCE / len(chances) for chance in chances):
         chance = min(chances)
         return Verdict("unsure", f"Errors on held-out data exceed the prediction (p = {chance:.1g}): {rms}.")
     if max(measured / expected if expected else 0.0, ratio or 0.0) > _LARGER:

@@ -206,7 +206,7 @@ def test_what_a_field_matches(tmp_path, motion, name, file, exclude, expected):
 @pytest.mark.parametrize(
     ("file", "exclude", "parts"),
     [
-        ("hole_{hole}.csv", [], ["names are 'hole_0_pose.csv', 'hole_1_pose.csv'.", "letters, digits and '-' only"]),
+        ("hole_{hole}.csv", [], ["names are 'hole_0_pose.csv', 'hole_1_pose.csv'.", "only letters, digits and '-'"]),
         ("{hole}_pose.csv", ["*_pose.csv"], ["except 'hole_0_pose.csv'", "leaves these files out; change exclude"]),
         ("hole_{hole}_poze.csv", [], ["similar names: 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
         ("plate/{hole}.csv", [], ["no file matches 'plate/{hole}.csv'", "check the path"]),
@@ -431,7 +431,7 @@ def test_bad_manifest(tmp_path, motion, text, parts):
     [
         (b"1,2,3,4,5.5\n", ["has 5 columns", "the arm's 6 joints", "one column per joint", "columns = [...]"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5\n", ["line 2 has 5 columns", "before it have 6", "give all lines the same"]),
-        (b"q\n1,2,3,4,5.5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "write it"]),
+        (b"q\n1,2,3,4,5.5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "write the number"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,1_0\n", ["line 2 column 6", "'1_0' is not a number"]),
         (b"1,2,3,4,5.5,\n", ["has 5 columns without names", "the arm's 6 joints"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,\n", ["line 2 column 6", "'' is not a number"]),

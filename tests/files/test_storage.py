@@ -140,7 +140,7 @@ def test_a_capture_is_no_calibration(tmp_path, good):
             lambda: aj.files.load_calibration(tmp_path / "bad.h5"), f"has no table '{name}'", "create it again"
         )
     path = good.files["capture"] / "below.h5"
-    assert_refused(lambda: aj.files.load_capture(path), path, "cannot be read: not a directory", "name another")
+    assert_refused(lambda: aj.files.load_capture(path), path, "cannot be read: not a directory", "give another")
 
 
 @pytest.mark.parametrize("kind", LOAD)

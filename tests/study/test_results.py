@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.study.results import concise, distribution, statistic
+from aacmm_jax.study.results import distribution, statistic
 from aacmm_jax.study.tables import level_title
 from tests.refusals import assert_refused
 
@@ -117,25 +117,6 @@ def test_standard_errors_where_groups_differ_are_those_of_repetition(name, count
     assert np.sqrt(np.mean(np.square(found))) == pytest.approx(
         np.std([function(values) for values in studies]), rel=0.25
     )
-
-
-@pytest.mark.parametrize(
-    ("value", "se", "text"),
-    [
-        (0.010684, 0.000031, "0.01068(3)"),
-        (1.0000335, 4.57e-5, "1.00003(5)"),
-        (3198.2, 36.1, "3198(36)"),
-        (0.9951, 0.0096, "1.00(1)"),
-        (-8.306e-7, 7.08e-7, "-8(7)e-07"),
-        (5.0, 0.0, "5"),
-        (5.0, None, "5"),
-        (None, None, "-"),
-        (float("nan"), 0.1, "-"),
-        (0.0, 0.02, "0.00(2)"),
-    ],
-)
-def test_concise_notation(value, se, text):
-    assert concise(value, se) == text
 
 
 def test_boxes_say_what_is_pooled(path):
