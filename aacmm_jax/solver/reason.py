@@ -24,7 +24,7 @@ class Reason(eqx.Enumeration):
     rounding = "Converged: no step can lower the cost by more than rounding error."
     max_steps = "Not converged: the step limit was reached; allow more steps or start closer."
     stalled = (
-        "Not converged: no step lowers the cost, although this is not a minimum; is the residual smooth, and is its "
+        "Not converged: no step lowers the cost, and this is not a minimum; is the residual smooth, and is its "
         "derivative correct?"
     )
     nonfinite = (

@@ -148,7 +148,7 @@ def test_refused_in_one_sentence(paper_arm, what):
     [
         ('units = { points = "m" }', ["says mm, but the manifest says m", "correct one of the two"]),
         ('[[points]]\nname = "a"\nfile = "b.csv"', ["two observations have the name 'a'", "give them different names"]),
-        ('target = "a\\nb"', ["target of observation 'a' has the name", "a name of one line"]),
+        ('target = "a\\nb"', ["target of observation 'a' has the name", "a text of one line"]),
     ],
 )
 def test_refused_in_a_manifest(tmp_path, text, parts):

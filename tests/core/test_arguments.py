@@ -65,7 +65,7 @@ checked_sphere = checked_arguments(where="sphere '{name}'")(sphere)
         ({"diameter": np.inf}, "diameter of sphere 'S' is inf mm; it must be positive."),
         ({"diameter": "2"}, "diameter of sphere 'S' is '2'; give a number."),
         ({"method": "jiont"}, "method of sphere 'S' is 'jiont'; did you mean 'joint'?"),
-        ({"method": np.zeros(2)}, "method of sphere 'S' is array([0., 0.]); known are"),
+        ({"method": np.zeros(2)}, "method of sphere 'S' is array([0., 0.]); choose one of"),
         ({"lengths": 3}, "lengths of sphere 'S' is 3; give a list."),
         ({"lengths": "AB"}, "lengths of sphere 'S' is 'AB'; give a list."),
         ({"lengths": [3]}, "lengths[0] of sphere 'S' is 3; give a ReferenceLength."),

@@ -9,7 +9,7 @@ from ..refusals import assert_refused
 
 def test_degrees_are_recognized():
     """Of revolute joints; prismatic ones slide by hundreds of mm."""
-    said = ["socket 'A' pose 2 joint 1 is 90 rad", "more than four revolutions", "look like degrees", "numpy.deg2rad"]
+    said = ["socket 'A' pose 2 joint 1 is 90 rad", "more than four revolutions", "probably in degrees", "numpy.deg2rad"]
     capture, arm = aj.Capture({"A": np.array([[0.0, 1.0], [90.0, 2.0]])}), aj.Arm(alpha=[1, 0], a=[1, 1], d=[0, 0])
     assert_refused(lambda: aj.evaluate(arm, capture), *said)
     aj.evaluate(arm.replace(prismatic=(1,)), capture)

@@ -230,7 +230,7 @@ def test_what_is_not_an_arm_file(tmp_path):
         lambda: aj.load_arm(written(tmp_path, craig)), "beta", "only with convention = 'standard'", "remove beta"
     )
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
-    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125", "ur5e.")
+    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "choose one of cheng2018-ra7125", "ur5e.")
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")
     assert_refused(lambda: aj.load_arm(tmp_path / "folder.toml"), tmp_path, "is a folder", "give a file")
     assert_refused(lambda: aj.load_arm(tmp_path / "binary.toml"), tmp_path, "not UTF-8 text")

@@ -262,7 +262,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (HEAD + ANGLES + '[[socket]]\nfiles = ["a.csv"]', ["socket 1", "needs a name"]),
         (HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = []', ["'socket 1.files' has no entries", "give at least 1"]),
         (SMALL + SOCKET, ["socket 'a' is defined twice", "in one [[socket]]"]),
-        (SMALL + LENGTH, ["'a' to 'b'", "unknown socket 'b'", "known are a."]),
+        (SMALL + LENGTH, ["'a' to 'b'", "unknown socket 'b'", "choose one of a."]),
         (SMALL + LENGTH.replace("200.0", "-200.0"), ["'a' to 'b' is -200 mm", "positive"]),
         (SMALL + LENGTH.replace("200.0", '"long"'), ["'length 1.value' must be a valid number, not 'long'"]),
         (SMALL + LENGTH + "u = -1", ["'length 1.u' must be greater than or equal to 0, not -1"]),

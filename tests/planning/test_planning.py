@@ -226,7 +226,7 @@ def test_readings_taken_by_the_plan_come_back_through_its_manifest(paper_arm, gi
 REFUSED = {
     "too few": ({"poses": 5}, "too few for 4 sockets"),
     "equations": ({"poses": 9, "sockets": 4}, "plan at least 11"),
-    "criterion": ({"criterion": "B"}, "criterion is 'B'; known are length, A, D, E"),
+    "criterion": ({"criterion": "B"}, "criterion is 'B'; choose one of length, A, D, E"),
     "margin": ({"margin": 4.0}, "no range of motion between the limits"),
     "u": ({"u": 0.0}, "u of a reference length is 0 mm"),
     "length": ({"length": 9000.0}, "does not fit this arm"),

@@ -127,7 +127,7 @@ def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
     aj.files.save_capture(
         tmp_path / "c.h5", aj.Recording(noisy_capture, aj.files.load_specification("cheng2018-simulation"))
     )
-    with pytest.raises(aj.InputError, match=r"c\.h5 contains a capture; name a study file"):
+    with pytest.raises(aj.InputError, match=r"c\.h5 contains a capture; give a study file"):
         aj.study.run_study(study, tmp_path / "c.h5")
     aj.files.load_capture(tmp_path / "c.h5")
 
