@@ -43,7 +43,7 @@ OURS = ("a link to a folder", "a link to a block", "an open folder")  # which ne
 # What is done to a study of the user with blocks, and how running it and reading it is refused; None: it is not.
 PLANTED = {
     "a link to a folder": (link_folder, *[r"s\.h5\.parts is a link, so the blocks in it are not read"] * 2),
-    "a link to a block": (link_block, *[r"cell.*\.npz is a link, so it is not read; remove it"] * 2),
+    "a link to a block": (link_block, *[r"cell.*\.npz is a link, so the block is not read; remove the file"] * 2),
     "an open folder": (
         lambda path: parts_of(path).chmod(0o777),
         *[r"other users may write to .*s\.h5\.parts \(mode 0777\), .* yours, run chmod go-w '.*\.parts'"] * 2,

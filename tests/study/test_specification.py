@@ -108,7 +108,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"capture": CAPTURE | {"poses": 3000}}, "3000 poses per socket are needed, but the pool has"),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "must contain at least two placements with 100 poses .* give at least 8192",
+            "must contain at least two placements with 100 poses; give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "'capture.pool' must be less than or equal to 16777216"),
@@ -122,7 +122,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"reference": {"u_mm": 0.1}}, "give either length_mm .* or ends_mm"),
         ({"reference": {"length_mm": 300}}, "a reference length at a random position needs a region"),
         ({"reference": {"ends_mm": [[[0, 0, 0], [0, 0, 0]]]}}, "two ends at the same position"),
-        ({"identification": {"method": "joint"}}, "needs a reference length"),
+        ({"identification": {"method": "joint"}}, "need a reference length"),
         (
             {"identification": {"method": "both"}},
             "'identification.method' must be 'stage1', 'two-stage' or 'joint', not 'both'",
@@ -166,7 +166,7 @@ def test_a_narrow_region_is_found(tmp_path):
         ),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "must contain at least two placements with 100 poses .* give at least 8192",
+            "must contain at least two placements with 100 poses; give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "'capture.pool' must be less than or equal to 16777216"),
@@ -188,7 +188,7 @@ def test_a_narrow_region_is_found(tmp_path):
         ),
         (
             {"reference": {"length_mm": 2900, "region": {"distance_mm": [100, 1000]}}},
-            "a reference length of 2900 mm has no placement in its region",
+            "no position of a reference length of 2900 mm in its region",
         ),
     ],
     ids=str,

@@ -104,7 +104,7 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
         ({"chunk": 0}, "chunk is 0; give a whole number of at least 1"),
         (
             {"version": "9.9"},
-            "was begun with aacmm_jax .*, but this process has aacmm_jax 9.9, which can change the numbers",
+            "was begun with aacmm_jax .*, but this process has aacmm_jax 9.9, which can change the results",
         ),
     ],
     ids=str,
