@@ -67,7 +67,7 @@ def dcc_xml(
     if not record.plausible_scale:
         raise InputError(
             f"a certificate cannot be issued: k = {record.k:.6g} is not a plausible scale of an arm; correct the "
-            "reference lengths and calibrate again."
+            "values of the reference lengths and calibrate again."
         )
     _check_evaluation(record, administrative_data, evaluation)
     try:
@@ -182,7 +182,7 @@ def _statements(record: CalibrationRecord, given: AdministrativeData, sources: S
         scale = ", ".join(scale_sources(record))
         traceable = "the certified values of these artefacts and the measuring instruments"
     says = f"The scale of the arm comes from {scale}. Measurements of the arm are traceable to the metre"
-    yield _statement("Scale", f"{says} only as far as {traceable} are.")
+    yield _statement("Scale", f"{says} only to the extent that {traceable} are traceable.")
     yield _statement("Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
@@ -223,7 +223,10 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
             continue
         status = {"nominal": "beforeAdjustment", "calibrated": "afterAdjustment"}[stage]
         formulas = "Formulas and requirements are taken from secondary sources."
-        contributions = "Only the contributions of the tester (ISO 14253-5), combined as independent."
+        contributions = (
+            "The uncertainty includes only the contributions of the tester (ISO 14253-5), combined as independent "
+            "contributions."
+        )
         data = element("data", english("text", _influences(record)))
         condition = named("influenceCondition", "Uncertainty of the test", element("status", status), data)
         editions = dict.fromkeys(test.called for test in tests)
@@ -253,9 +256,9 @@ def _influences(record: EvaluationRecord) -> str:
         if body is not None:
             parts.append(
                 f"the {name} expands by {body.coefficient:.4g} / K (u = {body.u_coefficient:.2g} / K), at "
-                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this"
+                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this expansion"
             )
-    return "; ".join(parts) + ". The arm's own scatter is what is tested, so it is not included."
+    return "; ".join(parts) + ". The arm's own scatter is not included, because it is what is tested."
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:
@@ -286,7 +289,9 @@ def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, 
             "metaData",
             f"Conformity of {test.symbol(metric)}",
             element("norm", RULES[test.rule]),
-            english("declaration", f"|value| compared with the maximum permissible error: {value.decision}."),
+            english(
+                "declaration", f"Decision from comparing |value| with the maximum permissible error: {value.decision}."
+            ),
             element("conformity", _conformity(value)),
             element("data", limit),
         )

@@ -143,7 +143,7 @@ class MeasuredTransforms(MeasuredPoints):
     u_angle: Float[AnyArray, ""] = declared(
         "standard uncertainty of an orientation about each axis", "rad", positive=True
     )
-    target: str = declared("target that was seen", default=NAME)
+    target: str = declared("target that was measured", default=NAME)
     orientation = Part("orientation of {target}", *FRAME[:3])  # of the target in the last frame
 
     def completed(self, where: str) -> Mapping[str, Any]:

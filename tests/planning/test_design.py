@@ -254,7 +254,10 @@ REFUSED = {
     "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; it must be"),
     "no range": ({"region": {"z": (10.0, 0.0)}}, "which is not a range"),
     "under the table": ({"above": 2000.0}, "reaches all sockets"),
-    "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "cannot determine all parameters.*the scale"),
+    "no length": (
+        {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}},
+        "cannot determine all parameters.*the scale",
+    ),
     "unknown end": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "C")]},
         "unknown socket 'C'",
