@@ -540,7 +540,7 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column '4'"),
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "pick the same column twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
-        (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
+        (("shoulder = [0, 0, 0]", ""), "reach and shoulder are needed together"),
         (
             ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
             "target, session and temperature_C apply only to",
