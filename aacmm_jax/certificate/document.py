@@ -208,7 +208,11 @@ def _statement(name: str, words: str, verdict: Element | None = None, *, norm: s
 
 def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
     """The measurement results of the acceptance tests of an evaluation, if it has any."""
-    which = "not used." if record.independent else "used: there are no others."
+    which = (
+        "not used for the calibration."
+        if record.independent
+        else "also used for the calibration, because there are no other poses."
+    )
     # With the uncertainties of their own certificates.
     lengths = [record.recording.capture.lengths[i] for i in record.held_out_lengths()]
     values = {f"Length {x.start} - {x.end}": (float(x.value), float(x.u)) for x in lengths}
@@ -243,7 +247,7 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
             artefacts,
             element("influenceConditions", condition),
             element("results", (_test(test, judged=record.recording.true is None) for test in tests)),
-            says=f"Computed from single readings in poses that the calibration has {which}",
+            says=f"Computed from single readings in poses that were {which}",
         )
 
 

@@ -64,14 +64,14 @@ def arm(
 ) -> None:
     """Analyse an arm before its first calibration.
 
-    The command prints the axes at zero readings and the reach of the arm; which parameters are redundant, and with
-    which others; how many parameters sockets, reference lengths and a tracker determine; and how many poses a first
-    capture needs.
+    The command prints the axes with all readings zero, the reach of the arm, the redundant parameters, the number of
+    parameters that sockets, reference lengths and a tracker determine, and the number of poses that a first capture
+    needs.
 
-    --check finds the order, signs, zeros and units of the columns with which recorded readings fit the arm, and prints
-    the table [angles] that a manifest then needs. Positions in a table are in the base frame (for a URDF: in its base
-    link). The frame of a tracker in a manifest is found from the data. The exit code is 1 if the readings cannot be
-    made to fit the arm.
+    --check finds the order, signs, zero offsets and units of the columns with which recorded readings fit the arm, and
+    prints the table [angles] for the manifest. Positions in a table must be in the base frame (for a URDF: in its base
+    link). The frame of a tracker in a manifest is determined from the data. The exit code is 1 if no order, signs, zero
+    offsets and units make the readings fit the arm.
     """
     from ..files.arm_tables import arm_template, with_model
 

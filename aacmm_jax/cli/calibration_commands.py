@@ -57,9 +57,11 @@ def calibrate(
         "fixes the scale.",
         default="measured",
     ),
-    same_probe: bool = flag("--same-probe", "The probe was not remounted between sessions."),
+    same_probe: bool = flag(
+        "--same-probe", "Use one probe position for all sessions, because the probe was not remounted."
+    ),
     only_poses: int | None = option(
-        "Calibrate with N poses drawn at random, and test the result on the others.", "N", min=1
+        "Calibrate with N poses drawn at random, and test the result on the remaining poses.", "N", min=1
     ),
     seed: int = seed("--only-poses"),
     hold: str = option(
@@ -219,7 +221,7 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
     name="compare-models",
 )
 def compare_models(
-    capture: Path = argument("Capture, written by import or simulate.", "CAPTURE.h5"),
+    capture: Path = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5"),
     models: str | None = option(
         "Models to compare, from the simplest to the most complex, separated by semicolons; each is written as for "
         "calibrate --model. Default: dh; gravity; harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); "
@@ -246,8 +248,8 @@ def compare_models(
 ) -> None:
     """Compare models of the joints on held-out regions.
 
-    Each model is calibrated with all poses, from which its prior is learned. It then predicts each region from all
-    other regions.
+    The prior of each model is learned from all poses. Each region is then held out in turn, and predicted by the model
+    fitted to the other regions.
     """
     from ..data.capture import draw_poses
     from ..files.arm_tables import masses_of
@@ -286,7 +288,7 @@ def compare_models(
 )
 def compare(
     paths: list[Path] = argument(
-        "Calibrations of one arm, written by calibrate. Two are compared in the order given; three or more are "
+        "Calibrations of one arm, written by aacmm calibrate. Two are compared in the order given; three or more are "
         "ordered by date.",
         "OLD.h5 NEW.h5 [MORE.h5 ...]",
     ),

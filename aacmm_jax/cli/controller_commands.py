@@ -219,9 +219,9 @@ def correct(
 ) -> None:
     """Turn commanded poses into corrected joint readings.
 
-    A controller that uses the nominal parameters expects the pose that the nominal arm has at the commanded joint
-    readings. The corrected readings bring the calibrated arm to this pose: to its position and orientation in the base
-    frame, which both arms have in common. Positions with orientations in POSES.csv are in this frame too (for a URDF:
+    A controller that uses the nominal parameters expects the tip in the pose that the nominal arm has at the commanded
+    joint readings. The corrected readings bring the tip of the calibrated arm to this pose. The nominal and the
+    calibrated arm have the same base frame; positions and orientations in POSES.csv are in this frame too (for a URDF:
     in its base link). With seven or more joints, the readings change as little as possible; with fewer than six
     joints, only the position is corrected. Rotations of the tool that the calibration data do not determine stay
     nominal.
@@ -230,7 +230,8 @@ def correct(
     capture are not applied.
 
     The output table has the columns and the unit of the input table. If the pose of a row cannot be reached within the
-    joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm there.
+    joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm to such a
+    pose.
     """
     from ..core.numpy_or_jax import to_numpy
     from ..files.table_columns import corrected_csv, read_poses

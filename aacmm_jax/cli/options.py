@@ -43,7 +43,7 @@ def seed(subject: str) -> Any:
 JSON = flag("--json", "Print one JSON object on standard output, and nothing else.")
 ONLY = option("Use only the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
 WITHOUT = option("Leave out the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
-CALIBRATION_FILE = argument("Calibration, written by calibrate.", "CALIBRATION.h5")
+CALIBRATION_FILE = argument("Calibration, written by aacmm calibrate.", "CALIBRATION.h5")
 NOMINAL_ARM = argument(
     "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM"
 )

@@ -51,7 +51,8 @@ def plan(
     ),
     poses: int = option("Total number of poses.", "N", default=30, min=2, max=10_000),
     sockets: int | None = option(
-        f"Plan the positions of this many sockets, in pairs at the ends of the reference length. Default: {_SOCKETS}.",
+        "Number of sockets whose positions are planned, in pairs at the ends of the reference length. Default: "
+        f"{_SOCKETS}.",
         "N",
         min=1,
         max=1000,
@@ -108,7 +109,9 @@ def plan(
     ),
     link_radius_mm: float | None = option("Use capsules of this radius along the links as the arm's body.", min=0),
     unconstrained: bool = flag(
-        "--unconstrained", "Also predict the uncertainty of a plan without cones, obstacles and approach points."
+        "--unconstrained",
+        "Also predict the uncertainty of a plan without obstacles, approach points and limits of the tool "
+        "direction (--cone-deg).",
     ),
     angles: Literal["deg", "rad"] = option("Unit of the joint readings in the plan and its manifest.", default="deg"),
     criterion: Literal["length", "A", "D", "E"] = option(
@@ -161,8 +164,8 @@ def plan(
 ) -> None:
     """Plan the poses of a measurement.
 
-    For a calibration, the poses and the positions of sockets and reference lengths are planned; for an acceptance test,
-    its poses.
+    For a calibration, the command plans the poses and the positions of sockets and reference lengths. For an acceptance
+    test, it plans the poses and the positions of the artefacts.
     """
     from ..files.arm_tables import with_model
     from ..files.plans import plan_csv, plan_manifest

@@ -34,10 +34,11 @@ _KINDS = {
 )
 def evaluate(
     calibration: Path = argument(
-        "Calibration, written by calibrate; or a manifest of recorded points (TOML), for which no capture is given.",
+        "Calibration, written by aacmm calibrate; or a manifest of recorded points (TOML), for which no capture is "
+        "given.",
         "CALIBRATION.h5",
     ),
-    capture: Path | None = argument("Capture, written by import or simulate.", "CAPTURE.h5", None),
+    capture: Path | None = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5", None),
     output: Path | None = output("File to write the evaluation to (HDF5); aacmm report reads it.", "FILE.h5", None),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
@@ -71,8 +72,12 @@ def evaluate(
     range_mm: float | None = option(
         "Measuring range (a diameter) stated by the maker. Default: the range stated in the capture or manifest.", min=0
     ),
-    max_rms_mm: float | None = option("Exit with code 1 if the RMS distance is larger than this.", min=0),
-    max_deltam_mm: float | None = option("Exit with code 1 if Deltam is larger than this.", min=0),
+    max_rms_mm: float | None = option(
+        "Exit with code 1 if the RMS distance of the poses from their geometry is larger than this.", min=0
+    ),
+    max_deltam_mm: float | None = option(
+        "Exit with code 1 if Deltam (largest half range of a coordinate in a socket) is larger than this.", min=0
+    ),
     max_length_error_mm: float | None = option(
         "Exit with code 1 if the error of any length is larger than this.", min=0
     ),
@@ -137,7 +142,9 @@ def _points(manifest: Path) -> Any:
 
 @command("aacmm report calibration.h5 -o report.html")
 def report(
-    file: Path = argument("File to report: a calibration, evaluation, study or model comparison.", "FILE.h5"),
+    file: Path = argument(
+        "File to write a report of: a calibration, evaluation, study or model comparison.", "FILE.h5"
+    ),
     output: Path = output(
         "File to write the report to: one HTML file, which can be read without a network connection.", "FILE.html"
     ),

@@ -29,8 +29,8 @@ def study(
         "Specification: a TOML file, or the name of a study that ships with aacmm.", "SPEC.toml", None
     ),
     resume: bool = flag("--resume", "Continue the study in the output file."),
-    trials: int | None = option("Number of trials per cell. Default: that of the specification.", "N", min=1),
-    seed: int | None = option("Seed. Default: that of the specification.", "N", min=0),
+    trials: int | None = option("Number of trials per cell. Default: the number in the specification.", "N", min=1),
+    seed: int | None = option("Seed of the random numbers. Default: the seed in the specification.", "N", min=0),
     chunk: int | None = option(
         "Number of trials computed at a time; results do not depend on it. Default: 1000.", "N", min=1
     ),
@@ -49,7 +49,7 @@ def study(
 ) -> None:
     """Run a Monte Carlo study of simulated calibrations.
 
-    The same command continues a study that was interrupted.
+    Repeat the command to continue a study that was interrupted.
     """
     from ..study.definition import Study
     from ..study.runner import dask_executor, run_study

@@ -257,7 +257,7 @@ def demo(summary: dict[str, Any]) -> View:
     yield tables.truth_table(summary)
     yield (
         f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 uses repeatability only, so all "
-        "lengths are wrong by this common factor; stage 2 divides them by it."
+        "lengths are wrong by this common factor; stage 2 divides all lengths by this factor."
     )
     yield f"Files in {summary['folder']}: {', '.join(summary['files'])}"
     yield from (f"Not written: {reason}" for reason in summary["left_out"].values())
@@ -294,7 +294,7 @@ def evaluation(summary: dict[str, Any]) -> View:
     yield from words.limits_of(summary)
     if summary["acceptance"] or summary["standards"]:
         yield from _acceptance(summary)
-    yield from words.warnings_of(summary, "Warning of the calibration:", "calibration_warnings")
+    yield from words.warnings_of(summary, "Warning from the calibration:", "calibration_warnings")
     for group, text in _GROUPS.items():
         part = summary[group]
         if part is None:

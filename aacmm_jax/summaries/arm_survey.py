@@ -61,7 +61,9 @@ def arm_survey(
         "warnings": [],
     }
     if not _SHORTEST <= links <= _LONGEST:
-        summary["warnings"].append(f"The total length of the links is {links:.4g} mm; check the unit of the lengths.")
+        summary["warnings"].append(
+            f"The total length of the links is {links:.4g} mm, which is implausible; check the unit of the lengths."
+        )
     if arm.limits is None:
         summary["warnings"].append(
             "No joint limits are given, so joints are assumed to move from -180 to 180 deg; add the limits."

@@ -155,7 +155,7 @@ def kit_plan(summary: dict[str, Any]) -> View:
         for i, place in enumerate(row["places"]):
             names = (row["observation"], row["kind"]) if i == 0 else ("", "")
             rows.append((*names, *(number(value, 0) for value in place["position_mm"]), place["poses"]))
-    yield listed("", rows, ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"))
+    yield listed("", rows, ("observation", "kind", "x [mm]", "y [mm]", "z [mm]", "poses"))
     yield (
         "Positions: for an artefact, the centre of its points; for all other observations, the centre of the tip "
         "positions."

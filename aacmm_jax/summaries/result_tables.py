@@ -93,7 +93,7 @@ def validation_tables(summary: Row) -> list[Table]:
             "predicted": "rms_predicted_mm",
             "RMS length error": "length_error_rms_mm" if lengths else None,
             "u": "length_u_mm" if lengths else None,
-            "by chance [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
+            "probability [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
             "": lambda row: _said(
                 "disagrees" if row["disagrees"] else "" if row["converged"] else "did not converge", "bad"
             ),
@@ -319,7 +319,7 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         "MPE": "limit_mm" if limited else None,
         "nominal": read("as_found_mm") if nominal else None,
         "worst at": "where",
-        "what it is": None if brief else "what",
+        "meaning": None if brief else "what",
     }
     return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
 

@@ -276,7 +276,7 @@ def lengths_sentence(row: Mapping[str, Any]) -> str:
 
 def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
     """Shared errors in words."""
-    words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
+    words = {PLACES: "all poses of a socket", VISITS: "all poses of a visit"}
 
     def shown(row: Mapping[str, Any]) -> str:
         scale, unit = (1.0, "mm") if row["unit"] == "mm" else people_read_change(row["unit"])
