@@ -116,8 +116,7 @@ def evaluate(
     if given and not kept:
         first = next(iter(given))
         raise InputError(
-            f"no part of the given geometry (such as '{first}') belongs to this capture"
-            f"{nearest(first, observed.blocks)}"
+            f"the capture has no '{first}' or other part of the given geometry{nearest(first, observed.blocks)}"
         )
     whole = bool(capture.observations) or bool(kept) or noise is not None
     subject = observed, *to_numpy((capture.lengths, kept, noise))

@@ -209,7 +209,7 @@ def against_division(calibration: Calibration) -> tuple[str, ...]:
     names = [f"{space.names[i]} ({'upper' if above[i] else 'lower'} bound)" for i in concerned]
     if anchor.partners is None:
         names += [f"{name} (fixed length)" for name in fixed_lengths(space.base, space)]
-        names += [f"q_{joint} (slide)" for joint in space.base.prismatic]
+        names += [f"q_{joint} (prismatic joint)" for joint in space.base.prismatic]
     return tuple(names)
 
 

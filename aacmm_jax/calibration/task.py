@@ -239,8 +239,8 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
         axes = [np.asarray(forward.frame[i])[:, np.concatenate(parts)] for i in (0, 2)]
         if max(np.ptp(axis, axis=1).max() for axis in axes) < _LEAST_TURN:
             raise InputError(
-                f"target '{target}' was seen in only one orientation of the last frame, so the position of the "
-                "target cannot be distinguished from that of the instrument; record poses with the wrist turned."
+                f"target '{target}' was measured in only one orientation of the last frame, so the position of the "
+                "target cannot be distinguished from that of the instrument; record poses in other orientations."
             )
     geometry = len(observed.steps)
     if observed.equations < count + geometry:

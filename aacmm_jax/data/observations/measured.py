@@ -74,7 +74,7 @@ class MeasuredPoints(AbstractObservation):
         "station of the instrument",
         default=NAME,
         of_session=True,
-        more="all observations of one station share its frame",
+        more="all observations of the same station have the same frame",
     )
     frame = Part("frame of {station}", *FRAME)
     fixes_scale = True
@@ -139,7 +139,7 @@ class MeasuredTransforms(MeasuredPoints):
     kind, table, rotates = "transforms", "transforms", True
     row_units = (*POINT, "rad", "rad", "rad")
     rotations: Float[AnyArray, "m 3 3"] = declared(
-        "measured axes of the target, as columns", "1", "pose", "axis", "axis_2"
+        "measured orientation of the target, with its axes as columns", "1", "pose", "axis", "axis_2"
     )
     u_angle: Float[AnyArray, ""] = declared(
         "standard uncertainty of an orientation about each axis", "rad", positive=True
@@ -216,7 +216,7 @@ class Distances(AbstractObservation):
     )
     constant: bool = declared(
         "whether an unknown constant is added to all distances", default=False,
-        more="for example for a bar whose zero is unknown",
+        more="for example, for a telescoping bar whose zero is unknown",
     )  # fmt: skip
     pivot = Part("pivot of {name}", *POINT)
     zero = Part("constant of {name}", "mm", when="constant")

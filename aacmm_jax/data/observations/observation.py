@@ -92,7 +92,7 @@ class AbstractObservation(Declared):
     linear: ClassVar[bool] = False
     fixes_scale: bool = False  # whether it determines the scale of the arm
     q: Float[AnyArray, "m n"] = declared("joint reading", "rad", "pose", "joint")
-    target: str = declared("tip that was held or measured; empty: the probe of the arm", default="")
+    target: str = declared("target that was seated or measured; empty for the arm's own probe", default="")
 
     # Of a repeated calibration: what is added to the residuals (r, m), and certified values in place of its own.
     shift: Float[AnyArray, "r m"] | None
@@ -370,7 +370,10 @@ class AbstractOfTarget(AbstractSimulated):
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if bool(self.target) != (self.place is not None):
-            raise InputError(f"{where} needs either both a target and its position in the last frame, or neither.")
+            raise InputError(
+                f"{where} needs both a target and its position in the last frame (place), or neither; add one or "
+                "remove the other."
+            )
         return {"offset": self.place}
 
 
