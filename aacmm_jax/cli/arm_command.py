@@ -16,7 +16,6 @@ from ..summaries.tables import Styled, View, formatted, listed, number, warnings
 from . import options, views
 from .app import command, show_summary, with_spinner
 from .options import argument, numbers_option, option
-from .plan_commands import assumed_noise
 
 _CAPTURES = (".toml", ".h5")  # others are tables
 
@@ -112,7 +111,7 @@ def arm(
     specification = specification if model is None else with_model(specification, model)
     frame = first_frame(specification)
     with together(figure):
-        usual = assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)
+        usual = options.assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)
         look = summaries.arm_survey.arm_survey
         summary = with_spinner("Analysing the arm", lambda: look(specification, usual, base=frame, model=model))
         if frame is not None:
