@@ -56,10 +56,10 @@ class Limit(NamedTuple):
 def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule: Rule = "iso-2017") -> Decision:
     """Decide whether an error keeps a limit.
 
-    With u = U / 2, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is within the limit, or
-    beyond it: guard bands of 1.65 u, and more where u is so large that both limits count. "iso-2013" has guard bands
-    of U. "simple" (ASME B89.7.3.1) compares the error alone, if the limit is at least four times U; otherwise it
-    leaves it undecided. The texts of ISO 14253-1 were not available.
+    With u = U / `COVERAGE_FACTOR`, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is
+    within the limit, or beyond it: guard bands of 1.65 u, and more where u is so large that both limits count.
+    "iso-2013" has guard bands of U. "simple" (ASME B89.7.3.1) compares the error alone, if the limit is at least four
+    times U; otherwise it leaves it undecided. The texts of ISO 14253-1 were not available.
 
     Args:
         error: Test value, mm.

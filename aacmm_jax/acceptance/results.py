@@ -40,7 +40,7 @@ class MetricValue(NamedTuple):
 
     where: str
     value: float
-    expanded: float  # expanded uncertainty U of the value, coverage factor 2
+    expanded: float  # expanded uncertainty U of the value, with `COVERAGE_FACTOR`
     length: float | None = None  # the calibrated length that was measured, if any: a limit may grow with it
     limit: float | None = None  # MPE
     decision: Decision | None = None  # None without a limit
