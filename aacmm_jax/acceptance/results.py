@@ -10,7 +10,8 @@ from jaxtyping import Float
 from ..data.capture import ReferenceLength
 from ..data.recording import ProbedSphere
 from ..kinematics.workspace import Reach
-from .judgement import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
+from ..uncertainty.coverage import COVERAGE_FACTOR
+from .judgement import DECISIONS, Decision, Rule, worst
 from .standards import EDITIONS, SYMBOLS
 
 # Metrics by name: what each of them is.
