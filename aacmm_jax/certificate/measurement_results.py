@@ -115,8 +115,8 @@ def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, .
     if record.removed:
         groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
         words += (
-            f" These data were left out because, by an F test, they contradict the rest: {groups}; see the statements "
-            "on data left out."
+            f" The following data were left out, because an F test shows that they contradict the rest: {groups}; see "
+            "the statements on data left out."
         )
     statement = uncertainty_statement(record)
     return element(
