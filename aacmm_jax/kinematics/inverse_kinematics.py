@@ -317,7 +317,9 @@ def readings_at_poses(
     scale, xp = length_scale(geometry, rows), namespace(geometry, rows, wanted)
     wanted = set_at(wanted, (slice(None), slice(3), 3), wanted[:, :3, 3] / scale[:, None])
 
-    solved: Any = lambda rows: _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)  # noqa: E731
+    def solved(rows: Any) -> Any:
+        return _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)
+
     both = xp.concatenate([rows[:, :n], wanted.reshape(count, 16)], axis=1)
     solution = in_chunks(solved, both, ROWS) if xp is np else solved(both)
     readings, distance, angle = solution[:, :-2], scale * solution[:, -2], solution[:, -1]
