@@ -214,13 +214,15 @@ def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
             values = []
         if match is None or len(values) != 4:
             raise InputError(
-                f"--expansion '{text}' is not artefact=C,u,T,u or arm=C,u,T,u (coefficient C in 1e-6/K, temperature T "
-                "in degrees Celsius, each with its u); for example artefact=11.5,1,20.8,0.2."
+                f"--expansion '{text}' is not of the form artefact=C,u,T,u or arm=C,u,T,u (coefficient C in 1e-6/K, "
+                "temperature T in degrees Celsius, each with its u); give, for example, artefact=11.5,1,20.8,0.2."
             )
         if 0 < abs(values[0]) < _SMALLEST_GIVEN:
-            raise InputError(f"--expansion '{text}' gives the coefficient in 1/K; give it in 1e-6/K (steel: 11.5).")
+            raise InputError(
+                f"--expansion '{text}' gives the coefficient in 1/K; give the coefficient in 1e-6/K (steel: 11.5)."
+            )
         if match["body"] in expansions:
-            raise InputError(f"--expansion gives two expansions for the {match['body']}; give one.")
+            raise InputError(f"--expansion gives two expansions for the {match['body']}; give one expansion.")
         body = Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:])
         expansions[match["body"]] = checked_fields(body, f"the {match['body']}")
     return expansions

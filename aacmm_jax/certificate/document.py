@@ -295,7 +295,7 @@ def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, 
             f"Conformity of {test.symbol(metric)}",
             element("norm", RULES[test.rule]),
             english(
-                "declaration", f"Decision from comparing |value| with the maximum permissible error: {value.decision}."
+                "declaration", f"Decision, from comparing |value| with the maximum permissible error: {value.decision}."
             ),
             element("conformity", _conformity(value)),
             element("data", limit),

@@ -26,6 +26,9 @@ from .table_columns import LINE, TEMPERATURE, header_units, position_columns, pr
 from .text_lines import TABLE_SHARE, Column
 from .text_table import TextTable
 
+# The units in which a manifest or table may state an entry, by the entry's own; of all others, lengths.
+_UNITS = {"rad": ANGLE_UNITS, "1": ANGLE_UNITS, "px": {"px": 1.0}}
+
 
 class Wanted(NamedTuple):
     """What the manifest states of the readings, or points, in a table."""
@@ -76,8 +79,8 @@ class Readings:
         thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
         if set(thermometer) & set(picked):
             raise InputError(
-                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; remove it from "
-                "columns."
+                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; remove this column "
+                "from columns."
             )
         numbers = text.numbers(picked, measured=True, stated=stated is not None)
         angles = self._angles_of(text, picked, wanted)
@@ -91,8 +94,8 @@ class Readings:
         if self._first[0] != readings.shape[1]:
             (_, without), (_, other) = sorted((self._first, (readings.shape[1], text.path)), key=lambda table: table[0])
             raise InputError(
-                f"{without} has no temperatures, but {other} has; add a column {TEMPERATURE} to {without}, or state "
-                f"{TEMPERATURE} in its table."
+                f"{without} has no temperatures, but {other} has temperatures; add a column {TEMPERATURE} to "
+                f"{without}, or state {TEMPERATURE} in its table."
             )
         return readings
 
@@ -223,8 +226,8 @@ def parts(
         different = sorted(tables[0].keys() ^ rows.keys())
         if different:
             raise InputError(
-                f"{where}: only one of {files_read[0]} and {file} has '{different[0]}'; add '{different[0]}' to all "
-                "files of the table, or make a separate table for each file."
+                f"{where}: {files_read[0]} and {file} differ, because only one of the two has '{different[0]}'; add "
+                f"'{different[0]}' to all files of the table, or make a separate table for each file."
             )
     by_pose = {key: np.concatenate([rows[key] for rows in tables]) for key in tables[0]}
     groups, sessions = by_pose.pop("group"), by_pose.pop("session")
@@ -246,7 +249,10 @@ def _filled(text: str, values: Mapping[str, str], what: str) -> str:
     """A text whose fields in braces are filled in."""
     unknown = fields_of(text) - values.keys()
     if unknown:
-        raise InputError(f"{what} uses the unknown field {shorten(sorted(unknown))}.")
+        raise InputError(
+            f"{what} uses the field {shorten(sorted(unknown))}, which the file names do not have; use only fields of "
+            "the file names."
+        )
     return fill(text, values)
 
 
@@ -269,10 +275,16 @@ class _Reader:
         labels = [e.name for e in kind.entries if e.dimensions == ("pose",) and e.content == "text"]
         self._label = labels[0] if labels else None
         if isinstance(table.files, dict) and self._label is None:
-            raise InputError(f"{where} has named files, but its poses have no names; give files as a list.")
+            raise InputError(
+                f"{where} has files with names, but its kind of observation has no named points or sides; give files "
+                "as a list."
+            )
         self._own_file = getattr(table, "readings", None)
         if self._own_file is not None and len(table.paths) > 1:
-            raise InputError(f"{where} has its readings in a separate file, so it needs exactly one file of values.")
+            raise InputError(
+                f"{where} has its readings in a separate file, so it needs exactly one file of measured values; give "
+                "one file."
+            )
 
     def read(self, label: str, file: str, session: str) -> dict[str, Any]:
         """Of each pose of a file what its columns hold, its group and its session."""
@@ -331,7 +343,10 @@ class _Reader:
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if not entry.of_poses:
-            raise InputError(f"{self._where}: {entry.name} has one value for all poses; state it outside columns.")
+            raise InputError(
+                f"{self._where}: {entry.name} has one value for all poses, so it cannot be a column; remove it from "
+                f"columns and write {entry.name} = ... in the table."
+            )
         if entry.content == "text":
             if len(wanted) != 1:
                 raise InputError(f"{self._where}: {entry.name} needs one column; pick one column.")
@@ -353,11 +368,13 @@ class _Reader:
     def _check_count(self, name: str, given: int, counts: Sequence[int]) -> None:
         if given not in counts:
             wanted = " or ".join(map(str, counts))
-            raise InputError(f"{self._where}: {name} needs {wanted} columns, but {given} are picked; pick {wanted}.")
+            raise InputError(
+                f"{self._where}: {name} needs {wanted} columns, but {given} are picked; pick {wanted} columns."
+            )
 
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
-        units = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
+        units = _UNITS.get(entry.unit, LENGTH_UNITS)
         name, usual = entry.name, self._preset.units.get(entry.name)
         unit = checked_unit(self._where, name, header, self._table.units.get(name), usual, units)
         if unit is None and entry.unit == "1":
@@ -378,7 +395,10 @@ class _Reader:
             return numbers.reshape(-1, 3, 3)
         if convention.startswith("quaternion"):
             if not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
-                raise InputError(f"{self._where} has quaternions whose length is not 1; pick their four columns.")
+                raise InputError(
+                    f"{self._where} has quaternions whose length is not 1; check that the right four columns are "
+                    "picked."
+                )
             return Rotation.from_quat(numbers, scalar_first=convention.endswith("wxyz")).as_matrix()
         numbers = numbers * self._unit(entry, header)
         vector = convention == "vector"

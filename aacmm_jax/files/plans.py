@@ -126,9 +126,9 @@ _WHAT = {
     Plan: "Manifest of a planned calibration. Fill in the calibrated lengths and uncertainties (k = 1), record one "
     "file per socket " + _ROWS.format("", "capture"),
     KitPlan: "Manifest of a planned calibration. Fill in certified values and uncertainties (k = 1), record the files "
-    + _ROWS.format(": joint readings, then what was measured", "capture"),
-    Procedure: "{}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, record one "
-    "file per socket and per group of touches " + _ROWS.format("", "acceptance"),
+    + _ROWS.format(": the joint readings first, then the measured values", "capture"),
+    Procedure: "{}: manifest of the plan. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, "
+    "record one file per socket and per group of touches " + _ROWS.format("", "acceptance"),
 }
 
 
@@ -153,7 +153,7 @@ def plan_manifest(plan: Planned, arm: str, urdf: UrdfSource | None = None, angle
             f"measuring_range = {plan.measuring_range:.0f}   # mm: diameter of the measuring volume, as the maker "
             "states it"
         )
-        size = [stated if plan.range_stated else f"# {stated}; the plan uses twice the reach"]
+        size = [stated if plan.range_stated else f"# {stated} (the plan assumes twice the reach)"]
         tables = _of_procedure(plan)
     date = "# date = 2026-01-31   # day of the measurement"
     comment = textwrap.fill(what, 118, initial_indent="# ", subsequent_indent="# ")
@@ -222,7 +222,8 @@ def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any
     if columns:
         covariance = getattr(observation, "covariance", None)
         u = np.sqrt(covariance) if covariance is not None else getattr(observation, "u", 0.0)
-        table |= {"columns": columns, "u": (round(float(np.max(u)), 9), "mm: standard uncertainty (k = 1)")}
+        unit = next((entry.unit for entry in observation.entries if entry.name == "u"), "mm")
+        table |= {"columns": columns, "u": (round(float(np.max(u)), 9), f"{unit}: standard uncertainty (k = 1)")}
     return table
 
 

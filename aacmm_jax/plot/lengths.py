@@ -193,7 +193,7 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) 
         >>> axes = aj.plot.volumetric_uncertainty_map(volume)
     """
     if not np.any(np.isfinite(volume.expanded_length)):
-        raise InputError("the data determine no length over the volume, so there is no uncertainty to draw.")
+        raise InputError("the data do not determine lengths over the volume, so there is no uncertainty to draw.")
     return draw(volume_chart(volume).plots[0], axes)
 
 

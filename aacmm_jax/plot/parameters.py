@@ -54,7 +54,7 @@ def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
     description = "Calibrated minus nominal value. Bars show U; where no bar is visible, U is smaller than the mark."
     if outside := int(np.sum((change < axis.low) | (change > axis.high))):
         description += (
-            f" {pluralise(outside, 'value')} without U drawn at the edge of the chart, because outside its range; "
+            f" Drawn at the edge of the chart, because outside its range: {pluralise(outside, 'value')} without U; "
             "see the table."
         )
     kind = "length" if unit == "mm" else "angle"

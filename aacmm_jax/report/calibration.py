@@ -32,11 +32,11 @@ from .elements import DRAWN, Block, Report, Section, length_table, observation_t
 
 _METHODS = {
     "two-stage": "Identification from repeatability, then a scale fix",
-    "joint": "Joint least squares of poses and lengths",
+    "joint": "One least-squares fit of poses and lengths",
     REPEATABILITY: "Identification with the scale of the nominal arm",
 }
 _MOST_KINDS = 3  # among the facts at the beginning
-_OBSERVED = "Joint least squares of all observations"
+_OBSERVED = "One least-squares fit of all observations"
 
 
 def calibration_report(record: CalibrationRecord) -> Report:

@@ -218,14 +218,14 @@ def _spread(array: AnyArray, shape: tuple[int, ...], fewest: int, what: str) -> 
         given = " or ".join(str(alternative) if alternative else "one number" for alternative in shapes)
         raise InputError(f"{what} has shape {array.shape}; give {given}.")
     if not fewest and is_concrete(array) and np.any(np.asarray(array) < 0):
-        raise InputError(f"{what} is negative, but a standard uncertainty must be zero or positive.")
+        raise InputError(f"{what} is negative, but a standard uncertainty must be 0 or positive.")
     return numpy_if_known(lambda values: namespace(values).broadcast_to(values, shape))(array)
 
 
 def checked_name(name: object, what: str) -> str:
     """A name of one line, or `InputError`."""
     if not isinstance(name, str) or not name.strip() or name.splitlines() != [name]:
-        raise InputError(f"{what} has the name {shown(name)}; give it a name of one line.")
+        raise InputError(f"{what} has the name {shown(name)}; give a text of one line as the name.")
     return name
 
 
