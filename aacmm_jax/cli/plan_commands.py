@@ -51,7 +51,7 @@ def plan(
     ),
     poses: int = option("Total number of poses.", "N", default=30, min=2, max=10_000),
     sockets: int | None = option(
-        "Number of sockets whose positions are planned, in pairs at the ends of the reference length. Default: "
+        "Number of sockets to plan; the sockets are placed in pairs, at the ends of the reference length. Default: "
         f"{_SOCKETS}.",
         "N",
         min=1,
@@ -62,12 +62,11 @@ def plan(
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     length_mm: str = option(
-        "Size of the reference length to be placed by the plan; if a range is given, the best size in this range is "
-        "chosen.",
+        "Value (mm) of the reference length to plan for; if a range is given, the best value in the range is chosen.",
         "L[:M]",
         default="500",
     ),
-    u_mm: float = option("Standard uncertainty of the reference length of --length-mm.", default=0.002),
+    u_mm: float = option("Standard uncertainty of the reference length given with --length-mm.", default=0.002),
     model: str | None = option(
         "Model of non-geometric joint errors, as for calibrate --model. The poses are chosen to determine its "
         "coefficients too.",

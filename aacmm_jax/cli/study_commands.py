@@ -30,7 +30,7 @@ def study(
     trials: int | None = option("Number of trials per cell. Default: the number in the specification.", "N", min=1),
     seed: int | None = option("Seed of the random numbers. Default: the seed in the specification.", "N", min=0),
     chunk: int | None = option(
-        "Number of trials computed at a time; results do not depend on it. Default: 1000.", "N", min=1
+        "Number of trials computed at a time; the results do not depend on this number. Default: 1000.", "N", min=1
     ),
     dask: str | None = option(
         "Run on the Dask cluster whose scheduler has this address. With tcp://, everybody who can reach the port can "
