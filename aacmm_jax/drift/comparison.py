@@ -12,7 +12,7 @@ from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, parameter_names, parameter_unit, value_of
-from ..uncertainty.coverage_level import LEVEL
+from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend

@@ -72,7 +72,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
         "points",
         "sphere",
         "frame of tracker",
-        "Held-out poses, drawn at random",
+        "Held-out poses, drawn",
     ):
         assert part in shown
     assert aacmm("show", "c.h5").stdout in shown
