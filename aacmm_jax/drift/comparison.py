@@ -245,6 +245,6 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         if alone := [name for name in record.names if name not in other.names]:
             yield (
-                f"Parameters free only in {label}: {shorten(alone)}. In the other calibration, the free parameters may "
-                "compensate for the errors of these; lengths can still be compared."
+                f"Parameters free only in {label}: {shorten(alone)}. These parameters are fixed in the other "
+                "calibration, so its other parameters may differ for this reason; compare lengths instead."
             )
