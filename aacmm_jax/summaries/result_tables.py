@@ -27,9 +27,9 @@ _HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
 _MOST_LISTED = 48  # coefficients of harmonics that a table lists one by one
 
 
-def with_u_digits(u: float | None, mark: str = "") -> Cell:
+def with_u_digits(u: float | None) -> Cell:
     """An uncertainty, to two digits."""
-    return number(u, decimals_for(u), mark=mark)
+    return number(u, decimals_for(u))
 
 
 def _said(words: str, mark: str) -> Cell:
