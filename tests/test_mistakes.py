@@ -12,7 +12,7 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 from mistakes.cases import CASES  # noqa: E402
-from mistakes.judge import applies, detection_limit, made, shown  # noqa: E402
+from mistakes.judge import applies, detection_limit, made, rank_of, shown  # noqa: E402
 from mistakes.kinds import KINDS  # noqa: E402
 
 
@@ -62,5 +62,5 @@ def test_a_row_runs_and_is_resumed(tmp_path):
     rows = [json.loads(line) for line in results.read_text().splitlines()]
     assert [row["kind"] for row in rows] == ["wrong sign", "slipped zero"]
     assert printed[0] == printed[1]
-    assert rows[0]["rank"] == 1
+    assert rank_of(rows[0]) == 1
     assert rows[0]["severity"] == "unusable"

@@ -27,7 +27,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from mistakes.cases import CASES
-from mistakes.judge import SOUND, Job, applies, measured
+from mistakes.judge import SOUND, Job, applies, measured, rank_of
 from mistakes.kinds import KINDS
 
 
@@ -72,12 +72,13 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             if row.get("limit", 0.0) is None:
                 counts["absorbed"] += 1
                 continue
+            rank = rank_of(row)
             counts["captures"] += 1
-            counts["first"] += row["rank"] == 1
-            counts["in two"] += row["rank"] in (1, 2)
-            counts["silent"] += not row["codes"]
+            counts["first"] += rank == 1
+            counts["in two"] += rank in (1, 2)
+            counts["silent"] += not row["findings"]
             counts["beyond"] += row["severity"] not in ("doubt", "unusable") and (row["over_u"] or 0.0) > 1
-            if row["rank"] != 1 and (kind != SOUND or row["codes"]):
+            if rank != 1 and (kind != SOUND or row["findings"]):
                 said = row["findings"][0] if row["findings"] else "nothing"
                 over = "" if row["over_u"] is None else f" (error {row['over_u']:.2g} U)"
                 wrong.append(f"    {row['case']}{over}: {said[:150]}")

@@ -129,28 +129,25 @@ def run(kind: str | None, case: str, size: float, seed: int = 1) -> dict[str, An
         except Exception as error:  # a refusal is an answer; anything else is an error of the program, to be seen
             code = "refused" if isinstance(error, aj.InputError) else "crashed"
             findings, record = [Finding(code, str(error).replace(folder, ""), severity="unusable")], None
-    texts = [text_of(finding) for finding in findings]
-    patterns = () if kind is None else tuple(p.format(**_escaped(trial.culprit)) for p in KINDS[kind].right)
-    right = [number for number, text in enumerate(texts) if any(re.search(p, text) for p in patterns)]
+    texts = [f"{finding.code}: {finding.sentence} [{'; '.join(finding.concerns)}]" for finding in findings]
     over = math.nan if record is None else beyond_u(trial, record)
     return {
-        "rank": right[0] + 1 if right else None,
         "severity": findings[0].severity if findings else "",
         "over_u": round(over, 3) if math.isfinite(over) else None,
-        "findings": [text[:300] for text in texts[:4]],
-        "codes": [finding.code for finding in findings],
+        "findings": texts,
         "culprit": trial.culprit,
         "cpu": round(time.process_time() - started, 2),
     }
 
 
-def text_of(finding: Finding) -> str:
-    """A finding as the patterns of `kinds` read it."""
-    return f"{finding.code}: {finding.sentence} [{'; '.join(finding.concerns)}]"
-
-
-def _escaped(culprit: dict[str, str]) -> dict[str, str]:
-    return {name: re.escape(value) for name, value in culprit.items()}
+def rank_of(row: dict[str, Any]) -> int | None:
+    """At which place the findings of a line name what is wrong; None where none of them does."""
+    if row["kind"] == SOUND:
+        return None
+    names = {name: re.escape(value) for name, value in row["culprit"].items()}
+    patterns = [pattern.format(**names) for pattern in KINDS[row["kind"]].right]
+    right = (n for n, text in enumerate(row["findings"], start=1) if any(re.search(p, text) for p in patterns))
+    return next(right, None)
 
 
 def beyond_u(trial: Trial, record: CalibrationRecord) -> float:

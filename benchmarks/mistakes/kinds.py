@@ -71,26 +71,30 @@ def _half(trial: Trial) -> np.ndarray:
     return trial.time > 0.43
 
 
-def _first_group(trial: Trial) -> np.ndarray:
-    """Poses of the second group, or of the only one."""
+def _second_group(trial: Trial) -> np.ndarray:
+    """Poses of the second group: a socket, hole, sphere or station. A finding may name the placement of a hole."""
     groups = list(dict.fromkeys(trial.label))
     name = groups[min(1, len(groups) - 1)]
-    trial.culprit["group"] = name
+    trial.culprit["group"] = name.partition("/")[0]
     return trial.label == name
 
 
 def _later_of_group(trial: Trial) -> np.ndarray:
-    rows = np.flatnonzero(_first_group(trial))
+    rows = np.flatnonzero(_second_group(trial))
     return rows[len(rows) // 2 :]
 
 
 def _a_pose(trial: Trial) -> int:
-    """Number of a pose in the second group, named as findings name it."""
-    row = int(np.flatnonzero(_first_group(trial))[4])
-    file = trial.culprit["group"].partition("/")[0]
-    of_file = [other for other, label in enumerate(trial.label) if label.partition("/")[0] == file]
-    trial.culprit["pose"] = f"{file} pose {of_file.index(row) + 1}"
+    """Number of a pose in the second group."""
+    row = int(np.flatnonzero(_second_group(trial))[4])
+    trial.culprit["pose"] = pose_name(trial, row)
     return row
+
+
+def pose_name(trial: Trial, row: int) -> str:
+    """A pose as findings name it: its socket or observation, and its number there."""
+    names = [label.partition("/")[0] for label in trial.label]
+    return f"{names[row]} pose {names[: row + 1].count(names[row])}"
 
 
 def growth(trial: Trial, size: float) -> None:
@@ -110,9 +114,9 @@ def seat_shift(trial: Trial, size: float) -> None:
 
 
 def seat_scatter(trial: Trial, size: float) -> None:
-    trial.scatter_factor[_first_group(trial)] += size
+    trial.scatter_factor[_second_group(trial)] += size
     if not trial.noise:  # the same errors, without any other
-        trial.seat[_first_group(trial)] += size * trial.case.u * _errors(trial)[_first_group(trial)]
+        trial.seat[_second_group(trial)] += size * trial.case.u * _errors(trial)[_second_group(trial)]
 
 
 def _errors(trial: Trial) -> np.ndarray:
@@ -197,18 +201,18 @@ def value_mistyped(trial: Trial, size: float) -> None:
 
 
 def pose_mislabelled(trial: Trial, size: float) -> None:
-    """One pose is recorded under the name of another socket, hole or sphere, or beside another point."""
+    """One pose is recorded under the name of another socket, hole or sphere."""
     row = _a_pose(trial)
-    if trial.case.instrument:
-        trial.measured[row] = trial.measured[row + 7]
-    else:
-        trial.label[row] = trial.label[0]
+    trial.label[row] = trial.label[0]
+    trial.culprit["pose"] = pose_name(trial, row)
 
 
 def rows_swapped(trial: Trial, size: float) -> None:
+    """Readings of two poses are exchanged, of different sockets or holes if something holds the tip."""
     row = _a_pose(trial)
     other = row + 9 if trial.case.instrument else int(np.flatnonzero(trial.label == trial.label[0])[3])
     trial.readings[[row, other]] = trial.readings[[other, row]]
+    trial.culprit["other"] = pose_name(trial, other)
 
 
 def row_late(trial: Trial, size: float) -> None:
@@ -228,11 +232,12 @@ def certified_mistyped(trial: Trial, size: float) -> None:
 
 
 def artefact_bent(trial: Trial, size: float) -> None:
-    """The artefact is bent since its certificate: all of one side, out of its plane; lengths and diameters differ."""
+    """The artefact is bent since its certificate: every second point is higher, or length and diameter larger, and the
+    others are lower or smaller."""
     for number, name in enumerate(trial.certified):
-        value = trial.certified[name]
-        trial.certified[name] = value + size * (np.arange(len(value)) == len(value) - 1) * (number % 2 * 2 - 1)
-    trial.culprit["value"] = "plate"
+        value = trial.certified[name].copy()
+        value[-1] += size * (number % 2 * 2 - 1)
+        trial.certified[name] = value
 
 
 def scale_wrong(trial: Trial, size: float) -> None:
@@ -243,17 +248,16 @@ def scale_wrong(trial: Trial, size: float) -> None:
 
 
 def groups_exchanged(trial: Trial, size: float) -> None:
-    """Names of two sockets or holes are exchanged (in one placement), of which poses were recorded; or the files of an
-    instrument are cut at the wrong row."""
+    """Names of two sockets, or of two holes in one placement, are exchanged; or the file of one station or pivot begins
+    with the last rows of another."""
+    groups = list(dict.fromkeys(trial.label))
     if trial.case.instrument:
-        groups = list(dict.fromkeys(trial.label))
-        rows = np.flatnonzero(trial.label == groups[0])[-6:]
-        trial.label[rows], trial.culprit["group"] = groups[-1], groups[0]
+        trial.label[np.flatnonzero(trial.label == groups[0])[-6:]] = groups[1]
+        trial.culprit["group"] = groups[1]
         return
-    second = list(dict.fromkeys(trial.label))[1:3]
-    first, other = (trial.label == name for name in second)
-    trial.label[first], trial.label[other] = second[1], second[0]
-    trial.culprit["group"] = f"{second[0]}"
+    first, other = (trial.label == name for name in groups[1:3])
+    trial.label[first], trial.label[other] = groups[2], groups[1]
+    trial.culprit["group"] = groups[1].partition("/")[0]
 
 
 def converted(change: Callable[[np.ndarray], np.ndarray]) -> Callable:
@@ -284,12 +288,8 @@ def length_unit(trial: Trial, size: float) -> None:
 
 
 def left_handed(trial: Trial, size: float) -> None:
-    """Two axes of measured or certified coordinates are exchanged."""
-    if trial.case.kind == "artefact":
-        # A plane artefact is the same from below: its mirror image is another labelling.
-        trial.certified = {name: value[[1, 0, 2]] for name, value in trial.certified.items()}
-    else:
-        trial.measured[:, :2] = trial.measured[:, 1::-1]
+    """Two axes of measured points are exchanged."""
+    trial.measured[:, :2] = trial.measured[:, 1::-1]
 
 
 def stated_u(factor: float) -> Callable:
@@ -299,20 +299,20 @@ def stated_u(factor: float) -> Callable:
     return make
 
 
-_MOVED = r"(base|station|instrument|socket|artefact)[^.]*\bmoved|^base-moved"
-_TIP = r"(tip|probe|target)[^.]*(moved|remounted|displaced)|^tip-moved"
-_POSE = (r"\[{pose}[\];]", r"pose [^.]*{pose}\b.*\[.*joint")
-_MISLABELLED = (r"\[{pose}[\];]", r"(label|name)[^.]*{pose}")
-_GROUP = (r"{group}[^.]*(moved|shift|contradict|scatter)", r"^[a-z-]+:.*\[{group}\]")
+_MOVED = r"(base|station|instrument|socket|artefact)[^.]*\bmoved|^base-moved|drift of the tip"
+_TIP = r"(probe|target|tool)[^.,;]*(remounted|displaced|moved)|^tip-moved"
+_POSE = (r"\[{pose}[\];]",)
+_SWAPPED = (r"\[({pose}|{other})[\];]",)
+_GROUP = (r"\b{group} [^.]*(moved|shift|contradict|scatter)", r"^[a-z-]+:.*\[{group}\]")
 _DRIFT = r"drift of joint {joint}|zero of joint {joint}|^joint-drift.*joint {joint}"
 _UNDETERMINED = (
-    r"close together|small part of|^refused",
+    r"close together|small part of",
     r"^(standing-joints|undetermined|hardly-determined|little-redundancy|weak-on-bounds)",
 )
 
 
-def _on_table(case: Case) -> bool:
-    return case.kind in ("socket", "artefact")
+def _several(case: Case) -> bool:
+    return len(case.groups) > 1
 
 
 def _not_instrument(case: Case) -> bool:
@@ -341,30 +341,30 @@ KINDS: dict[str, Kind] = {
     "commanded for measured": Kind(commanded, "angle", True, (r"command",)),
     # Arm, base and tip
     "growth": Kind(growth, "share", True, (r"growth of the arm", r"temperature")),
-    "base moved": Kind(base_moved, "length", True, (_MOVED, r"drift of the tip")),
+    "base moved": Kind(base_moved, "length", True, (_MOVED,)),
     "tip moved": Kind(tip_moved, "length", True, (_TIP,)),
     "tool misplaced": Kind(tool_misplaced, "", False, (r"\[probe_[xyz]", r"(tool|probe)[^.]*stated"),
         lambda case: not case.target and case.kind != "transforms"),
     "fixed parameter wrong": Kind(fixed_wrong, "length", False, (r"{parameter}\b.*(fixed|held|free)",)),
     "bounds too tight": Kind(bounds_tight, "angle", False, (r"^on-bounds.*\[{parameter}[\];]",)),
     # Seats
-    "seat shifts": Kind(seat_shift, "length", True, _GROUP),
-    "seat scatters": Kind(seat_scatter, "times", True, _GROUP),
+    "seat shifts": Kind(seat_shift, "length", True, _GROUP, _several),
+    "seat scatters": Kind(seat_scatter, "times", True, _GROUP, _several),
     "pose unseated": Kind(pose_unseated, "length", True, _POSE),
     # Rows
     "reading mistyped": Kind(reading_mistyped, "angle", False, _POSE),
     "value mistyped": Kind(value_mistyped, "length", False, _POSE, lambda case: case.instrument),
-    "pose mislabelled": Kind(pose_mislabelled, "", False, _MISLABELLED, _not_instrument),
-    "rows swapped": Kind(rows_swapped, "", False, (r"\[{pose}[\];]", r"(swap|exchang)[^.]*{pose}")),
+    "pose mislabelled": Kind(pose_mislabelled, "", False, _POSE, _not_instrument),
+    "rows swapped": Kind(rows_swapped, "", False, _SWAPPED),
     "one row late": Kind(row_late, "", False, (r"row[^.]*(late|shift|earlier|behind)",)),
     "duplicates": Kind(duplicates, "", False, (r"^repeated", r"[Dd]uplicate")),
     # Artefacts and instruments
     "certified value mistyped": Kind(certified_mistyped, "length", False, (r"{value} differs", r"\[{value}[\];]"),
         _not_instrument),
     "artefact bent": Kind(artefact_bent, "length", False, (r"bent|shape", r"^lengths-disagree"), _not_instrument),
-    "scale wrong": Kind(scale_wrong, "", False, (r"^scale-far-from-1", r"scale")),
+    "scale wrong": Kind(scale_wrong, "", False, (r"^scale-far-from-1", r"scale of the (instrument|lengths|artefact)")),
     "groups exchanged": Kind(groups_exchanged, "", False, (r"exchang[^.]*{group}", r"^[a-z-]+:.*\[{group}[\];]"),
-        lambda case: _on_table(case) or (case.instrument and len(case.groups) > 1)),
+        lambda case: case.kind != "touched_sphere" and _several(case)),
     # Conventions
     "wrong sign": Kind(converted(_one_column(lambda column: -column)), "", False, (r"sign[^.]*(joint|column) {joint}",
         r"(joint|column) {joint}[^.]*sign")),
@@ -373,7 +373,7 @@ KINDS: dict[str, Kind] = {
     "wrong offset": Kind(converted(_one_column(lambda column: column + np.radians(30.0))), "", False,
         (r"zero of joint {joint}", r"offset[^.]*joint {joint}", r"\[theta_{joint}\]")),
     "degrees for radians": Kind(converted(np.degrees), "", False, (r"degrees|in deg|\bdeg\b|unit of the readings",)),
-    "wrong unit of lengths": Kind(length_unit, "", False, (r"in (m|cm|metres|inches)\b|\bunit", r"^implausible-scale")),
+    "wrong unit of lengths": Kind(length_unit, "", False, (r"\bin (m|cm|metres|inches)\b", r"^implausible-scale")),
     "left-handed": Kind(left_handed, "", False, (r"left-handed|mirror|exchanged axes",),
         lambda case: case.kind in ("points", "transforms")),
     "u too small": Kind(stated_u(0.1), "", False, (r"\bu\b[^.]*too small|^lengths-disagree|u and the|their u\b",)),
