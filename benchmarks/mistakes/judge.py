@@ -151,10 +151,10 @@ def rank_of(row: dict[str, Any]) -> int | None:
 
 
 def beyond_u(trial: Trial, record: CalibrationRecord) -> float:
-    """Root mean square error of lengths between poses like those of the capture, over that of their U (95 %).
+    """Root mean square error of lengths measured between poses like those of the capture, over that of their U.
 
-    The arm is used as it was recorded: with the same conventions, and with its joints as they are after the last pose.
-    Above 1, errors are twice what is predicted. 0 where U is infinite.
+    The arm is used as it was recorded: with the same conventions, with noise of its encoders, which U contains, and
+    with its joints as they are after the last pose. Above 1, errors are twice what is predicted. 0 where U is infinite.
     """
     q = trial.exact
     start, end = trial.random.integers(0, len(q), (2, LENGTHS))
@@ -164,11 +164,12 @@ def beyond_u(trial: Trial, record: CalibrationRecord) -> float:
     true_length = np.linalg.norm(tips[start] - tips[end], axis=1)
     far = true_length > 0.05 * true_length.max()
     start, end, true_length = start[far], end[far], true_length[far]
-    readings, uncertainty = trial.in_use(q), aj.uncertainty_of(record)
+    noise = trial.encoder_factor * math.radians(trial.case.encoder_arcsec / 3600) * trial.random.normal(size=q.shape)
+    readings, uncertainty = trial.in_use(q) + noise, aj.uncertainty_of(record)
     shown = np.asarray(record.calibrated.arm.position(readings))
     errors = np.linalg.norm(shown[start] - shown[end], axis=1) - true_length
     with np.errstate(all="ignore"):
-        expanded = uncertainty.expanded_by_parts(uncertainty.length_parts(readings[start], readings[end]))
+        expanded = uncertainty.expanded_by_parts(uncertainty.length_parts(readings[start], readings[end], reading=True))
     if not np.all(np.isfinite(expanded)):
         return 0.0
     return float(np.sqrt(np.mean(errors**2) / np.mean(expanded**2)))
