@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 from ..core.arguments import Range, checked_arguments, checked_fields
 from ..core.errors import InputError, nearest
 from ..core.text import number
+from ..uncertainty.coverage import COVERAGE_FACTOR
 
 Decision = Literal["fails", "undecided", "conforms"]
 DECISIONS: tuple[Decision, ...] = get_args(Decision)  # the worst first
@@ -23,7 +24,6 @@ RULES: dict[Rule, str] = {
     "iso-2013": "ISO 14253-1:2013, guard band U",
     "simple": "simple acceptance with a ratio of 4:1 (ASME B89.7.3.1)",
 }
-COVERAGE_FACTOR = 2.0  # of every U of a test value
 GUARD_FACTOR = 1.65  # one-sided, 95 %, of a normal distribution: the guard band of 2017 is this times u
 _PROBABILITY, _RATIO = 0.95, 4.0
 MOST, LEAST_DIVISOR = 1e6, 1e-3  # of a limit in mm, and of its divisor
@@ -56,15 +56,15 @@ class Limit(NamedTuple):
 def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule: Rule = "iso-2017") -> Decision:
     """Decide whether an error keeps a limit.
 
-    With u = U / 2, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is within the limit, or
-    beyond it: guard bands of 1.65 u, and more where u is so large that both limits count. "iso-2013" has guard bands
-    of U. "simple" (ASME B89.7.3.1) compares the error alone, if the limit is at least four times U; otherwise it
-    leaves it undecided. The texts of ISO 14253-1 were not available.
+    With u = U / `COVERAGE_FACTOR`, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is
+    within the limit, or beyond it: guard bands of 1.65 u, and more where u is so large that both limits count.
+    "iso-2013" has guard bands of U. "simple" (ASME B89.7.3.1) compares the error alone, if the limit is at least four
+    times U; otherwise it leaves it undecided. The texts of ISO 14253-1 were not available.
 
     Args:
         error: Test value, mm.
         limit: Maximum permissible error (MPE), mm.
-        expanded: Expanded uncertainty U of the test value (coverage factor 2), mm.
+        expanded: Expanded uncertainty U of the test value, u times `COVERAGE_FACTOR`, mm.
         rule: A key of `RULES`.
 
     Example:
@@ -102,7 +102,8 @@ def checked_limit(limit: Limit, what: str) -> Limit:
     """The same limit, or `InputError` where it is impossible."""
     if not (0 <= limit.fixed <= MOST and limit.divisor >= LEAST_DIVISOR):
         raise InputError(
-            f"{what} is {limit} mm; in A+L/K, A must be zero or positive and finite, and K at least {LEAST_DIVISOR:g}."
+            f"{what} is {limit} mm; in A+L/K, A must be finite and not negative, and K must be at least "
+            f"{LEAST_DIVISOR:g}."
         )
     return limit
 
@@ -115,7 +116,9 @@ def limit_of_text(text: str, given: str) -> Limit:
             raise ValueError(text)
         limit = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
     except ValueError as error:
-        raise InputError(f"{given} is not A or A+L/K with numbers in mm; give, for example, 0.002+L/500000.") from error
+        raise InputError(
+            f"{given} is not of the form A or A+L/K with numbers in mm; give, for example, 0.002+L/500000."
+        ) from error
     return checked_limit(limit, given)
 
 
@@ -127,11 +130,13 @@ def read_limits(texts: list[str], metrics: Mapping[str, str]) -> dict[str, Limit
         given, equals, value = text.partition("=")
         name = names.get(given.strip().lower())
         if not equals:
-            raise InputError(f"--mpe '{text}' is not NAME=A or NAME=A+L/K, in mm; for example E_Uni=0.025+L/40000.")
+            raise InputError(
+                f"--mpe '{text}' is not of the form NAME=A or NAME=A+L/K in mm; give, for example, E_Uni=0.025+L/40000."
+            )
         if name is None:
             raise InputError(f"--mpe '{text}' names the unknown metric '{given}'{without_test(given, metrics)}")
         if name in limits:
-            raise InputError(f"--mpe gives two limits for {name}; give one.")
+            raise InputError(f"--mpe gives two limits for {name}; give one limit.")
         limits[name] = limit_of_text(value, f"--mpe {name}={value}")
     return limits
 
@@ -209,13 +214,15 @@ def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
             values = []
         if match is None or len(values) != 4:
             raise InputError(
-                f"--expansion '{text}' is not artefact=C,u,T,u or arm=C,u,T,u (coefficient C in 1e-6/K, temperature T "
-                "in degrees Celsius, each with its u); for example artefact=11.5,1,20.8,0.2."
+                f"--expansion '{text}' is not of the form artefact=C,u,T,u or arm=C,u,T,u (coefficient C in 1e-6/K, "
+                "temperature T in degrees Celsius, each with its u); give, for example, artefact=11.5,1,20.8,0.2."
             )
         if 0 < abs(values[0]) < _SMALLEST_GIVEN:
-            raise InputError(f"--expansion '{text}' gives the coefficient in 1/K; give it in 1e-6/K (steel: 11.5).")
+            raise InputError(
+                f"--expansion '{text}' gives the coefficient in 1/K; give the coefficient in 1e-6/K (steel: 11.5)."
+            )
         if match["body"] in expansions:
-            raise InputError(f"--expansion gives two expansions for the {match['body']}; give one.")
+            raise InputError(f"--expansion gives two expansions for the {match['body']}; give one expansion.")
         body = Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:])
         expansions[match["body"]] = checked_fields(body, f"the {match['body']}")
     return expansions

@@ -47,7 +47,8 @@ class OtherPoses(NamedTuple):
     names: tuple[str, ...]  # sockets and other observations
     poses: np.ndarray
     rms: np.ndarray  # mm
-    rms_angle: np.ndarray  # rad; NaN where no orientation was measured
+    rms_angle: np.ndarray  # of residuals in rad; NaN where there are none
+    rms_px: np.ndarray | None = None  # in px; None where no observation has any
 
     @property
     def rms_of_all(self) -> float:
@@ -119,7 +120,7 @@ class CalibrationRecord(NamedTuple):
     removed: tuple[Removed, ...] = ()
     prior: PriorMetrics | None = None  # with arrays of NumPy
     noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected
-    shared: SharedErrors | None = None  # errors that poses share, likewise
+    shared: SharedErrors | None = None  # shared errors, likewise
     components: Components | None = None  # parts of the covariance that do not rest on the scatter of single poses
     surplus_k: float = 0.0  # of u_k^2, by lengths that disagree
 
@@ -227,11 +228,11 @@ def record_of(
         geometry = calibration.observed.geometry if others.observations else None
         evaluation = evaluate(calibration.arm, others, geometry=geometry)
         poses = np.array([*others.sizes, *(observation.q.shape[0] for observation in others.observations)])
-        rms, rms_angle = evaluation.repeatability.socket_rms, np.full(len(poses), np.nan)
+        rms, rms_angle, rms_px = evaluation.repeatability.socket_rms, np.full(len(poses), np.nan), None
         if evaluation.observed is not None:
-            rms, rms_angle = evaluation.observed.rms, evaluation.observed.rms_angle
-        names = tuple(names_in(others))
-        tested = OtherPoses(names, poses, np.asarray(rms), np.asarray(rms_angle))
+            rms, rms_angle, rms_px = (getattr(evaluation.observed, name) for name in ("rms", "rms_angle", "rms_px"))
+            rms_px = None if np.all(np.isnan(rms_px)) else np.asarray(rms_px)
+        tested = OtherPoses(tuple(names_in(others)), poses, np.asarray(rms), np.asarray(rms_angle), rms_px)
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -288,7 +289,7 @@ def _reason(calibration: Calibration | Identification) -> str:
     if values[0] >= _CORRELATED or len(leading) < 2:
         return sentence
     together = ", ".join(calibration.space.names[moving[i]] for i in leading)
-    return f"{sentence.partition(';')[0]}; {together} trade off; hold one of these parameters, or give it a prior."
+    return f"{sentence.partition(';')[0]}; {together} trade off; fix one of these parameters, or give it a prior."
 
 
 @checked_arguments
@@ -340,7 +341,7 @@ class JointFunction(NamedTuple):
 
     reading: Float[np.ndarray, " points"]  # the travel of the poses and a little beyond, within the joint's limits
     value: Float[np.ndarray, " points"]
-    expanded: Float[np.ndarray, " points"]  # expanded uncertainty, 95 %
+    expanded: Float[np.ndarray, " points"]  # expanded uncertainty U
     at_poses: Float[np.ndarray, " poses"]
 
 

@@ -19,6 +19,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
+from ..uncertainty.coverage import LEVEL, in_percent
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
 from .record import uncertainty_of
@@ -86,7 +87,7 @@ class Sampled(NamedTuple):
                 f"{len(self.quantities)} quantities: {', '.join(apart[:8])}{' ...' if len(apart) > 8 else ''}; use "
                 "the Monte Carlo intervals."
             )
-        return [*sentences, f"The linear {100 * self.level:g} % intervals {says}"]
+        return [*sentences, f"The linear {in_percent(self.level)} intervals {says}"]
 
 
 @checked_arguments
@@ -94,7 +95,7 @@ def monte_carlo(
     result: Calibration,
     capture: Capture,
     *,
-    level: Level = 0.95,
+    level: Level = LEVEL,
     digits: Annotated[int, OneOf((1, 2))] = 1,
     most: int = 1_000_000,
     lengths: tuple[np.ndarray, np.ndarray] | None = None,
@@ -104,7 +105,7 @@ def monte_carlo(
     """Propagation of distributions (JCGM 101:2008): the whole calibration is repeated on readings drawn anew.
 
     Readings are drawn about poses in which the calibrated arm meets its sockets exactly, certified values with their u.
-    Errors that poses share (``result.shared``) are drawn too. Of captures with other observations, residuals are drawn
+    Shared errors (``result.shared``) are drawn too. Of captures with other observations, residuals are drawn
     about 0: readings, seat and measured values have new errors, by the geometry that was found. Blocks of
     max(100 / (1 - level), 10,000) trials are added until mean, u and both ends of the interval of every quantity are
     stable to a fifth of the tolerance (section 7.9). Bounds act in every trial as they did in the calibration, so the
@@ -175,7 +176,7 @@ def bootstrap(
     capture: Capture,
     *,
     trials: Annotated[int, Range(least=100)] = 2000,
-    level: Level = 0.95,
+    level: Level = LEVEL,
     robust: LossName | None = None,
     seed: int = 0,
 ) -> Sampled:
@@ -215,7 +216,7 @@ def bootstrap(
 
 def _check_some(values: np.ndarray, trials: int, what: str, remedy: str) -> None:
     if len(values) < _LEAST:
-        raise InputError(f"{len(values)} of {trials} {what} trials converged; {remedy}.")
+        raise InputError(f"only {len(values)} of {trials} {what} trials converged; {remedy}.")
 
 
 def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
@@ -248,8 +249,8 @@ class Repeated(NamedTuple):
         lost = any(bool(np.any(np.asarray(weights) < 1)) for weights in result.observed.weights)
         if joint and lost and robust is None:
             raise InputError(
-                "a robust loss reduced the weight of poses in this calibration; give the bootstrap, which keeps "
-                "such poses, the same loss (robust='huber', for example), or calibrate without a robust loss."
+                "a robust loss reduced the weight of poses in this calibration; use bootstrap with the same loss "
+                "(robust='huber', for example), or calibrate without a robust loss."
             )
         if lengths is None:
             lengths = sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))

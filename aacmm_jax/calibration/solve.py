@@ -59,7 +59,7 @@ class Solution(NamedTuple):
         xp, names, height = namespace(linear.z), linear.space.names, linear.height
         steps = xp.where(influence.fixed[: len(names)], 0.0, linear.steps[: len(names)])
         head = xp.concatenate([xp.diag(steps), xp.zeros((len(names), height - len(names)))], axis=1)
-        components = [xp.zeros((len(names), *inverse.shape[:2])) for inverse in influence.own]
+        components = [xp.zeros((len(names), *inverse.shape[:2])) for inverse in influence.d_inverses]
         index = np.array([space.names.index(name) for name in names])
         of_free = propagation.rows_of_functions(influence, head, components)
         return [set_at(xp.zeros((len(space.names), *rows.shape[1:])), index, rows) for rows in of_free]
@@ -219,7 +219,7 @@ def _metrics(
     total = sum(xp.sum(square) for square in squares)
     degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
     before_and_after = (
-        xp.sqrt(observed.mean_by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in point.rows]))
+        xp.sqrt(observed.mean_by_observation(observed.squared_distances(point.rows)))
         for point in (before.point, linear.point)
     )
     parts = observed.split(linear.z[len(linear.space.names) :])

@@ -17,13 +17,13 @@ from ..kinematics.parameters import Parameters
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.degrees_of_freedom import LEVEL
+from ..uncertainty.coverage import LEVEL, LEVEL_IN_PERCENT
 from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
 _METHODS = {
-    "two-stage": "first from repeatability, and then the scale from the lengths",
-    "joint": "from repeatability and lengths together",
+    "two-stage": "first from the repeatability in the sockets, and then the scale from the reference lengths",
+    "joint": "from the repeatability in the sockets and the reference lengths together",
 }
 _METRICS = {
     "DE": ("de", "Mean distance of the tip from its mean position in the socket"),
@@ -35,7 +35,19 @@ _FIXED_SCALE = (
 )
 _DECIMALS = {MILLIMETRE: 5, ONE: 3, RADIAN: 8}  # of what has no uncertainty
 _SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared as one
-_D_SI = {"mm": MILLIMETRE, "rad": RADIAN, "m": r"\metre", "kN": r"\kilo\newton", "K": r"\kelvin"}
+_D_SI = {
+    "mm": MILLIMETRE,
+    "rad": RADIAN,
+    "m": r"\metre",
+    "kN": r"\kilo\newton",
+    "K": r"\kelvin",
+    "px": ONE,
+}  # D-SI has no pixel
+_MEASURED = {
+    "mm": "standard uncertainty of a measured coordinate or distance",
+    "rad": "standard uncertainty of a measured angle or orientation about each axis",
+    "px": "standard uncertainty of a measured image coordinate, in pixels",
+}
 
 
 def results_of(record: CalibrationRecord, given: AdministrativeData, command: str) -> Iterator[Element]:
@@ -49,7 +61,7 @@ def results_of(record: CalibrationRecord, given: AdministrativeData, command: st
         (
             "calibrated",
             "after",
-            "The same readings, evaluated with the calibrated parameters, which were identified from them.",
+            "The same readings, evaluated with the calibrated parameters, which were identified from these readings.",
         ),
     ):
         status, data = element("status", f"{status}Adjustment"), element("data", temperature)
@@ -81,13 +93,13 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
     if record.calibrated.arm.corrections is not None:
         model += " with the joint corrections below"
     return (
-        "Each expanded uncertainty is the standard uncertainty times the coverage factor stated with it. This factor "
-        f"is that of Student's t distribution for a coverage probability of {LEVEL:.0%} and the effective degrees of "
-        "freedom of the quantity, which follow from what each part of its variance rests on. The standard "
-        f"uncertainties follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and "
-        f"from the {sources}. Uncertainties apply to each parameter alone; the covariance matrix gives the "
-        "correlations. Expanded uncertainties are rounded to two digits, and values to the same decimal place. "
-        f"Errors that the {model} does not describe are not included."
+        "Each expanded uncertainty is the standard uncertainty times the coverage factor stated beside it. This "
+        f"factor follows from Student's t distribution for a coverage probability of {LEVEL_IN_PERCENT} and the "
+        "effective degrees of freedom of the quantity, which are computed from the contributions to its variance. "
+        "The standard uncertainties follow, by the law of propagation of uncertainty, from the noise of the "
+        f"readings, {noise}, and from the {sources}. Each uncertainty is for one parameter alone; the covariance "
+        "matrix gives the correlations. Expanded uncertainties are rounded to two digits, and values to the same "
+        f"decimal place. Errors that the {model} does not describe are not included."
     )
 
 
@@ -110,13 +122,13 @@ def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, .
     if record.robust:
         words += (
             f" The robust loss '{record.robust}' reduced the weight of poses with large residuals; "
-            f"{len(less_weight(residuals))} poses have half of their weight or less."
+            f"{len(less_weight(residuals))} poses have half of the full weight or less."
         )
     if record.removed:
         groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
         words += (
-            f" These data were left out because, by an F test, they contradict the rest: {groups}; see the statements "
-            "on data left out."
+            f" The following data were left out, because an F test shows that they contradict the rest: {groups}; see "
+            "the statements on data left out."
         )
     statement = uncertainty_statement(record)
     return element(
@@ -148,11 +160,7 @@ def _equipment(
     for part in residuals:
         observation, certified = part.observation, list(certified_quantities(part.observation))
         # As they were given.
-        stated = {
-            "standard uncertainty of a measured coordinate or distance": (part.u or None, "mm"),
-            "standard uncertainty of a measured orientation about each axis": (part.u_angle, "rad"),
-        }
-        measured = [Quantity(what, np.array([u]), unit) for what, (u, unit) in stated.items() if u is not None]
+        measured = [Quantity(_MEASURED[unit], np.array([u]), unit) for unit, u in part.u.items() if u]
         key = tuple((quantity.says, *np.asarray(quantity.values).tolist(), quantity.u) for quantity in certified)
         if certified or measured:
             where = (observation.kind, *(key if certified and not measured else (observation.name,)))
@@ -203,7 +211,7 @@ def _results(
         k = real(record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
         yield _result(
             "Scale",
-            "Reference lengths that the arm measured before its scale was set, divided by their calibrated values.",
+            "Reference lengths as measured by the arm before its scale was set, divided by their calibrated values.",
             named("quantity", "k", k),
         )
 
@@ -242,8 +250,8 @@ def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool
         rows.append(element("list", text("name", _length_name(number, length)), construction, quantities))
     return _result(
         "Reference lengths",
-        "An error is the measured value minus the calibrated one; its uncertainty includes that of the calibrated "
-        "value and the scatter of the poses at both ends.",
+        "An error is the measured value minus the calibrated one; the uncertainty of the error includes the "
+        "uncertainty of the calibrated value and the scatter of the poses at both ends.",
         *rows,
     )
 
@@ -253,8 +261,7 @@ def _observation(number: int, part: ObservationResiduals, distances: np.ndarray,
     values = [("RMS residual", rms(part.distance if calibrated else distances), MILLIMETRE)]
     if calibrated:
         values.append(("RMS residual in standard deviations", rms(part.normalised), ONE))
-        if part.angle is not None:
-            values.append(("RMS residual of the orientation", rms(part.angle), RADIAN))
+        values += [(f"RMS residual in {unit}", rms(sizes), _in_d_si(unit)) for unit, sizes in part.other.items()]
     target = f", tip: {part.observation.target}" if part.observation.target else ""
     return element(
         "list",

@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element
 from ..core.errors import InputError
 from ..core.text import number, quoted
 from ..files.administrative_data import NOT_STATED, CalibratedItem, Contact, Reference, held_by_xml
-from ..uncertainty.degrees_of_freedom import LEVEL
+from ..uncertainty.coverage import LEVEL
 
 DCC, SI, XSI = "https://ptb.de/dcc", "https://ptb.de/si", "http://www.w3.org/2001/XMLSchema-instance"
 MILLIMETRE, RADIAN, ONE, CELSIUS = r"\milli\metre", r"\radian", r"\one", r"\degreecelsius"
@@ -203,7 +203,7 @@ def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
     try:
         root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_NoDocumentType()))
     except (ElementTree.ParseError, UnicodeError) as error:
-        raise InputError(f"the certificate is not valid XML: {error}; export it again.") from error
+        raise InputError(f"the certificate is not valid XML: {error}; export the certificate again.") from error
     if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
         raise InputError(f"the XML is a '{root.tag}', not a digital calibration certificate; give a DCC.")
     values: dict[tuple[str, ...], CertifiedValue] = {}

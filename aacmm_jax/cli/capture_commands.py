@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 import typer
 
-from .. import acceptance as acceptance_tests
-from .. import data, files, kinematics, summaries
+from .. import data, files, pipeline, summaries
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
@@ -17,8 +16,6 @@ from .app import command, show_summary, with_spinner
 from .arm_command import checked_recording, reading_check
 from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
 
-_U_ARTEFACT = 0.001  # mm
-_POSES = 70  # in each socket
 _DIGITS = 9
 
 
@@ -28,7 +25,7 @@ def demo(
     seed: int = seed("the noise"),
     as_json: bool = options.JSON,
 ) -> None:
-    """Calibrate a simulated arm and compare it with the truth.
+    """Calibrate a simulated arm and compare the result with the true arm.
 
     The simulated arm is that of Cheng et al. 2018, with realistic noise.
     """
@@ -50,36 +47,40 @@ def simulate(
         "Simulate a socket at this position (mm); may be given several times.", "NAME=X,Y,Z"
     ),
     poses: list[str] | None = option(
-        f"Number of poses in each socket, or in the named socket; may be given several times. Default: {_POSES}.",
+        "Number of poses in each socket, or in the named socket; may be given several times. Default: 70.",
         "[NAME=]N",
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     encoder_arcsec: float = options.ENCODER_NOISE,
-    resolution_arcsec: float = option("Round joint readings to multiples of this.", default=0.0, min=0),
+    resolution_arcsec: float = option("Round joint readings to multiples of this value.", default=0.0, min=0),
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     linear_resolution_mm: float = option(
-        "Round readings of prismatic joints to multiples of this.", default=0.0, min=0
+        "Round readings of prismatic joints to multiples of this value.", default=0.0, min=0
     ),
     seating_mm: float = options.SEATING_NOISE,
     temperature_c: str | None = option(
-        "Temperature (C) of an arm with a thermometer; with two values, the temperatures are drawn between them. "
-        "Default: 20.",
+        "Temperature (C), for an arm with a temperature sensor; if two values are given, random temperatures between "
+        "them are simulated. Default: 20.",
         "LOWEST[,HIGHEST]",
     ),
     true_arm: str | None = option(
-        "Simulate with this true arm: a TOML file, a URDF or a name. Default: the nominal arm.", "ARM"
+        "Simulate with this true arm: a TOML file, a URDF, or the name of an arm that ships with aacmm. Default: the "
+        "nominal arm.",
+        "ARM",
     ),
     deviate_length_mm: float = option(
-        "Simulate with a random true arm whose lengths differ from the nominal ones by at most this.",
+        "Simulate with a random true arm whose lengths differ from the nominal lengths by at most this value.",
         default=0.0,
         min=0,
     ),
     deviate_angle_deg: float = option(
-        "Simulate with a random true arm whose angles differ from the nominal ones by at most this.", default=0.0, min=0
+        "Simulate with a random true arm whose angles differ from the nominal angles by at most this value.",
+        default=0.0,
+        min=0,
     ),
     acceptance: Literal["asme", "iso"] | None = option(
-        "Instead of sockets, simulate the acceptance test to ASME B89.4.22 or ISO 10360-12 that 'aacmm plan "
-        "--acceptance' plans; artefacts have u = 0.001 mm."
+        "Simulate the acceptance test to ASME B89.4.22 or ISO 10360-12 that 'aacmm plan --acceptance' plans, instead "
+        "of poses in sockets; the artefacts have u = 0.001 mm."
     ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
@@ -87,60 +88,40 @@ def simulate(
     as_json: bool = options.JSON,
 ) -> None:
     """Make a capture with a simulated arm."""
+    from ..pipeline.capture_simulation import simulate_capture
+
     with together(output):
-        nominal = files.load_specification(arm, base=base, tip=tip)
-        true = nominal
+        nominal, true = files.load_specification(arm, base=base, tip=tip), None
         if true_arm:
             true_base, true_tip = (base, tip) if true_arm.lower().endswith(".urdf") else (None, None)
             true = files.load_specification(true_arm, base=true_base, tip=true_tip)
-        if true.arm.joints != nominal.arm.joints:
-            raise InputError(
-                f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints} joints; "
-                "choose a true arm with as many joints."
-            )
-        if deviate_length_mm or deviate_angle_deg:
-            deviation = {"length": deviate_length_mm, "angle": deviate_angle_deg * DEG}
-            drawn = kinematics.perturbed_arm(true.space(), **deviation, seed=seed)
-            true = true._replace(arm=drawn, name=f"{true.name}, deviated")
-        noise = data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
-        if acceptance is not None:
-            if socket or poses or length or resolution_arcsec or linear_resolution_mm or temperature_c:
-                raise InputError(
-                    "--acceptance sets the sockets, poses and lengths itself, at 20 C; leave out --socket, --poses, "
-                    "--length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
-                )
-            u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
-            recording = with_spinner("Simulating", lambda: acceptance_tests.simulate_procedure(
-                acceptance_tests.plan_procedure(nominal.arm, acceptance), nominal, true, noise=noise, **u, seed=seed
-            ))  # fmt: skip
-        else:
-            points, form = sockets_option(socket), "T or LOWEST,HIGHEST, in C"
-            warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)
-            if not points:
-                raise InputError("no socket is given; give --socket NAME=X,Y,Z, or --acceptance.")
-            capture = with_spinner("Simulating", lambda: data.simulate(
-                true.arm,
-                points,
-                poses=_poses_option(poses or (), points),
-                lengths=[length_option(text) for text in length or ()],
-                noise=noise,
-                resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
-                temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
-                seed=seed,
-            ))  # fmt: skip
-            if temperature_c is not None:
-                nominal = files.load_specification(arm, base=base, tip=tip, capture=capture)
-            recording = data.Recording(capture, nominal, true, seed)
-        recording = recording._replace(usual=files.usual_noise(arm, base=base, tip=tip))
+        points, form = sockets_option(socket), "T or LOWEST,HIGHEST, in C"
+        warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)
+        chosen = pipeline.SimulationOptions(
+            true=true,
+            deviate_length=deviate_length_mm,
+            deviate_angle=deviate_angle_deg * DEG,
+            lengths=[length_option(text) for text in length or ()],
+            noise=data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm),
+            resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
+            temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
+            acceptance=acceptance,
+            seed=seed,
+        )
+        chosen = chosen._replace(poses=_poses_option(poses, points, chosen.poses)) if poses else chosen
+        recording = with_spinner("Simulating", lambda: simulate_capture(nominal, points, **chosen._asdict()))
+        if temperature_c is not None:
+            nominal = files.load_specification(arm, base=base, tip=tip, capture=recording.capture)
+        recording = recording._replace(nominal=nominal, usual=files.usual_noise(arm, base=base, tip=tip))
         summary = summaries.calibration.capture_summary(recording)
         files.save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, views.capture)
 
 
-def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, int]:
-    """Poses by socket, from ``N`` and ``NAME=N``."""
-    counts = dict.fromkeys(sockets, _POSES)
-    for text in texts:
+def _poses_option(texts: Sequence[str], sockets: dict[str, Any], usual: Any) -> dict[str, Any]:
+    """Poses by socket, from ``N`` and ``NAME=N``; ``usual`` where none are given. Without sockets, none."""
+    counts: dict[str, Any] = dict.fromkeys(sockets, usual)
+    for text in texts if sockets else ():
         name, equals, count = text.rpartition("=")
         if not (count.isascii() and count.isdecimal() and len(count) < _DIGITS):
             bad_option("--poses", quoted(text)[1:-1], "N, or NAME=N for one socket")
@@ -156,22 +137,22 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, in
 @command("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check", name="import")
 def import_(
     manifest: Path = argument(
-        "Manifest, which states which files contain the poses and measured values, in which columns and units.",
+        "Manifest (TOML) that names the files with the poses and measured values, and states their columns and units.",
         "MANIFEST.toml",
     ),
     output: Path | None = output("Capture to write (HDF5).", "FILE.h5", None),
     check: bool = flag(
         "--check",
-        "Compare the readings with the arm: find the order, signs, zeros and units of the columns, and joints that do "
-        "not move, and compare commanded with measured readings if the tables contain both. Exit with code 1 if the "
-        "readings cannot be made to fit the arm.",
+        "Check the readings against the arm: find the order, signs, zero offsets and units of the columns, and the "
+        "joints that do not move. If the tables contain both commanded and measured readings, compare them. Exit with "
+        "code 1 if no order, signs, zero offsets and units make the readings fit the arm.",
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Read recorded joint readings into a capture."""
     if output is None and not check:
         raise InputError(
-            "no output is named; name the capture to write with -o FILE.h5, or check the readings with --check."
+            "no output file is given; give -o FILE.h5 to write a capture, or --check to check the readings only."
         )
     with together(output):
         recording = files.read_manifest(manifest)

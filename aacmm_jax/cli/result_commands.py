@@ -7,13 +7,12 @@ from typing import Any, Literal
 import typer
 
 from .. import acceptance as acceptance_tests
-from .. import files, summaries
+from .. import files, pipeline, plot, summaries
 from ..core.errors import InputError
-from ..core.text import shorten
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from ..files.schema import check_shown
+from ..files.stored_checks import check_shown
 from . import options, views
 from .app import command, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame
@@ -35,15 +34,17 @@ _KINDS = {
 )
 def evaluate(
     calibration: Path = argument(
-        "Calibration, written by calibrate; or a manifest of points (TOML), without a capture.", "CALIBRATION.h5"
+        "Calibration, written by aacmm calibrate; or a manifest of recorded points (TOML), for which no capture is "
+        "given.",
+        "CALIBRATION.h5",
     ),
-    capture: Path | None = argument("Capture, written by import or simulate.", "CAPTURE.h5", None),
-    output: Path | None = output("Evaluation to write (HDF5), for aacmm report.", "FILE.h5", None),
+    capture: Path | None = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5", None),
+    output: Path | None = output("File to write the evaluation to (HDF5); aacmm report reads it.", "FILE.h5", None),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     mpe: list[str] | None = option(
-        "Maximum permissible error of an acceptance test, mm (L: the length); may be given several times. The exit "
-        "code is 1 if a value does not conform by the decision rule.",
+        "Maximum permissible error (mm) of an acceptance test; L is the measured length. May be given several times. "
+        "The exit code is 1 if a value does not conform by the decision rule.",
         "NAME=A[+L/K]",
     ),
     acceptance: list[str] | None = option(
@@ -53,25 +54,30 @@ def evaluate(
         "[jjf|asme|iso]",
     ),
     test_u_mm: str = option(
-        "Standard uncertainty (mm) that seat and fixture add to every test value (L: the length).",
+        "Standard uncertainty (mm) that seat and fixture add to every test value; L is the measured length.",
         "A[+L/K]",
         default="0",
     ),
     expansion: list[str] | None = option(
         "Thermal expansion of the artefact or the arm in an acceptance test: coefficient (1e-6/K) and temperature "
         "(C), each followed by its standard uncertainty, for example 'artefact=11.5,1,20.8,0.2'. Lengths are "
-        "corrected for expansion. Give the expansion of the arm only if the arm does not compensate it itself.",
+        "corrected for this expansion. Give the expansion of the arm only if the arm does not compensate for its "
+        "temperature.",
         "OF=C,U,T,U",
     ),
     rule: Literal["iso-2017", "iso-2013", "simple"] | None = option(
-        "Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance (ASME "
-        "B89.7.3.1, 4:1). Default: simple for ASME, otherwise iso-2017."
+        "Decision rule: ISO 14253-1:2017 (95 % probability), ISO 14253-1:2013 (guard band U), or simple acceptance "
+        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, otherwise iso-2017."
     ),
     range_mm: float | None = option(
-        "Measuring range (a diameter) that the maker states. Default: the range in the files.", min=0
+        "Measuring range (a diameter) stated by the maker. Default: the range stated in the capture or manifest.", min=0
     ),
-    max_rms_mm: float | None = option("Exit with code 1 if the RMS distance is larger than this.", min=0),
-    max_deltam_mm: float | None = option("Exit with code 1 if Deltam is larger than this.", min=0),
+    max_rms_mm: float | None = option(
+        "Exit with code 1 if the RMS distance of the poses from their geometry is larger than this.", min=0
+    ),
+    max_deltam_mm: float | None = option(
+        "Exit with code 1 if Deltam (largest half range of a coordinate in a socket) is larger than this.", min=0
+    ),
     max_length_error_mm: float | None = option(
         "Exit with code 1 if the error of any length is larger than this.", min=0
     ),
@@ -83,41 +89,29 @@ def evaluate(
     of points is tested without a calibration.
     """
     from ..acceptance.judgement import limit_of_text, read_expansions, read_limits
+    from ..pipeline.capture_evaluation import evaluate_points
 
     u_test, bodies = limit_of_text(test_u_mm, f"--test-u-mm {test_u_mm}"), read_expansions(expansion or [])
-    of_test = {
-        "limits": read_limits(mpe or [], acceptance_tests.METRICS),
-        "u_test": u_test.fixed,
-        "influences": acceptance_tests.Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
-        "rule": rule,
-    }
     maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
-    maxima = {name: value for name, value in maxima.items() if value is not None}
-    if capture is None and (maxima or only or without):
-        raise InputError(
-            "--max-..., --only and --without do not apply to a manifest of points; name a calibration and a capture, "
-            "or leave these options out."
-        )
+    chosen = pipeline.EvaluationOptions(
+        only=only or None,
+        without=without or (),
+        limits=read_limits(mpe or [], acceptance_tests.METRICS),
+        u_test=u_test.fixed,
+        influences=acceptance_tests.Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
+        rule=rule,
+        standards=acceptance,
+        measuring_range=range_mm,
+        maxima={name: value for name, value in maxima.items() if value is not None},
+    )
     with together(output):
         if capture is None:
-            record, summarise = _points(calibration, acceptance, range_mm, of_test), summaries.evaluation.points_summary
+            record = evaluate_points(_points(calibration), **chosen._asdict())
+            summarise = summaries.evaluation.points_summary
         else:
-            paths, choice = (InputFile(calibration), InputFile(capture)), (only or None, without or ())
-            of_test |= {"maxima": maxima, "standards": acceptance}
-            record, summarise = _evaluation(paths, choice, range_mm, of_test), summaries.evaluation.evaluation_summary
+            record = _evaluation(InputFile(calibration), InputFile(capture), chosen)
+            summarise = summaries.evaluation.evaluation_summary
         summary = with_spinner("Evaluating", lambda: summarise(record))
-        given = {
-            "--rule": rule is not None,
-            "--test-u-mm": u_test.fixed > 0 or 1 / u_test.divisor > 0,
-            "--expansion": bool(expansion),
-            "--range-mm": range_mm is not None,
-        }
-        if capture is not None and not summary["acceptance"] and any(given.values()):
-            raise InputError(
-                f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only, but "
-                "this capture supports none, or none was requested; request one with --acceptance, or leave the "
-                "option out."
-            )
         if output is not None:
             files.save_evaluation(output, record, summary)
             summary["written"] = str(output)
@@ -126,40 +120,34 @@ def evaluate(
         raise typer.Exit(1)
 
 
-def _evaluation(paths: tuple[InputFile, InputFile], choice: tuple, stated_range: float | None, of_test: dict) -> Any:
-    """The record of a calibration evaluated on a part of a capture."""
-    from ..diagnostics.findings import findings_of, sentences
+def _evaluation(calibration: InputFile, capture: InputFile, chosen: Any) -> Any:
+    """The record of a calibration evaluated on a capture, whose warnings the calibration's file may have."""
+    from ..pipeline.capture_evaluation import evaluate_capture
 
-    record, recording = files.load_calibration(paths[0]), files.load_capture(paths[1])
-    recording = recording._replace(
-        capture=recording.capture.select(*choice),
-        sources=(*map(fingerprint, paths), *recording.sources),
-        measuring_range=stated_range or recording.measuring_range,
-    )
-    stored = read_summary(paths[0], ("calibration",))[1]
-    warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
-    evaluation = acceptance_tests.evaluation_of(record, recording, **of_test)
-    return evaluation._replace(calibration_warnings=tuple(warnings))
+    record, recording = files.load_calibration(calibration), files.load_capture(capture)
+    sources = (fingerprint(calibration), fingerprint(capture), *recording.sources)
+    stored = read_summary(calibration, ("calibration",))[1]
+    chosen = chosen._replace(calibration_warnings=None if stored is None else stored["warnings"])
+    return evaluate_capture(record, recording._replace(sources=sources), **chosen._asdict())
 
 
-def _points(manifest: Path, standards: list[str] | None, stated_range: float | None, of_test: dict) -> Any:
-    """The record of a manifest of points, with the acceptance tests that they allow."""
-    from ..acceptance.standards import STANDARDS, checked_standards
-
+def _points(manifest: Path) -> Any:
+    """The points of a manifest."""
     if manifest.suffix != ".toml":
         raise InputError(
             f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
         )
-    chosen = checked_standards(STANDARDS if standards is None else standards)
-    measured = files.read_points(manifest)
-    measured = measured._replace(measuring_range=stated_range or measured.measuring_range)
-    return acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
+    return files.read_points(manifest)
 
 
 @command("aacmm report calibration.h5 -o report.html")
 def report(
-    file: Path = argument("File to report: a calibration, evaluation, study or model comparison.", "FILE.h5"),
-    output: Path = output("Report to write: one HTML file that needs no network connection.", "FILE.html"),
+    file: Path = argument(
+        "File to write a report of: a calibration, evaluation, study or model comparison.", "FILE.h5"
+    ),
+    output: Path = output(
+        "File to write the report to: one HTML file, which can be read without a network connection.", "FILE.html"
+    ),
     about: Path | None = options.ABOUT,
     as_json: bool = options.JSON,
 ) -> None:
@@ -182,7 +170,7 @@ def show(
         "URDF, kinematics.yaml, or the name of an arm that ships with aacmm).",
         "FILE",
     ),
-    cell: int | None = option("Show this cell of a study in full.", "N", min=1),
+    cell: int | None = option("Show all results of this cell of a study.", "N", min=1),
     figures: Path | None = option("Write the figures of a study (PNG) to this folder.", "FOLDER"),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
@@ -199,14 +187,14 @@ def show(
         show_summary(summary, as_json, views.arm)
         return
     if base is not None or tip is not None:
-        raise InputError(f"--base and --tip name links of a URDF, but {file} is not a URDF; leave them out.")
+        raise InputError(
+            f"--base and --tip name links of a URDF, but {file} is not a URDF; leave out --base and --tip."
+        )
     attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study", "model comparison"))
     kind = attributes["kind"]
     if kind == "study":
-        from .study_commands import show_study
-
         prepare_jax()
-        show_study(path, cell, figures, as_json)
+        _show_study(path, cell, figures, as_json)
         return
     if cell is not None or figures is not None:
         raise InputError(f"{file} is not a study but a file of the kind '{kind}'; leave out --cell and --figures.")
@@ -223,3 +211,23 @@ def show(
     else:
         check_shown(path, kind, summary)
     show_summary(summary, as_json, view)
+
+
+def _show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
+    """Print a study's results, and draw its figures."""
+    from ..study.results import study_summary
+    from ..study.store import Results
+    from ..study.tables import study_view
+
+    results = Results.of(file)
+    if cell is not None and cell > len(results.study.cells):
+        raise InputError(
+            f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; choose a cell from 1 to "
+            f"{len(results.study.cells)}."
+        )
+    summary = with_spinner("Reading", lambda: study_summary(results, cell))
+    if figures is not None:
+        with together():
+            paths = with_spinner("Drawing", lambda: plot.save_study_figures(results, figures))
+        summary["figures_written"] = [str(path) for path in paths]
+    show_summary(summary, as_json, study_view)

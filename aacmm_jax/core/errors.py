@@ -55,7 +55,7 @@ class IdentifiabilityWarning(UserWarning):
         >>> print(caught[0].category.__name__)
         IdentifiabilityWarning
         >>> print(str(caught[0].message).partition(";")[0])
-        No measurement of this kind can separate: d_1 (changes nothing that is measured)
+        Not determined by any measurement of this kind: d_1 (has no effect on the measurements)
     """
 
 
@@ -75,4 +75,4 @@ def nearest(word: str, names: Iterable[str], most: int = 12) -> str:
     if matches:
         return f"; did you mean {quoted(matches[0])}?"
     shown = ", ".join(quoted(name)[1:-1] for name in names[:most]) + (", ..." if len(names) > most else "")
-    return f"; known are {shown}." if names else "."
+    return f"; choose one of {shown}." if names else "."

@@ -78,7 +78,7 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
     the free parameters that a calibration of the capture would take, where there is one."""
     still = standing_joints(arm, np.asarray(capture.readings))
     joints = [standing.joint for standing in still]
-    remedy = "move this joint" if len(still) == 1 else "move the joints that stand still"
+    remedy = "move this joint" if len(still) == 1 else "let every joint move"
     if nominal is not None and still:
         space = nominal.space()
         added = _open_parameters(space, capture, joints)
@@ -87,11 +87,11 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
         if added:
             remedy += f"with --held {','.join(name for name in parameter_names(space.base) if name in held)}"
         else:
-            remedy += "without changes: these data determine all parameters that are free by default"
+            remedy += "with the default free parameters, which these data determine"
     rows = []
     for (joint, travel, poses), names in zip(still, lost_by_standing(arm, capture, joints), strict=True):
         unit, size = ("mm", travel) if joint in arm.prismatic else ("deg", travel / DEG)
-        says = f"Joint {joint} stands still ({size:.2g} {unit} over {pluralise(poses, 'pose')})"
+        says = f"Joint {joint} hardly moves ({size:.2g} {unit} over {pluralise(poses, 'pose')})"
         if names:
             says += f": {listed(names)} cannot be identified; {remedy}."
         else:
@@ -170,10 +170,10 @@ class TriedPoses(NamedTuple):
 def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
     """How far poses are from those of a calibration, and these from one another.
 
-    What a model lacks depends on the readings, so a calibration has seen such errors only near its own poses. Elsewhere
-    an uncertainty that follows from the model alone says nothing of them. ``calibrated`` are the readings that the arm
-    was calibrated with, ``(N, n)``, and ``q`` those of other poses, rad (slides: mm); a temperature after them is left
-    out. Raises `InputError` for fewer than two poses.
+    What a model lacks depends on the readings, so the data of a calibration contain such errors only near its own
+    poses. Elsewhere, an uncertainty that follows from the model alone does not include them. ``calibrated`` are the
+    readings that the arm was calibrated with, ``(N, n)``, and ``q`` those of other poses, rad (slides: mm); a
+    temperature after them is left out. Raises `InputError` for fewer than two poses.
     """
     units = np.asarray(reading_units(arm.geometry))
     poses, others = (np.asarray(values, dtype=float)[:, : arm.joints] / units for values in (calibrated, q))

@@ -70,7 +70,7 @@ def of_recording(recording: Recording) -> list[Finding]:
     exact = [f"{length.start} - {length.end}" for length in capture.lengths if float(length.u) == 0]
     findings = [*_outside_limits(recording), *repeated]
     if exact:
-        says = f"Taken as exact, because u is 0: {shorten(exact)}."
+        says = f"These lengths are treated as exact, because their u is 0: {shorten(exact)}."
         advice = "Give the standard uncertainty of each length."
         findings.append(Finding("exact-lengths", says, advice=advice, concerns=tuple(exact)))
     return findings + _implausible_uncertainties(capture)
@@ -100,7 +100,8 @@ def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     stated = [(f"[[length]] {length.start} - {length.end}", length.u) for length in capture.lengths]
     for observation in capture.observations:
         stored = observation.stored()
-        u = stored.get("u")
+        in_mm = any(entry.name == "u" and entry.unit == "mm" for entry in observation.entries)
+        u = stored.get("u") if in_mm else None
         if stored.get("covariance") is not None:
             u = np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1))
         if u is not None:
@@ -112,7 +113,10 @@ def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     large = [f"{where} (u = {u:,.0f} um)" for where, u in most]
     return [
         Finding(
-            code, f"{says}: {shorten(texts)}.", advice=f"u is in mm; was it given in {unit}?", concerns=tuple(texts)
+            code,
+            f"{says}: {shorten(texts)}.",
+            advice=f"u must be in mm; was it given in {unit}?",
+            concerns=tuple(texts),
         )
         for code, texts, says, unit in (
             ("small-u", small, "u < 0.1 um is implausibly small", "m"),
@@ -185,10 +189,12 @@ def _rms(arm: Arm, observed: Observed) -> float:
         z = np.concatenate([vector, *(start[name] for name in observed.blocks)])
         for _ in range(_ROUNDS):
             point, roots = rows_at(space, observed, z), []
-            for rows in point.rows:
-                size, poses = rows.values.shape
-                root = np.diag([1.0] * min(size, 3) + [lever] * (size - 3))
-                roots.append(np.broadcast_to(root, (poses, size, size)))
+            for stack, rows in zip(observed.stacks, point.rows, strict=True):
+                # Of a kind without lengths, a residual counts as it moves the tip.
+                moves = np.maximum(np.linalg.norm(rows.by_tip, axis=1).T, 1e-300)
+                weights = [1.0] * stack.lengths + [lever] * (stack.rows - stack.lengths) if stack.lengths else 1 / moves
+                size = np.broadcast_to(weights, moves.shape)
+                roots.append(size[:, :, None] * np.eye(stack.rows))
             whitening = Whitening(tuple(roots), np.zeros(0), {name: 0 * value for name, value in certified.items()})
             linear = Linearisation.of(observed, space, z, point, [], whitening, None)
             squares = sum(float(np.sum(white**2)) for white in linear.white())
@@ -237,8 +243,8 @@ def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[tuple[str, Flo
         order[i], order[j] = j, i
         yield f"the columns of joints {i + 1} and {j + 1} are exchanged", q[:, order]
     yield "the columns are in reverse order", q[:, ::-1]
-    yield "the column of the last joint comes first", np.roll(q, -1, axis=1)
-    yield "the column of the first joint comes last", np.roll(q, 1, axis=1)
+    yield "the first column is that of the last joint", np.roll(q, -1, axis=1)
+    yield "the last column is that of the first joint", np.roll(q, 1, axis=1)
     slides = np.array(by_joint(arm, False, True))
     yield "readings are in gon, but were read as degrees", np.where(slides, q, 0.9 * q)
     largest = float(np.abs(q[:, ~slides]).max(initial=0.0))

@@ -1,7 +1,7 @@
 """Calibrations of one arm compared: parameters that changed beyond their uncertainty, and the effect on lengths."""
 
 import datetime
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -11,7 +11,8 @@ from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..core.text import shorten
-from ..kinematics.arm import DOWN, Arm, correction_names, parameter_names, parameter_unit, value_of
+from ..kinematics.arm import DOWN, Arm, parameter_names, parameter_unit, value_of
+from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
@@ -26,7 +27,7 @@ def compare(
     old: CalibrationRecord,
     new: CalibrationRecord,
     *,
-    level: _Level = 0.95,
+    level: _Level = LEVEL,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
@@ -36,9 +37,10 @@ def compare(
 
     The two are taken as independent, so variances add (JCGM 100, 5.1.2) and effective degrees of freedom follow Welch
     and Satterthwaite (annex G.4). A common error, such as that of one artefact's certified length, cancels in the
-    change, so the uncertainty is then too large rather than too small. k is not compared: it is a correction of
-    stage 1, not a parameter of the arm. `InputError` for arms with different numbers of joints, and for lengths that do
-    not fit into the volume.
+    change, so the uncertainty is then too large rather than too small. A coefficient that the model of one of them
+    lacks is 0 there, and its change has no uncertainty. k is not compared: it is a correction of stage 1, not a
+    parameter of the arm. `InputError` for arms with different numbers of joints, and for lengths that do not fit into
+    the volume.
 
     Args:
         old: The earlier calibration.
@@ -64,7 +66,7 @@ def trend(
     records: Sequence[CalibrationRecord],
     dates: Sequence[datetime.datetime | str],
     *,
-    level: _Level = 0.95,
+    level: _Level = LEVEL,
     points: int = 400,
     length: float | None = None,
     seed: int = 0,
@@ -124,16 +126,16 @@ def _compared(
     for arm, label in zip(arms, labels, strict=True):
         if arm.arm.joints != arms[0].arm.joints:
             raise InputError(
-                f"{labels[0]} is of '{arms[0].name}' with {arms[0].arm.joints} joints, but {label} is of '{arm.name}' "
-                f"with {arm.arm.joints} joints; compare calibrations of one arm."
+                f"{labels[0]} is for the arm '{arms[0].name}' with {arms[0].arm.joints} joints, but {label} is for the "
+                f"arm '{arm.name}' with {arm.arm.joints} joints; compare calibrations of the same arm."
             )
     points, length, seed = volume
     length = default_length(first.calibrated.arm) if length is None else length
     ends = sample_lengths(first.calibrated.arm, points, length=length, seed=seed)
-    # Those of the first in its order, then those that others add.
-    names = tuple(dict.fromkeys(name for record in records for name in record.names))
+    # Those of the first in its order, then those that others add. An arm may lack coefficients that others have.
+    units = {name: parameter_unit(record.calibrated.arm, name) for record in records for name in record.names}
     return [
-        _of_two(first, new, names, level, (length, *ends), (labels[0], label))
+        _of_two(first, new, units, level, (length, *ends), (labels[0], label))
         for new, label in zip(others, labels[1:], strict=True)
     ]
 
@@ -141,12 +143,14 @@ def _compared(
 def _of_two(
     old: CalibrationRecord,
     new: CalibrationRecord,
-    names: tuple[str, ...],
+    units: Mapping[str, str],
     level: float,
     lengths: tuple[float, np.ndarray, np.ndarray],
     labels: tuple[str, str],
 ) -> Drift:
-    """``lengths``: their length, and the configurations at both ends."""
+    """``units``: parameters to compare, with their units; ``lengths``: their length, and the configurations at both
+    ends."""
+    names = tuple(units)
     arms = old.calibrated.arm, new.calibrated.arm
     before, after = (_values(arm, names) for arm in arms)
     reasons = tuple(_why_open((old, new), name) for name in names)
@@ -161,8 +165,7 @@ def _of_two(
     u = np.where(certain, np.sqrt(parts.sum(axis=1)), np.nan)
     return Drift(
         names=names,
-        # One of the arms may lack a coefficient.
-        units=tuple(parameter_unit(arms[name not in correction_names(arms[0])], name) for name in names),
+        units=tuple(units.values()),
         old=before,
         new=after,
         u=u,
@@ -179,7 +182,7 @@ def _of_two(
 def _values(arm: Arm, names: tuple[str, ...]) -> Float[np.ndarray, " p"]:
     """Values of parameters; coefficients of corrections that the arm lacks are 0."""
     down: dict[str, float] = dict(zip(("gravity_x", "gravity_y", "gravity_z"), DOWN, strict=True))
-    present = {*parameter_names(arm), *(f"beta_{i}" for i in range(1, arm.joints + 1) if arm.beta is not None)}
+    present = parameter_names(arm)
     return np.array([float(value_of(arm, name)) if name in present else down.get(name, 0.0) for name in names])
 
 
@@ -189,7 +192,9 @@ def _why_open(records: Sequence[CalibrationRecord], name: str) -> str:
     for record in records:
         i = record.names.index(name) if name in record.names else None
         if i is None:
-            reasons.append(FIXED)
+            arm = record.calibrated.arm
+            lacking = name not in parameter_names(arm)
+            reasons.append(f"{FIXED} at {_values(arm, (name,))[0]:g} by the model" if lacking else FIXED)
         elif record.active[i]:
             reasons.append(ON_BOUND)
         else:
@@ -240,6 +245,6 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         if alone := [name for name in record.names if name not in other.names]:
             yield (
-                f"Free in {label} only: {shorten(alone)}. In the other calibration, other parameters may compensate "
-                "for them; lengths can still be compared."
+                f"Parameters free only in {label}: {shorten(alone)}. These parameters are fixed in the other "
+                "calibration, so its other parameters may differ for this reason; compare lengths instead."
             )

@@ -108,7 +108,7 @@ def joint_test(
     covariance = sum(record.covariance[np.ix_(index, index)] for record, index in rows) / np.outer(steps, steps)
     covariance = determined.T @ covariance @ determined
     # Scaled by each combination's own uncertainty, so that eigenvalues are comparable.
-    u = np.sqrt(np.diag(covariance))
+    u = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding makes variances of exact data negative
     u = np.where(u > 0, u, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(u, u))
     regular = values > _SINGULAR * values[-1] if len(values) else np.zeros(0, dtype=bool)

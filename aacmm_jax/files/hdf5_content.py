@@ -18,7 +18,7 @@ from ..core.errors import InputError
 _LOW: Any = h5py  # whose type hints lack some of its modules
 _SEAL = b"\naacmm_jax: SHA-256 of all bytes before this line: %s\n"
 _SEAL_SIZE = len(_SEAL % (64 * b"0"))
-# An honest file's arrays exceed its size little; a few repeated numbers are compressed a thousand times.
+# The arrays of a file that aacmm wrote exceed its size little; a few repeated numbers are compressed a thousand times.
 _ALWAYS_READ, _MOST_COMPRESSED = 64 * 2**20, 100
 _BUFFER = 16 * 2**20  # bytes of an array that are read at a time
 # Numbers, truth values (an enumeration) and text; no compound, reference or array types, nor lists of lists.
@@ -87,12 +87,12 @@ class _Check:
 
     def _refuse(self, name: bytes, what: str) -> InputError:
         where = f"{self._path}: '{name.decode()}'"
-        return InputError(f"{where} is {what}, which aacmm does not read; name a file written by aacmm.")
+        return InputError(f"{where} is {what}, so aacmm does not read this file; give a file written by aacmm.")
 
     def _check_size(self, name: bytes, item: Any, size: float) -> None:
         if size > self._credible:
             sizes = " x ".join(map(str, item.shape)) or "1"
-            raise self._refuse(name, f"an array of {sizes}, far more than the file contains")
+            raise self._refuse(name, f"an array of {sizes} values, far more than the file can contain")
 
     def item(self, group: Any, name: bytes) -> Any:
         """A member of a group."""
@@ -114,7 +114,7 @@ class _Check:
         self._check_size(name, item, size)
         text = bool(h5py.check_string_dtype(kind))
         if text and len(shape) > 1:
-            raise self._refuse(name, "a table of texts in several dimensions")
+            raise self._refuse(name, "an array of texts with more than one dimension")
         if not shape or not size:
             data[()]
             return

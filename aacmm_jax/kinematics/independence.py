@@ -1,7 +1,7 @@
 """Which parameters data determine: a choice of independent columns of derivatives, without near-degenerate ones.
 
 A matrix of derivatives has full rank as soon as no combination of parameters leaves the tips exactly where they are.
-That says nothing of how well the combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank
+Full rank does not show how well a combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank
 of its own, but 1 mrad of it moves no tip by more than 0.3 um once ``a_6`` and the probe have followed. So directions
 are judged by size.
 
@@ -241,7 +241,7 @@ class TradeOff(NamedTuple):
         """The trade-off in words."""
         (first, *others), movement = self.names, f"{1e3 * self.movement:.2g} um"
         step = _step(first)
-        text = f"one {step} of {first} changes the tips by {movement}"
+        text = f"a change of 1 {step} in {first} moves the tips by only {movement}"
         if others:
             pairs = list(zip(self.amounts[1:], others, strict=True))[:_PARTNERS_NAMED]
             imitation = listed(f"{amount:.2g} {_step(name)} of {name}" for amount, name in pairs)

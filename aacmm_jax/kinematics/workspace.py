@@ -286,8 +286,8 @@ def search_region(
     allowed, margins = joint_limits(arm, limits), margin * reading_units(arm.geometry)
     if not (math.isfinite(margin) and margin >= 0 and np.all(margins < (allowed[:, 1] - allowed[:, 0]) / 2)):
         raise InputError(
-            f"a margin of {math.degrees(margin):g} deg leaves a joint no range within its limits; give a smaller "
-            "margin."
+            f"a margin of {math.degrees(margin):g} deg leaves no range of motion between the limits of a joint; give a "
+            "smaller margin."
         )
     inner = allowed + margins[:, None] * np.array([1.0, -1.0])
     cell = None if cell is None else checked_cell(arm, cell, inner)
@@ -324,13 +324,13 @@ def reached(
 
 
 def configurations_at(
-    region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
+    region: SearchRegion, points: Float[np.ndarray, "s 3"], starts_per_point: int
 ) -> tuple[Configurations, Places]:
-    """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point.
+    """Configurations that reach the points from random starts, and the index of the point that each of them reaches.
 
     Of several cones, point i has the cone i, modulo their number (for several placements of the same sockets).
     """
-    owner = np.repeat(np.arange(len(points)), each)
+    owner = np.repeat(np.arange(len(points)), starts_per_point)
     sockets = owner % (1 if region.cones is None else len(region.cones.normals))
     q, good = reached(region, region.draw(len(owner)), points[owner], sockets=sockets, scattered=True)
     return q[good], owner[good]

@@ -17,6 +17,7 @@ from ..data.capture import Capture, draw_poses, join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.contradictions import remove_contradicting
+from ..diagnostics.findings import case_of
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
 from .cross_validation import can_cross_validate, cross_validate
@@ -73,7 +74,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         hold: the scale anchor of stage 1, as for `identify`.
         noise: standard deviations of readings and seat, as for `identify`.
         replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
-        shared_errors: add errors that poses share to the covariance, as for `calibrate`.
+        shared_errors: add shared errors to the covariance, as for `calibrate`.
         cross_validate: calibrate without each group, as `cross_validate` does. By default where a real arm was recorded
             in several placements of the reference length, and there is neither a prior nor a robust loss.
         leave_out: groups that cross-validation leaves out, as names or shell patterns.
@@ -127,6 +128,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         result = chosen.stage("Calibrating", lambda: solved(recording.capture))
         record = record_of(result, recording, robust=chosen.robust, others=others)
+        case_of(record)  # takes over what the calibration has computed to test its noise, before others are tested
         if chosen.remove_contradicting:
             record = chosen.stage("Comparing groups", lambda: remove_contradicting(record, solved))
         if _to_cross_validate(record.recording, solving, chosen):

@@ -12,6 +12,7 @@ from ..core.units import DEG
 from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.calibration import metrics_by_socket_and_length
 from ..summaries.tables import decimals_for, format_number
+from ..uncertainty.coverage import U_AT_LEVEL
 from ..uncertainty.volume import VolumetricUncertainty
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, runs, shades, thinned
 from .figures import draw
@@ -65,7 +66,7 @@ def length_chart(rows: Sequence[Mapping[str, Any]], earlier: Mapping[str, np.nda
         for row in rows
     ]
     marks = [Marks(name, x, values, "diamond", "accent") for name, values in earlier.items()]
-    name = "calibrated" + (", with U (95 %)" if np.any(np.isfinite(expanded)) else "")
+    name = "calibrated" + (f", with {U_AT_LEVEL}" if np.any(np.isfinite(expanded)) else "")
     marks.append(Marks(name, x, error, "square", "main", words, error - expanded, error + expanded, size=7))
     description = "Measured minus calibrated value" + (", before and after the scale fix." if earlier else ".")
     return Chart("lengths", "Errors of the reference lengths", description, (_errors_plot(axis, edges, marks),))
@@ -97,7 +98,7 @@ def reading_errors_chart(tests: Sequence[AcceptanceTest]) -> Chart | None:
 
 
 def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
-    """Plot the errors of the reference lengths before and after the scale fix, mm, with expanded uncertainty (95 %).
+    """Plot the errors of the reference lengths before and after the scale fix, mm, with expanded uncertainty U.
 
     Args:
         record: The calibration; `InputError` if it has no reference lengths.
@@ -108,7 +109,7 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     """
     capture, evaluations = record.recording.capture, record.evaluations()
     if not capture.lengths:
-        raise InputError("the calibration has no reference lengths, so there are no errors of lengths to draw.")
+        raise InputError("the calibration has no reference lengths, so there are no length errors to draw.")
     rows = metrics_by_socket_and_length(capture, evaluations["calibrated"], uncertainty_of(record))["lengths"]
     earlier = {"stage 1": np.asarray(evaluations["stage1"].error)} if record.stage1_apart else {}
     return draw(length_chart(rows, earlier).plots[0], axes)
@@ -124,8 +125,8 @@ def metrics_chart(tests: Sequence[AcceptanceTest]) -> Chart:
         metrics, y, lines, title = limited, "|value| / MPE", [1.0], "Metrics against their limits"
         divisors = np.array([max(metric.worst.limit or 0.0, _LEAST) for metric in metrics])
         description = (
-            "The value of each metric divided by its limit, with U. The decisions are in the tables. They follow the "
-            "decision rule stated above; its guard band may be smaller than U."
+            "The value of each metric divided by its limit, with U. The decisions in the tables follow the decision "
+            "rule stated above, whose guard band may be smaller than U."
         )
     values = np.array([abs(metric.value) for metric in metrics]) / divisors
     bars = np.array([metric.worst.expanded for metric in metrics]) / divisors
@@ -174,12 +175,12 @@ def volume_chart(volume: VolumetricUncertainty) -> Chart:
     said = [f"U = {format_number(u, decimals_for(u))} mm" for u in expanded.tolist()]
     marks = _section(volume.start[finite], (shade, limits if np.any(finite) else ()), said, name, unit="mm")
     axes = linear(_ACROSS, np.hypot(volume.start[:, 0], volume.start[:, 1]), [0.0]), linear(_UP, volume.start[:, 2])
-    description = "Height against distance from the first axis; the larger the mark, the larger U."
+    description = "Height against distance from the first axis; a larger mark shows a larger U."
     return Chart("volume", f"{name} over the volume", description, (Plot(*axes, (marks,), height=380),))
 
 
 def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) -> Any:
-    """Plot U (95 %) of lengths over the working volume: larger and darker marks are more uncertain.
+    """Plot the expanded uncertainty U of lengths over the working volume: larger and darker marks are more uncertain.
 
     Each length is marked at the height and the distance from the first axis where it starts.
 
@@ -192,7 +193,7 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) 
         >>> axes = aj.plot.volumetric_uncertainty_map(volume)
     """
     if not np.any(np.isfinite(volume.expanded_length)):
-        raise InputError("the data determine no length over the volume, so there is no uncertainty to draw.")
+        raise InputError("the data do not determine lengths over the volume, so there is no uncertainty to draw.")
     return draw(volume_chart(volume).plots[0], axes)
 
 
@@ -211,9 +212,9 @@ def tried_chart(volume: VolumetricUncertainty, tips: np.ndarray, poses: TriedPos
     axes = linear(_ACROSS, random.x, across, [0.0]), linear(_UP, volume.start[:, 2], tips[:, 2])
     plot = Plot(*axes, marks, height=380)
     description = (
-        "Random poses over the whole volume. The size of a mark shows the distance in joint space from the nearest "
-        "calibration pose, in multiples of the spacing of the calibration poses. Random poses with a distance of up to "
-        "1 are covered by the calibration."
+        "Tip positions of random poses over the whole volume. The size of a mark shows the distance in joint space "
+        "from the nearest calibration pose, in multiples of the spacing of the calibration poses. Random poses with a "
+        "distance of up to 1 are covered by the calibration."
     )
     return Chart("tried", "Coverage of the working volume", description, (plot,))
 

@@ -37,6 +37,7 @@ from ..summaries.tables import (
     two_digits,
 )
 from ..uncertainty.arm_uncertainty import Uncertainty
+from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_of_arm
@@ -56,8 +57,9 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     """Every parameter with its expanded uncertainty; hundreds of coefficients joint by joint, and on demand."""
     others, harmonics = listed_apart(summary["parameters"])
     introduction = (
-        "U is the expanded uncertainty (95 %), with the coverage factor of each parameter's own degrees of freedom. A "
-        "parameter on a bound, or one that the data determine only together with others, has no U of its own."
+        f"U is the expanded uncertainty ({LEVEL_IN_PERCENT}), with the coverage factor that follows from the degrees "
+        "of freedom of each parameter. No U is stated for a parameter that is on a bound, or that the data determine "
+        "only together with other parameters."
     )
     by_unit = {unit: [row for row in others if row["unit"] == unit] for unit in ("mm", "rad")}
     functions = functions_chart(record)
@@ -69,8 +71,8 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     ]
     if harmonics:
         blocks += [
-            f"The {len(harmonics)} coefficients of harmonics are not printed. On screen, the table below lists them; "
-            "aacmm export --format csv writes them from the calibration's file.",
+            f"The {len(harmonics)} coefficients of harmonics are not printed. On screen, the table below lists the "
+            "coefficients; aacmm export --format csv writes them to a file.",
             harmonics_table(harmonics),
             parameter_table("Coefficients of harmonics", harmonics)._replace(folded=True),
         ]
@@ -78,7 +80,7 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
 
 
 def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
-    """Residuals of the calibrated arm, pose by pose; of observations in mm, in standard deviations and of orientations,
+    """Residuals of the calibrated arm, pose by pose; of observations in mm, in standard deviations, in deg and px,
     with the poses that a robust loss took weight from, and the geometry."""
     capture = record.recording.capture
     if record.sockets_alone:
@@ -99,12 +101,12 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
     if not summary["robust"]:
         introduction += "Poses with more than eight times the median distance, in standard deviations, are marked."
         far = "far from its geometry", pose_outliers(normalised, groups.sizes)[0]
-    charts = (kinds_chart(record, unit, far, DRAWN) for unit in ("mm", "standard deviations", "deg"))
+    charts = (kinds_chart(record, unit, far, DRAWN) for unit in ("mm", "standard deviations", "deg", "px"))
     blocks = [introduction, *([weights_table(summary)] if summary["robust"] else []), *filter(None, charts)]
     introduction = (
-        "The unknown geometry was determined together with the parameters. Positions and frames are given in "
-        "the base frame, rotations as vectors along their axis. Offsets and orientations of targets are given in the "
-        "last frame, placements on an indexed platform in the platform's frame."
+        "The unknown geometry of the observations was determined together with the parameters. Positions and frames "
+        "are given in the base frame, rotations as vectors along their axis. Offsets and orientations of targets are "
+        "given in the last frame, placements on an indexed platform in the platform's frame."
     )
     factor = summary["uncertainty"]["coverage_factor_geometry_95"]
     return [
@@ -139,8 +141,8 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     ends = zip("xyz", volume.start.min(axis=0), volume.start.max(axis=0), strict=True)
     box = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends).replace("-", "−")
     introduction = (
-        f"Expanded uncertainty at {len(volume.start)} positions that random poses within the joint limits reach "
-        f"({box} mm), for a coverage of 95 % ({factor_words(statistics)})."
+        f"Expanded uncertainty at the tip positions of {len(volume.start)} random poses within the joint limits "
+        f"({box} mm), for a coverage of {LEVEL_IN_PERCENT} ({factor_words(statistics)})."
     )
     positions = {f"{axis} [mm]": numbers(volume.start[:, k], 0) for k, axis in enumerate("xyz")}
     for name, u in (
@@ -170,7 +172,7 @@ def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[S
     medians = [float(np.median(volume.expanded_tip[part])) for part in (poses.tried, ~poses.tried) if np.any(part)]
     if len(medians) == 2 and all(map(math.isfinite, medians)):
         near, far = map(two_digits, medians)
-        sentence += f" The median U of a tip is {near} mm in the covered part and {far} mm outside."
+        sentence += f" The median U of a tip is {near} mm in the covered part and {far} mm outside this part."
     return [Section("tried", "Coverage of the working volume", [sentence, chart, _travel(record, readings)])]
 
 
@@ -201,7 +203,7 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     )
     axis = linear("reading [deg]" + (" or [mm]" if any(slides) else ""), limits, shown)
     plot = Plot(names("", [f"joint {i + 1}" for i in x]), axis, marks, height=260)
-    description = "The travel of each joint within its limits, and the readings of the calibration."
+    description = "The range of each joint within its limits, and the readings of the calibration poses."
     return Chart("travel", "Travel of the joints", description, (plot,), by_columns("Travel by joint", columns))
 
 
@@ -216,7 +218,7 @@ def monte_carlo(record: CalibrationRecord) -> list[Section]:
         **{name: numbers(sampled[key], 6) for name, key in keys.items()},
         "agree": ["yes" if agrees else Cell("no", None, "unsure") for agrees in sampled["agrees"]],
     }
-    quantities = by_columns("Quantities, in mm and rad; 95 % coverage intervals", columns)
+    quantities = by_columns("Quantities, in mm and rad; coverage intervals", columns)
     return [Section("monte-carlo", "Monte Carlo (JCGM 101)", [record.sampled_says or "", quantities])]
 
 
@@ -242,7 +244,11 @@ def observability(observability: Observability) -> Section:
         )
     rows = [
         ("rank", f"{rank} of {count}", "number of independent combinations of parameters that the data determine"),
-        ("condition", f"{observability.condition:.3g}", "of the determined combinations, with scaled columns"),
+        (
+            "condition",
+            f"{observability.condition:.3g}",
+            "condition number for the determined combinations, with scaled columns",
+        ),
         *((name, f"{x:.3g}", f"{_INDICES[name]}; larger is better") for name, x in observability.indices.items()),
     ]
     metrics = by_columns("Metrics", dict(zip(("", "value", "meaning"), zip(*rows, strict=True), strict=True)))
@@ -282,7 +288,7 @@ def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     }
     introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
     if record.final_method == "two-stage":
-        introduction += " The bounds apply to stage 1; the scale fix comes after stage 1."
+        introduction += " The bounds apply to stage 1 only; the scale is fixed after stage 1."
     width = upper - lower
     with np.errstate(invalid="ignore", divide="ignore"):
         within = np.where(np.isfinite(width) & (width > 0), 2 * (vector - lower) / width - 1, math.nan)[index]

@@ -1,6 +1,5 @@
 from .definition import Study as Study
 from .results import cell_summary as cell_summary
-from .results import concise as concise
 from .results import open_study as open_study
 from .results import study_summary as study_summary
 from .runner import dask_executor as dask_executor

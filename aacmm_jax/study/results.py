@@ -5,7 +5,6 @@ Standard errors come from the scatter between groups, so they contain the whole 
 pools included, and need no formula for the statistic: one group at a time is left out (delete-a-group jackknife).
 """
 
-import math
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -244,34 +243,3 @@ def correlation(results: Results, cell: int) -> Float[np.ndarray, "p p"]:
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
     scale = np.outer(deviation, deviation)
     return np.divide(covariance, scale, out=np.zeros_like(scale), where=scale > 0)
-
-
-def concise(value: float | None, se: float | None) -> str:
-    """Write a number with the standard error of its last digits in parentheses, as in 0.01068(3) (JCGM 100, 7.2.2).
-
-    Args:
-        value: The number; "-" is written for None and NaN.
-        se: Its standard error; without one four digits are written.
-
-    Returns:
-        The text.
-
-    Example:
-        >>> print(aj.study.concise(0.010683, 0.000031), aj.study.concise(0.010683, None))
-        0.01068(3) 0.01068
-    """
-    if value is None or math.isnan(value):
-        return "-"
-    if not se:
-        return f"{value:.4g}"
-    if not math.isfinite(se):
-        return f"{value:.4g}(?)"
-    magnitude = math.floor(math.log10(abs(value))) if value else 0
-    if magnitude < -4 and se < 1:
-        mantissa = concise(value / 10.0**magnitude, se / 10.0**magnitude)
-        return f"{mantissa}e{magnitude:+03d}"
-    decimals = max(-math.floor(math.log10(se)), 0)
-    digits = round(se * 10**decimals)
-    if digits == 10 and decimals > 0:  # 0.0096 is 0.01
-        decimals, digits = decimals - 1, 1
-    return f"{value:.{decimals}f}({digits})"

@@ -4,8 +4,8 @@ The file holds what was asked from the beginning, and all results at the end. Un
 of NumPy's arrays in ``FILE.parts``, written under a temporary name and renamed: it is there entirely or not at all, and
 workers on a shared folder may write their blocks themselves. Their zip archives carry a checksum of every array.
 
-Believed are blocks in a folder of the user who runs the study, or who owns the file that is read. That is checked
-before anything in the folder is read or removed: nobody but its owner can replace what has been checked.
+Blocks are read only from a folder of the user who runs the study, or who owns the file that is read. The owner is
+checked before anything in the folder is read or removed: only the owner can replace what has been checked.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ from .blocks import DIMENSIONS, VARIABLES, Block, blocks_of
 from .definition import POOL_PARTS, Study
 from .specification import Specification, unit
 
-_ADVICE = "free some space there, then run the same command again: finished blocks are kept"
+_ADVICE = "free some disk space, then run the same command again (finished blocks are kept)"
 _TRIALS_IN_MEMORY = 50_000
 _LARGEST = 1e20  # mm, rad, or a factor
 _BY_TRIAL = tuple(name for name, kind in VARIABLES.items() if not kind.by_parameter)
@@ -54,7 +54,7 @@ def write_block(file: Path, results: Mapping[str, np.ndarray]) -> None:
     arrays: dict[str, Any] = {name: np.asarray(results[name]) for name in VARIABLES}
     np.savez(content, block=np.array(file.name), **arrays)
     with write_atomically(file, _ADVICE, leftovers=False) as temporary:
-        temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: nobody else may change a block
+        temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: only the owner may change a block
         temporary.write_bytes(content.getbuffer())
 
 
@@ -95,7 +95,7 @@ class Results:
                 shapes = any(array.shape != results.empty(name).shape for name, array in arrays.items())
                 check_sense(results.path, {"the shapes of its results do not match its study": shapes})
                 ran = (arrays["converged"][()] != VARIABLES["converged"].fill).all()
-                check_sense(results.path, {"it has trials that did not run": not ran})
+                check_sense(results.path, {"it contains trials that were not run": not ran})
         return results
 
     @cached_property
@@ -206,7 +206,7 @@ class Results:
         """Make the file of a new study, and the folder of its blocks."""
         folder, _ = parts_of(self.path), self.blocks  # of which too many are refused
         try:
-            folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
+            folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: only the owner may write blocks
             check_owners(self.path)
             for item in folder.glob("*.npz"):  # blocks of a study whose file was removed
                 if not item.name.startswith(f"{self.mark}-"):
@@ -304,11 +304,12 @@ def read(path: Path) -> Results:
         return results
     if parts != parts_of(path).name:
         raise InputError(
-            f"{path} was renamed, but its results are in {parts}; rename it back to {parts.removesuffix('.parts')}."
+            f"{path} was renamed, but its results are in {parts}; rename the file back to "
+            f"{parts.removesuffix('.parts')}."
         )
     if not parts_of(path).is_dir():
         raise InputError(
-            f"{path} has its results in the folder {parts}, which is missing; put that folder next to the file."
+            f"the results of {path} are in the folder {parts}, which is missing; put this folder next to the file."
         )
     check_owners(path, reading=True)
     return results
@@ -324,7 +325,7 @@ def check_owners(path: Path, *, reading: bool = False) -> None:
             continue
         user = user_name(status.st_uid)
         if not reading:
-            _refuse(item, f"{item} belongs to {user}, so its results are not continued; choose another output path.")
+            _refuse(item, f"{item} belongs to {user}, so its study is not continued; choose another output path.")
         elif status.st_uid != (owner := os.stat(path).st_uid):
             raise InputError(
                 f"{folder} belongs to {user}, but {path.name} belongs to {user_name(owner)}, so the blocks are not "
@@ -352,13 +353,15 @@ def _check_block(file: Path) -> None:
         return
     what = "is a link" if stat.S_ISLNK(status.st_mode) else ""
     if not what and status.st_uid != os.stat(file.parent).st_uid:
-        what = f"belongs to {user_name(status.st_uid)}, who does not own its folder"
+        what = f"belongs to {user_name(status.st_uid)}, who is not the owner of its folder"
     if what:
-        raise InputError(f"{file} {what}, so it is not read; remove it, and run the study again with --resume.")
+        raise InputError(
+            f"{file} {what}, so the block is not read; remove the file, and run the study again with --resume."
+        )
 
 
 def _refuse(path: Path, sentence: str) -> None:
-    """Raise `InputError`, unless the file system says nothing of owners: then a warning says that none are checked."""
+    """Raise `InputError`, unless the file system keeps no owners: then a warning says that none are checked."""
     if keeps_owners(path.parent):
         raise InputError(sentence)
     warnings.warn(

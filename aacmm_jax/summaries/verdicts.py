@@ -7,9 +7,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..calibration.prediction import LEVEL
+from ..calibration.prediction import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
+from ..uncertainty.coverage import U_AT_LEVEL
 from .tables import two_digits
 
 _LACKING = "the residuals show errors that the model does not describe"  # what tests of residuals doubt
@@ -38,7 +39,7 @@ def calibration_verdict(
         doubts = ["the data do not determine lengths everywhere in the working volume", *doubts]
         return Verdict("unsure", f"To be used with care: {'; '.join(doubts)}.")
     stated = (
-        f"U (95 %) of a measured length of {volume['length_mm']:g} mm is {two_digits(median)} mm (at worst "
+        f"{U_AT_LEVEL} of a measured length of {volume['length_mm']:g} mm is {two_digits(median)} mm (at worst "
         f"{two_digits(largest)} mm)"
     )
     if doubts:
@@ -96,17 +97,17 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         reasons = [*(f"{name} is over its limit" for name in names), *failed]
         return Verdict("bad", f"Fails: {shorten(reasons, 3)}.")
     if decision == "undecided":
-        return Verdict("unsure", f"Undecided: the measurement is too uncertain for {shorten(names)}.")
+        return Verdict("unsure", f"Undecided: the measurement is too uncertain for a decision on {shorten(names)}.")
     if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
         before = {metric["name"]: metric["as_found_decision"] for metric in metrics}
-        says = f"Conforms{' (calibrated arm)' if any(before.values()) else ''}: every limit given is kept"
+        says = f"Conforms{' (calibrated arm)' if any(before.values()) else ''}: all limits given are met"
         says += f" ({shorten(list(dict.fromkeys(names)))})" if names else ""
         failed = [name for name, decision in before.items() if decision == "fails"]
         says += f"; the nominal arm fails ({shorten(failed)})" if failed else ""
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
-        says += "; a procedure was not complete." if incomplete else "."
+        says += "; the procedure of a test was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)
     if summary.get("held_out") is None:
         return Verdict("neutral", "Measured; no limit was given.")
@@ -124,9 +125,9 @@ def _as_predicted(predicted: Mapping[str, Any]) -> Verdict:
     ratio = predicted["lengths"]["normalised_error_rms"]
     if ratio is not None:
         rms += f", and length errors are {ratio:.2g} times as large as predicted"
-    if any(chance < LEVEL / len(chances) for chance in chances):
+    if any(chance < SIGNIFICANCE / len(chances) for chance in chances):
         chance = min(chances)
         return Verdict("unsure", f"Errors on held-out data exceed the prediction (p = {chance:.1g}): {rms}.")
     if max(measured / expected if expected else 0.0, ratio or 0.0) > _LARGER:
         return Verdict("unsure", f"Errors on held-out data are larger than predicted, but this may be chance: {rms}.")
-    return Verdict("neutral", f"The calibration holds on held-out data: {rms}. No limit was given.")
+    return Verdict("neutral", f"Errors on held-out data are about as predicted, or smaller: {rms}. No limit was given.")

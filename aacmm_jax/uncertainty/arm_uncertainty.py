@@ -16,7 +16,8 @@ from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
 from .covariance import SharedErrors
-from .degrees_of_freedom import LEVEL, Components, Law, coverage_factor, degrees_of_freedom
+from .coverage import LEVEL
+from .degrees_of_freedom import Components, Law, coverage_factor, degrees_of_freedom
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 

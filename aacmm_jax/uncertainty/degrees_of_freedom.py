@@ -1,7 +1,7 @@
 """Degrees of freedom of a quantity, by what each part of its variance rests on, and the one coverage factor of every U.
 
 A covariance is a sum of parts: the scatter of single poses, certified lengths and what instruments state, the
-disagreement of the lengths, effects that poses share. A quantity with derivatives g has the variances v_i = g' C_i g of
+disagreement of the lengths, shared errors. A quantity with derivatives g has the variances v_i = g' C_i g of
 these parts, and where each was estimated from nu_i degrees of freedom, those of their sum are (Welch 1947,
 Satterthwaite 1946; JCGM 100, G.4.1)
 
@@ -12,7 +12,7 @@ placements show is neither: it may well be 0, or four times what is most probabl
 posterior distribution (`Law.ratios`), and an error of the quantity is then distributed as a mixture of Student's t with
 the variances that are possible, as the propagation of distributions has it (JCGM 101, 6.4.9; Bodnar, Link and Elster
 2016, Bayesian Analysis 11, 25-45). The coverage factor is that of the mixture, the degrees of freedom those of
-Student's t with the same factor at 95 %.
+Student's t with the same factor for the coverage probability `LEVEL`.
 """
 
 from typing import Any, NamedTuple
@@ -24,10 +24,10 @@ from jaxtyping import Float
 from ..core.distributions import student_density, student_quantile, student_tail
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
+from .coverage import LEVEL
 
-LEVEL = 0.95  # coverage at which degrees of freedom are those of Student's t
 _DRAWS = 128  # combinations of the variances of several parts that have distributions
-_ROUNDS = 24  # bisections of the logarithm of a coverage factor
+_ROUNDS = 24  # most steps of Newton's method to a coverage factor
 _STEPS = (0.41421356237309515, 0.7320508075688772, 0.23606797749978969, 0.6457513110645906)  # fractions of square roots
 
 
@@ -125,7 +125,7 @@ def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law)
     """The factor of U over u, for a coverage probability, of quantities with these variances of their parts, whose sum
     is u^2; ``law`` says how well each is known."""
     if not 0 < level < 1:
-        raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example 0.95.")
+        raise InputError(f"level is {level:g}; give a probability between 0 and 1, for example {LEVEL:g}.")
     law, variances = law.in_numpy, np.asarray(variances, dtype=float)
     variances = np.where(np.all(np.isfinite(variances), axis=-1)[..., None], variances, 0.0)
     freedom = effective_degrees_of_freedom(variances, np.asarray(law.degrees_of_freedom))
@@ -138,7 +138,7 @@ def coverage_factor(level: float, variances: Float[AnyArray, "... c"], law: Law)
 
 
 def degrees_of_freedom(variances: Float[AnyArray, "... c"], law: Law) -> Float[np.ndarray, "..."]:
-    """Those of Student's t with the same coverage factor at 95 %."""
+    """Those of Student's t with the same coverage factor for the coverage probability `LEVEL`."""
     from scipy import special
 
     plain = effective_degrees_of_freedom(np.asarray(variances, dtype=float), np.asarray(law.degrees_of_freedom))

@@ -19,7 +19,7 @@ _LENGTH_MM = 300.0  # lengths of the map, where none is given: those of the pape
 
 
 class VolumetricUncertainty(NamedTuple):
-    """Uncertainties over the working volume, standard ones and expanded to 95 %, point by point, as NumPy arrays, mm.
+    """Uncertainties over the working volume, standard and expanded ones, point by point, as NumPy arrays, mm.
 
     At each point: of a tip, and of a length that starts there, in random poses.
 
@@ -43,7 +43,7 @@ class VolumetricUncertainty(NamedTuple):
 
     @property
     def summary(self) -> dict[str, float]:
-        """Median, 95th percentile and largest uncertainty, standard and expanded to 95 %, mm; the smallest and the
+        """Median, 95th percentile and largest uncertainty, standard and expanded, mm; the smallest and the
         largest coverage factor."""
         u, expanded = np.concatenate(self[5:8]), np.concatenate(self[8:])
         usable = np.isfinite(u) & (u > 0)

@@ -220,11 +220,11 @@ def test_limits_are_read(text, at_zero, at_metre):
         (["E_Uni"], "NAME=A+L/K"),
         (["E_Uny=1"], "did you mean 'E_Uni'"),
         (["E_Uni=a"], "numbers"),
-        (["E_Uni=-1"], "zero or positive"),
-        (["E_Uni=1+L/0"], "K at least"),
-        (["E_Uni=1+L/1e-320"], "K at least"),
+        (["E_Uni=-1"], "not negative"),
+        (["E_Uni=1+L/0"], "K must be at least"),
+        (["E_Uni=1+L/1e-320"], "K must be at least"),
         (["E_Uni=1e308"], "finite"),
-        (["E_Uni=nan"], "zero or positive"),
+        (["E_Uni=nan"], "not negative"),
         (["E_Uni=1", "e_uni=2"], "two limits"),
     ],
 )
@@ -238,7 +238,7 @@ def test_limits_that_cannot_be_are_refused(texts, said):
         (lambda: acceptance.decide("a", 1, 0), "error is 'a'; give a number"),
         (lambda: acceptance.decide(np.array([1.0, 2.0]), 1, 0), "give a number"),
         (lambda: acceptance.decide(math.nan, 1, 0), "error is nan; give a number"),
-        (lambda: acceptance.decide(0.0, 1.0, 0.0, "din"), "known are iso-2017, iso-2013, simple"),
+        (lambda: acceptance.decide(0.0, 1.0, 0.0, "din"), "choose one of iso-2017, iso-2013, simple"),
         (lambda: run(Measured({"A": np.eye(3)}, measuring_range=-1.0)), "measuring_range"),
         (lambda: run(Measured({"A": [[1, 2]]})), "'A'"),
         (lambda: run(Measured({"A": np.full((2, 3), 1e200)})), "beyond"),
@@ -246,7 +246,7 @@ def test_limits_that_cannot_be_are_refused(texts, said):
         (lambda: unwrap(checked_limits)({"Deltam": "x"}), "limit of Deltam"),
         (lambda: unwrap(checked_limits)({"E_Bi": 0.05}), "opposite directions cannot be recorded"),
         (lambda: run(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
-        (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": Limit(1, -1000)}), "K at least"),
+        (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": Limit(1, -1000)}), "K must be at least"),
         (lambda: run(Measured({"A": np.eye(3)}), u_test=-1), "u_test is -1 mm; it must be zero or positive"),
         (
             lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probing", (PLACE + AXES,), math.nan),))),
@@ -405,15 +405,15 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
                     "Exactly two bars are required",
                     "500 to 750 mm) and one of 120 to 150 % of the reach (1200 to 1500 mm",
                     "20 different positions are required (1 given)",
-                    "not in one plane",
-                    "scatter by 0.0 % of its size",
+                    "not all in one plane",
+                    "scatter by 0.0 % of the size of the volume",
                     "measuring range",
                 ],
                 "length error": [
                     "5 different lengths are required (1 given)",
-                    "7 different positions of every length are required (one has 1)",
+                    "7 different positions of every length are required (one length has 1)",
                     "3 readings in each position are required (one position has 1)",
-                    "not in one plane",
+                    "not all in one plane",
                     "at least 10 % is required",
                     "measuring range",
                 ],
@@ -538,12 +538,12 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("diameter = 30.98", "diameter = 0"), "diameter"),
         (('file = "sphere/touch.txt"', ""), "either file or files"),
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column '4'"),
-        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "one column is picked twice"),
+        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "pick the same column twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
-        (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
+        (("shoulder = [0, 0, 0]", ""), "reach and shoulder are needed together"),
         (
             ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
-            "target, session and temperature_C apply to",
+            "target, session and temperature_C apply only to",
         ),
     ],
 )
@@ -589,7 +589,7 @@ def calibrated(cheng):
 def test_only_held_out_data_are_tested_with_the_uncertainty_that_is_stated(calibrated):
     record, recording = calibrated
     found = values_of(
-        acceptance.evaluation_of(record, recording, u_test=0.01, standards=STANDARDS).acceptance()["calibrated"]
+        aj.evaluate_capture(record, recording, u_test=0.01, standards=STANDARDS).acceptance()["calibrated"]
     )
     assert {value.where for value in found["Deltam"]} == {"C"}
     assert {value.where.partition(",")[0] for value in found["E_Uni"]} == {"A - C"}
@@ -602,7 +602,7 @@ def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
     # C is new, B is known except for two poses.
     q = recording.capture.sockets
     more = {"A": q["A"], "B": np.concatenate([q["B"], q["C"][:2] + 0.001]), "C": q["C"]}
-    evaluation = acceptance.evaluation_of(
+    evaluation = aj.evaluate_capture(
         record, recording._replace(capture=aj.Capture(more, recording.capture.lengths)), limits={"Deltam": 1.0}
     )
     assert evaluation.limits == {"Deltam": Limit(1.0)}
@@ -615,7 +615,7 @@ def test_procedures_are_run_where_they_are_asked_for(calibrated, procedure, reco
     record, recording = calibrated
 
     def standards(recording, **options):
-        found = acceptance.evaluation_of(record, recording, **options).acceptance()
+        found = aj.evaluate_capture(record, recording, **options).acceptance()
         nominal, calibrated = ({test.standard for test in found[stage]} for stage in ("nominal", "calibrated"))
         assert nominal == calibrated
         return calibrated
@@ -630,14 +630,14 @@ def test_procedures_are_run_where_they_are_asked_for(calibrated, procedure, reco
 
 def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
     record, recording = calibrated
-    seen = acceptance.evaluation_of(record, record.recording, limits={"Deltam": Limit(1.0)})
+    seen = aj.evaluate_capture(record, record.recording, limits={"Deltam": Limit(1.0)})
     words = " ".join(seen.warnings)
     assert "too favourable and are not a test" in words
     assert "No uncertainty was stated for Deltam" in words
     assert all(test.missing for test in seen.acceptance()["calibrated"])
-    failed = acceptance.evaluation_of(record._replace(converged=False, reason="It did not."), recording)
+    failed = aj.evaluate_capture(record._replace(converged=False, reason="It did not."), recording)
     assert "The calibration failed" in failed.warnings[0]
-    simulated = acceptance.evaluation_of(record, recording._replace(true=recording.nominal))
+    simulated = aj.evaluate_capture(record, recording._replace(true=recording.nominal))
     assert "simulated" in simulated.warnings[0]
 
 
@@ -655,7 +655,7 @@ def test_an_evaluation_of_points_is_stored_whole(tmp_path):
     assert again.acceptance() == record.acceptance()
     assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
     written = aj.report.write_report(tmp_path / "points.h5", tmp_path / "points.html")
-    assert written["verdict"].startswith("Conforms: every limit given is kept")
+    assert written["verdict"].startswith("Conforms: all limits given are met")
 
 
 def test_bars_at_hand_are_planned_for(cheng):
@@ -673,7 +673,7 @@ def test_an_arm_that_cannot_take_a_zone_goes_without_it():
     assert "0 to 20 %" in procedure.left_out[0]
     assert {item.name for item in procedure.sockets if item.name.startswith("spat")} == {"spat/middle", "spat/far"}
     assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "asme", margin=3.0), "margin")
-    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "known are asme, iso")
+    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "choose one of asme, iso")
 
 
 def test_planned_poses_can_be_taken(cheng, procedure):

@@ -209,8 +209,13 @@ BROKEN = [
     ("iso", ISO[0], lambda m: spheres(m, "probing", lambda s: s._replace(diameter=60.0)), "10 to 51 mm"),
     ("iso", ISO[0], lambda m: spheres(m, "probing", each_group(lambda g, s: g[:24])), "25 points per group"),
     ("iso", ISO[0], lambda m: spheres(m, "probing", each_group(cap), slice(1)), "spread over a hemisphere"),
-    ("iso", ISO[0], lambda m: spheres(m, "probing", lambda s: None, slice(1)), "far apart; it was measured in 1"),
-    ("iso", ISO[0], lambda m: spheres(m, "probing", together), "far apart; it was measured in 1"),
+    (
+        "iso",
+        ISO[0],
+        lambda m: spheres(m, "probing", lambda s: None, slice(1)),
+        "far apart; the number of positions measured is 1",
+    ),
+    ("iso", ISO[0], lambda m: spheres(m, "probing", together), "far apart; the number of positions measured is 1"),
     ("iso", ISO[0], no_range, "measuring range"),
     ("iso", ISO[1], lambda m: spheres(m, "articulation", lambda s: s._replace(diameter=60.0)), "10 to 51 mm"),
     ("iso", ISO[1], lambda m: spheres(m, "articulation", lambda s: s._replace(groups=s.groups[:4])), "5 orientations"),
@@ -218,14 +223,14 @@ BROKEN = [
     ("iso", ISO[1], lambda m: spheres(m, "articulation", each_group(cap), slice(1)), "spread over a hemisphere"),
     ("iso", ISO[1], one_orientation, "orientations of the probe must differ"),
     ("iso", ISO[1], lambda m: m._replace(postures=None), "orientations of the probe; record"),
-    ("iso", ISO[1], lambda m: spheres(m, "articulation", lambda s: None, slice(1)), "2 positions far apart"),
+    ("iso", ISO[1], lambda m: spheres(m, "articulation", lambda s: None, slice(1)), "2 positions that are far apart"),
     ("iso", ISO[1], no_range, "measuring range"),
     ("iso", ISO[2], without_length("bar1"), "5 different lengths"),
     ("iso", ISO[2], without_length("bar2/07"), "7 different positions of every length"),
     ("iso", ISO[2], repeated, "7 different positions of every length"),
     ("iso", ISO[2], fewer_readings, "3 readings in each position are required (one position has 2"),
-    ("iso", ISO[2], lambda m: bars(m, along(lambda n: (1, 0, 0)), one_bar), "not in one plane"),
-    ("iso", ISO[2], lambda m: bars(m, along(lambda n: (math.cos(n), math.sin(n), 0)), one_bar), "not in one plane"),
+    ("iso", ISO[2], lambda m: bars(m, along(lambda n: (1, 0, 0)), one_bar), "not all in one plane"),
+    ("iso", ISO[2], lambda m: bars(m, along(lambda n: (math.cos(n), math.sin(n), 0)), one_bar), "not all in one plane"),
     ("iso", ISO[2], lambda m: bars(m, to_one_place, one_bar), "scatter by 0.0 %"),
     ("iso", ISO[2], no_range, "measuring range"),
     ("iso", ISO[2], scaled_bar("bar5", 0.9), "A length of 1782 mm or more"),
@@ -240,16 +245,16 @@ BROKEN = [
     ("asme", ASME[0], lambda m: spheres(m, "effective-diameter", each_group(cap)), "spread over a hemisphere"),
     ("asme", ASME[0], lambda m: spheres(m, "effective-diameter", each_group(straight_rings)), "at least 22.5 deg"),
     ("asme", ASME[1], without_socket("spat/near"), "at 0 to 20 % of the reach (0 to 270 mm"),
-    ("asme", ASME[1], lambda m: m._replace(reach=None), "zones cannot be determined"),
-    ("asme", ASME[1], elbow(1.0), "elbow must be on the left"),
-    ("asme", ASME[1], elbow(0.0), "elbow must be on the left"),
+    ("asme", ASME[1], lambda m: m._replace(reach=None), "zones of the reach cannot be determined"),
+    ("asme", ASME[1], elbow(1.0), "with the elbow on the left"),
+    ("asme", ASME[1], elbow(0.0), "with the elbow on the left"),
     ("asme", ASME[1], lambda m: m._replace(postures=None), "side the elbow was"),
     ("asme", ASME[1], no_range, "measuring range"),
-    ("asme", ASME[2], without_length("bar1/0"), "Each bar is required in 5 positions"),
+    ("asme", ASME[2], without_length("bar1/0"), "Each bar must be measured in 5 positions"),
     ("asme", ASME[2], scaled_bar("bar1", 0.5), "A bar of 50 to 75 %"),
     ("asme", ASME[2], without_length("bar1/07"), "20 different positions are required (19 given)"),
     ("asme", ASME[2], repeated, "20 different positions are required (19 given)"),
-    ("asme", ASME[2], lambda m: bars(m, along(lambda n: (math.cos(n), math.sin(n), 0)), every), "not in one plane"),
+    ("asme", ASME[2], lambda m: bars(m, along(lambda n: (math.cos(n), math.sin(n), 0)), every), "not all in one plane"),
     ("asme", ASME[2], lambda m: bars(m, to_one_place, every), "scatter by 0.0 %"),
     ("asme", ASME[2], no_range, "measuring range"),
     ("jjf", JJF, without_socket("S"), "10 poses"),
@@ -353,7 +358,7 @@ def test_expansions_that_cannot_be_read_are_refused(text):
 
     assert_refused(lambda: read_expansions([text]), "--expansion", "artefact=11.5,1,20.8,0.2")
     assert_refused(lambda: read_expansions(["arm=1e6,0,20,0"]), "arm", "per K")
-    assert_refused(lambda: read_expansions(["arm=11.5e-6,0,20,0"]), "in 1/K; give it in 1e-6/K")
+    assert_refused(lambda: read_expansions(["arm=11.5e-6,0,20,0"]), "in 1/K; give the coefficient in 1e-6/K")
     assert_refused(lambda: read_expansions(["arm=1,0,20,0", "arm=1,0,20,0"]), "two expansions")
 
 

@@ -127,7 +127,7 @@ def evaluation(record) -> aj.acceptance.EvaluationRecord:
     sphere = aj.data.ProbedSphere("s & S", "effective-diameter", (touched + np.linspace(0, 0.03, 25)[:, None],), 25.0)
     recording = aj.Recording(capture, record.recording.nominal, spheres=(sphere,))
     warm = aj.acceptance.Influences(u_relative=1e-6, artefact=aj.acceptance.Expansion(11.5e-6, 1e-6, 21.0, 0.2))
-    return aj.acceptance.evaluation_of(
+    return aj.evaluate_capture(
         record,
         recording,
         limits={"Deltam": 5.0, "E_Uni": 0.05},
@@ -443,7 +443,7 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
         chi = values[*row, "RMS residual in standard deviations"].value
         assert chi == pytest.approx(found.reduced_chi[i], abs=5.1e-4)
         assert values["Nominal parameters", *row[1:], "RMS residual"].value > 0.3
-    assert ("Calibrated parameters", "Observations", "3: tracker", "RMS residual of the orientation") in values
+    assert ("Calibrated parameters", "Observations", "3: tracker", "RMS residual in rad") in values
     assert ("Calibrated parameters", "Scale", "k") not in values
     said = " ".join(contents(text, "*/dcc:statements"))
     assert "comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact)." in said
@@ -692,7 +692,7 @@ def test_any_text_survives_or_is_refused(text):
             {},
             ["too few steps", "calibrate again"],
         ),
-        ({"k": 25.4}, {}, ["25.4", "correct the reference lengths"]),
+        ({"k": 25.4}, {}, ["25.4", "correct the values of the reference lengths"]),
         ({"method": "repeatability"}, {}, ["traceable", "--scale nominal", "another observation"]),
         ({}, {"created": "yesterday"}, ["yesterday", "ISO 8601"]),
         ({}, {"sources": ["a\x07.h5"]}, [r"'a\x07.h5' in the certificate", "U+0007", "remove the character"]),

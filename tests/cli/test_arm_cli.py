@@ -42,8 +42,8 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
         "sockets and a reference length",
         "enough",
         "Record",
-        "for encoders with 2 arcsec and a seat with 0.005 mm (class measuring arm: ",  # as aacmm plan assumes it
-        "reference lengths with u = 0.002 mm",
+        "of 2 arcsec (encoders) and 0.005 mm (seating; class measuring arm: ",  # as aacmm plan assumes it
+        "u = 0.002 mm (reference lengths)",
     ):
         assert part in printed, part
 
@@ -213,6 +213,6 @@ def test_import_checks_the_readings(aacmm, tmp_path, few, paper_arm, paper_captu
     shown = " ".join(aacmm("import", "m.toml", "--check").stdout.split())
     assert sorted(tmp_path.iterdir()) == before
     assert "The readings fit as they are" in shown
-    assert "Joint 5 stands still (0.1 deg over 60 poses): alpha_5, a_5, d_5 and theta_5 cannot be identified;" in shown
-    assert "the manifest uses those that fit better: a calibration with the measured readings leaves" in shown
+    assert "Joint 5 hardly moves (0.1 deg over 60 poses): alpha_5, a_5, d_5 and theta_5 cannot be identified;" in shown
+    assert "the manifest uses the readings that fit better: a calibration with the measured readings leaves" in shown
     assert "--check" in aacmm("import", "m.toml", expect=2).stderr

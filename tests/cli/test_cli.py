@@ -119,7 +119,7 @@ def test_not_converged_is_exit_code_1_and_still_written(aacmm, tmp_path, monkeyp
         ),
         (
             ("simulate", "cheng2018-simulation", "-o", "x.h5", "--true-arm", "panda", "--socket", "A=400,0,300"),
-            "true arm panda has 7 joints, but cheng2018-simulation has 6",
+            "has 7 joints, but 'Cheng 2018, simulated arm' has 6",
         ),
         (("simulate", "panda", "-o", "x.h5", "--socket", "A=400,0,300", "--seed", 2**63), "Invalid value for '--seed'"),
         (("demo", "/dev/null/x"), "/dev/null/x cannot be used as a folder"),
@@ -250,7 +250,7 @@ def test_uncertainties_are_printed(aacmm):
     assert summary["cross_validation"]["groups"] == 2
     assert summary["cross_validation"]["excess"] < 2.5
     shown = " ".join(aacmm("show", "c.h5").stdout.split())
-    assert shown.index("Cross-validated") < shown.index("On the poses used for identification")
+    assert shown.index("Cross-validation: each") < shown.index("Errors in the poses used for identification")
     assert "Expanded uncertainty U over the working volume (95 %, coverage factor 1.96)" in shown
     assert "Observability: rank 21 of 21" in shown
 
@@ -268,7 +268,7 @@ def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("--sockets", 2, "--socket", "A=1,2,3"), "give one of the two"),
+        (("--sockets", 2, "--socket", "A=1,2,3"), "give only one of these options"),
         (("--region", "z=1"), "not of the form AXIS=LOW:HIGH"),
         (("--length-mm", "long"), "not of the form L or L:M"),
         (("--length", "A,B"), "--length needs two sockets given with --socket"),
@@ -298,7 +298,7 @@ def test_options_without_an_acceptance_test_are_refused(aacmm, panda_files, tmp_
     shutil.copytree(panda_files, tmp_path, dirs_exist_ok=True)
     chosen = ("--only", "A", "--acceptance", "iso")  # one socket, which is too little for any test
     said = aacmm("evaluate", "c.h5", "p.h5", "-o", "e.h5", *chosen, *option, expect=2).stderr
-    assert f"{option[0]} applies to acceptance tests only" in said
+    assert re.search(rf"{option[0]} \(\w+\) applies to acceptance tests only", said)
     assert not (tmp_path / "e.h5").exists()
 
 

@@ -153,7 +153,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     ("converged", "plausible", "said", "unsaid"),
     [
         (True, True, ": converged in 3 steps", "no arm has"),
-        (True, False, "ended with residuals too large for this arm, in 3 steps", "converged"),
+        (True, False, "ended with residuals that are too large for this arm, in 3 steps", "converged"),
         (False, False, "did not converge in 3 steps", "no arm has"),
     ],
 )
@@ -246,7 +246,7 @@ REFUSED = [
     (("export", "there.h5", "--format", "csv", "--arm", "true"), "--arm applies to --format toml"),
     (
         ("evaluate", "there.h5", "there.h5", "--mpe", "zzz=1"),
-        "names the unknown metric 'zzz'; known are " + ", ".join(aj.acceptance.METRICS),
+        "names the unknown metric 'zzz'; choose one of " + ", ".join(aj.acceptance.METRICS),
     ),
 ]
 

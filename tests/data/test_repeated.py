@@ -37,7 +37,7 @@ def test_copies_change_nothing(paper_arm, noisy_capture, copied):
             np.testing.assert_array_equal(one, other)
     specification = aj.kinematics.ArmSpecification(paper_arm, "test")
     record = aj.calibration.record_of(once, aj.Recording(noisy_capture, specification))
-    evaluated = aj.acceptance.evaluation_of(record, aj.Recording(copied, specification))
+    evaluated = aj.evaluate_capture(record, aj.Recording(copied, specification))
     assert sum(warning.startswith("Duplicates ignored") for warning in evaluated.warnings) == 2
     pairs = ((aj.evaluate(paper_arm, c), aj.fix_scale(paper_arm, c)) for c in (noisy_capture, copied))
     for one, other in zip(*map(numbers_of, pairs), strict=True):
@@ -52,7 +52,7 @@ def test_what_was_left_out_is_reported_and_kept(paper_arm, noisy_capture, copied
     counts = ", ".join(f"{name} ({count})" for name, count in zip(noisy_capture.names, poses, strict=True))
     for found in (recording, aj.files.load_capture(tmp_path / "c.h5")):
         said = sentences(of_recording(found))
-        assert f"of another pose of the same socket or observation: {counts}." in said[0]
+        assert f"as another pose of the same socket or observation: {counts}." in said[0]
         assert said[1].startswith("Duplicates ignored: reference lengths given more than once")
         assert f"{length[::-1]}, {length}; delete" in said[1]
     only = copied.select(only="A")

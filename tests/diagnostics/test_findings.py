@@ -1,5 +1,8 @@
 """The mistakes that a laboratory makes are named before any number is printed."""
 
+from collections import Counter
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -100,7 +103,7 @@ def test_a_pose_that_was_not_seated(paper_arm, noisy_capture):
 def test_redundant_and_too_few(paper_arm, noisy_capture):
     sockets = noisy_capture.sockets
     few = aj.Capture({"A": sockets["A"][:8], "B": sockets["B"][:2]}, noisy_capture.lengths)
-    assert "Only 4 more equations than unknowns" in warnings_of(few, paper_arm)[1]
+    assert "There are only 4 more equations than unknowns" in warnings_of(few, paper_arm)[1]
     specification = aj.kinematics.ArmSpecification(
         paper_arm, "test", held=("theta_1", "d_1", "a_6", "probe_x", "probe_y")
     )
@@ -108,7 +111,7 @@ def test_redundant_and_too_few(paper_arm, noisy_capture):
         result = aj.calibrate(paper_arm, noisy_capture, specification.bounds())
     record = aj.calibration.record_of(result, aj.Recording(noisy_capture, specification))
     text = " ".join(sentences(findings_of(record)))
-    assert "No measurement of this kind can separate: alpha_6 and d_6 trade off." in text
+    assert "Not determined by any measurement of this kind: alpha_6 and d_6 trade off." in text
 
 
 def test_readings_outside_the_limits():
@@ -117,7 +120,7 @@ def test_readings_outside_the_limits():
     lengths = [aj.ReferenceLength("A", "B", 50.0)]
     right = aj.Capture({"A": q, "B": q + 0.1}, lengths)
     assert [finding.says for finding in of_recording(aj.Recording(right, panda))] == [
-        "Taken as exact, because u is 0: A - B."
+        "These lengths are treated as exact, because their u is 0: A - B."
     ]
     near = q.copy()
     near[0, 3] = panda.arm.limits[3][1] + np.deg2rad(0.009)  # as far beyond a limit as noise may take it
@@ -137,8 +140,8 @@ def test_readings_outside_the_limits():
         (0.02, []),
         (1e-4, []),
         (1.0, []),
-        (20e-6, ["u < 0.1 um is implausibly small: {} (u = 0.02 um). u is in mm; was it given in m?"]),
-        (20.0, ["u > 1 mm is implausibly large: {} (u = 20,000 um). u is in mm; was it given in um?"]),
+        (20e-6, ["u < 0.1 um is implausibly small: {} (u = 0.02 um). u must be in mm; was it given in m?"]),
+        (20.0, ["u > 1 mm is implausibly large: {} (u = 20,000 um). u must be in mm; was it given in um?"]),
     ],
 )
 def test_uncertainties_in_another_unit_are_named(paper_arm, u, said):
@@ -176,3 +179,42 @@ def test_every_diagnostic_says_where_it_stands(noisy_capture, paper_arm):
     assert aj.warnings_of(result, noisy_capture) == sentences(findings)
     assert finding_rows(findings)[0]["concerns"] == ["a_2"]
     assert case_of(record) is case_of(record)
+
+
+def test_equations_and_noise_of_a_calibration_are_tested_once(paper_arm, monkeypatch):
+    """By the calibration, and again for what is said of it; another record has equations of its own."""
+    from aacmm_jax.diagnostics import findings, noisy_encoders
+
+    counts = Counter()
+
+    def counted(module, name):
+        function = getattr(module, name)
+
+        def count(*arguments):
+            counts[name] += 1
+            return function(*arguments)
+
+        monkeypatch.setattr(module, name, count)
+
+    counted(findings, "equations_of")
+    counted(noisy_encoders, "_noisiest")
+    specification = ArmSpecification(paper_arm, "test")
+    sockets = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (500, 400, 400), "D": (300, 400, 600)}
+    lengths, noise = [("A", "B", 0.002), ("C", "D", 0.002)], {"encoder_arcsec": 2.0, "seating": 0.005}
+    capture = aj.simulate(paper_arm, sockets, poses=20, lengths=lengths, seed=1, **noise)
+    record = aj.calibrate_capture(aj.Recording(capture, specification), cross_validate=True)
+    assert record.shared is None
+    folds = len(record.validation.groups)
+    assert counts["_noisiest"] == 1 + folds
+    tests = aj.diagnostics.model_tests(record)
+    assert tests.noisy_joint is not None
+    assert not tests.terms
+    assert counts == {"equations_of": 1 + folds, "_noisiest": 1 + folds}
+    # As tested by itself.
+    findings._last.clear()
+    findings._solved.clear()
+    assert aj.diagnostics.model_tests(record) == tests
+    assert counts == {"equations_of": 2 + folds, "_noisiest": 2 + folds}
+    twice = record._replace(noise=jax.tree.map(lambda value: 2 * value, record.noise))
+    cost = case_of(record).left.cost
+    assert case_of(twice).left.cost == pytest.approx(cost / 4, rel=1e-6)

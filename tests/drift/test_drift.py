@@ -122,8 +122,8 @@ def test_parameters_against_numbers_worked_out_by_hand(old, new):
     assert found.joint_test.p == pytest.approx(stats.chi2.sf((9.9**2 + 9.7**2) / 25, 21), rel=1e-6)
     assert found.by_chance == pytest.approx(1.05)
     assert (
-        "1 of 21 parameters changed by more than its uncertainty (95 %; 1 expected by chance): theta_4 by +2.04 arcsec"
-        in " ".join(found.sentences())
+        "1 of 21 parameters changed by more than its expanded uncertainty (95 %; 1 expected by chance): theta_4 by "
+        "+2.04 arcsec" in " ".join(found.sentences())
     )
 
 
@@ -191,7 +191,7 @@ def test_on_a_bound_or_fixed_there_is_no_uncertainty_of_change(old, new):
         assert found.joint_test.rank == 19
         assert len(found.joint_test.names) == 19
         assert found.by_chance == pytest.approx(19 * 0.05)
-        assert f"Free in the {other} calibration only: d_6." in " ".join(found.warnings)
+        assert f"Parameters free only in the {other} calibration: d_6." in " ".join(found.warnings)
         rows = {row["parameter"]: row for row in drift_summary(found)["parameters"]}
         assert rows["d_6"]["u"] is rows["d_6"]["moved"] is None
         assert rows["d_6"]["change"] == pytest.approx(float(pair[1].calibrated.arm.d[5] - pair[0].calibrated.arm.d[5]))
@@ -235,8 +235,12 @@ def test_coefficients_of_corrections_have_their_own_units(old):
 def test_an_arm_without_corrections_is_compared_with_one_that_has_some(old):
     drift = compare(old, corrected(old, gear_2=2e-4))
     i = drift.names.index("gear_2")
-    assert (drift.old[i], drift.new[i], drift.reasons[i]) == (0.0, 2e-4, "fixed in the old calibration")
-    assert "Free in the new calibration only: cos1_3, gear_2, compliance3_2" in " ".join(drift.warnings)
+    assert (drift.old[i], drift.new[i], drift.reasons[i]) == (
+        0.0,
+        2e-4,
+        "fixed at 0 by the model in the old calibration",
+    )
+    assert "Parameters free only in the new calibration: cos1_3, gear_2, compliance3_2" in " ".join(drift.warnings)
 
 
 def test_lengths_follow_the_scale(paper_arm, specification):
@@ -452,7 +456,7 @@ def test_figures_draw_the_numbers(calibrated, tmp_path):
     np.testing.assert_allclose(found.get_xdata(), [2 * 31 / 181, 2])
     assert lower.get_xlabel() == "calibration"
     by_file = drift_figure.drift_trend(table._replace(dated_by_file=(True, False, True)))[1]
-    assert "(*: date of its file" in by_file.get_xlabel()
+    assert "(*: date of the file" in by_file.get_xlabel()
     assert [label.get_text().endswith("*") for label in by_file.get_xticklabels()] == [True, False, True]
     two = drift_figure.drift_trend(trend(given[::2], dates[::2], points=40))
     assert [label.get_text().split()[0] for label in two[0].get_xticklabels()] == list(table.names)
@@ -494,7 +498,8 @@ def test_command(run, files, calibrated):
     assert printed.exit_code == 0, printed.exception
     words = " ".join(printed.stdout.split())
     assert words.startswith(
-        "Cheng 2018, simulated arm: c.h5 (2026-03-01) compared with a.h5 (2026-01-01) Together, the changes of 21"
+        "Cheng 2018, simulated arm: c.h5 (2026-03-01) compared with a.h5 (2026-01-01) Tested together, the "
+        "changes of 21"
     )
     assert "Warning" not in words
     assert "* beyond U" in words
@@ -524,8 +529,40 @@ def test_command_on_three_calibrations(run, files):
     assert len((files / "table.csv").read_text().splitlines()) == 1 + 2 * 21
     assert (files / "trend.svg").stat().st_size > 10_000
     printed = " ".join(run("c.h5", "a.h5", "b.h5").stdout.split())
-    assert "Each calibration compared with the first" in printed
+    assert "Each calibration minus the first" in printed
     assert "For the change of every parameter from the first calibration, use --csv" in printed
+
+
+@pytest.fixture(scope="module")
+def with_gear(calibrated):
+    """A calibration whose model of the joints the others lack."""
+    recording = calibrated[2].recording
+    arm = aj.kinematics.with_corrections(recording.nominal.arm, "gear")
+    options = {"cross_validate": False, "shared_errors": False}
+    return aj.calibrate_capture(recording._replace(nominal=recording.nominal._replace(arm=arm)), **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ["abm", "amb", "mab"])
+def test_command_where_one_of_three_has_a_model_of_its_joints(run, files, calibrated, with_gear, monkeypatch, order):
+    """Coefficients that a model lacks are 0, and the table says so."""
+    records = {"a": calibrated[0], "b": calibrated[1], "m": with_gear}
+    for month, name in enumerate(order, start=1):
+        saved(records[name], files / f"{name}.h5", f"2026-0{month}-01T00:00:00+00:00", monkeypatch)
+    done = run(*(f"{name}.h5" for name in order), "--csv", "table.csv", "--json")
+    assert done.exit_code == 0, done.exception
+    at = with_gear.names.index("gear_2")
+    values = {name: record.vectors()["calibrated"][at] if name == "m" else 0.0 for name, record in records.items()}
+    first, *others = json.loads(done.stdout)["trend"]
+    for calibration in others:
+        row = {row["parameter"]: row for row in calibration["parameters"]}["gear_2"]
+        pair = [found["calibration"].removesuffix(".h5") for found in (first, calibration)]
+        assert [row["old"], row["new"]] == [values[name] for name in pair]
+        lacking = [which for which, name in zip(("old", "new"), pair, strict=True) if name != "m"]
+        where = "both calibrations" if len(lacking) == 2 else f"the {lacking[0]} calibration"
+        assert row["without"] == f"fixed at 0 by the model in {where}"
+        assert (row["unit"], row["u"]) == ("1", None)
+    assert len((files / "table.csv").read_text().splitlines()) == 1 + 2 * (21 + 6)
 
 
 def test_command_refuses(run, files):
@@ -534,7 +571,7 @@ def test_command_refuses(run, files):
     for arguments, text in (
         (("a.h5",), "a.h5 alone cannot be compared"),
         (("a.h5", "none.h5"), "none.h5 does not exist"),
-        (("a.h5", "b.h5", "--figure", "trend.gif"), "end its name in .png, .svg or .pdf"),
+        (("a.h5", "b.h5", "--figure", "trend.gif"), "a file name that ends in .png, .svg or .pdf"),
         (("a.h5", "b.h5", "--csv", "b.h5"), "b.h5 is one of the files that this command reads"),
         (("a.h5", "b.h5", "--level", 0), "level is 0"),
     ):

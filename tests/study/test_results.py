@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.study.results import concise, distribution, statistic
+from aacmm_jax.study.results import distribution, statistic
 from aacmm_jax.study.tables import level_title
 from tests.refusals import assert_refused
 
@@ -119,25 +119,6 @@ def test_standard_errors_where_groups_differ_are_those_of_repetition(name, count
     )
 
 
-@pytest.mark.parametrize(
-    ("value", "se", "text"),
-    [
-        (0.010684, 0.000031, "0.01068(3)"),
-        (1.0000335, 4.57e-5, "1.00003(5)"),
-        (3198.2, 36.1, "3198(36)"),
-        (0.9951, 0.0096, "1.00(1)"),
-        (-8.306e-7, 7.08e-7, "-8(7)e-07"),
-        (5.0, 0.0, "5"),
-        (5.0, None, "5"),
-        (None, None, "-"),
-        (float("nan"), 0.1, "-"),
-        (0.0, 0.02, "0.00(2)"),
-    ],
-)
-def test_concise_notation(value, se, text):
-    assert concise(value, se) == text
-
-
 def test_boxes_say_what_is_pooled(path):
     title = aj.plot.study_distributions(aj.study.Results.of(path), "bounds.length_mm").get_suptitle()
     assert title.endswith("trials pooled over all levels of: shift of the centre, lengths [mm]")
@@ -224,7 +205,7 @@ def test_the_terminal_shows_all_of_it(path, aacmm):
     assert "probe_z" in one.stdout
     machine = json.loads(aacmm("show", path, "--cell", 1, "--json").stdout)
     assert machine["results"][0]["figures"]["de"]["mean"]["se"] > 0
-    assert "no cell 5; name another" in aacmm("show", path, "--cell", 5, expect=2).stderr
+    assert "no cell 5; choose a cell from 1 to 4" in aacmm("show", path, "--cell", 5, expect=2).stderr
 
 
 @pytest.mark.slow
@@ -244,7 +225,7 @@ def test_every_figure_is_drawn(path, aacmm, tmp_path):
     ("arguments", "message"),
     [
         (("-o", "s.h5"), "name a specification, or use --resume"),
-        (("--resume", "-o", "s.h5"), "s.h5 does not exist, so there is nothing to resume; leave --resume out"),
+        (("--resume", "-o", "s.h5"), "s.h5 does not exist, so there is nothing to resume; leave out --resume"),
         (
             ("bound-sensitivty", "-o", "s.h5"),
             "neither a file nor a study that ships with the package; did you mean 'bound-sensitivity'",

@@ -54,7 +54,7 @@ class AbstractTouched(AbstractObservation):
     ball added or taken off, times ``share``: 1/2 of a diameter.
     """
 
-    rows: ClassVar[int] = 1
+    row_units = ("mm",)
     certificate: ClassVar[str] = ""
     share: ClassVar[float] = 1.0
     advice: ClassVar[str]  # to whoever has touched too little of it
@@ -145,7 +145,7 @@ class AbstractTouched(AbstractObservation):
                 f"{where} has {tips.shape[1]} touches, but there are {len(rows)} unknowns; record more touches."
             )
         if np.linalg.svd(rows, compute_uv=False)[-1] < _LEAST_SINGULAR * np.sqrt(tips.shape[1]):
-            raise InputError(f"the touches hardly determine the geometry of {where}; {self.advice}.")
+            raise InputError(f"the touches do not determine the geometry of {where} well enough; {self.advice}.")
 
 
 class AbstractRound(AbstractTouched):
@@ -159,8 +159,8 @@ class AbstractRound(AbstractTouched):
     stylus: Float[AnyArray, ""] = declared(
         "diameter of the tip's ball", "mm", default=0.0,
         more=(
-            "0 if the tip itself touches the surface, or if the diameter is unknown (the fitted diameter then "
-            "includes the stylus)"
+            "0 if the tip itself touches the surface, or if the diameter is unknown (then the fitted diameter includes "
+            "the ball)"
         ),
     )  # fmt: skip
     derived = ("free",)
@@ -207,8 +207,8 @@ class Cylinder(AbstractRound):
     """
 
     kind, table, noun = "cylinder", "touched_cylinder", "cylinder"
-    inside: bool = declared("whether the ball was inside", default=False)
-    form: Float[AnyArray, ""] = declared("standard deviation of the surface about its cylinder", "mm", default=0.0)
+    inside: bool = declared("whether the ball touched the cylinder from inside", default=False)
+    form: Float[AnyArray, ""] = declared("standard deviation of the surface from an ideal cylinder", "mm", default=0.0)
     geometry = Part("axis of {name}", *AXIS)
     size = Part("radius of {name}", "mm", when="free")
     advice = "distribute the touches around the cylinder at two heights, or give its diameter"
@@ -230,7 +230,7 @@ class Plane(AbstractTouched):
     """
 
     kind, table, noun = "plane", "plane", "plane"
-    form: Float[AnyArray, ""] = declared("standard deviation of the surface about its plane", "mm", default=0.0)
+    form: Float[AnyArray, ""] = declared("standard deviation of the surface from an ideal plane", "mm", default=0.0)
     geometry = Part("plane {name}", *PLANE)
     advice = "record touches that are not on one line"
     distances, closest = staticmethod(heights), staticmethod(fitted_plane)
@@ -255,13 +255,15 @@ class ParallelPlanes(Plane):
     """
 
     kind, table, noun = "parallel planes", "parallel_planes", "planes"
-    side: tuple[str, ...] = declared("plane that was touched: one or other", "", "pose")
+    side: tuple[str, ...] = declared("the plane that was touched: 'one' or 'other'", "", "pose")
     distance: Float[AnyArray, ""] = declared(
         "certified distance between the planes", "mm", uncertainty="u", positive=True
     )
     u: Float[AnyArray, ""] = declared("standard uncertainty of the distance", "mm", default=0.0)
     stylus: Float[AnyArray, ""] = declared("diameter of the tip's ball", "mm", default=0.0)
-    inside: bool = declared("whether the ball was between the planes (a gap), not outside (a block)", default=False)
+    inside: bool = declared(
+        "whether the ball was between the planes (true, a gap) or outside (false, a block)", default=False
+    )
     derived, certificate = ("free",), "distance"
     size = Part("distance of {name}", "mm", when="free")  # from the plane of the first side
     stacks = False  # which way the other plane is follows from all of its poses
@@ -355,7 +357,7 @@ class SimulatedCylinder(AbstractSimulatedRound):
     ends: Float[np.ndarray, "2 3"] = declared("both ends of the axis in the base frame", "mm", moves="point")
     diameter: float = declared("true diameter", "mm")
     poses: int = declared("number of poses")
-    inside: bool = declared("whether the ball is inside", default=False)
+    inside: bool = declared("whether the ball touches the cylinder from inside", default=False)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         along = self.ends[1] - self.ends[0]
@@ -381,11 +383,11 @@ class SimulatedPlanes(AbstractSimulated):
 
     table = "planes"
     corner: Float[np.ndarray, "3"] = declared("corner of the (first) rectangle in the base frame", "mm", moves="point")
-    sides: Float[np.ndarray, "2 3"] = declared("its two sides as vectors", "mm", moves="vector")
+    sides: Float[np.ndarray, "2 3"] = declared("two sides of the rectangle as vectors", "mm", moves="vector")
     poses: int = declared("number of poses")
     distance: float | None = declared(
         "true distance to the second plane", "mm", default=None,
-        more="along the cross product of the sides; None for a single plane",
+        more="in the direction of the cross product of the sides; None for a single plane",
     )  # fmt: skip
     u: float = declared("standard uncertainty of the certified distance", "mm", default=0.0)
 
