@@ -17,7 +17,7 @@ from ..kinematics.parameters import Parameters
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import LEVEL, LEVEL_IN_PERCENT
+from ..uncertainty.coverage import LEVEL, LEVEL_IN_PERCENT
 from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 

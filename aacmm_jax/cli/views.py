@@ -10,7 +10,7 @@ from ..summaries import result_tables as tables
 from ..summaries import tables as words
 from ..summaries.result_tables import BY_CONSTRUCTION, STAGES, listed_apart
 from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatted, listed, number
-from ..uncertainty.coverage_level import LEVEL_IN_PERCENT, U_AT_LEVEL
+from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
 
 _MOST_PARTS = 12  # rows of a table
 _ARMS = {"nominal": "nominal", "calibrated": "calibrated"}

@@ -12,7 +12,7 @@ from ..core.units import DEG
 from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.calibration import metrics_by_socket_and_length
 from ..summaries.tables import decimals_for, format_number
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import U_AT_LEVEL
 from ..uncertainty.volume import VolumetricUncertainty
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, runs, shades, thinned
 from .figures import draw

@@ -17,7 +17,7 @@ from ..summaries.compared_models import compared_models_summary
 from ..summaries.result_tables import listed_apart
 from ..summaries.tables import decimals_for, format_number, rows_of
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import U_AT_LEVEL
 from ..uncertainty.identifiability import Observability
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, names
 from .figures import TONES, draw

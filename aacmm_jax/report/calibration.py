@@ -25,7 +25,7 @@ from ..summaries.tables import (
     shared_sentence,
     two_digits,
 )
-from ..uncertainty.coverage_level import LEVEL_IN_PERCENT
+from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
 from .elements import DRAWN, Block, Report, Section, length_table, observation_tables, removed_tables

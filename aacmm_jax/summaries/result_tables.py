@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.units import DEG, people_read
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import K_IN_WORDS, U_AT_LEVEL
 from . import tables
 from .tables import METRICS, Cell, Columns, Table, decimals_for, listed, number
 
@@ -310,7 +310,7 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         f"decision, {value}" if nominal and not brief else "decision": decided if limited else None,
         "decision, nominal": before if limited and nominal and not brief else None,
         value: read("value_mm"),
-        "U (k = 2)": lambda row: stated_expanded(row["expanded_mm"]),
+        f"U ({K_IN_WORDS})": lambda row: stated_expanded(row["expanded_mm"]),
         "MPE": "limit_mm" if limited else None,
         "nominal": read("as_found_mm") if nominal else None,
         "worst at": "where",
