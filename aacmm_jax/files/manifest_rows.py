@@ -211,9 +211,9 @@ class _Reader:
         header = text.unit(picked, self._table.units.get(entry.name) or self._preset.units.get(entry.name), entry.name)
         if entry.unit == "1":
             return self._rotations(entry, numbers, header)
-        shape = (3,) * (len(entry.dimensions) - 1)
+        shape = entry.row_shape
         count = math.prod(shape)
-        of_all_axes = entry.name == "u" and count == 3
+        of_all_axes = entry.name == "u" and len(shape) == 1
         self._check_count(entry.name, numbers.shape[1], (1, 3) if of_all_axes else (count,))
         numbers = numbers * self._unit(entry, header)
         if entry.name == "u":
