@@ -273,7 +273,7 @@ def correct(
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
     from ..data.capture_data import check_temperatures
-    from ..files.manifest_rows import with_temperature
+    from ..files.manifest_readings import with_temperature
     from ..kinematics.arm import correction_names
     from ..kinematics.corrections import Expansion
 

@@ -12,7 +12,7 @@ from ..core.errors import InputError
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from ..files.schema import check_shown
+from ..files.stored_checks import check_shown
 from . import options, views
 from .app import command, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame

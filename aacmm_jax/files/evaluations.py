@@ -22,7 +22,7 @@ from ..uncertainty.degrees_of_freedom import Components
 from . import captures, schema
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, opened, undamaged, write_tables
 from .records import Fields, Within, number, records_within, rows_table, table_of, tables_within, text, truth, values_in
-from .schema import read_checked
+from .stored_checks import read_checked
 
 _RECORDS = {
     "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
