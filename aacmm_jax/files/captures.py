@@ -138,7 +138,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
             visits=visits,
         )
         spheres = tuple(checked_sphere(sphere, capture.columns) for sphere in spheres_of(stored))
-        check_readings(capture, nominal.arm, advice='import them with unit = "deg" in [angles] of the manifest')
+        check_readings(capture, nominal.arm, advice='import the readings with unit = "deg" in [angles] of the manifest')
     table = stored.tables.get("urdf")
     if table is not None:
         text = "".join(map(str, table["text"]))
@@ -285,7 +285,9 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
     fields = {key: field for key, field in ARM.items() if key in ArmSpecification._fields}
     proposed = values_in(ArmSpecification, fields, table, attributes)
     widths = (proposed["length"], proposed["angle"], *proposed["override"].values())
-    check_sense(path, {"a half-width is not positive and finite": not all(0 < width < np.inf for width in widths)})
+    check_sense(
+        path, {"a half-width of the bounds is not positive and finite": not all(0 < width < np.inf for width in widths)}
+    )
     prior = None
     if "prior_groups" in attributes:
         sd = dict(zip(attributes["prior_groups"], attributes["prior_sd"], strict=True))

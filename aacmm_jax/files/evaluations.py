@@ -73,7 +73,7 @@ def save_evaluation(
             f"expanded uncertainty, coverage factor {COVERAGE_FACTOR:g}",
         ),
         limit=(limits, "mm", "MPE"),
-        decision=(decisions, "", "decision by the rule of the test"),
+        decision=(decisions, "", "statement of conformity by the decision rule of the test"),
         where=([part.where for part in worst], "", "what gave the worst part"),
     )
     tables["figures"] = Table(figures)
@@ -128,7 +128,7 @@ def load_evaluation(path: str | os.PathLike) -> Any:
             parameters = values_in(Uncertainty, schema.UNCERTAINTY, table, table.attributes)
             names = set(parameters["names"])
             strange = not names <= set(parameter_names(calibrated.arm)) or len(names) < len(parameters["names"])
-            check_sense(path, {"a parameter is unknown or is named twice": strange})
+            check_sense(path, {"a parameter is unknown or is given twice": strange})
             within = records_within(stored.tables, _RECORDS)
             uncertainty = Uncertainty(arm=calibrated.arm, u_k=None, **within, **parameters)
         return EvaluationRecord(captures.recording_of(path, stored), calibrated, uncertainty=uncertainty, **values)
@@ -250,7 +250,7 @@ def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
             "a model lacks a region": uneven,
             "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
             "a number is impossibly large": any(abs(value) > _LARGEST for value in numbers if value is not None),
-            "a number is negative where only 0 or more is possible": any(
+            "a number that must be 0 or positive is negative": any(
                 value is not None and value < 0 for value in positive
             ),
         },

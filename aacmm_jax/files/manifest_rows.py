@@ -77,7 +77,7 @@ class Readings:
         if set(thermometer) & set(picked):
             raise InputError(
                 f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; remove this column "
-                "from columns."
+                "from the key columns."
             )
         numbers = text.numbers(picked, measured=True, stated=stated is not None)
         angles = self._angles_of(text, picked, wanted)
@@ -323,7 +323,7 @@ class _Reader:
             if len(values) != len(rows):
                 raise InputError(
                     f"{self._where}: {file} has {len(values)} rows of '{key}', but there are {len(rows)} readings; "
-                    "give one row of each per pose."
+                    "give one row of values and one row of readings per pose."
                 )
         return rows_of
 

@@ -72,7 +72,7 @@ ARM: Fields = {
     "angle": number("half-width of the bounds of angles", "rad", name="half_width_angle_rad"),
     "override": mapping("half-widths of single parameters, mm or rad"),
     "held": text("fixed parameters"),
-    "free": text("parameters that are free in addition to those that are free by default"),
+    "free": text("parameters that are free in addition to the default parameters"),
     **_GEOMETRY,
     "coefficient": text("name of the coefficient", "coefficient"),
     "coefficients": number("coefficient of a joint correction, in its own unit", "1", "coefficient"),
@@ -267,7 +267,7 @@ JUDGED: Fields = {
     "limits": mapping("MPE of each metric: constant term (mm) and divisor of the length"),
     "u_test": number("standard uncertainty due to seat and fixture", "mm", least=0),
     "standards": text("standards whose tests are run", among=("", *STANDARDS)),
-    "influences": mapping("uncertainty (mm; relative to a length), and thermal expansion of artefact and arm"),
+    "influences": mapping("uncertainty in mm, relative uncertainty, thermal expansion of artefact and arm"),
     "rule": text("decision rule"),
 }
 
