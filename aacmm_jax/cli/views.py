@@ -313,9 +313,6 @@ def evaluation(summary: dict[str, Any]) -> View:
         if part["observations"]:
             title = "Observations, RMS distance of poses from their geometry [mm]"
             yield tables.observations_table(title, part["observations"])
-        for row in part["observations"]:
-            if row["rms_angle_rad"] is not None:
-                yield f"Orientation residuals of {row['observation']}: RMS {row['rms_angle_rad'] / DEG:.4f} deg."
         if predicted:
             yield from _predicted(part)
         if part["lengths"]:

@@ -26,6 +26,9 @@ from .table_columns import LINE, TEMPERATURE, header_units, position_columns, pr
 from .text_lines import TABLE_SHARE, Column
 from .text_table import TextTable
 
+# The units in which a manifest or table may state an entry, by the entry's own; of all others, lengths.
+_UNITS = {"rad": ANGLE_UNITS, "1": ANGLE_UNITS, "px": {"px": 1.0}}
+
 
 class Wanted(NamedTuple):
     """What the manifest states of the readings, or points, in a table."""
@@ -371,7 +374,7 @@ class _Reader:
 
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
-        units = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
+        units = _UNITS.get(entry.unit, LENGTH_UNITS)
         name, usual = entry.name, self._preset.units.get(entry.name)
         unit = checked_unit(self._where, name, header, self._table.units.get(name), usual, units)
         if unit is None and entry.unit == "1":

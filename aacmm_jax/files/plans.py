@@ -222,7 +222,8 @@ def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any
     if columns:
         covariance = getattr(observation, "covariance", None)
         u = np.sqrt(covariance) if covariance is not None else getattr(observation, "u", 0.0)
-        table |= {"columns": columns, "u": (round(float(np.max(u)), 9), "mm: standard uncertainty (k = 1)")}
+        unit = next((entry.unit for entry in observation.entries if entry.name == "u"), "mm")
+        table |= {"columns": columns, "u": (round(float(np.max(u)), 9), f"{unit}: standard uncertainty (k = 1)")}
     return table
 
 

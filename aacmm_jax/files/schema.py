@@ -196,7 +196,8 @@ OTHER_POSES: Fields = {
     "names": text("observation", "observation", name="observation"),
     "poses": count("number of poses that were not used in the calibration", "observation"),
     "rms": number("RMS distance of the unused poses from the estimated geometry", "mm", "observation"),
-    "rms_angle": number("RMS angle of the unused poses from the estimated geometry", "rad", "observation"),
+    "rms_angle": number("RMS of the residuals of the unused poses in rad, such as orientations", "rad", "observation"),
+    "rms_px": number("RMS of the residuals of the unused poses in px", "px", "observation"),
 }
 
 PRIOR: Fields = {

@@ -10,6 +10,7 @@ Example:
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple
 
@@ -250,6 +251,23 @@ def noise_sentence(summary: Mapping[str, Any]) -> str:
         "common": f"The same noise for all poses: {seating} per coordinate.",
         "robust": "The variance of each pose is estimated from the residual of this pose (robust noise model).",
     }[part["form"]]
+
+
+# Unit of residuals that are not lengths -> the key of their root mean square.
+OTHER_RMS = {"rad": "rms_angle_rad", "px": "rms_px"}
+
+
+def other_rms_columns(rows: Sequence[Mapping[str, Any]], title: str) -> dict[str, Any]:
+    """Columns with the root mean squares of residuals that are not lengths, in the units that people read; only of
+    units in which something was measured."""
+    present = {unit: key for unit, key in OTHER_RMS.items() if any(row.get(key) is not None for row in rows)}
+    return {f"{title} [{people_read(unit)[1]}]": partial(in_read_unit, unit, key) for unit, key in present.items()}
+
+
+def in_read_unit(unit: str, key: str, row: Mapping[str, Any]) -> "Cell":
+    """A value of a row in the unit in which people read it; nothing where the row has none."""
+    value = row.get(key)
+    return number(None if value is None else people_read(unit)[0] * value)
 
 
 def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:

@@ -76,8 +76,8 @@ REFUSED = {
     ),
     "one orientation": (
         lambda arm: one_orientation(arm, "SMR"),
-        "target 'SMR' was seen in only one orientation of the last frame, so the position of the target cannot be "
-        "distinguished from that of the instrument; record poses with the wrist turned.",
+        "target 'SMR' was measured in only one orientation of the last frame, so the position of the target cannot be "
+        "distinguished from that of the instrument; record poses in other orientations.",
     ),
     "a plane touched in one line": (
         lambda arm: kinds.Plane("wall", reaching(arm, np.array([400, -100, 200]) + 2 * LINE)),

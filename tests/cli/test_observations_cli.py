@@ -72,7 +72,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
         "points",
         "sphere",
         "frame of tracker",
-        "Held-out poses, drawn at random",
+        "Held-out poses, drawn",
     ):
         assert part in shown
     assert aacmm("show", "c.h5").stdout in shown
@@ -256,7 +256,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
 @pytest.mark.parametrize(
     ("command", "parts"),
     [
-        ("calibrate tracker.h5 -o x.h5 --method two-stage", ["method='two-stage' is for sockets"]),
+        ("calibrate tracker.h5 -o x.h5 --method two-stage", ["method='two-stage' applies only to sockets"]),
         ("calibrate tracker.h5 -o x.h5 --scale nominal", ["--scale nominal is for captures that do not fix the scale"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --method joint", ["stage 1 only; omit --method"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --cross-validate", ["needs a calibrated scale"]),

@@ -42,7 +42,7 @@ class Socket(AbstractObservation):
         (40, 6) ['position of hole']
     """
 
-    kind, table, noun, rows, linear = "socket", "socket", "socket", 3, True
+    kind, table, noun, row_units, linear = "socket", "socket", "socket", POINT, True
     position = Part("position of {name}", *POINT)
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
@@ -88,7 +88,7 @@ class Artefact(AbstractObservation):
         (12, 6) ['placement plate', 'coordinates of plate']
     """
 
-    kind, table, noun, rows = "artefact", "artefact", "artefact", 3
+    kind, table, noun, row_units = "artefact", "artefact", "artefact", POINT
     point: tuple[str, ...] = declared("point of the artefact in which the tip was seated", "", "pose")
     names: tuple[str, ...] = declared("point of the artefact", "", "names")
     coordinates: Float[AnyArray, "c 3"] = declared("certified coordinates", "mm", "names", "axis", uncertainty="u")

@@ -60,7 +60,7 @@ class MeasuredPoints(AbstractObservation):
         (50, 3) ['frame of tracker']
     """
 
-    kind, table, rows = "points", "points", 3
+    kind, table, row_units = "points", "points", POINT
     points: Float[AnyArray, "m 3"] = declared("measured point", "mm", "pose", "axis")
     u: AnyArray | None = declared(
         "standard uncertainty of a coordinate", "mm", "pose", "axis", default=None, spread=0,
@@ -138,7 +138,8 @@ class MeasuredTransforms(MeasuredPoints):
         ['frame of 6-D probe', 'orientation of 6-D probe']
     """
 
-    kind, table, rows, rotates = "transforms", "transforms", 6, True
+    kind, table, rotates = "transforms", "transforms", True
+    row_units = (*POINT, "rad", "rad", "rad")
     rotations: Float[AnyArray, "m 3 3"] = declared(
         "measured orientation of the target, with its axes as columns", "1", "pose", "axis", "axis_2"
     )
@@ -205,7 +206,7 @@ class Distances(AbstractObservation):
         ['pivot of telescoping bar']
     """
 
-    kind, table, rows = "distances", "distances", 1
+    kind, table, row_units = "distances", "distances", ("mm",)
     values: Float[AnyArray, " m"] = declared("measured distance from the pivot", "mm", "pose")
     u: Float[AnyArray, " m"] = declared(
         "standard uncertainty of a distance",

@@ -54,7 +54,7 @@ class AbstractTouched(AbstractObservation):
     ball added or taken off, times ``share``: 1/2 of a diameter.
     """
 
-    rows: ClassVar[int] = 1
+    row_units = ("mm",)
     certificate: ClassVar[str] = ""
     share: ClassVar[float] = 1.0
     advice: ClassVar[str]  # to whoever has touched too little of it
