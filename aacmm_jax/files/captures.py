@@ -71,7 +71,9 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     capture, arm, urdf = recording.capture, recording.nominal.arm, recording.nominal.urdf
     check_one_capture(capture)
     poses = _reading_variables("angle", np.asarray(capture.q), arm)
-    poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket that held the tip"))
+    poses |= columns(
+        "pose", socket=([capture.names[i] for i in capture.owner], "", "socket in which the tip was seated")
+    )
     if capture.visits is not None:
         visits = np.array(capture.visits)
         poses |= columns(

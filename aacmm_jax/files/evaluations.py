@@ -66,7 +66,7 @@ def save_evaluation(
         arm=(arms, "", "arm that measured"),
         standard=(standards, "", "standard of the test"),
         name=(names, "", "metric"),
-        value=(values, "mm", "value of the worst part"),
+        value=(values, "mm", "value of the metric that decides (the worst)"),
         expanded=(
             [part.expanded for part in worst],
             "mm",
@@ -74,7 +74,7 @@ def save_evaluation(
         ),
         limit=(limits, "mm", "MPE"),
         decision=(decisions, "", "statement of conformity by the decision rule of the test"),
-        where=([part.where for part in worst], "", "what gave the worst part"),
+        where=([part.where for part in worst], "", "measurement that gave the deciding value"),
     )
     tables["figures"] = Table(figures)
     if record.uncertainty is not None:
@@ -87,7 +87,7 @@ def _points_tables(record: PointsRecord) -> dict[str, Table]:
     measured, reach = record.measured, record.measured.reach
     owner = [name for name, points in measured.sockets.items() for _ in points]
     position = np.concatenate([np.zeros((0, 3)), *measured.sockets.values()])
-    points = columns("point", socket=(owner, "", "socket that held it"))
+    points = columns("point", socket=(owner, "", "socket in which the tip was seated"))
     points["position"] = Variable(("point", "axis"), position, "mm", "centre of the probe")
     attributes = dict(table_of(record, schema.JUDGED).attributes)
     if reach is not None:

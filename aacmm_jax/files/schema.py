@@ -35,7 +35,7 @@ NOISE: Fields = {
 
 USUAL_NOISE: Fields = {
     "arm_class": text("class of the arm"),
-    "source": text("where the noise is stated"),
+    "source": text("source of the stated noise"),
     "noise": part(NOISE),
 }
 
@@ -67,7 +67,7 @@ _GEOMETRY: Fields = {
     "probe": number("tip in the last frame", "mm", "axis"),
 }
 ARM: Fields = {
-    "name": text("what the arm is called"),
+    "name": text("name of the arm"),
     "length": number("half-width of the bounds of lengths", "mm", name="half_width_length_mm"),
     "angle": number("half-width of the bounds of angles", "rad", name="half_width_angle_rad"),
     "override": mapping("half-widths of single parameters, mm or rad"),
