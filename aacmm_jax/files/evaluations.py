@@ -66,7 +66,7 @@ def save_evaluation(
         arm=(arms, "", "arm that measured"),
         standard=(standards, "", "standard of the test"),
         name=(names, "", "metric"),
-        value=(values, "mm", "value of the metric that decides (the worst)"),
+        value=(values, "mm", "worst value of the metric"),
         expanded=(
             [part.expanded for part in worst],
             "mm",
@@ -74,7 +74,7 @@ def save_evaluation(
         ),
         limit=(limits, "mm", "MPE"),
         decision=(decisions, "", "statement of conformity by the decision rule of the test"),
-        where=([part.where for part in worst], "", "measurement that gave the deciding value"),
+        where=([part.where for part in worst], "", "measurement that gave the worst value"),
     )
     tables["figures"] = Table(figures)
     if record.uncertainty is not None:
