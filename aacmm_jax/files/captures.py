@@ -71,15 +71,10 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     capture, arm, urdf = recording.capture, recording.nominal.arm, recording.nominal.urdf
     check_one_capture(capture)
     poses = _reading_variables("angle", np.asarray(capture.q), arm)
-    poses |= columns(
-        "pose", socket=([capture.names[i] for i in capture.owner], "", "socket in which the tip was seated")
-    )
+    poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket of the pose"))
     if capture.visits is not None:
         visits = np.array(capture.visits)
-        poses |= columns(
-            "pose",
-            visit=(visits, "1", "number of the visit to the socket during which the pose was recorded; -1 if unknown"),
-        )
+        poses |= columns("pose", visit=(visits, "1", "number of the visit to the socket; -1 if unknown"))
     # Copies that were left out: poses by socket, and lengths by their ends.
     (sockets, counts), (starts, ends) = (tuple(zip(*rows, strict=True)) or ((), ()) for rows in capture.repeated)
     attributes = {
@@ -209,12 +204,7 @@ def sphere_table(spheres: Sequence[ProbedSphere], arm: Arm | None = None) -> Tab
     ]
     values = np.array([touched for *_, touched in rows])
     variables = rows_table("touch", (sphere for sphere, *_ in rows), SPHERES).variables | columns(
-        "touch",
-        group=(
-            [number for _, number, _ in rows],
-            "1",
-            "number of the group of touches: a repetition, or an orientation of the wrist",
-        ),
+        "touch", group=([number for _, number, _ in rows], "1", "number of the repetition or wrist orientation")
     )
     if arm is None:
         return Table(variables | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")})
