@@ -269,7 +269,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out [AC]", ["without '[AC]', no data fix the scale"]),
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe applies to several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the file name 'monday'"]),
-        ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be drawn", "1 to 79"]),
+        ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be selected", "1 to 79"]),
         ("calibrate tracker.h5 -o x.h5 --without 'no*'", ["no socket matches"]),
         ("evaluate c.h5 few.h5", ["sphere 'ball' has 2 touches"]),
         ("evaluate c.h5 monday.h5 --acceptance din", ["'din'", "jjf, asme, iso"]),
