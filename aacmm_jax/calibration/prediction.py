@@ -24,7 +24,7 @@ from ..data.observations.observation import OTHER_UNITS
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import LEVEL
+from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows

@@ -17,7 +17,7 @@ from ..kinematics.parameters import Parameters
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import LEVEL, LEVEL_IN_PERCENT
+from ..uncertainty.coverage import LEVEL, LEVEL_IN_PERCENT
 from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
@@ -127,8 +127,8 @@ def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, .
     if record.removed:
         groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
         words += (
-            f" These data were left out because, by an F test, they contradict the rest: {groups}; see the statements "
-            "on data left out."
+            f" The following data were left out, because an F test shows that they contradict the rest: {groups}; see "
+            "the statements on data left out."
         )
     statement = uncertainty_statement(record)
     return element(

@@ -83,7 +83,9 @@ def surprise(
         )
         worst = [name for _, name in improbable[:3]]
         most = [
-            f"{name} ({parts[name].rms:.3g} mm, {parts[name].rms / parts[name].predicted:.1f} times)" for name in worst
+            f"{name} ({parts[name].rms:.3g} mm RMS, {parts[name].rms / parts[name].predicted:.1f} times the predicted "
+            "value)"
+            for name in worst
         ]
         texts.append(
             f"poses are {poses.rms:.3g} mm RMS from their geometry, {poses.rms / poses.predicted:.1f} times the "

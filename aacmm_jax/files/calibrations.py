@@ -19,7 +19,7 @@ from . import schema
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Within, records_within, rows_in, rows_table, table_of, tables_within, values_in
-from .schema import read_checked
+from .stored_checks import read_checked
 
 # Records within the record that are a table each.
 _RECORDS = {

@@ -22,7 +22,8 @@ from ..kinematics.priors import Prior
 from .arm_tables import GEOMETRY, with_coefficients
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Field, attribute_name, record_in, row_values, rows_table, table_of, values_in
-from .schema import ARM, LENGTHS, RECORDING, SPHERES, USUAL_NOISE, read_checked
+from .schema import ARM, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
+from .stored_checks import read_checked
 
 _OBSERVATION = "observation_"
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import COVERAGE_FACTOR, Expansion, Influences, Limit, Rule, checked_influences
+from ..acceptance.judgement import Expansion, Influences, Limit, Rule, checked_influences
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord, checked_limits
 from ..acceptance.results import Measured
 from ..core.arguments import checked
@@ -17,11 +17,12 @@ from ..kinematics.arm import parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import SharedErrors
+from ..uncertainty.coverage import COVERAGE_FACTOR
 from ..uncertainty.degrees_of_freedom import Components
 from . import captures, schema
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, opened, undamaged, write_tables
 from .records import Fields, Within, number, records_within, rows_table, table_of, tables_within, text, truth, values_in
-from .schema import read_checked
+from .stored_checks import read_checked
 
 _RECORDS = {
     "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),

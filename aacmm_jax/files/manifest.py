@@ -19,7 +19,8 @@ from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile
-from .manifest_rows import Readings, Source, name_of, parts, points_of
+from .manifest_readings import Readings, points_of
+from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches

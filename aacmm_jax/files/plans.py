@@ -1,6 +1,7 @@
 """Plans as files: the poses of a calibration or of an acceptance test as CSV, and the manifest for the readings."""
 
 import json
+import math
 import os
 import textwrap
 from collections.abc import Mapping
@@ -212,7 +213,7 @@ def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any
             table[entry.name] = round(float(np.asarray(value)), 9), says
         elif entry.dimensions[0] == "pose" and entry.required:
             # A rotation is recorded as a quaternion.
-            count = 4 if entry.unit == "1" else 3 ** (len(entry.dimensions) - 1)
+            count = 4 if entry.unit == "1" else math.prod(entry.row_shape)
             columns[entry.name] = list(range(next_column, next_column + count)) if count > 1 else next_column
             next_column += count
             table |= {"rotation": "quaternion wxyz"} if entry.unit == "1" else {}

@@ -140,7 +140,7 @@ def pose_chart(
     )
     median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
     description = f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
-    description += " The only pose of a socket has no distance and is not drawn." if len(finite) < len(last) else ""
+    description += " Poses that are the only pose of their socket are not drawn." if len(finite) < len(last) else ""
     description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
     return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
 

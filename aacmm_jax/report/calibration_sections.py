@@ -37,7 +37,7 @@ from ..summaries.tables import (
     two_digits,
 )
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import LEVEL_IN_PERCENT
+from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_of_arm

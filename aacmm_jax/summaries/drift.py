@@ -8,7 +8,7 @@ from ..core.text import csv_text
 from ..core.units import people_read, people_read_change
 from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange
-from ..uncertainty.coverage_level import in_percent
+from ..uncertainty.coverage import in_percent
 from . import tables
 from .result_tables import listed_apart
 from .tables import Cell, Styled, View, attributes, decimals_for, listed, number, plain, rows_of
@@ -115,7 +115,7 @@ def comparison(summary: dict[str, Any]) -> View:
     yield listed(
         f"Lengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
         [["not determined" if lengths[key] is None else lengths[key] for key in keys]],
-        ("RMS", "RMS from the uncertainties alone", "95th percentile", "largest", "mean"),
+        ("RMS", "RMS expected from the uncertainties", "95th percentile", "largest", "mean"),
     )
     if len(summary["trend"]) > 2:
         first, *others = summary["trend"]
@@ -133,7 +133,7 @@ def comparison(summary: dict[str, Any]) -> View:
             "beyond U",
             "p of all changes",
             "RMS [mm]",
-            "by chance [mm]",
+            "RMS expected [mm]",
             "largest [mm]",
         )
         title = "Each calibration minus the first (the error of the first calibration is contained in every row)"

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.units import DEG, people_read
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import K_IN_WORDS, U_AT_LEVEL
 from . import tables
 from .tables import METRICS, Cell, Columns, Table, decimals_for, listed, number
 
@@ -17,10 +17,10 @@ BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
 MODELS_MEANING = (
     "Determined: number of parameters that the data determine. Inside: RMS distance of all poses from their geometry. "
-    "Outside: RMS distance of held-out poses, with each region held out in turn. Above the best: outside error minus "
-    "the outside error of the best model, from the differences in each region. u: standard errors from the scatter of "
-    "the regions. Ratio: mean of (error / predicted standard deviation)² of held-out poses. Evidence: logarithm of "
-    "the evidence, minus the value of the most probable model."
+    "Outside: RMS distance of held-out poses, with each region held out in turn. Excess: outside error minus the "
+    "outside error of the best model, from the differences in each region. u: standard errors from the scatter of the "
+    "regions. Ratio: mean of (error / predicted standard deviation)² of held-out poses. Evidence: logarithm of the "
+    "evidence, minus the value of the most probable model."
 )
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
@@ -310,7 +310,7 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         f"decision, {value}" if nominal and not brief else "decision": decided if limited else None,
         "decision, nominal": before if limited and nominal and not brief else None,
         value: read("value_mm"),
-        "U (k = 2)": lambda row: stated_expanded(row["expanded_mm"]),
+        f"U ({K_IN_WORDS})": lambda row: stated_expanded(row["expanded_mm"]),
         "MPE": "limit_mm" if limited else None,
         "nominal": read("as_found_mm") if nominal else None,
         "worst at": "where",
@@ -339,8 +339,8 @@ def model_tables(summary: Row) -> tuple[Table, Table]:
         "inside [mm]": "rms_inside",
         "outside [mm]": "rms_outside",
         "u of outside": "u_outside",
-        "above the best": lambda row: to_best(row)[0],
-        "u of this": lambda row: to_best(row)[1],
+        "excess [mm]": lambda row: to_best(row)[0],
+        "u of excess": lambda row: to_best(row)[1],
         "ratio": _two_decimals("ratio"),
         "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
         "CPU [s]": lambda row: number(row["cpu_seconds"], 1),

@@ -310,7 +310,8 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
 def tried_sentence(row: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
-        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses, which means "
-        f"that the nearest calibration pose is within the spacing of these poses ({row['spacing_rad'] / DEG:.2g} deg "
-        "RMS over the joints). In the rest of the joint space, U is an extrapolation by the model."
+        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses: in this part, "
+        "the nearest calibration pose is no farther away than the spacing of the calibration poses "
+        f"({row['spacing_rad'] / DEG:.2g} deg RMS over the joints). In the rest of the joint space, U is an "
+        "extrapolation by the model."
     )

@@ -4,6 +4,7 @@ What reports lengths takes the distance of the tip from the line of sight, and e
 """
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,10 @@ class Bearing(AbstractSight):
     elevation: Float[AnyArray, " m"] = declared("measured elevation", "rad", "pose")
     u: Float[AnyArray, ""] = declared("standard uncertainty of an angle", "rad", default=1e-5)
 
+    @classmethod
+    def of(cls, name, q, values):
+        return cls(name, q, *values)
+
     def seen(self):
         return namespace(self.azimuth).stack([self.azimuth, self.elevation])
 
@@ -91,12 +96,15 @@ class Picture(AbstractSight):
     """Pixels of a camera without distortion."""
 
     kind, table, row_units = "picture", "picture", ("px", "px")
-    column: Float[AnyArray, " m"] = declared("column in the image", "px", "pose")
-    row: Float[AnyArray, " m"] = declared("row in the image", "px", "pose")
+    pixels: Float[AnyArray, "m 2"] = declared("column and row in the image", "px", "pose", "image_axis")
     u: Float[AnyArray, ""] = declared("standard uncertainty of an image coordinate", "px", default=0.03)
 
+    @classmethod
+    def of(cls, name, q, values):
+        return cls(name, q, values.T)
+
     def seen(self):
-        return namespace(self.column).stack([self.column, self.row])
+        return self.pixels.T
 
     def directions(self, seen):
         xp = namespace(seen)
@@ -116,9 +124,9 @@ class AbstractSimulatedSight(AbstractInBox):
     seen: type[AbstractSight]
 
     def recorded(self, q, transforms, random):
-        exact = self.seen(self.name, q, np.zeros(len(q)), np.zeros(len(q)))
+        exact = self.seen.of(self.name, q, np.zeros((2, len(q))))
         values, _ = exact.seen_at(seen_from(self.frame, transforms[:, :3, 3]).T)
-        return self.seen(self.name, q, *(values + exact.u * random.normal(size=values.shape)))
+        return self.seen.of(self.name, q, values + exact.u * random.normal(size=values.shape))
 
 
 class SimulatedBearing(AbstractSimulatedSight):
@@ -183,10 +191,10 @@ def files(recording, kind, tmp_path_factory):
 
 @pytest.mark.parametrize("observed", [Bearing, Picture])
 def test_derivatives_are_exact(observed):
-    sight = to_numpy(observed("s", Q, np.zeros(POSES), np.zeros(POSES)))
+    sight = to_numpy(observed.of("s", Q, np.zeros((2, POSES))))
     frame = np.array([0.1, 0.05, 0.4, -1200, -600, 300])
     values, _ = sight.seen_at(seen_from(frame, TIPS.position.T).T)
-    sight = to_numpy(observed("s", Q, *values))
+    sight = to_numpy(observed.of("s", Q, values))
     found = sight.start(TIPS, np.zeros(3))
     np.testing.assert_allclose(found["frame of s"], frame, atol=1e-6)
     check_derivatives(sight, columns(found))
@@ -196,9 +204,9 @@ def test_a_residual_in_mm_is_the_distance_from_the_line_of_sight():
     """Whatever the unit, and nothing along the line, which no residual depends on."""
     frame = np.array([0.1, 0.05, 0.4, -1200, -600, 300])
     for observed in (Bearing, Picture):
-        sight = to_numpy(observed("s", Q, np.zeros(POSES), np.zeros(POSES)))
+        sight = to_numpy(observed.of("s", Q, np.zeros((2, POSES))))
         values, _ = sight.seen_at(seen_from(frame, TIPS.position.T).T)
-        sight = to_numpy(observed("s", Q, *values))
+        sight = to_numpy(observed.of("s", Q, values))
         line = TIPS.position - frame[3:, None]
         line = line / np.linalg.norm(line, axis=0)
         moved = np.random.default_rng(0).normal(size=line.shape) * 1e-3
@@ -299,16 +307,17 @@ def test_a_manifest_reads_its_columns(recording, kind, tmp_path, monkeypatch):
     )
     monkeypatch.setattr(manifest, "PosesManifest", tables)
     sight = recording.capture.observations[0]
-    names = [entry.name for entry in observed.entries if entry.of_poses and entry.name != "q"]
-    header = ",".join([*(f"q{i}" for i in range(1, 7)), *(f"{name} [{unit}]" for name in names)])
-    table = np.column_stack([sight.q, *(getattr(sight, name) for name in names)])
+    entries = [entry for entry in observed.entries if entry.of_poses and entry.name != "q"]
+    picked = {entry.name: [f"{entry.name}{i} [{unit}]" for i in range(math.prod(entry.row_shape))] for entry in entries}
+    header = ",".join([*(f"q{i}" for i in range(1, 7)), *(name for names in picked.values() for name in names)])
+    table = np.column_stack([sight.q, *(getattr(sight, name) for name in picked)])
     np.savetxt(tmp_path / "a.csv", table, "%.17g", ",", header=header, comments="")
-    columns_of = ", ".join(f'{name} = "{name} [{unit}]"' for name in names)
+    columns_of = ", ".join(f"{name} = {json.dumps(names)}" for name, names in picked.items())
     text = f'arm = "cheng2018-simulation"\n[angles]\nunit = "rad"\n[[{kind}]]\nfile = "a.csv"\n'
     (tmp_path / "c.toml").write_text(f'{text}columns = {{ q = "q?", {columns_of} }}\n')
     (again,) = aj.files.read_manifest(tmp_path / "c.toml").capture.observations
     assert isinstance(again, observed)
-    for name in names:
+    for name in picked:
         np.testing.assert_array_equal(getattr(again, name), getattr(sight, name))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.core.units import ANGLE_UNITS
-from aacmm_jax.files.manifest_rows import Readings, Wanted
+from aacmm_jax.files.manifest_readings import Readings, Wanted
 from aacmm_jax.files.manifest_tables import Angles
 from aacmm_jax.files.text_table import TextTable
 from tests.refusals import assert_refused, refusal
