@@ -13,12 +13,12 @@ from ..calibration.results import Calibration, Identification
 from ..calibration.sampling import monte_carlo
 from ..core.arguments import checked_arguments, with_options
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..data.capture import Capture, draw_poses, join_sessions
+from ..data.capture import draw_poses, join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..diagnostics.contradictions import remove_contradicting
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
+from .automatic import with_best_model, with_wider_bounds, without_contradicting
 from .cross_validation import can_cross_validate, cross_validate
 from .single import CalibrationOptions, calibrate, identify
 
@@ -49,6 +49,7 @@ class CaptureOptions(NamedTuple):
     monte_carlo: bool = False
     strict: bool = False
     remove_contradicting: bool = False
+    automatic: bool = True
     max_steps: int = _SOLVE.max_steps
     stage: Callable[[str, Callable[[], Any]], Any] = lambda what, work: work()
 
@@ -80,6 +81,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         monte_carlo: check the uncertainties by Monte Carlo.
         strict: raise `InputError` where such data could not determine free parameters even without noise.
         remove_contradicting: leave out groups that contradict all others.
+        automatic: widen default bounds that the fit reaches, leave out what contradicts the rest, and take the model of
+            the joints that predicts held-out regions best, unless a model, a prior, a method or a robust loss is
+            stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -111,7 +115,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     same = {name: value for name, value in chosen._asdict().items() if name in CalibrationOptions._fields}
     solving = CalibrationOptions(**same | {"prior": prior, "undetermined": undetermined})
 
-    def solved(capture: Capture) -> Calibration | Identification:
+    def solved(part: Recording) -> Calibration | Identification:
+        capture, bounds = part.capture, part.nominal.bounds()
         if chosen.scale == "measured":
             return calibrate(bounds.space.base, capture, bounds, **solving._asdict())
         if chosen.method is not None or chosen.strict:
@@ -125,10 +130,15 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
-        result = chosen.stage("Calibrating", lambda: solved(recording.capture))
+        result = chosen.stage("Calibrating", lambda: solved(recording))
         record = record_of(result, recording, robust=chosen.robust, others=others)
-        if chosen.remove_contradicting:
-            record = chosen.stage("Comparing groups", lambda: remove_contradicting(record, solved))
+        if chosen.automatic:
+            record = chosen.stage("Widening bounds", lambda: with_wider_bounds(record, solved))
+        if chosen.remove_contradicting or chosen.automatic:
+            record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved))
+        stated = chosen.robust or prior or chosen.method or chosen.scale != "measured" or chosen.strict
+        if chosen.automatic and not stated and not recording.nominal.arm.corrections:
+            record = with_best_model(record, chosen.noise, chosen.stage)
         if _to_cross_validate(record.recording, solving, chosen):
             if chosen.scale != "measured":
                 raise InputError("--cross-validate needs a calibrated scale; omit --scale nominal (scale).")
@@ -136,7 +146,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             run = partial(cross_validate, bounds.space.base, capture, bounds, groups=groups, **solving._asdict())
             record = record._replace(validation=chosen.stage("Cross-validating", run))
         if chosen.monte_carlo:
-            result = solved(record.recording.capture) if record.removed else result
+            result = solved(record.recording) if record.removed else result
             if not isinstance(result, Calibration) or chosen.robust is not None:
                 raise InputError(
                     "--monte-carlo cannot be combined with --robust or --scale nominal; omit --monte-carlo."
