@@ -42,6 +42,9 @@ from .kinematics.priors import Prior as Prior
 from .model.scale import fix_scale as fix_scale
 from .model.scale import scale_from_lengths as scale_from_lengths
 from .pipeline.capture_calibration import calibrate_capture as calibrate_capture
+from .pipeline.capture_evaluation import evaluate_capture as evaluate_capture
+from .pipeline.capture_evaluation import evaluate_points as evaluate_points
+from .pipeline.capture_simulation import simulate_capture as simulate_capture
 from .pipeline.cross_validation import cross_validate as cross_validate
 from .pipeline.model_ladder import compare_models as compare_models
 from .pipeline.single import calibrate as calibrate

@@ -297,7 +297,7 @@ def test_too_few_poses(given, monkeypatch, sizes, held, hold):
         return aj.identify(given.arm, capture, bounds, hold=hold)
 
     sentence = refusal(lambda: run(sizes))
-    assert "record more poses or hold more parameters" in sentence
+    assert "record more poses or fix more parameters" in sentence
     poses, sockets, equations, unknowns, needed = map(int, re.findall(r"\d+", sentence))
     assert (poses, sockets, equations) == (sum(sizes), len(sizes), 3 * sum(size - 1 for size in sizes))
     # One length is the scale, which repeatability does not see, whether it is held or slides.

@@ -16,7 +16,6 @@ from .procedure import plan_procedure as plan_procedure
 from .procedure import simulate_procedure as simulate_procedure
 from .record import EvaluationRecord as EvaluationRecord
 from .record import PointsRecord as PointsRecord
-from .record import evaluation_of as evaluation_of
 from .record import measured_by as measured_by
 from .record import run as run
 from .requirements import requirements_table as requirements_table

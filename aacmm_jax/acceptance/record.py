@@ -7,7 +7,7 @@ Uncertainties are the tester's (artefacts, seat, fixture, temperature): the arm'
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from ..calibration.evaluation import evaluate
-from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.task import check_observed
 from ..core.arguments import Range, checked, checked_arguments
 from ..core.errors import InputError, nearest
@@ -32,12 +31,12 @@ from .geometry import elbow_sides, points_of, unit_rows
 from .judgement import MOST, Influences, Limit, Rule, checked_influences, checked_limit, decide, without_test
 from .requirements import TESTS
 from .results import METRICS, AcceptanceTest, Measured, Metric, Postures
-from .standards import DEFAULT_RULES, OF_SPHERES, STANDARDS, checked_standards
+from .standards import DEFAULT_RULES, STANDARDS
 
 NO_INFLUENCES = Influences()
 MAXIMA = ("rms_mm", "deltam_mm", "length_error_largest_mm")
 SIMULATED = "The readings are simulated: no real arm was measured."
-_Millimetres = Annotated[float, Range(least=0, most=MOST, unit="mm")]
+Millimetres = Annotated[float, Range(least=0, most=MOST, unit="mm")]
 _FARTHEST = 1e6  # mm: no arm reaches a kilometre
 _ROUNDING = 1e-7  # relative error up to which a length has the error zero by construction
 
@@ -80,7 +79,7 @@ def measured_by(arm: Arm, recording: Recording) -> Measured:
 def run(
     measured: Measured,
     limits: Mapping[str, Limit | float] | None = None,
-    u_test: _Millimetres = 0.0,
+    u_test: Millimetres = 0.0,
     *,
     influences: Influences = NO_INFLUENCES,
     rule: Rule | None = None,
@@ -135,7 +134,7 @@ def checked_limits(limits: Mapping[str, Limit | float]) -> dict[str, Limit]:
             raise InputError(f"there is no metric '{name}'{without_test(name, list(METRICS))}")
         fixed, divisor = limit if isinstance(limit, Limit) else (limit, math.inf)
         what = f"the limit of {name}"
-        by_name[name] = checked_limit(Limit(float(checked(fixed, _Millimetres, what)), divisor), what)
+        by_name[name] = checked_limit(Limit(float(checked(fixed, Millimetres, what)), divisor), what)
     return by_name
 
 
@@ -176,7 +175,7 @@ class EvaluationRecord(NamedTuple):
     """A calibrated arm and the capture it is evaluated on; the metrics follow from these.
 
     Example:
-        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal), standards=["asme"])
+        >>> evaluation = aj.evaluate_capture(record, aj.Recording(two_bars, nominal), standards=["asme"])
         >>> print([test.title for test in evaluation.acceptance()["calibrated"]])
         ['single-point articulation', 'volumetric']
     """
@@ -266,102 +265,6 @@ def _tests(record: EvaluationRecord | PointsRecord, measured: Measured) -> list[
     return [test for test in tests if test.standard in wanted or {m.name for m in test.metrics} & record.limits.keys()]
 
 
-def evaluation_of(
-    record: CalibrationRecord,
-    recording: Recording,
-    *,
-    limits: Mapping[str, Limit | float] | None = None,
-    u_test: float = 0.0,
-    maxima: Mapping[str, float] | None = None,
-    standards: Iterable[str] | None = None,
-    influences: Influences = NO_INFLUENCES,
-    rule: Rule | None = None,
-) -> EvaluationRecord:
-    """Evaluate a calibration on a capture; the record has warnings on what makes it doubtful.
-
-    A socket counts as identified from if the calibration used any of its poses. Of another observation, the poses that
-    it did not use are held out, as far as they determine their geometry: that is fitted to the arm.
-    `InputError` for an impossible limit, one whose metric nothing can be measured for, and observations that do not
-    determine their own unknown geometry.
-
-    Args:
-        record: The calibration.
-        recording: The capture; its nominal arm should be that of the calibration.
-        limits: MPE of metrics, mm, as for `run`, like all arguments that are not named here.
-        maxima: Limits of the quantities in `MAXIMA`, mm.
-        standards: Standards whose acceptance tests are run: "jjf", "asme", "iso". Default: those whose procedure the
-            recording was made for. Tests with a limit are run in any case.
-
-    Example:
-        >>> limits = {"Length": 0.1}
-        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal), limits=limits)
-        >>> for test in evaluation.acceptance()["calibrated"]:
-        ...     print(test.title, test.decision)
-        single point and length, as in Cheng et al. 2018 conforms
-    """
-    used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
-    recording = recording._replace(capture=_divided(record.calibrated.arm, recording.capture, used))
-    check_geometry(record.calibrated.arm, recording.capture)
-    readings = dict(recording.capture.sockets) | {part.name: part.q for part in recording.capture.observations}
-    shared = {name: sum(row.tobytes() in used for row in np.asarray(q)) for name, q in readings.items()}
-    warnings = []
-    if not record.converged or not record.plausible_scale:
-        reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
-        warnings.append(f"The calibration failed, so the results are meaningless: {reason}")
-    if recording.true is not None:
-        warnings.append(SIMULATED)
-    warnings += recording.capture.repeated.sentences()
-    counts = ((name, count, len(readings[name])) for name, count in shared.items())
-    if partly := [f"{name} ({count} of {poses} poses)" for name, count, poses in counts if 0 < count < poses]:
-        names = ", ".join(partly)
-        warnings.append(
-            f"The arm was identified from some poses of {names}; the other poses of these sockets and observations "
-            "count as used, too."
-        )
-    if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
-        warnings.append(
-            f"The capture is of '{recording.nominal.name}', but the calibration is of "
-            f"'{record.recording.nominal.name}'; check that the arm is the same."
-        )
-    made_for = (*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres))
-    evaluation = EvaluationRecord(
-        recording._replace(nominal=record.recording.nominal),
-        record.calibrated,
-        frozenset(name for name, count in shared.items() if count),
-        limits=checked_limits(limits or {}),
-        u_test=u_test,
-        maxima=dict(maxima or {}),
-        standards=checked_standards(made_for if standards is None else standards),
-        uncertainty=uncertainty_of(record),
-        influences=influences,
-        rule=rule,
-    )
-    if not evaluation.independent:
-        warnings.append(
-            "The calibration used all data of this capture, so the results are too favourable and are not a test; "
-            "measure sockets or lengths that the calibration does not use."
-        )
-    warnings += unstated_uncertainty_warning(evaluation.acceptance()["calibrated"])
-    return evaluation._replace(warnings=tuple(warnings))
-
-
-def _divided(arm: Arm, capture: Capture, used: Collection[bytes]) -> Capture:
-    """With the poses of an observation that were not used as an observation of their own, where others were."""
-    observations = []
-    for observation in capture.observations:
-        seen = np.array([row.tobytes() in used for row in np.asarray(observation.q)])
-        parts = [observation]
-        if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
-            unseen = observation.select(np.flatnonzero(~seen)).changed(name=f"{observation.name}, held out")
-            try:
-                check_geometry(arm, Capture({}, [], [unseen]))
-                parts = [observation.select(np.flatnonzero(seen)), unseen]
-            except InputError:
-                pass  # too few poses: the observation counts as identified from
-        observations += parts
-    return Capture(capture.sockets, capture.lengths, observations, capture.repeated)
-
-
 def check_geometry(arm: Arm, capture: Capture) -> None:
     """Raise `InputError` where observations do not determine their own unknowns."""
     space = to_numpy(Parameters(arm, ("d_1",)))
@@ -379,7 +282,7 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     return [sentence] if names else []
 
 
-def same_arm(one: Arm, other: Arm) -> bool:
+def same_arm(first: Arm, second: Arm) -> bool:
     """Whether two arms have the same parameters; without beta it is 0. A model of its joints may come
     with a calibration."""
 
@@ -387,4 +290,4 @@ def same_arm(one: Arm, other: Arm) -> bool:
         plain = arm.geometry._replace(coefficients=None, gravity=None, corrections=None)
         return plain._replace(beta=np.zeros(arm.joints) if arm.beta is None else arm.beta)
 
-    return jax.tree.all(jax.tree.map(np.array_equal, parameters(one), parameters(other)))
+    return jax.tree.all(jax.tree.map(np.array_equal, parameters(first), parameters(second)))

@@ -207,15 +207,15 @@ def _laid_out(
     # A batch is distributed over threads by its values, so that it cannot be traced.
     if not is_concrete(*jax.tree.leaves((arm, capture, lower, upper, start))):
         raise InputError(
-            f"{single}_many needs known values, but is called inside jit, vmap or a derivative; call {single}_many "
-            f"outside of these, or use jax.vmap of {single} inside."
+            f"{single}_many needs the values of its arguments, which are not known inside jit, vmap or a derivative; "
+            f"call {single}_many outside of these, or use jax.vmap of {single} inside."
         )
     if isinstance(lower, Bounds):
         for what, given in (("upper bounds", upper), ("a space", options.space)):
             if given is not None:
                 raise InputError(
-                    f"a Bounds object and {what} are both given, but Bounds already contain {what}; omit one of "
-                    "them (give a start by its name: start=...)."
+                    f"a Bounds object and {what} are both given, but a Bounds object already contains {what}; omit "
+                    "one of the two, and give a start by its name (start=...)."
                 )
         lower, upper, space = lower.lower, lower.upper, lower.space
     elif upper is None:

@@ -115,7 +115,8 @@ def evaluate(
     if given and not kept:
         first = next(iter(given))
         raise InputError(
-            f"the capture has no '{first}' and no other part of this geometry{nearest(first, observed.blocks)}"
+            f"no part of the given geometry (such as '{first}') belongs to this capture"
+            f"{nearest(first, observed.blocks)}"
         )
     whole = bool(capture.observations) or bool(kept) or noise is not None
     subject = observed, *to_numpy((capture.lengths, kept, noise))

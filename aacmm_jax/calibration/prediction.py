@@ -206,7 +206,7 @@ class _Unseen(NamedTuple):
             if rows is None:
                 private.append(np.zeros((0, *block.white.shape)))
                 continue
-            values, vectors = np.linalg.eigh(np.asarray(influence.own[block.of]))
+            values, vectors = np.linalg.eigh(np.asarray(influence.d_inverses[block.class_index]))
             roots = np.sqrt(np.maximum(values, 0.0))[:, None, :] * vectors
             private.append(np.asarray(followed(np.asarray(rows), roots, block.sizes)))
         private, joined = observed.by_observation(private), observed.by_observation(joined)
@@ -258,7 +258,7 @@ def _of_lengths(
     by_head = np.asarray(influence.eliminated(head, components))
     pull = by_head[:, p:] @ problem.basis
     along = by_head[:, :p] / np.asarray(linear.space.scale) - pull @ problem.along
-    pairs = zip(components, influence.own, strict=True)
+    pairs = zip(components, influence.d_inverses, strict=True)
     scatter = np.sum([np.einsum("lKk,Kkj,gKj->lg", part, inverse, part) for part, inverse in pairs], axis=0)
     covariance = uncertainty.covariance_of_functions(along) + scatter + pull @ pull.T + places + np.diag(u**2)
     error = np.asarray(measured) - np.array([float(length.value) for length in capture.lengths])

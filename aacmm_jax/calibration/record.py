@@ -289,7 +289,7 @@ def _reason(calibration: Calibration | Identification) -> str:
     if values[0] >= _CORRELATED or len(leading) < 2:
         return sentence
     together = ", ".join(calibration.space.names[moving[i]] for i in leading)
-    return f"{sentence.partition(';')[0]}; {together} trade off; hold one of these parameters, or give it a prior."
+    return f"{sentence.partition(';')[0]}; {together} trade off; fix one of these parameters, or give it a prior."
 
 
 @checked_arguments

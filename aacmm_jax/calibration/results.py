@@ -50,7 +50,7 @@ class PriorMetrics(eqx.Module):
     weight: Float[AnyArray, " q"]  # one over the standard deviation, 1/mm and 1/rad; 0 without a prior
 
     @property
-    def known(self) -> tuple[str, ...]:
+    def with_prior(self) -> tuple[str, ...]:
         """Names of the parameters that have a prior."""
         return tuple(name for name, weight in zip(self.names, np.asarray(self.weight), strict=True) if weight > 0)
 

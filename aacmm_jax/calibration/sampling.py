@@ -216,7 +216,7 @@ def bootstrap(
 
 def _check_some(values: np.ndarray, trials: int, what: str, remedy: str) -> None:
     if len(values) < _LEAST:
-        raise InputError(f"{len(values)} of {trials} {what} trials converged; {remedy}.")
+        raise InputError(f"only {len(values)} of {trials} {what} trials converged; {remedy}.")
 
 
 def numerical_tolerance(u: Float[np.ndarray, " q"], digits: int) -> Float[np.ndarray, " q"]:
@@ -249,8 +249,8 @@ class Repeated(NamedTuple):
         lost = any(bool(np.any(np.asarray(weights) < 1)) for weights in result.observed.weights)
         if joint and lost and robust is None:
             raise InputError(
-                "a robust loss reduced the weight of poses in this calibration; give the bootstrap, which keeps "
-                "such poses, the same loss (robust='huber', for example), or calibrate without a robust loss."
+                "a robust loss reduced the weight of poses in this calibration; use bootstrap with the same loss "
+                "(robust='huber', for example), or calibrate without a robust loss."
             )
         if lengths is None:
             lengths = sample_lengths(result.arm, _LENGTHS, length=default_length(result.arm))

@@ -148,7 +148,8 @@ def _checked_hold(hold: object, space: Parameters, lengths: list[str], concrete:
         return None
     if hold == "longest" and not concrete:
         raise InputError(
-            "hold='longest' needs an arm with known values; if the arm itself is traced, name the length to hold."
+            "hold='longest' needs the values of the arm, which are not known inside jit, vmap or a derivative; name "
+            "the length to hold."
         )
     return hold
 
@@ -178,8 +179,8 @@ def method_of(
     method = default_method(arm, at_once) if method is None else method
     if method == "two-stage" and at_once:
         raise InputError(
-            "method='two-stage' is for sockets with reference lengths, without a robust loss, without a prior and "
-            "without covariances of batches; use method='joint'."
+            "method='two-stage' applies only to sockets with reference lengths, and cannot be combined with a robust "
+            "loss, a prior or the covariances of a batch; use method='joint'."
         )
     if not by_slides and not fixes_scale(capture):
         raise InputError(

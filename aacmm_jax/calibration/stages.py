@@ -134,7 +134,7 @@ def measured_scale(solution: Solution, capture: Capture) -> MeasuredScale:
     """
     linear, influence, p = solution.linear, solution.influence, len(solution.linear.space.names)
     geometry = linear.z[p:]
-    xp, ends = namespace(linear.z), ends_between(linear.observed, geometry, influence.own, capture)
+    xp, ends = namespace(linear.z), ends_between(linear.observed, geometry, influence.d_inverses, capture)
     scale, relative = scale_and_weights(ends)
     _, pull = linear.observed.distances(geometry, ends_of(capture))
     rows = rows_of_functions(influence, *linear.observed.by_unknowns((relative @ pull)[None], p))

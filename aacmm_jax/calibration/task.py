@@ -181,7 +181,7 @@ def checked_noise_model(noise_model: NoiseModel | None, noise: Noise | None, joi
     if noise_model == "given" and noise is None:
         raise InputError("noise_model='given' needs the noise; give noise=aj.Noise(encoder_arcsec=..., seating=...).")
     if noise_model == "estimated" and noise is not None:
-        raise InputError("the noise is given, so it is not estimated; omit noise, or choose another noise_model.")
+        raise InputError("noise_model='estimated' cannot be combined with a given noise; omit one of the two.")
     return noise_model
 
 
@@ -220,7 +220,7 @@ def check_enough(sizes: tuple[int, ...], unknowns: int) -> None:
         needed = -(-unknowns // 3) + sockets
         raise InputError(
             f"{poses} poses in {sockets} socket{'s' if sockets > 1 else ''} give {equations} equations, but {unknowns} "
-            f"unknowns need at least {needed} poses; record more poses or hold more parameters."
+            f"unknowns need at least {needed} poses; record more poses or fix more parameters."
         )
 
 

@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 import typer
 
-from .. import acceptance as acceptance_tests
-from .. import data, files, kinematics, summaries
+from .. import data, files, pipeline, summaries
 from ..core.errors import InputError
 from ..core.text import quoted
 from ..core.units import DEG
@@ -17,8 +16,6 @@ from .app import command, show_summary, with_spinner
 from .arm_command import checked_recording, reading_check
 from .options import argument, bad_option, flag, length_option, numbers_option, option, output, seed, sockets_option
 
-_U_ARTEFACT = 0.001  # mm
-_POSES = 70  # in each socket
 _DIGITS = 9
 
 
@@ -50,7 +47,7 @@ def simulate(
         "Simulate a socket at this position (mm); may be given several times.", "NAME=X,Y,Z"
     ),
     poses: list[str] | None = option(
-        f"Number of poses in each socket, or in the named socket; may be given several times. Default: {_POSES}.",
+        "Number of poses in each socket, or in the named socket; may be given several times. Default: 70.",
         "[NAME=]N",
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
@@ -87,60 +84,40 @@ def simulate(
     as_json: bool = options.JSON,
 ) -> None:
     """Make a capture with a simulated arm."""
+    from ..pipeline.capture_simulation import simulate_capture
+
     with together(output):
-        nominal = files.load_specification(arm, base=base, tip=tip)
-        true = nominal
+        nominal, true = files.load_specification(arm, base=base, tip=tip), None
         if true_arm:
             true_base, true_tip = (base, tip) if true_arm.lower().endswith(".urdf") else (None, None)
             true = files.load_specification(true_arm, base=true_base, tip=true_tip)
-        if true.arm.joints != nominal.arm.joints:
-            raise InputError(
-                f"the true arm {true_arm} has {true.arm.joints} joints, but {arm} has {nominal.arm.joints} joints; "
-                "choose a true arm with as many joints."
-            )
-        if deviate_length_mm or deviate_angle_deg:
-            deviation = {"length": deviate_length_mm, "angle": deviate_angle_deg * DEG}
-            drawn = kinematics.perturbed_arm(true.space(), **deviation, seed=seed)
-            true = true._replace(arm=drawn, name=f"{true.name}, deviated")
-        noise = data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
-        if acceptance is not None:
-            if socket or poses or length or resolution_arcsec or linear_resolution_mm or temperature_c:
-                raise InputError(
-                    "--acceptance sets the sockets, poses and lengths itself, at 20 C; leave out --socket, --poses, "
-                    "--length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
-                )
-            u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
-            recording = with_spinner("Simulating", lambda: acceptance_tests.simulate_procedure(
-                acceptance_tests.plan_procedure(nominal.arm, acceptance), nominal, true, noise=noise, **u, seed=seed
-            ))  # fmt: skip
-        else:
-            points, form = sockets_option(socket), "T or LOWEST,HIGHEST, in C"
-            warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)
-            if not points:
-                raise InputError("no socket is given; give --socket NAME=X,Y,Z, or --acceptance.")
-            capture = with_spinner("Simulating", lambda: data.simulate(
-                true.arm,
-                points,
-                poses=_poses_option(poses or (), points),
-                lengths=[length_option(text) for text in length or ()],
-                noise=noise,
-                resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
-                temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
-                seed=seed,
-            ))  # fmt: skip
-            if temperature_c is not None:
-                nominal = files.load_specification(arm, base=base, tip=tip, capture=capture)
-            recording = data.Recording(capture, nominal, true, seed)
-        recording = recording._replace(usual=files.usual_noise(arm, base=base, tip=tip))
+        points, form = sockets_option(socket), "T or LOWEST,HIGHEST, in C"
+        warmth = None if temperature_c is None else numbers_option("--temperature-c", temperature_c, form)
+        chosen = pipeline.SimulationOptions(
+            true=true,
+            deviate_length=deviate_length_mm,
+            deviate_angle=deviate_angle_deg * DEG,
+            lengths=[length_option(text) for text in length or ()],
+            noise=data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm),
+            resolution_arcsec=(resolution_arcsec, linear_resolution_mm),
+            temperature=None if warmth is None else warmth[0] if len(warmth) == 1 else list(warmth),
+            acceptance=acceptance,
+            seed=seed,
+        )
+        chosen = chosen._replace(poses=_poses_option(poses, points, chosen.poses)) if poses else chosen
+        recording = with_spinner("Simulating", lambda: simulate_capture(nominal, points, **chosen._asdict()))
+        if temperature_c is not None:
+            nominal = files.load_specification(arm, base=base, tip=tip, capture=recording.capture)
+        recording = recording._replace(nominal=nominal, usual=files.usual_noise(arm, base=base, tip=tip))
         summary = summaries.calibration.capture_summary(recording)
         files.save_capture(output, recording, summary)
     show_summary(summary | {"written": str(output)}, as_json, views.capture)
 
 
-def _poses_option(texts: Sequence[str], sockets: dict[str, Any]) -> dict[str, int]:
-    """Poses by socket, from ``N`` and ``NAME=N``."""
-    counts = dict.fromkeys(sockets, _POSES)
-    for text in texts:
+def _poses_option(texts: Sequence[str], sockets: dict[str, Any], usual: Any) -> dict[str, Any]:
+    """Poses by socket, from ``N`` and ``NAME=N``; ``usual`` where none are given. Without sockets, none."""
+    counts: dict[str, Any] = dict.fromkeys(sockets, usual)
+    for text in texts if sockets else ():
         name, equals, count = text.rpartition("=")
         if not (count.isascii() and count.isdecimal() and len(count) < _DIGITS):
             bad_option("--poses", quoted(text)[1:-1], "N, or NAME=N for one socket")

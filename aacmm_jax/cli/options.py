@@ -35,9 +35,9 @@ def output(help: str, metavar: str, default: Any = ...) -> Any:
     return option(help + kept, metavar, "--output", "-o", default=default)
 
 
-def seed(of: str) -> Any:
+def seed(subject: str) -> Any:
     """The option --seed."""
-    return option(f"Seed of {of}.", "N", default=0, min=0, max=LARGEST_INTEGER)
+    return option(f"Seed of {subject}.", "N", default=0, min=0, max=LARGEST_INTEGER)
 
 
 JSON = flag("--json", "Print one JSON object on standard output, and nothing else.")

@@ -7,9 +7,8 @@ from typing import Any, Literal
 import typer
 
 from .. import acceptance as acceptance_tests
-from .. import files, summaries
+from .. import files, pipeline, summaries
 from ..core.errors import InputError
-from ..core.text import shorten
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
@@ -83,41 +82,29 @@ def evaluate(
     of points is tested without a calibration.
     """
     from ..acceptance.judgement import limit_of_text, read_expansions, read_limits
+    from ..pipeline.capture_evaluation import evaluate_points
 
     u_test, bodies = limit_of_text(test_u_mm, f"--test-u-mm {test_u_mm}"), read_expansions(expansion or [])
-    of_test = {
-        "limits": read_limits(mpe or [], acceptance_tests.METRICS),
-        "u_test": u_test.fixed,
-        "influences": acceptance_tests.Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
-        "rule": rule,
-    }
     maxima = {"rms_mm": max_rms_mm, "deltam_mm": max_deltam_mm, "length_error_largest_mm": max_length_error_mm}
-    maxima = {name: value for name, value in maxima.items() if value is not None}
-    if capture is None and (maxima or only or without):
-        raise InputError(
-            "--max-..., --only and --without do not apply to a manifest of points; name a calibration and a capture, "
-            "or leave these options out."
-        )
+    chosen = pipeline.EvaluationOptions(
+        only=only or None,
+        without=without or (),
+        limits=read_limits(mpe or [], acceptance_tests.METRICS),
+        u_test=u_test.fixed,
+        influences=acceptance_tests.Influences(0.0, 1 / u_test.divisor, bodies.get("artefact"), bodies.get("arm")),
+        rule=rule,
+        standards=acceptance,
+        measuring_range=range_mm,
+        maxima={name: value for name, value in maxima.items() if value is not None},
+    )
     with together(output):
         if capture is None:
-            record, summarise = _points(calibration, acceptance, range_mm, of_test), summaries.evaluation.points_summary
+            record = evaluate_points(_points(calibration), **chosen._asdict())
+            summarise = summaries.evaluation.points_summary
         else:
-            paths, choice = (InputFile(calibration), InputFile(capture)), (only or None, without or ())
-            of_test |= {"maxima": maxima, "standards": acceptance}
-            record, summarise = _evaluation(paths, choice, range_mm, of_test), summaries.evaluation.evaluation_summary
+            record = _evaluation(InputFile(calibration), InputFile(capture), chosen)
+            summarise = summaries.evaluation.evaluation_summary
         summary = with_spinner("Evaluating", lambda: summarise(record))
-        given = {
-            "--rule": rule is not None,
-            "--test-u-mm": u_test.fixed > 0 or 1 / u_test.divisor > 0,
-            "--expansion": bool(expansion),
-            "--range-mm": range_mm is not None,
-        }
-        if capture is not None and not summary["acceptance"] and any(given.values()):
-            raise InputError(
-                f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only, but "
-                "this capture supports none, or none was requested; request one with --acceptance, or leave the "
-                "option out."
-            )
         if output is not None:
             files.save_evaluation(output, record, summary)
             summary["written"] = str(output)
@@ -126,34 +113,24 @@ def evaluate(
         raise typer.Exit(1)
 
 
-def _evaluation(paths: tuple[InputFile, InputFile], choice: tuple, stated_range: float | None, of_test: dict) -> Any:
-    """The record of a calibration evaluated on a part of a capture."""
-    from ..diagnostics.findings import findings_of, sentences
+def _evaluation(calibration: InputFile, capture: InputFile, chosen: Any) -> Any:
+    """The record of a calibration evaluated on a capture, whose warnings the calibration's file may have."""
+    from ..pipeline.capture_evaluation import evaluate_capture
 
-    record, recording = files.load_calibration(paths[0]), files.load_capture(paths[1])
-    recording = recording._replace(
-        capture=recording.capture.select(*choice),
-        sources=(*map(fingerprint, paths), *recording.sources),
-        measuring_range=stated_range or recording.measuring_range,
-    )
-    stored = read_summary(paths[0], ("calibration",))[1]
-    warnings = sentences(findings_of(record)) if stored is None else stored["warnings"]
-    evaluation = acceptance_tests.evaluation_of(record, recording, **of_test)
-    return evaluation._replace(calibration_warnings=tuple(warnings))
+    record, recording = files.load_calibration(calibration), files.load_capture(capture)
+    sources = (fingerprint(calibration), fingerprint(capture), *recording.sources)
+    stored = read_summary(calibration, ("calibration",))[1]
+    chosen = chosen._replace(calibration_warnings=None if stored is None else stored["warnings"])
+    return evaluate_capture(record, recording._replace(sources=sources), **chosen._asdict())
 
 
-def _points(manifest: Path, standards: list[str] | None, stated_range: float | None, of_test: dict) -> Any:
-    """The record of a manifest of points, with the acceptance tests that they allow."""
-    from ..acceptance.standards import STANDARDS, checked_standards
-
+def _points(manifest: Path) -> Any:
+    """The points of a manifest."""
     if manifest.suffix != ".toml":
         raise InputError(
             f"{manifest} alone cannot be evaluated; name a capture as well, or a manifest of points (TOML)."
         )
-    chosen = checked_standards(STANDARDS if standards is None else standards)
-    measured = files.read_points(manifest)
-    measured = measured._replace(measuring_range=stated_range or measured.measuring_range)
-    return acceptance_tests.PointsRecord(measured, standards=chosen, **of_test)
+    return files.read_points(manifest)
 
 
 @command("aacmm report calibration.h5 -o report.html")

@@ -55,7 +55,7 @@ class IdentifiabilityWarning(UserWarning):
         >>> print(caught[0].category.__name__)
         IdentifiabilityWarning
         >>> print(str(caught[0].message).partition(";")[0])
-        No measurement of this kind can separate: d_1 (changes nothing that is measured)
+        Not determined by any measurement of this kind: d_1 (has no effect on the measurements)
     """
 
 

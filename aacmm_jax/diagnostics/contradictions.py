@@ -114,9 +114,9 @@ def _finding(contradiction: Contradiction) -> Finding:
     return Finding(
         "contradiction",
         f"{says}: {changes}.{seems}",
-        advice="Calibrate with a probe for each session (without --same-probe)."
+        advice="Calibrate with a separate probe for each session (omit --same-probe)."
         if remounted
-        else f"Check the readings, and leave the wrong ones out of the calibration ({options}).",
+        else f"Check the readings, and leave what is wrong out of the calibration ({options}).",
         probability=max(suspect.test.probability for suspect in suspects),
         concerns=tuple(name for suspect in suspects for name in suspect.members),
     )
@@ -181,8 +181,9 @@ def _contradictions(case: Case) -> list[Contradiction]:
             # Kinds with the same group differ by rounding.
             if tests and (not best or tests[0][0].ratio > (1 + 1e-9) * best[0][0].ratio):
                 best, kind, labels = tests, candidate, groups
-    found = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in best]
-    return [] if not found or found[0].suspects[0].rms_others[0] < EXACT else found
+    contradictions = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in best]
+    negligible = contradictions and contradictions[0].suspects[0].rms_others[0] < EXACT
+    return [] if negligible else contradictions
 
 
 def _different(
@@ -201,16 +202,16 @@ def _different(
 
 def _suspect(equations: Equations, labels: Mapping[str, str | None], test: GroupTest) -> Suspect:
     members = tuple(name for name, label in labels.items() if label == test.group)
-    own = [rows for rows in equations.rows if rows.name in members]
+    group = [rows for rows in equations.rows if rows.name in members]
     others = [rows for rows in equations.rows if rows.name not in members]
     # Geometry that only this group has is open in the least squares of the others, and follows its poses.
     loose = ~np.any([np.any(rows.shared, axis=(0, 1)) for rows in others], axis=0)
     step, following = np.where(loose, 0.0, test.step), []
-    for block in (rows.block("") for rows in own):
+    for block in (rows.block("") for rows in group):
         residual = block.residual + block.shared @ step
         following.append(block._replace(residual=residual, shared=block.shared[:, loose]))
     step[loose] = fit_of(following).step
-    rms, rms_others = ((rms_of(rows, 0 * step), rms_of(rows, step)) for rows in (own, others))
+    rms, rms_others = ((rms_of(rows, 0 * step), rms_of(rows, step)) for rows in (group, others))
     return Suspect(str(test.group), members, test, rms, rms_others, _cause(equations, members))
 
 
@@ -261,11 +262,11 @@ def session_metrics(record: CalibrationRecord) -> dict[str, tuple[int, float, fl
         return {}
     equations, metrics = case_of(record).equations, {}
     for session in capture.sessions:
-        own = [rows for rows in equations.rows if capture.session_of(rows.name) == session]
-        if own:
-            alone = fit_of([*(rows.block("") for rows in own), *equations.relations]).step
-            poses = sum(len(rows.residual) for rows in own)
-            metrics[session] = poses, rms_of(own, np.zeros_like(alone)), rms_of(own, alone)
+        of_session = [rows for rows in equations.rows if capture.session_of(rows.name) == session]
+        if of_session:
+            alone = fit_of([*(rows.block("") for rows in of_session), *equations.relations]).step
+            poses = sum(len(rows.residual) for rows in of_session)
+            metrics[session] = poses, rms_of(of_session, np.zeros_like(alone)), rms_of(of_session, alone)
     return metrics
 
 

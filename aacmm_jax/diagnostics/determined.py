@@ -25,8 +25,8 @@ _ON_BOUNDS = {
     ),
     "on-bounds": (
         "On a bound: {names}.",
-        "Every uncertainty, including that of k, takes these values as exact.",
-        "Widen the bounds unless they are known limits.",
+        "All uncertainties, including that of k, are computed as if these values were exact.",
+        "Widen the bounds, unless they are true limits of these parameters.",
     ),
 }
 
@@ -38,9 +38,9 @@ def determined(case: Case) -> Observability:
     space = Parameters(arm, record.names)
     geometry, noise = to_numpy((arm.geometry, record.noise))
     sigma = rms_of_noise(geometry, np.asarray(capture.readings), noise)
-    known = () if record.prior is None else record.prior.known
+    with_prior = () if record.prior is None else record.prior.with_prior
     bounds = Bounds(space, record.lower, record.upper)
-    return observability(arm, capture, space, sigma=sigma, bounds=bounds, known=known)
+    return observability(arm, capture, space, sigma=sigma, bounds=bounds, with_prior=with_prior)
 
 
 def test(case: Case) -> list[Finding]:
@@ -68,8 +68,8 @@ def test(case: Case) -> list[Finding]:
         findings.append(
             Finding(
                 "hardly-determined",
-                "Hardly determined individually, because these parameters are strongly correlated or have a "
-                f"standard uncertainty above half of the half-width of their bounds: {shorten(names, 12)}.",
+                f"Hardly determined individually: {shorten(names, 12)}. These parameters are strongly correlated, or "
+                "their standard uncertainty exceeds a quarter of the distance between their bounds.",
                 "Tip and length uncertainties remain valid.",
                 "Fix some of these parameters (--held), or record poses that separate them.",
                 concerns=tuple(names),
@@ -86,7 +86,8 @@ def _redundancy(record: CalibrationRecord) -> Iterator[Finding]:
     if redundancy < unknown / 2:
         yield Finding(
             "little-redundancy",
-            f"Only {redundancy} more equations than unknowns, so the residuals are small even if the errors are large.",
+            f"There are only {redundancy} more equations than unknowns, so the residuals are small even if the errors "
+            "are large.",
             advice="Record more poses.",
         )
     if len(capture.lengths) == 1 and record.method != REPEATABILITY and not record.scale_set_by:

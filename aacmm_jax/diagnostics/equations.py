@@ -58,7 +58,7 @@ class Block(NamedTuple):
     group: Hashable | None
     residual: Float[np.ndarray, " r"]
     shared: Float[np.ndarray, "r p"]  # by the parameters, and by what several fixtures share
-    own: Float[np.ndarray, "r k"]  # by what only this fixture has, such as the position of a socket
+    private: Float[np.ndarray, "r k"]  # by what only this fixture has, such as the position of a socket
 
 
 class Fit(NamedTuple):
@@ -80,10 +80,10 @@ class _Gram(NamedTuple):
     def of(cls, blocks: Iterable[Block]) -> "_Gram":
         matrix, rows = np.zeros((0, 0)), 0
         for block in blocks:
-            columns = np.concatenate([block.shared, block.residual[:, None], block.own], axis=1)
+            columns = np.concatenate([block.shared, block.residual[:, None], block.private], axis=1)
             whole, size, rank = columns.T @ columns, block.shared.shape[1] + 1, 0
             part = whole[:size, :size]
-            if block.own.shape[1]:
+            if block.private.shape[1]:
                 inverse, rank = _inverse(whole[size:, size:], np.diag(whole)[size:])
                 part = part - whole[:size, size:] @ inverse @ whole[size:, :size]
             matrix, rows = (part + matrix if rows else part), rows + len(columns) - rank
@@ -167,13 +167,13 @@ def different_groups(blocks: Sequence[Block]) -> list[GroupTest]:
     """
     whole, tests = fit_of(blocks), []
     for group in _groups(blocks):
-        own = fit_of([block for block in blocks if block.group in (group, None)])
+        alone = fit_of([block for block in blocks if block.group in (group, None)])
         others = fit_of([block for block in blocks if block.group != group])
-        freedom = own.degrees_of_freedom + others.degrees_of_freedom
+        freedom = alone.degrees_of_freedom + others.degrees_of_freedom
         again = sum(block.residual.size for block in blocks if block.group is None)
         added = whole.degrees_of_freedom + again - freedom
-        if added > 0 and min(own.degrees_of_freedom, others.degrees_of_freedom) > 0:
-            apart = own.cost + others.cost
+        if added > 0 and min(alone.degrees_of_freedom, others.degrees_of_freedom) > 0:
+            apart = alone.cost + others.cost
             tests.append(GroupTest.of(group, added, whole.cost - apart, apart, freedom, others.step))
     return sorted(tests, key=lambda test: -test.ratio)
 
@@ -192,7 +192,7 @@ class Rows(NamedTuple):
     name: str
     residual: Float[np.ndarray, "m r"]
     shared: Float[np.ndarray, "m r s"]  # derivatives by the parameters, and by the geometry of several observations
-    own: Float[np.ndarray, "m r k"]  # by the geometry of this observation alone
+    private: Float[np.ndarray, "m r k"]  # by the geometry of this observation alone
     extra: Float[np.ndarray, "m r e"]  # by what may be wrong in some of the poses: `Equations.extra`
     in_mm: Float[np.ndarray, "m 3 r"]  # the residual's position in mm
     by_tip: Float[np.ndarray, "m r 3"]  # derivatives by the tip's position
@@ -201,7 +201,7 @@ class Rows(NamedTuple):
     def block(self, group: str | None, extra: Sequence[int] = (), concerned: bool = True) -> Block:
         """For the test; with columns of ``extra`` after the shared ones, which are 0 where it is not concerned."""
         shared = np.concatenate([self.shared, self.extra[..., list(extra)] * concerned], axis=2)
-        flat = (array.reshape(self.residual.size, array.shape[2]) for array in (shared, self.own))
+        flat = (array.reshape(self.residual.size, array.shape[2]) for array in (shared, self.private))
         return Block(self.name, group, self.residual.ravel(), *flat)
 
     def at(self, poses: "slice | np.ndarray") -> "Rows":
@@ -211,8 +211,8 @@ class Rows(NamedTuple):
     def squares(self, step: Float[np.ndarray, " s"]) -> Float[np.ndarray, " m"]:
         """Squared distance of each pose from the geometry, mm^2, after a step; its own geometry follows."""
         moved = self.residual + self.shared @ step
-        own = self.own.reshape(self.residual.size, self.own.shape[2])
-        moved = moved - self.own @ (np.linalg.pinv(own) @ moved.ravel())
+        private = self.private.reshape(self.residual.size, self.private.shape[2])
+        moved = moved - self.private @ (np.linalg.pinv(private) @ moved.ravel())
         return np.sum(np.einsum("mcr,mr->mc", self.in_mm, moved) ** 2, axis=1)
 
 
@@ -257,7 +257,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
         weight = np.sqrt(np.asarray(part.weight))
         root = weight[:, None, None] * np.asarray(part.root)
         by = np.moveaxis(np.asarray(part.by_head) * weight, (0, 1, 2), (2, 1, 0)) * steps[: linear.height]
-        own = np.moveaxis(np.asarray(part.by_private) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + part.private]
+        by_private = np.moveaxis(np.asarray(part.by_private) * weight, (0, 1, 2), (2, 1, 0)) * steps[p + part.private]
         among = np.isin(part.private, common)
         # A socket with one pose shows no scatter; only lengths in the solve need it.
         if not in_solve and len(weight) == 1 and np.sum(~among) == 3:
@@ -265,13 +265,13 @@ def equations_of(record: CalibrationRecord) -> Equations:
         shared = np.zeros((*by.shape[:2], free + len(common)))
         shared[..., :free] = by[..., :free]
         shared[..., free : free + observed.layout.shared] = by[..., p:]
-        shared[..., free + np.searchsorted(common, part.private[among])] = own[..., among]
+        shared[..., free + np.searchsorted(common, part.private[among])] = by_private[..., among]
         rows.append(
             Rows(
                 part.observation.name,
                 (np.asarray(part.white) * weight).T,
                 shared,
-                own[..., ~among],
+                by_private[..., ~among],
                 by[..., columns],
                 np.linalg.pinv(root)[:, :3],
                 root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
@@ -297,17 +297,17 @@ def in_chunks(equations: Equations) -> tuple[list[Rows], list[Block]]:
 
     Unknowns of an observation that is divided become shared ones.
     """
-    added = sum(rows.own.shape[2] for rows in equations.rows if len(rows.poses) > _CHUNK)
+    added = sum(rows.private.shape[2] for rows in equations.rows if len(rows.poses) > _CHUNK)
     chunks, position = [], 0
     for rows in equations.rows:
         shared = np.pad(rows.shared, ((0, 0), (0, 0), (0, added)))
         if len(rows.poses) <= _CHUNK:
             chunks.append(rows._replace(shared=shared))
             continue
-        width = rows.own.shape[2]
-        shared[..., rows.shared.shape[2] + position :][..., :width] = rows.own
+        width = rows.private.shape[2]
+        shared[..., rows.shared.shape[2] + position :][..., :width] = rows.private
         position += width
-        whole = rows._replace(shared=shared, own=rows.own[..., :0])
+        whole = rows._replace(shared=shared, private=rows.private[..., :0])
         chunks += [whole.at(slice(start, start + _CHUNK)) for start in range(0, len(rows.poses), _CHUNK)]
     step = -(-sum(len(rows.poses) for rows in chunks) // _MOST_POSES)
     return chunks[:: max(step, 1)], wider(equations.relations, added)

@@ -188,8 +188,8 @@ def findings_of(
     plausible = {"nothing"}
     if case.record.plausible_scale:
         plausible |= {"scale"} | ({"fit"} if not case.record.implausible_residual else set())
-    found = [finding for module in diagnostics() if module.NEEDS in plausible for finding in case.once(module.test)]
-    return sorted(found, key=lambda finding: _SEVERITIES.index(finding.severity))
+    findings = [finding for module in diagnostics() if module.NEEDS in plausible for finding in case.once(module.test)]
+    return sorted(findings, key=lambda finding: _SEVERITIES.index(finding.severity))
 
 
 def warnings_of(

@@ -28,10 +28,10 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
         poses, lengths = group.probabilities
         if not lengths < poses:
             ratio = group.rms / group.rms_predicted
-            texts.append(f"{label} ({group.rms:.3g} mm RMS, {ratio:.1f} times its prediction)")
+            texts.append(f"{label} ({group.rms:.3g} mm RMS, {ratio:.1f} times the predicted value)")
         else:
             error = float(np.sqrt(np.mean(np.square(group.length_error))))
-            texts.append(f"{label} (lengths off by {error:.3g} mm, {group.length_ratio:.1f} times their u)")
+            texts.append(f"{label} (length error {error:.3g} mm RMS, {group.length_ratio:.1f} times its u)")
     named, doubt = shorten(texts, 3), "held-out data disagree by more than predicted"
     concerns = tuple(validation.labels[i] for i in validation.disagreeing)
     if 0 < count < len(validation.groups) / 2:
@@ -58,8 +58,8 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
         f"When each placement is held out in turn, the errors are larger than predicted: {'; '.join(ratios)}"
         + (f"; worst in {named}" if named else "")
         + (
-            ". Neighbouring poses have similar errors; effects outside the D-H model (compliant joints, eccentric "
-            "encoders) cause such errors."
+            ". Typical causes are effects outside the D-H model (compliant joints, eccentric encoders), whose errors "
+            "are similar in neighbouring poses."
         ),
         "Every stated uncertainty is too small.",
         "Use the cross-validated values.",
@@ -98,10 +98,10 @@ def surprise(
         return []
     finding = Finding(
         "unseen-data",
-        f"Data that the calibration has not seen disagree with it by more than chance explains: {'; '.join(texts)}.",
+        f"Data not used in the calibration disagree with it by more than chance explains: {'; '.join(texts)}.",
         "Either the arm or its probe has changed since the calibration (a remounted tip, for example), or these "
-        "data have errors that the data of the calibration did not have, or the model lacks effects that the poses "
-        "of the calibration did not show. The uncertainties of the calibration do not apply to these data.",
+        "data contain errors that the data of the calibration did not contain, or the model lacks effects that the "
+        "poses of the calibration did not show. The uncertainties of the calibration do not apply to these data.",
         severity="doubt",
         probability=min(probabilities),
         concerns=tuple(worst),
@@ -110,10 +110,10 @@ def surprise(
     # Most of the excess: more than half of it, in squares.
     if again is not None and poses.rms**2 - again.rms**2 > (poses.rms**2 - poses.predicted**2) / 2:
         says = (
-            " If the position of the probe in the last frame is fitted to these data, the poses are "
+            " If the position of the probe in the last frame is fitted to these data, the poses are only "
             f"{again.rms:.3g} mm RMS from their geometry: the tip was remounted or exchanged."
         )
-        advice = "Calibrate such data as a separate session with its own probe (aacmm calibrate A.h5 B.h5)."
+        advice = "Calibrate these data as a separate session with its own probe (aacmm calibrate A.h5 B.h5)."
         return [finding._replace(code="unseen-probe", says=finding.says + says, costs="", advice=advice)]
     return [finding]
 
@@ -123,7 +123,7 @@ def no_better(nominal: float | None, calibrated: float | None) -> list[Finding]:
     if nominal is None or calibrated is None or calibrated < nominal:
         return []
     says = (
-        "On data that the calibration has not seen, the calibrated arm is no better than the nominal arm: "
+        "On data not used in the calibration, the calibrated arm is no better than the nominal arm: "
         f"{calibrated:.3g} mm RMS instead of {nominal:.3g} mm."
     )
     return [Finding("no-better-than-nominal", says, severity="doubt")]

@@ -87,11 +87,11 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
         if added:
             remedy += f"with --held {','.join(name for name in parameter_names(space.base) if name in held)}"
         else:
-            remedy += "without changes: these data determine all parameters that are free by default"
+            remedy += "with the default free parameters, which these data determine"
     rows = []
     for (joint, travel, poses), names in zip(still, lost_by_standing(arm, capture, joints), strict=True):
         unit, size = ("mm", travel) if joint in arm.prismatic else ("deg", travel / DEG)
-        says = f"Joint {joint} stands still ({size:.2g} {unit} over {pluralise(poses, 'pose')})"
+        says = f"Joint {joint} hardly moves ({size:.2g} {unit} over {pluralise(poses, 'pose')})"
         if names:
             says += f": {listed(names)} cannot be identified; {remedy}."
         else:

@@ -33,8 +33,8 @@ _AS_WELL = 6.0  # difference of the information criterion (Akaike 1974) below wh
 _SECOND_ORDER = 3e-3
 # Terms that no kind of joint correction has: what residuals follow, of joint {i}, and what causes that.
 _OTHERS: dict[str, tuple[str, str]] = {
-    "zero": ("the zero of joint {i}, which is fixed", "a wrong zero"),
-    "drifting zero": ("a drift of joint {i} from pose to pose", "a zero that drifts"),
+    "zero": ("a zero offset of joint {i}, which is fixed", "a wrong zero offset"),
+    "drifting zero": ("a drift of joint {i} from pose to pose", "a zero offset that drifts"),
     "drifting base": ("a drift of the tip from pose to pose", "a base or socket that moves"),
     "growing arm": ("a growth of the arm from pose to pose", "an arm that warms or cools"),
 }

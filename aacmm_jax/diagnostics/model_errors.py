@@ -68,7 +68,7 @@ def test(case: Case) -> list[Finding]:
                 f"Residuals of successive poses are autocorrelated (correlation {successive.correlation:.2f}, "
                 f"{chance_text(successive.probability)}): either the seat shifts at each visit, or there are errors "
                 "that the model does not describe.",
-                "The stated uncertainties include the errors that successive poses share, as estimated from the "
+                "The stated uncertainties include the shared errors of successive poses, as estimated from the "
                 "residuals."
                 if shared & {VISITS, SUCCESSIVE}
                 else (
@@ -85,7 +85,7 @@ def test(case: Case) -> list[Finding]:
             Finding(
                 "noisy-observations",
                 f"Residuals are larger than the uncertainties and the scatter of the tips predict: {shorten(texts)}.",
-                advice="Check these observations and their u.",
+                advice="Check these observations and their stated standard uncertainties.",
                 severity="doubt",
                 probability=max(part.probability for part in noisy),
                 concerns=tuple(part.name for part in noisy),
@@ -100,16 +100,17 @@ def _misfit(misfit: Misfit) -> Finding:
         return Finding(
             "residuals-unusual",
             f"Residuals are {misfit.ratio:.2g} times as large as is usual for such an arm ({misfit.usual}; "
-            f"{chance}): either there are errors that the model does not describe, or the encoders are worse.",
+            f"{chance}): either there are errors that the model does not describe, or the encoders are worse than "
+            "usual.",
             severity="doubt",
             probability=misfit.probability,
         )
     return Finding(
         "residuals-not-as-given",
         f"Residuals are {misfit.ratio:.3g} times as large as the given noise predicts ({chance}).",
-        "Every uncertainty follows from the given noise. Either every uncertainty is about "
-        f"{max(misfit.ratio, 1 / misfit.ratio):.3g} times too {'small' if small else 'large'}, or the model lacks "
-        "something.",
+        "All uncertainties are computed from the given noise. Either all uncertainties are about "
+        f"{max(misfit.ratio, 1 / misfit.ratio):.3g} times too {'small' if small else 'large'}, or the model lacks an "
+        "effect.",
         "Check the given noise, or omit it; the noise is then estimated.",
         severity="doubt" if small else "note",  # noise given too large makes every uncertainty too large
         probability=misfit.probability,
@@ -169,8 +170,8 @@ def successive_of(case: Case) -> Successive | None:
         with_terms, relations = case.once(explained)
         left = Residuals.of([*(part.block("") for part in with_terms), *relations])
     product = total = 0.0
-    for part, own in zip(rows, left.slices, strict=False):
-        tips = np.einsum("mrc,mr->mc", part.by_tip, left.values[own].reshape(part.residual.shape))
+    for part, selected in zip(rows, left.slices, strict=False):
+        tips = np.einsum("mrc,mr->mc", part.by_tip, left.values[selected].reshape(part.residual.shape))
         product += float(np.sum(tips[1:] * tips[:-1]))
         total += float(np.sum(tips[1:] ** 2) + np.sum(tips[:-1] ** 2)) / 2
     return Successive(product / total if total else 0.0, form_test(left, kernels, relative=True).probability)

@@ -125,8 +125,8 @@ class _Equations(NamedTuple):
     def poses(self, left: Residuals) -> list[tuple[Rows, Float[np.ndarray, "m r"], Float[np.ndarray, "m r r"]]]:
         """The rows of each part, their residuals, and the blocks of M that belong to single poses."""
         parts = []
-        for rows, part, own in zip(self.rows, left.slices, left.own, strict=False):
-            explained = np.concatenate([own, left.basis[part]], axis=1).reshape(*rows.residual.shape, -1)
+        for rows, part, private in zip(self.rows, left.slices, left.private, strict=False):
+            explained = np.concatenate([private, left.basis[part]], axis=1).reshape(*rows.residual.shape, -1)
             block = np.eye(explained.shape[1]) - explained @ explained.swapaxes(1, 2)
             parts.append((rows, left.values[part].reshape(rows.residual.shape), block))
         return parts
@@ -160,7 +160,7 @@ class _Equations(NamedTuple):
             covariance += (1 + 1e-9) * np.eye(z.shape[1])
             factor = np.linalg.cholesky(0.5 * (covariance + covariance.swapaxes(1, 2)))
             root = np.linalg.inv(factor)
-            whitened = {name: root @ getattr(rows, name) for name in ("shared", "own", "extra", "by_tip")}
+            whitened = {name: root @ getattr(rows, name) for name in ("shared", "private", "extra", "by_tip")}
             residual = np.einsum("mab,mb->ma", root, rows.residual)
             weighted.append(rows._replace(residual=residual, in_mm=rows.in_mm @ factor, **whitened))
         return self._replace(rows=weighted, variances=new)
@@ -256,7 +256,7 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     # A zero that is off in some observations, as after a slip, moves all of their poses alike: these contradict the
     # others, and that is what has to be said. So the joint must be noisy where its zero may differ between them.
     j = noisiest.joint - 1
-    loose = [part._replace(own=np.concatenate([part.own, part.extra[..., [j]]], axis=2)) for part in now.rows]
+    loose = [part._replace(private=np.concatenate([part.private, part.extra[..., [j]]], axis=2)) for part in now.rows]
     within = now._replace(rows=loose).noisiest([j])
     if within is None or within.probability >= LEVEL:
         return None

@@ -35,7 +35,7 @@ def test(case: Case) -> list[Finding]:
     finding = Finding(
         "outlying-poses",
         f"Poses far from the centroid of their socket (typical distance: {typical:.2g} mm): {shorten(texts)}.",
-        advice="Was the tip seated?",
+        advice="Check whether the tip was seated in these poses.",
         concerns=tuple(poses),
     )
     return [finding] if poses else []

@@ -20,7 +20,7 @@ from ..kinematics.chain import Geometry, JointKinds, tip_pose
 _MOST = 6_000_000  # hypotheses of one family: about a second
 _BLOCK = 50_000  # hypotheses of one array, so that it stays in the processor's cache
 _KEPT = 3000
-_POSES, _EACH = 36, 9  # of the search: in all, and in one socket
+_POSES, _PER_SOCKET = 36, 9  # of the search: in all, and in one socket
 _EIGHTH = math.pi / 4  # of zeros: Gauss and Newton find the right one from an eighth of a revolution away
 
 
@@ -48,11 +48,11 @@ class Evidence(NamedTuple):
         """With readings and positions in other units, of which these are the factors."""
         return self._replace(q=angle * self.q, points=None if self.points is None else length * self.points)
 
-    def thinned(self, most: int = _POSES, each: int = _EACH) -> "Evidence":
+    def thinned(self, most: int = _POSES, per_socket: int = _PER_SOCKET) -> "Evidence":
         """At most about so many poses, in sockets at most so many each, evenly from beginning to end."""
         if self.points is not None:
             return self.at(_evenly(np.arange(len(self.q)), most))
-        rows = [_evenly(np.flatnonzero(self.owner == i), each) for i in range(self.owner.max() + 1)]
+        rows = [_evenly(np.flatnonzero(self.owner == i), per_socket) for i in range(self.owner.max() + 1)]
         rows.sort(key=len, reverse=True)
         count = max(1, int(np.sum(np.cumsum([len(part) for part in rows]) <= most)))
         return self.at(np.sort(np.concatenate(rows[:count])))

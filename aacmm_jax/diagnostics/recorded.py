@@ -70,7 +70,7 @@ def of_recording(recording: Recording) -> list[Finding]:
     exact = [f"{length.start} - {length.end}" for length in capture.lengths if float(length.u) == 0]
     findings = [*_outside_limits(recording), *repeated]
     if exact:
-        says = f"Taken as exact, because u is 0: {shorten(exact)}."
+        says = f"These lengths are treated as exact, because their u is 0: {shorten(exact)}."
         advice = "Give the standard uncertainty of each length."
         findings.append(Finding("exact-lengths", says, advice=advice, concerns=tuple(exact)))
     return findings + _implausible_uncertainties(capture)
@@ -112,7 +112,10 @@ def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     large = [f"{where} (u = {u:,.0f} um)" for where, u in most]
     return [
         Finding(
-            code, f"{says}: {shorten(texts)}.", advice=f"u is in mm; was it given in {unit}?", concerns=tuple(texts)
+            code,
+            f"{says}: {shorten(texts)}.",
+            advice=f"u must be in mm; was it given in {unit}?",
+            concerns=tuple(texts),
         )
         for code, texts, says, unit in (
             ("small-u", small, "u < 0.1 um is implausibly small", "m"),
@@ -237,8 +240,8 @@ def _of_joints(q: Float[np.ndarray, "M n"], arm: Arm) -> Iterator[tuple[str, Flo
         order[i], order[j] = j, i
         yield f"the columns of joints {i + 1} and {j + 1} are exchanged", q[:, order]
     yield "the columns are in reverse order", q[:, ::-1]
-    yield "the column of the last joint comes first", np.roll(q, -1, axis=1)
-    yield "the column of the first joint comes last", np.roll(q, 1, axis=1)
+    yield "the first column is that of the last joint", np.roll(q, -1, axis=1)
+    yield "the last column is that of the first joint", np.roll(q, 1, axis=1)
     slides = np.array(by_joint(arm, False, True))
     yield "readings are in gon, but were read as degrees", np.where(slides, q, 0.9 * q)
     largest = float(np.abs(q[:, ~slides]).max(initial=0.0))

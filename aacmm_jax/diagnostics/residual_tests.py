@@ -29,7 +29,7 @@ class Residuals(NamedTuple):
     """What a linear least squares leaves of all rows, part after part."""
 
     slices: tuple[slice, ...]  # rows of each part
-    own: tuple[Float[np.ndarray, "r k"], ...]  # orthonormal columns of each part's own unknowns
+    private: tuple[Float[np.ndarray, "r k"], ...]  # orthonormal columns of each part's own unknowns
     basis: Float[np.ndarray, "R q"]  # orthonormal columns of the shared unknowns, less the own
     values: Float[np.ndarray, " R"]
 
@@ -39,14 +39,14 @@ class Residuals(NamedTuple):
         ends = np.cumsum([len(part.residual) for part in parts])
         slices = tuple(slice(end - len(part.residual), end) for part, end in zip(parts, ends, strict=True))
         values = np.concatenate([part.residual for part in parts])
-        empty = cls(slices, tuple(_orthonormal(part.own) for part in parts), np.zeros((len(values), 0)), values)
+        empty = cls(slices, tuple(_orthonormal(part.private) for part in parts), np.zeros((len(values), 0)), values)
         empty = empty._replace(values=empty.unexplained(values[:, None])[:, 0])
         return empty.extended(np.concatenate([part.shared for part in parts]))
 
     @property
     def degrees_of_freedom(self) -> int:
         """Rows less unknowns that the rows determine."""
-        return len(self.values) - self.basis.shape[1] - sum(own.shape[1] for own in self.own)
+        return len(self.values) - self.basis.shape[1] - sum(columns.shape[1] for columns in self.private)
 
     @property
     def cost(self) -> float:
@@ -56,8 +56,8 @@ class Residuals(NamedTuple):
     def unexplained(self, columns: Float[np.ndarray, "R c"]) -> Float[np.ndarray, "R c"]:
         """M times some columns."""
         rest = np.array(columns)
-        for rows, own in zip(self.slices, self.own, strict=True):
-            rest[rows] -= own @ (own.T @ rest[rows])
+        for rows, private in zip(self.slices, self.private, strict=True):
+            rest[rows] -= private @ (private.T @ rest[rows])
         return rest - self.basis @ (self.basis.T @ rest)
 
     def extended(self, columns: Float[np.ndarray, "R c"]) -> "Residuals":
@@ -186,17 +186,17 @@ def form_test(left: Residuals, kernels: Kernels, relative: bool) -> FormTest:
     is compared with the variance of all residuals instead of 1.
     """
     spare, (value, traces) = left.degrees_of_freedom, _value_and_traces(left, kernels)
-    one, two, three = traces
+    t1, t2, t3 = traces
     if relative:
         # r'A r > x r'r, which is r'(A - x I) r > 0.
         x = value / max(left.cost, 1e-300)
-        shifted = (one - x * spare, two - 2 * x * one + x**2 * spare)
-        shifted = (*shifted, three - 3 * x * two + 3 * x**2 * one - x**3 * spare)
-        probability, expected = _tail(0.0, shifted), one * left.cost / max(spare, 1)
+        shifted = (t1 - x * spare, t2 - 2 * x * t1 + x**2 * spare)
+        shifted = (*shifted, t3 - 3 * x * t2 + 3 * x**2 * t1 - x**3 * spare)
+        probability, expected = _tail(0.0, shifted), t1 * left.cost / max(spare, 1)
     else:
-        probability, expected = _tail(value, traces), one
+        probability, expected = _tail(value, traces), t1
     ratio = value / expected if expected > 0 else float("nan")
-    return FormTest(ratio, probability, one**2 / max(two, 1e-300))
+    return FormTest(ratio, probability, t1**2 / max(t2, 1e-300))
 
 
 def alike(columns: Float[np.ndarray, "m r c"], poses: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "1 R R"]:
@@ -225,41 +225,41 @@ def _value_and_traces(left: Residuals, kernels: Kernels) -> tuple[float, tuple[f
     width = left.basis.shape[1]
     shared = np.zeros((3, width, width))  # B' A^k B
     mixed = np.zeros((width, width))  # B' A O O' A B
-    value = one = two = three = 0.0
-    for rows, own, kernel in zip(left.slices, left.own, kernels, strict=False):
+    value = t1 = t2 = t3 = 0.0
+    for rows, private, kernel in zip(left.slices, left.private, kernels, strict=False):
         if kernel is None:
             continue
         poses, size = kernel.shape[:2]
         k2 = kernel @ kernel
         r, basis = left.values[rows].reshape(poses, size), left.basis[rows]
-        o = own.reshape(poses, size, -1)
+        o = private.reshape(poses, size, -1)
         value += float(np.einsum("ma,mab,mb->", r, kernel, r))
-        ko, k2o = (kernel @ o).reshape(own.shape), (k2 @ o).reshape(own.shape)
+        ko, k2o = (kernel @ o).reshape(private.shape), (k2 @ o).reshape(private.shape)
         kb, k2b = ((k @ basis.reshape(poses, size, -1)).reshape(basis.shape) for k in (kernel, k2))
         shared += np.stack([basis.T @ kb, basis.T @ k2b, kb.T @ k2b])
-        d1, d2, d3, e1, e2 = own.T @ ko, own.T @ k2o, ko.T @ k2o, own.T @ kb, own.T @ k2b
+        d1, d2, d3, e1, e2 = private.T @ ko, private.T @ k2o, ko.T @ k2o, private.T @ kb, private.T @ k2b
         mixed += e1.T @ e1
-        one += float(np.einsum("maa->", kernel)) - float(np.trace(d1))
-        two += float(np.sum(kernel**2)) - 2 * float(np.trace(d2)) + float(np.sum(d1**2)) + 2 * float(np.sum(e1**2))
-        three += float(np.sum(kernel * k2)) - 3 * float(np.trace(d3))
-        three += 3 * float(np.sum(d1 * d2)) + 6 * float(np.sum(e1 * e2))
-        three -= float(np.trace(d1 @ d1 @ d1)) + 3 * float(np.sum((d1 @ e1) * e1))
+        t1 += float(np.einsum("maa->", kernel)) - float(np.trace(d1))
+        t2 += float(np.sum(kernel**2)) - 2 * float(np.trace(d2)) + float(np.sum(d1**2)) + 2 * float(np.sum(e1**2))
+        t3 += float(np.sum(kernel * k2)) - 3 * float(np.trace(d3))
+        t3 += 3 * float(np.sum(d1 * d2)) + 6 * float(np.sum(e1 * e2))
+        t3 -= float(np.trace(d1 @ d1 @ d1)) + 3 * float(np.sum((d1 @ e1) * e1))
     g1, g2, g3 = shared
-    one -= float(np.trace(g1))
-    two += float(np.sum(g1**2)) - 2 * float(np.trace(g2))
-    three += 3 * float(np.sum(g1 * g2)) - 3 * float(np.trace(g3))
-    three -= float(np.trace(g1 @ g1 @ g1)) + 3 * float(np.sum(mixed * g1))
-    return value, (one, two, three)
+    t1 -= float(np.trace(g1))
+    t2 += float(np.sum(g1**2)) - 2 * float(np.trace(g2))
+    t3 += 3 * float(np.sum(g1 * g2)) - 3 * float(np.trace(g3))
+    t3 -= float(np.trace(g1 @ g1 @ g1)) + 3 * float(np.sum(mixed * g1))
+    return value, (t1, t2, t3)
 
 
 def _tail(value: float, traces: tuple[float, float, float]) -> float:
     """Probability that a quadratic form of normal errors exceeds a value, from its first three cumulants."""
-    one, two, three = traces
-    if two <= 0:
+    t1, t2, t3 = traces
+    if t2 <= 0:
         return 1.0
-    if abs(three) < 1e-3 * two**1.5:
-        three = 1e-3 * two**1.5  # as good as normal
-    freedom = two**3 / three**2
-    argument = freedom + np.sign(three) * (value - one) * np.sqrt(freedom / two)
+    if abs(t3) < 1e-3 * t2**1.5:
+        t3 = 1e-3 * t2**1.5  # as good as normal
+    freedom = t2**3 / t3**2
+    argument = freedom + np.sign(t3) * (value - t1) * np.sqrt(freedom / t2)
     upper = chi_square_tail(max(float(argument), 0.0), freedom)
-    return upper if three > 0 else 1 - upper
+    return upper if t3 > 0 else 1 - upper

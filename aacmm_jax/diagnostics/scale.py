@@ -84,7 +84,7 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
         low, high = PLAUSIBLE_SCALE
         return Finding(
             "implausible-scale",
-            f"k = {k:.6g} is not plausible (expected {low:g} to {high:g}).",
+            f"The scale factor k = {k:.6g} is not plausible (expected {low:g} to {high:g}).",
             advice=next(mistakes, "Check units, sockets, lengths and arm."),
             severity="unusable",
             doubt="the reference lengths give an implausible scale",
@@ -101,17 +101,17 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
     if record.hold is None and sides and not set_by:
         return Finding(
             "scale-stopped-by-bounds",
-            f"Stage 1 ran with every length free and {'shrank' if k < 1 else 'stretched'} the arm to k = {k:.5f} "
-            f"until bounds stopped it: {shorten([f'{name} ({side})' for name, side in sides.items()])}. Stage 2 "
-            "(scale fix) undoes this.",
-            "The uncertainty of k takes these bounds as exact.",
+            f"In stage 1, every length was free, and the arm {'shrank' if k < 1 else 'grew'} (k = {k:.5f}) until "
+            f"parameters reached their bounds: {shorten([f'{name} ({side})' for name, side in sides.items()])}. "
+            "Stage 2 (scale fix) corrects the scale.",
+            "The uncertainty of k is computed as if these parameters were exact.",
             "Hold a length (--hold) to avoid this.",
             concerns=tuple(sides),
         )
     if record.hold is not None and abs(k - 1) > max(_SUSPICIOUS, 3 * record.u_k):
         return Finding(
             "scale-far-from-1",
-            f"k = {k:.5f} is far from 1.",
+            f"The scale factor k = {k:.5f} is far from 1.",
             advice=f"Is the nominal value of {record.hold} right, and is each reference length right?",
             concerns=(record.hold,),
         )
@@ -123,14 +123,16 @@ def _of_lengths(case: Case) -> Finding | None:
     if lengths is None or lengths.probability >= LEVEL:
         return None
     kinds = set() if case.record.shared is None else set(case.record.shared.kinds)
-    odd = f"; {lengths.odd} differs by {lengths.difference:+.3g} mm from the others, which agree" if lengths.odd else ""
-    predicted = "u, the poses and the errors common to several poses" if kinds and not odd else "u and the poses"
+    odd = ""
+    if lengths.odd:
+        odd = f"; {lengths.odd} differs by {lengths.difference:+.3g} mm from the others, which agree with each other"
+    predicted = "the poses, the stated u and the shared errors" if kinds and not odd else "the poses and the stated u"
     # Errors of places take the part of what u(k) had for lengths that disagree.
     enlarged = case.record.final_method == "two-stage" and PLACES not in kinds
     return Finding(
         "lengths-disagree",
         f"Reference lengths disagree with the arm: the errors of the {lengths.number} lengths are "
-        f"{lengths.birge_ratio:.2g} times as large as their {predicted} predict (Birge ratio, "
+        f"{lengths.birge_ratio:.2g} times as large as {predicted} predict (Birge ratio, "
         f"{chance_text(lengths.probability)}){odd}.",
         "u(k) includes this disagreement." if enlarged else "",
         "Look for a wrong length, or for errors outside the D-H model.",
@@ -205,15 +207,15 @@ def lengths_of_sockets(record: CalibrationRecord, rows: Sequence[Rows]) -> Relat
     kept, p = np.array([name != anchor for name in record.names]), len(record.names)
     linear = linearisation_of(record, record.names, noise=record.noise, lengths=False)
     influence, observed = linear.influence(), linear.observed
-    ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.own, capture)
+    ends = ends_between(observed, np.asarray(linear.with_fitted_geometry())[p:], influence.d_inverses, capture)
     error = np.asarray(ends.measured - ends.nominal)
     if np.max(np.abs(error)) < EXACT:
         return None
     # Positions follow the arm as the means of their tips do.
     followers = []
     for name in positions_at_ends(capture):
-        of, component, first = observed.layout.component_of(int(observed.positions[name][0]))
-        followers.append(-influence.follow[of][component, first : first + 3])
+        class_index, component, first = observed.layout.component_of(int(observed.positions[name][0]))
+        followers.append(-influence.follow[class_index][component, first : first + 3])
     slopes = np.einsum("lec,ech->lh", ends.by_positions, np.stack(followers))[:, :p]
     scale = None
     if anchor is not None:

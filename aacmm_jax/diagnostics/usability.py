@@ -13,7 +13,7 @@ from .recorded import likely_cause
 
 ORDER, NEEDS = 10, "nothing"
 _APART = 5.0  # RMS of a session among others, over that which it has alone, beyond which they are not of one arm
-_TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and the zeros of the joints."
+_TRY_ALL = "aacmm arm ARM --check MANIFEST tries every order and sign of the columns, and zero offsets of the joints."
 
 
 def test(case: Case) -> list[Finding]:

@@ -126,8 +126,8 @@ def _compared(
     for arm, label in zip(arms, labels, strict=True):
         if arm.arm.joints != arms[0].arm.joints:
             raise InputError(
-                f"{labels[0]} is of '{arms[0].name}' with {arms[0].arm.joints} joints, but {label} is of '{arm.name}' "
-                f"with {arm.arm.joints} joints; compare calibrations of one arm."
+                f"{labels[0]} is for the arm '{arms[0].name}' with {arms[0].arm.joints} joints, but {label} is for the "
+                f"arm '{arm.name}' with {arm.arm.joints} joints; compare calibrations of the same arm."
             )
     points, length, seed = volume
     length = default_length(first.calibrated.arm) if length is None else length
@@ -245,6 +245,6 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         if alone := [name for name in record.names if name not in other.names]:
             yield (
-                f"Free in {label} only: {shorten(alone)}. In the other calibration, other parameters may compensate "
-                "for them; lengths can still be compared."
+                f"Parameters free only in {label}: {shorten(alone)}. In the other calibration, the free parameters may "
+                "compensate for the errors of these; lengths can still be compared."
             )

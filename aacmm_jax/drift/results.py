@@ -128,15 +128,15 @@ def _of_all(drift: Drift) -> str:
         ratio = test.statistic / test.rank
         law = f"F {ratio:.2f} with {test.rank} and {test.degrees_of_freedom:.0f} degrees of freedom"
     probability = "p < 0.0001" if test.p < 1e-4 else f"p = {test.p:.2g}"
-    start = f"Together, the changes of {len(test.names)} parameters are"
+    start = f"Tested together, the changes of {len(test.names)} parameters are"
     if test.p >= 1 - drift.level:
-        return f"{start} no more than their uncertainties explain ({law}, {probability})."
+        return f"{start} explained by their uncertainties ({law}, {probability})."
     units = dict(zip(drift.names, drift.units, strict=True))
     causes = [f"{name} by {in_words(units[name], amount)}" for name, amount in test.causes]
     arm = "the arm has changed" if test.probe is None or not test.probe.remounted else "its probe has been remounted"
     few = f" A change of these parameters alone would explain all changes: {', '.join(causes)}." if causes else ""
     return (
-        f"{start} more than their uncertainties explain ({law}, {probability}): {arm}, or there are "
+        f"{start} larger than their uncertainties explain ({law}, {probability}): {arm}, or there are "
         f"errors that the uncertainties do not include.{few}"
     )
 
@@ -145,10 +145,10 @@ def _of_probe(drift: Drift, probe: ProbeTest) -> str:
     share = 100 * (1 - probe.statistic / drift.joint_test.statistic)
     change = ", ".join(f"{name} by {in_words('mm', value)}" for name, value in probe.change)
     if not probe.remounted:
-        return f"Not only the probe has changed: a remounted probe would explain {share:.0f} % of the changes."
+        return f"Not only the probe has changed: a remounted probe would explain only {share:.0f} % of the changes."
     start = f"Probe remounted: a change of the probe alone ({change}) explains {share:.0f} % of the changes"
     if not probe.p < 1 - drift.level:
-        return f"{start} and chance explains the rest, so the arm has not changed."
+        return f"{start}, and chance explains the rest, so the arm has not changed."
     return (
         f"{start}, but the rest (chi-squared {probe.statistic:.0f} with {probe.rank} degrees of freedom) is more than "
         "the uncertainties explain: either there are errors that the model does not describe, or the arm has changed "
@@ -162,7 +162,7 @@ def _of_each(drift: Drift) -> str:
         return ""
     chance = f"{drift.by_chance:.0f}" if drift.by_chance >= 0.95 else f"{drift.by_chance:.1g}"
     whose = "its" if len(moved) == 1 else "their"
-    count = f"{len(moved) or 'None'} of {drift.compared} parameters changed by more than {whose} uncertainty"
+    count = f"{len(moved) or 'None'} of {drift.compared} parameters changed by more than {whose} expanded uncertainty"
     changes = []
     for i in sorted(map(int, moved), key=lambda i: -abs(drift.change[i]) / drift.expanded[i]):
         name, unit, u = drift.names[i], drift.units[i], float(drift.expanded[i])
@@ -178,7 +178,7 @@ def _of_lengths(lengths: LengthChange, level: float) -> Iterator[str]:
         yield (
             f"{start} over the volume changed by {lengths.rms:.4f} mm RMS, where the uncertainties alone would give "
             f"{lengths.rms_by_chance:.4f} mm, and by at most {lengths.largest:+.4f} mm; {percent:.0f} % of the lengths "
-            f"changed by more than their uncertainty ({100 * (1 - level):.2g} % expected by chance)."
+            f"changed by more than their expanded uncertainty ({100 * (1 - level):.2g} % expected by chance)."
         )
     else:
         yield (

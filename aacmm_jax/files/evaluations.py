@@ -36,11 +36,11 @@ def save_evaluation(
 
     Args:
         path: the file to write.
-        record: the evaluation, from `acceptance.evaluation_of`; or points with their limits.
+        record: the evaluation, from `evaluate_capture`; or points with their limits, from `evaluate_points`.
         summary: what ``aacmm show`` prints of the file; without it, ``show`` computes it, which takes longer.
 
     Example:
-        >>> evaluation = aj.acceptance.evaluation_of(record, aj.Recording(two_bars, nominal))
+        >>> evaluation = aj.evaluate_capture(record, aj.Recording(two_bars, nominal))
         >>> aj.files.save_evaluation("evaluation.h5", evaluation)
         >>> print(aj.files.load_evaluation("evaluation.h5").recording.capture.names)
         ('A', 'B', 'C', 'D')

@@ -351,10 +351,10 @@ def _check_different(output: OutputFile, path: Path) -> None:
         raise InputError(f"{output.named} is one of the files that this command reads; choose another output.")
 
 
-def _same(one: Path, other: Path) -> bool:
-    if os.path.realpath(one) == os.path.realpath(other):
+def _same(first: Path, second: Path) -> bool:
+    if os.path.realpath(first) == os.path.realpath(second):
         return True
     try:
-        return os.path.samefile(one, other)
+        return os.path.samefile(first, second)
     except (OSError, ValueError):  # one of them does not exist
         return False

@@ -324,13 +324,13 @@ def reached(
 
 
 def configurations_at(
-    region: SearchRegion, points: Float[np.ndarray, "s 3"], each: int
+    region: SearchRegion, points: Float[np.ndarray, "s 3"], starts_per_point: int
 ) -> tuple[Configurations, Places]:
-    """Configurations that reach the points from ``each`` random starts a point, and the index of each one's point.
+    """Configurations that reach the points from random starts, and the index of the point that each of them reaches.
 
     Of several cones, point i has the cone i, modulo their number (for several placements of the same sockets).
     """
-    owner = np.repeat(np.arange(len(points)), each)
+    owner = np.repeat(np.arange(len(points)), starts_per_point)
     sockets = owner % (1 if region.cones is None else len(region.cones.normals))
     q, good = reached(region, region.draw(len(owner)), points[owner], sockets=sockets, scattered=True)
     return q[good], owner[good]

@@ -106,7 +106,7 @@ def weighted(block: RowBlock, weight: Float[AnyArray, " m"] | None) -> RowBlock:
         return block
     root = namespace(weight).sqrt(weight)[None]
     by_head, by_own = (None if by is None else by * root[None] for by in (block.by_head, block.by_own))
-    return RowBlock(block.white * root, by_head, by_own, block.of, block.sizes)
+    return RowBlock(block.white * root, by_head, by_own, block.class_index, block.sizes)
 
 
 def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
@@ -121,7 +121,7 @@ def _curved(block: RowBlock, along: Float[AnyArray, " m"]) -> RowBlock:
             by = by - ((1 - along)[None] * xp.sum(direction[None] * by, axis=1))[:, None] * direction[None]
         changed.append(by)
     by_head, by_own = changed
-    return RowBlock(block.white / along[None], by_head, by_own, block.of, block.sizes)
+    return RowBlock(block.white / along[None], by_head, by_own, block.class_index, block.sizes)
 
 
 def cost_and_weights(
@@ -157,7 +157,7 @@ def arrow_of(
         # C = B A^T, D = B B^T and the gradient B w, summed over the blocks with components of this class.
         c, d, g = xp.zeros((count, size, height)), xp.zeros((count, size, size)), xp.zeros((count, size))
         for block in blocks:
-            if block.of != number:
+            if block.class_index != number:
                 continue
             if block.by_own is None:
                 # Coordinates less those of their point: B is minus the identity at every pose, so that these are sums
@@ -205,7 +205,7 @@ def _fitted(block: RowBlock) -> RowBlock:
             # w - B^T D^-1 B w: the projection onto what the component cannot follow.
             step = inverse_positive_definite(sums[..., :-1]) @ sums[..., -1:]
             white = white - followed(block.by_own, step, block.sizes)[0]
-    return RowBlock(white, block.by_head, block.by_own, block.of, block.sizes)
+    return RowBlock(white, block.by_head, block.by_own, block.class_index, block.sizes)
 
 
 def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
@@ -214,7 +214,7 @@ def _blocks(z: Float[AnyArray, " z"], args: Args) -> list[RowBlock]:
     whole = z if linear is None else namespace(z, linear).concatenate([z, linear])
     blocks = row_blocks(space, observed, whole, rows_at(space, observed, whole, batch is not None), whitening)
     first = len(observed.layout.classes) - args.eliminated
-    return [_fitted(block) if block.of >= first else block for block in blocks]
+    return [_fitted(block) if block.class_index >= first else block for block in blocks]
 
 
 def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True) -> QuadraticModel:
@@ -241,7 +241,7 @@ def observed_model(z: Float[AnyArray, " z"], args: Args, *, curved: bool = True)
         slope = added_to(slope, np.arange(p), prior.weight * residual)
     head = arrow.head
     for block in blocks[: len(layout.groups)]:
-        if block.of >= kept:
+        if block.class_index >= kept:
             shifts = _shifts(block)
             head = head - shifts @ shifts.T
     return QuadraticModel(cost, joined(slope, *slopes), arrow._replace(head=head))
@@ -268,9 +268,9 @@ def with_linear_geometry(z: Float[AnyArray, " n"], args: Args) -> tuple[Float[An
     point = rows_at(space, observed, whole, batch is not None)
     rows_of_groups = list(point.rows)
     for number, (group, root) in enumerate(zip(layout.groups, whitening.roots, strict=True)):
-        if group.of >= first:
+        if group.class_index >= first:
             rows = point.rows[number]
-            fitted[group.of - first] = shift = _of_rows(rows, root, group)[1]
+            fitted[group.class_index - first] = shift = _of_rows(rows, root, group)[1]
             rows_of_groups[number] = rows._replace(values=rows.values - to_poses(shift.T, group.sizes))
     return xp.concatenate([z, linear + joined(xp.zeros(0), *fitted)]), point._replace(rows=rows_of_groups)
 
@@ -294,8 +294,8 @@ def own_covariances(observed: Observed, point: PointRows, whitening: Whitening) 
     layout = observed.layout
     covariances: list[Any] = [namespace(whitening).zeros((0, 3, 3))] * len(layout.classes)
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
-        if group.of >= 0 and stack.linear:
-            covariances[group.of] = inverse_positive_definite(_of_rows(rows, root, group)[0])
+        if group.class_index >= 0 and stack.linear:
+            covariances[group.class_index] = inverse_positive_definite(_of_rows(rows, root, group)[0])
     return covariances
 
 
@@ -304,7 +304,7 @@ def reduced(arrow: Arrow, gradient: Float[AnyArray, " z"]) -> tuple[Float[AnyArr
     xp = namespace(arrow, gradient)
     # A A^T - C^T D^-1 C, and the slope of the cost where the components follow the head.
     head, (slope, parts) = arrow.head, arrow.split(gradient)
-    for crossed, information, part in zip(arrow.crossed, arrow.own, parts, strict=True):
+    for crossed, information, part in zip(arrow.crossed, arrow.private, parts, strict=True):
         follow = pseudo_inverse(information) @ crossed
         head = head - xp.einsum("Kkh,Kkg->hg", crossed, follow)
         slope = slope - xp.einsum("Kkh,Kk->h", follow, part)

@@ -44,7 +44,7 @@ class Group(NamedTuple):
     poses: tuple[tuple[int, int], ...]  # of each member, first and last but one among all
     roles: tuple[Role, ...]  # as the kind names its unknowns; then the place of the target, where there is one
     targeted: bool
-    of: int  # class of the components; -1 where no unknown is private
+    class_index: int  # index of the class of the components; -1 where no unknown is private
     sizes: tuple[int, ...]  # poses of each component
     start: tuple[int, ...]  # of each member's private numbers within its component
 
@@ -131,14 +131,14 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
     ]
     classes = _by(lambda member: member.kind, [member for member in problem if member.private])
     classes = sorted(classes, key=lambda members: members[0].is_linear)  # those with linear rows come last
-    names, shapes, places, of = [name for name in units if name not in private], [], {}, {}
+    names, shapes, places, class_index_of = [name for name in units if name not in private], [], {}, {}
     shared = sum(len(units[name]) for name in names)
     for number, some in enumerate(classes):
         components: dict[int, list[str]] = {}
         for member in some:
             components.setdefault(member.first, []).extend(member.private)
         places |= {at: place for place, at in enumerate(components)}
-        of |= {member.number: number for member in some}
+        class_index_of |= {member.number: number for member in some}
         names += itertools.chain(*components.values())
         shapes.append((len(components), some[0].size))
     linear = sum(some[0].is_linear for some in classes)
@@ -147,7 +147,7 @@ def layout_of(observations: Sequence[AbstractObservation], ends: Sequence[tuple[
     groups = []
     for some in _by(lambda member: member.key, problem):
         ordered = sorted(some, key=lambda member: places.get(member.first, 0))
-        groups.append(_group(ordered, layout, of.get(some[0].number, -1), places, stops))
+        groups.append(_group(ordered, layout, class_index_of.get(some[0].number, -1), places, stops))
     return layout._replace(groups=tuple(groups))
 
 
@@ -191,7 +191,9 @@ class _Member(NamedTuple):
         return self.observation.linear and len(self.parts) == 1 and not self.coupled
 
 
-def _group(members: Sequence[_Member], layout: Layout, of: int, places: dict[int, int], stops: Sequence[int]) -> Group:
+def _group(
+    members: Sequence[_Member], layout: Layout, class_index: int, places: dict[int, int], stops: Sequence[int]
+) -> Group:
     positions, roles = layout.positions, []
     for names in zip(*(member.parts for member in members), strict=True):
         first = tuple(int(positions[name][0]) for name in names)
@@ -199,10 +201,12 @@ def _group(members: Sequence[_Member], layout: Layout, of: int, places: dict[int
     counts = [member.observation.q.shape[-2] for member in members]
     poses = tuple((stops[member.number] - m, stops[member.number]) for member, m in zip(members, counts, strict=True))
     sizes, start = (), ()
-    if of >= 0:
+    if class_index >= 0:
         components = [places[member.first] for member in members]
-        sizes = tuple(np.bincount(components, weights=counts, minlength=layout.classes[of][0]).astype(int).tolist())
+        sizes = tuple(
+            np.bincount(components, weights=counts, minlength=layout.classes[class_index][0]).astype(int).tolist()
+        )
         private = next(role for role in roles if role.private)
         start = tuple(layout.component_of(index)[2] for index in private.first)
     numbers, targeted = tuple(member.number for member in members), bool(members[0].observation.target)
-    return Group(numbers, poses, tuple(roles), targeted, of, sizes, start)
+    return Group(numbers, poses, tuple(roles), targeted, class_index, sizes, start)

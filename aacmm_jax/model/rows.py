@@ -59,7 +59,7 @@ class RowBlock(eqx.Module):
     # By the numbers of the component of each pose. None where it has none, or where the rows are coordinates less those
     # of a point, all of one weight.
     by_own: Float[AnyArray, "k r m"] | None
-    of: int = eqx.field(static=True)  # class of these components; -1 without
+    class_index: int = eqx.field(static=True)  # index of the class of these components; -1 without
     sizes: tuple[int, ...] = eqx.field(static=True)  # poses of each of them, in their order
 
 
@@ -111,17 +111,17 @@ def row_blocks(
     blocks = []
     for group, stack, rows, root in zip(layout.groups, observed.stacks, point.rows, whitening.roots, strict=True):
         poses = group.index
-        mine = columns[..., poses]
+        tip_columns = columns[..., poses]
         if root is None and stack.linear:  # a tip less a point
-            by_parameters = shared.multiplied(mine, forward, poses)
+            by_parameters = shared.multiplied(tip_columns, forward, poses)
             by_head = _by_head(by_parameters, [rows.values[None]], group, layout.shared)
-            blocks.append(RowBlock(rows.values, by_head, None, group.of, group.sizes))
+            blocks.append(RowBlock(rows.values, by_head, None, group.class_index, group.sizes))
             continue
         assert root is not None
         rows = _whitened(rows, root)
         if group.targeted and own_probe.any():
-            mine = xp.where(own_probe[:, None, None], 0.0, mine)
-        by_parameters = times(rows.by_tip, mine)
+            tip_columns = xp.where(own_probe[:, None, None], 0.0, tip_columns)
+        by_parameters = times(rows.by_tip, tip_columns)
         if rows.by_rotation is not None:
             assert turned is not None
             by_parameters = by_parameters + times(rows.by_rotation, turned[..., poses])
@@ -130,8 +130,8 @@ def row_blocks(
         if group.targeted:
             by_roles.append(times(rows.by_tip, xp.stack([axis[:, poses] for axis in forward.frame])))
         by_head = _by_head(by_parameters, by_roles, group, layout.shared)
-        by_own = None if group.of < 0 else _by_own(by_roles, group, layout.classes[group.of][1])
-        blocks.append(RowBlock(rows.values, by_head, by_own, group.of, group.sizes))
+        by_own = None if group.class_index < 0 else _by_own(by_roles, group, layout.classes[group.class_index][1])
+        blocks.append(RowBlock(rows.values, by_head, by_own, group.class_index, group.sizes))
     return [*blocks, *_relations(observed, z[p:], whitening, p)]
 
 
@@ -190,13 +190,15 @@ def _relations(observed: Observed, geometry: Float[AnyArray, " g"], whitening: W
     first = [int(positions[pair[0]][0]) for pair in observed.ends]
     first += [int(index) for name in certified for index in positions[name]]
     blocks = []
-    for of, (rows, owner) in _relations_by_class(layout, tuple(first)).items():
-        if of < 0:
+    for class_index, (rows, owner) in _relations_by_class(layout, tuple(first)).items():
+        if class_index < 0:
             by_head = xp.concatenate([xp.zeros((p, len(rows))), head[rows].T])[:, None]
-            blocks.append(RowBlock(white[rows][None], by_head, None, of, ()))
+            blocks.append(RowBlock(white[rows][None], by_head, None, class_index, ()))
         else:
-            poses = tuple(np.bincount(owner, minlength=layout.classes[of][0]).tolist())
-            blocks.append(RowBlock(white[rows][None], None, components[of][rows, owner].T[:, None], of, poses))
+            poses = tuple(np.bincount(owner, minlength=layout.classes[class_index][0]).tolist())
+            blocks.append(
+                RowBlock(white[rows][None], None, components[class_index][rows, owner].T[:, None], class_index, poses)
+            )
     return blocks
 
 
@@ -205,11 +207,11 @@ def _relations_by_class(layout: Layout, first: tuple[int, ...]) -> dict[int, tup
     """Numbers of the relations of each class and their components, which they are sorted by; of ``first`` numbers."""
     located = [layout.component_of(index)[:2] for index in first]
     by_class = {}
-    for of in dict.fromkeys(place[0] for place in located):
-        rows = np.array([row for row, place in enumerate(located) if place[0] == of])
+    for class_index in dict.fromkeys(place[0] for place in located):
+        rows = np.array([row for row, place in enumerate(located) if place[0] == class_index])
         owner = np.array([located[row][1] for row in rows])
         order = np.argsort(owner, kind="stable")
-        by_class[of] = rows[order], owner[order]
+        by_class[class_index] = rows[order], owner[order]
     return by_class
 
 

@@ -245,11 +245,11 @@ class _Dense(NamedTuple):
 
 def _dense(equations: Equations, parameters: int) -> _Dense:
     first = shared = equations.rows[0].shared.shape[2]
-    size, parts = shared + sum(rows.own.shape[2] for rows in equations.rows), []
+    size, parts = shared + sum(rows.private.shape[2] for rows in equations.rows), []
     for rows in equations.rows:
-        (m, r), k = rows.residual.shape, rows.own.shape[2]
+        (m, r), k = rows.residual.shape, rows.private.shape[2]
         white = np.zeros((m, r, size))
-        white[..., :shared], white[..., first : first + k] = rows.shared, rows.own
+        white[..., :shared], white[..., first : first + k] = rows.shared, rows.private
         first += k
         parts.append((
             *(white.reshape(-1, size), rows.residual.ravel(), np.repeat(rows.poses, r)),

@@ -239,7 +239,7 @@ def log_evidence(equations: Equations, prior: PriorMetrics, expected: Mapping[st
             logarithm -= 0.5 * (away**2 / _EXPECTED_VARIANCE + np.log1p(0.5 * float(effective) * _EXPECTED_VARIANCE))
     for rows in equations.rows:
         # The geometry of this observation is eliminated.
-        shared, private = (part.reshape(rows.residual.size, part.shape[2]) for part in (rows.shared, rows.own))
+        shared, private = (part.reshape(rows.residual.size, part.shape[2]) for part in (rows.shared, rows.private))
         basis, sizes, _ = np.linalg.svd(private, full_matrices=False)
         determined = sizes > _SMALL * sizes.max(initial=1e-300)
         shared = shared - basis[:, determined] @ (basis[:, determined].T @ shared)

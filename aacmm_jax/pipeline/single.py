@@ -197,8 +197,8 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         check_finite(arm=arm, capture=capture, noise=given.noise)
     elif given.hold is None and not is_concrete(*jax.tree.leaves(arm)) and bounds.space.lengths.any():
         raise InputError(
-            "hold=None needs an arm with known values in calibrate; if the arm itself is traced, name the length "
-            "to hold."
+            "with hold=None, calibrate needs the values of the arm, which are not known inside jit, vmap or a "
+            "derivative; name the length to hold."
         )
     first = None if at_once else _stage1_task("calibrate_many", arm, capture, bounds, given.solving)
     task = task_of(arm, capture, bounds, given.solving._replace(hold=None))
@@ -239,7 +239,7 @@ def _check_identifiable(capture: Capture, bounds: Bounds, prior: Prior | None, s
     space = bounds.space
     stated = prior and prior.of(space.names, space.vector())
     seen = observability(
-        space.base, capture, space, known=tuple(space.names[i] for i in stated.index) if stated else ()
+        space.base, capture, space, with_prior=tuple(space.names[i] for i in stated.index) if stated else ()
     )
     lost = seen._replace(by_prior=()).sentences()
     if lost and strict:

@@ -170,7 +170,7 @@ def _best(
         _, of_geometry = _products(rows[:, :, p:], np.linalg.inv(information[p:, p:]))
         improvement = np.linalg.slogdet(inner)[1] - np.linalg.slogdet(of_geometry)[1]
     else:
-        _, outer = _products(moved[:, :, :p], objective.gradient(inverse[:p, :p]), 0.0)
+        _, outer = _products(moved[:, :, :p], objective.gradient(inverse[:p, :p]), identity=0.0)
         improvement = np.trace(np.linalg.solve(inner, outer), axis1=1, axis2=2)
     if not (allowed.any() and np.all(np.isfinite(improvement))):
         raise InputError(
@@ -181,12 +181,12 @@ def _best(
 
 
 def _products(
-    rows: Float[np.ndarray, "c r k"], matrix: Float[np.ndarray, "k k"], one: float = 1.0
+    rows: Float[np.ndarray, "c r k"], matrix: Float[np.ndarray, "k k"], identity: float = 1.0
 ) -> tuple[Float[np.ndarray, "c r k"], Float[np.ndarray, "c r r"]]:
-    """A M and I + A M A^T of each candidate's rows A, or without I; A M as one long product, a tenth of the time."""
+    """A M and ``identity`` I + A M A^T of each candidate's rows A; A M as one long product, a tenth of the time."""
     c, r, k = rows.shape
     moved = (rows.reshape(c * r, k) @ matrix).reshape(c, r, k)
-    return moved, one * np.eye(r) + np.einsum("crk,csk->crs", moved, rows)
+    return moved, identity * np.eye(r) + np.einsum("crk,csk->crs", moved, rows)
 
 
 def best_layout(

@@ -20,11 +20,11 @@ Mask = Bool[AnyArray, "*batch z"]
 
 
 class Arrow(NamedTuple):
-    """A symmetric matrix in arrow form; ``crossed`` and ``own`` have one entry for each class of blocks."""
+    """A symmetric matrix in arrow form; ``crossed`` and ``private`` have one entry for each class of blocks."""
 
     head: Float[AnyArray, "*batch h h"]
     crossed: tuple[Float[AnyArray, "*batch K k h"], ...] = ()
-    own: tuple[Float[AnyArray, "*batch K k k"], ...] = ()
+    private: tuple[Float[AnyArray, "*batch K k k"], ...] = ()
 
     @classmethod
     def of(cls, matrix: "Arrow | Float[AnyArray, '*batch p p']") -> "Arrow":
@@ -34,7 +34,7 @@ class Arrow(NamedTuple):
     @property
     def shape(self) -> tuple[tuple[int, int], ...]:
         """Number and size of the blocks of each class."""
-        return tuple((own.shape[-3], own.shape[-1]) for own in self.own)
+        return tuple((part.shape[-3], part.shape[-1]) for part in self.private)
 
     def split(self, vector: Shaped[AnyArray, "*batch z"]) -> tuple[AnyArray, list[AnyArray]]:
         """The head of a vector, and its blocks ``(*batch, K, k)`` class by class."""
@@ -42,14 +42,14 @@ class Arrow(NamedTuple):
 
     def diagonal(self) -> Vector:
         """The diagonal."""
-        parts = (namespace(part).diagonal(part, axis1=-2, axis2=-1) for part in (self.head, *self.own))
+        parts = (namespace(part).diagonal(part, axis1=-2, axis2=-1) for part in (self.head, *self.private))
         return joined(*parts)
 
     def sum(self) -> Float[AnyArray, "*batch"]:
         """The sum of what is stored, which is finite where everything is."""
         xp = namespace(self)
         total = xp.sum(self.head, axis=(-2, -1))
-        for part in (*self.crossed, *self.own):
+        for part in (*self.crossed, *self.private):
             total = total + xp.sum(part, axis=(-3, -2, -1))
         return total
 
@@ -57,18 +57,18 @@ class Arrow(NamedTuple):
         """S A S with a diagonal S."""
         head, parts = self.split(scale)
         crossed = (c * s[..., None] * head[..., None, None, :] for c, s in zip(self.crossed, parts, strict=True))
-        own = (d * s[..., :, None] * s[..., None, :] for d, s in zip(self.own, parts, strict=True))
-        return Arrow(self.head * head[..., :, None] * head[..., None, :], tuple(crossed), tuple(own))
+        private = (d * s[..., :, None] * s[..., None, :] for d, s in zip(self.private, parts, strict=True))
+        return Arrow(self.head * head[..., :, None] * head[..., None, :], tuple(crossed), tuple(private))
 
     def times(self, vector: Vector) -> Vector:
         """The product with a vector."""
         head, parts = self.split(vector)
         top, below = (self.head @ head[..., None])[..., 0], []
-        for crossed, own, part in zip(self.crossed, self.own, parts, strict=True):
+        for crossed, block, part in zip(self.crossed, self.private, parts, strict=True):
             flat = crossed.reshape(*crossed.shape[:-3], -1, crossed.shape[-1])
             top = top + (part.reshape(*part.shape[:-2], 1, -1) @ flat)[..., 0, :]
             of_head = (flat @ head[..., None])[..., 0]
-            below.append((own @ part[..., None])[..., 0] + of_head.reshape(part.shape))
+            below.append((block @ part[..., None])[..., 0] + of_head.reshape(part.shape))
         return joined(top, *below)
 
     def damped_solution(self, right: Vector, fixed: Mask, damping: Float[AnyArray, "*batch"]) -> Vector:
@@ -78,9 +78,9 @@ class Arrow(NamedTuple):
         (head_fixed, fixed_of), (head_right, rights) = self.split(fixed), self.split(right)
         head = _damped(self.head, head_fixed, damping)
         followers = []
-        for crossed, own, still, part in zip(self.crossed, self.own, fixed_of, rights, strict=True):
+        for crossed, block, still, part in zip(self.crossed, self.private, fixed_of, rights, strict=True):
             # Schur complement by whitened blocks: with W D W^T = I, C^T D^-1 C = (W C)^T (W C).
-            whitening = inverse_cholesky(_damped(own, still, damping[..., None]))
+            whitening = inverse_cholesky(_damped(block, still, damping[..., None]))
             crossed = xp.where(still[..., None] | head_fixed[..., None, None, :], 0.0, crossed)
             by_head, alone = whitening @ crossed, (whitening @ part[..., None])[..., 0]
             flat = by_head.reshape(*by_head.shape[:-3], -1, by_head.shape[-1])

@@ -75,7 +75,7 @@ def correction_summary(
     before = np.asarray(calibrated.position(q[reached])) - np.asarray(nominal.position(commanded[reached]))
     summary["largest_distance_before_mm"] = float(np.linalg.norm(before, axis=1).max())
     moved = np.where(reached[:, None], np.abs(after - commanded), 0.0)
-    change, slide = (moved * np.array(by_joint(nominal, *of)) for of in ((1 / DEG, 0.0), (0.0, 1.0)))
+    change, slide = (moved * np.array(by_joint(nominal, *units)) for units in ((1 / DEG, 0.0), (0.0, 1.0)))
     slides, turns = bool(nominal.prismatic), len(nominal.prismatic) < nominal.joints
     for key, exists, values, in_unit in (("change", turns, change, "deg"), ("slide", slides, slide, "mm")):
         if exists:

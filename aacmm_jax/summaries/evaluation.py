@@ -220,7 +220,7 @@ def _judged(
     influences = record.influences
     bodies = {"artefact": influences.artefact, "arm": influences.arm}
     expansions = {
-        f"{of}_expansion": None if body is None else attributes(body, **_EXPANSION) for of, body in bodies.items()
+        f"{name}_expansion": None if body is None else attributes(body, **_EXPANSION) for name, body in bodies.items()
     }
     return {
         "acceptance": [

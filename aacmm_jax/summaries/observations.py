@@ -96,8 +96,8 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
         residuals = observation_residuals(record)
         pairs = list(zip(residuals, distances_of(record.recording.capture, nominal), strict=True))
         for pair in pairs:
-            of = pair[0].observation
-            row = {"observation": of.name, "kind": of.kind, "target": of.target}
+            observation = pair[0].observation
+            row = {"observation": observation.name, "kind": observation.kind, "target": observation.target}
             summary["observations"].append(row | _agreement([pair]))
         for kind in dict.fromkeys(part.observation.kind for part in residuals):
             of_kind = [pair for pair in pairs if pair[0].observation.kind == kind]

@@ -101,7 +101,7 @@ class Observability(NamedTuple):
         always, now = ([text for text, never in pairs if never == wanted] for wanted in (True, False))
         if always:
             sentences.append(
-                f"No measurement of this kind can separate: {'; '.join(always)}. Fix one parameter of each "
+                f"Not determined by any measurement of this kind: {'; '.join(always)}. Fix one parameter of each "
                 "combination (--held)."
             )
         if now:
@@ -109,7 +109,7 @@ class Observability(NamedTuple):
             sentences.append(f"Not determined by these data: {_first(now)}. {remedy}")
         if self.by_prior:
             sentences.append(
-                f"Determined by the prior, and little or not at all by these data: {_first(self.by_prior)}."
+                f"Determined by the prior, and hardly or not at all by these data: {_first(self.by_prior)}."
             )
         if self.trade_offs:
             texts = _first([trade_off.text for trade_off in self.trade_offs])
@@ -137,7 +137,7 @@ def observability(
     noise: Noise | None = None,
     sigma: float | None = None,
     bounds: Bounds | None = None,
-    known: Iterable[str] = (),
+    with_prior: Iterable[str] = (),
 ) -> Observability:
     """What the poses, reference lengths and other observations of a capture determine of the free parameters.
 
@@ -154,7 +154,7 @@ def observability(
             that. With it near-degenerate is also what the data determine hardly better than the bounds.
         bounds: Bounds that ``sigma`` is compared with; by default of +-10 mm and +-17.5 mrad, the default of
             `Bounds.around`.
-        known: Names of parameters that a prior determines: what the data leave open of them is told apart.
+        with_prior: Names of parameters that a prior determines: what the data leave open of them is told apart.
 
     Raises:
         InputError: Capture and arm do not fit.
@@ -186,22 +186,23 @@ def observability(
         # A nominal arm may have an exact alignment (a probe on the last axis) that the real one does not share.
         other = _Spectrum.of(neighbouring_arm(base, space.names), capture, space.names, noise, targets_of=base)
         spectrum = other if other.null.shape[1] < spectrum.null.shape[1] else spectrum
-    return _of_spectrum(spectrum, spectrum.trade_offs(sigma, bounds), set(items_of(known, "known")), arm)
+    return _of_spectrum(spectrum, spectrum.trade_offs(sigma, bounds), set(items_of(with_prior, "with_prior")), arm)
 
 
-def _of_spectrum(spectrum: "_Spectrum", weak: tuple[TradeOff, ...], known: set[str], arm: Arm) -> Observability:
+def _of_spectrum(spectrum: "_Spectrum", weak: tuple[TradeOff, ...], with_prior: set[str], arm: Arm) -> Observability:
     """Which directions are open, why, and what would determine them; told apart what a prior determines."""
     base, names, null = spectrum.arm, spectrum.names, spectrum.null
     functions = set(correction_names(base))
-    # Undetermined directions that concern no known parameter, and the others.
-    _, sizes, turned = np.linalg.svd(null[[name in known for name in names]])
+    # Undetermined directions that concern no parameter with a prior, and the others.
+    _, sizes, turned = np.linalg.svd(null[[name in with_prior for name in names]])
     split = int(np.sum(sizes > 1e-6))
     null, of_prior = null @ turned[split:].T, null @ turned[:split].T
-    of_prior = of_prior[:, ~np.any(np.abs(of_prior[[name in functions & known for name in names]]) > _FOLLOWS, axis=0)]
+    by_functions = of_prior[[name in functions & with_prior for name in names]]
+    of_prior = of_prior[:, ~np.any(np.abs(by_functions) > _FOLLOWS, axis=0)]
     null, undetermined = spectrum.named(null)
     structural = spectrum.structural(null)
-    weak_by_prior = [trade_off for trade_off in weak if known.intersection(trade_off.names)]
-    weak = tuple(trade_off for trade_off in weak if not known.intersection(trade_off.names))
+    weak_by_prior = [trade_off for trade_off in weak if with_prior.intersection(trade_off.names)]
+    weak = tuple(trade_off for trade_off in weak if not with_prior.intersection(trade_off.names))
     groups = []
     for direction in np.abs(null.T):
         chief, every = (np.array(names)[direction > share * direction.max()] for share in (0.5, _FOLLOWS))
@@ -223,7 +224,7 @@ def _of_spectrum(spectrum: "_Spectrum", weak: tuple[TradeOff, ...], known: set[s
         trade_offs=weak,
         by_prior=(
             *spectrum.named(of_prior)[1],
-            *(trade_off.text for trade_off in weak_by_prior if not known & functions & set(trade_off.names)),
+            *(trade_off.text for trade_off in weak_by_prior if not with_prior & functions & set(trade_off.names)),
         ),
         corrections=reasons + spectrum.by_more_sockets(unexplained),
     )
@@ -310,7 +311,7 @@ class _Spectrum(NamedTuple):
             parts = [name for name, at in self.agreeing.parts if np.abs(followers[at]).max() > _MOVED * size]
             items = _some(names, _PARAMETERS_NAMED, "more")
             items += _some(parts, _PARTS_NAMED, "more parts of the geometry")
-            alone = f"{items[0]} (changes nothing that is measured)"
+            alone = f"{items[0]} (has no effect on the measurements)"
             texts.append(f"{listed(items)} trade off" if len(items) > 1 else alone)
             directions.append(direction / np.linalg.norm(direction))
         return np.stack(directions, axis=1), tuple(texts)

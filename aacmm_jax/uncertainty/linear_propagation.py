@@ -110,7 +110,7 @@ class Influence(NamedTuple):
     inverse: Float[AnyArray, "h h"]  # G
     lost: Float[AnyArray, "h h"]  # projector onto what the data leave open
     determined: Bool[AnyArray, " h"]  # numbers of the head that are determined one by one
-    own: list[Float[AnyArray, "_ _ _"]]  # D^-1, class by class
+    d_inverses: list[Float[AnyArray, "_ _ _"]]  # D^-1, class by class
     follow: list[Float[AnyArray, "_ _ h"]]  # D^-1 C
     open: list[Bool[AnyArray, "_ _"]]  # numbers of components that their rows leave open
 
@@ -129,14 +129,14 @@ class Influence(NamedTuple):
         counted = [weighted(block, weight) for block, weight in zip(blocks, weights, strict=True)]
         arrow = arrow_of(counted, classes, height, prior)[0].scaled(steps)
         head, parts = arrow.split(steps)
-        own = [pseudo_inverse(matrix) for matrix in arrow.own]
-        follow = [inverse @ crossed for inverse, crossed in zip(own, arrow.crossed, strict=True)]
+        d_inverses = [pseudo_inverse(matrix) for matrix in arrow.private]
+        follow = [inverse @ crossed for inverse, crossed in zip(d_inverses, arrow.crossed, strict=True)]
         rows = []
         for block in blocks:
             eliminated: Any = 0.0 if block.by_head is None else block.by_head * head[:, None, None]
-            if block.of >= 0:
+            if block.class_index >= 0:
                 assert block.by_own is not None
-                by_component = parts[block.of][..., None] * follow[block.of]
+                by_component = parts[block.class_index][..., None] * follow[block.class_index]
                 eliminated = eliminated - followed(block.by_own, by_component, block.sizes)
             rows.append(eliminated)
         of_prior = xp.zeros((height, height))
@@ -151,11 +151,24 @@ class Influence(NamedTuple):
         inverse, lost, determined = inverse_information(information, fixed)
         # D D^-1 has ones on the diagonal where a number is determined.
         seen = [
-            xp.diagonal(matrix @ inverted, axis1=-2, axis2=-1) for matrix, inverted in zip(arrow.own, own, strict=True)
+            xp.diagonal(matrix @ inverted, axis1=-2, axis2=-1)
+            for matrix, inverted in zip(arrow.private, d_inverses, strict=True)
         ]
         left = [values < 1 - 1e-6 for values in seen]
         return cls(
-            blocks, weights, fixed, rows, parts, of_prior, information, inverse, lost, determined, own, follow, left
+            blocks,
+            weights,
+            fixed,
+            rows,
+            parts,
+            of_prior,
+            information,
+            inverse,
+            lost,
+            determined,
+            d_inverses,
+            follow,
+            left,
         )
 
     def weighted(self, number: int, rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k r m"]:
@@ -170,10 +183,10 @@ class Influence(NamedTuple):
     def own_rows(self, number: int) -> Float[AnyArray, "k r m"] | None:
         """B of a block in natural steps; None where it has no private geometry."""
         block = self.blocks[number]
-        if block.of < 0:
+        if block.class_index < 0:
             return None
         assert block.by_own is not None
-        steps = self.parts[block.of]
+        steps = self.parts[block.class_index]
         owner = np.repeat(np.arange(len(block.sizes)), block.sizes)
         return block.by_own * (steps[0][:, None, None] if len(block.sizes) == 1 else steps.T[:, None, owner])
 
@@ -183,13 +196,13 @@ class Influence(NamedTuple):
         """A W r^T and, of each component, B W r^T, summed over all rows r, of which every block has q."""
         xp, count = namespace(self.inverse, rows), rows[0].shape[0]
         head = xp.zeros((self.inverse.shape[0], count))
-        components = [xp.zeros((*inverse.shape[:2], count)) for inverse in self.own]
+        components = [xp.zeros((*inverse.shape[:2], count)) for inverse in self.d_inverses]
         for number, (block, values) in enumerate(zip(self.blocks, rows, strict=True)):
             head = head + _flat(self.weighted_rows(number)) @ _flat(values).T
             private = self.own_rows(number)
             if private is not None:
                 of_block = sums_by_component(self.weighted(number, private), values, block.sizes)
-                components[block.of] = components[block.of] + of_block
+                components[block.class_index] = components[block.class_index] + of_block
         return head, components
 
     def response(
@@ -201,7 +214,7 @@ class Influence(NamedTuple):
         times Cov(w), it is the unknowns' covariance with these functions.
         """
         sums, of_components = self.sums(rows)
-        head, triples = -self.inverse @ sums, zip(self.own, self.follow, of_components, strict=True)
+        head, triples = -self.inverse @ sums, zip(self.d_inverses, self.follow, of_components, strict=True)
         return head, [-(d_inverse @ part) - follow @ head for d_inverse, follow, part in triples]
 
     def eliminated(
@@ -227,7 +240,8 @@ def rows_of_functions(
         a, private = influence.weighted_rows(number), influence.own_rows(number)
         of_block = (gain @ _flat(a)).reshape(-1, *a.shape[1:])
         if private is not None:
-            by_component = xp.einsum("qKk,Kkl->Klq", components[block.of], influence.own[block.of])
+            k = block.class_index
+            by_component = xp.einsum("qKk,Kkl->Klq", components[k], influence.d_inverses[k])
             of_block = of_block - followed(influence.weighted(number, private), by_component, block.sizes)
         rows.append(of_block)
     return rows
@@ -240,7 +254,7 @@ def variances_of_functions(
     ``components`` are their derivatives, natural steps."""
     xp, by_head = namespace(influence.inverse, head), influence.eliminated(head, components)
     variances = xp.einsum("qh,hg,qg->q", by_head, influence.inverse, by_head)
-    for part, inverse in zip(components, influence.own, strict=True):
+    for part, inverse in zip(components, influence.d_inverses, strict=True):
         variances = variances + xp.einsum("qKk,Kkl,qKl->q", part, inverse, part)
     return variances
 
@@ -311,7 +325,7 @@ def alone(influence: Influence, groups: int) -> list[Float[AnyArray, "_ _ _"]]:
         private = influence.own_rows(number)
         if private is not None:
             private = influence.weighted(number, private)
-            per_pose = influence.own[block.of][np.repeat(np.arange(len(block.sizes)), block.sizes)]
+            per_pose = influence.d_inverses[block.class_index][np.repeat(np.arange(len(block.sizes)), block.sizes)]
             leverage = leverage + xp.einsum("kam,mkl,lbm->mab", private, per_pose, private)
         identity = xp.asarray(np.eye(a.shape[1]))
         # Where a pose determines its own geometry nearly alone, its residual says nothing: it has the common variance.
@@ -341,16 +355,16 @@ def propagated(
     total, crossed = influence.sums(moved)
     total = total + influence.prior + (0.0 if shared_readings is None else shared_readings)
     head = inverse @ total @ inverse + (0.0 if added is None else added)
-    middle = [xp.zeros_like(matrix) for matrix in influence.own]
+    middle = [xp.zeros_like(matrix) for matrix in influence.d_inverses]
     for number, block in enumerate(influence.blocks):
         private = influence.own_rows(number)
         if private is not None:
             private = influence.weighted(number, private)
             times = products(private, covariances[number]) if number < len(covariances) else private
-            middle[block.of] = middle[block.of] + sums_by_component(times, private, block.sizes)
+            middle[block.class_index] = middle[block.class_index] + sums_by_component(times, private, block.sizes)
     # Of dy = -D^-1 (B W w + C dx): both parts, and twice what they have in common.
     components = []
-    for d_inverse, follow, square, both in zip(influence.own, influence.follow, middle, crossed, strict=True):
+    for d_inverse, follow, square, both in zip(influence.d_inverses, influence.follow, middle, crossed, strict=True):
         turned = xp.swapaxes(follow, -1, -2)
         mixed = d_inverse @ both @ inverse @ turned
         separate = follow @ head @ turned + d_inverse @ square @ d_inverse

@@ -122,7 +122,7 @@ class Agreeing(NamedTuple):
             return pull
         head, components = split(pull, observed.layout.shared, observed.layout.classes)
         covariance = np.diag(np.maximum(self.u, _LEAST_U) ** 2)
-        for part, inverse_of_part, follow in zip(components, influence.own, influence.follow, strict=True):
+        for part, inverse_of_part, follow in zip(components, influence.d_inverses, influence.follow, strict=True):
             head = head - np.einsum("lKk,Kkh->lh", part, follow[..., len(self.linear.space.names) :])
             turned = np.einsum("lKk,Kkm->lKm", part, inverse_of_part)
             covariance += turned.reshape(len(pull), -1) @ part.reshape(len(pull), -1).T
@@ -166,17 +166,17 @@ def _without_components(influence: Influence) -> list[Float[np.ndarray, "h r m"]
 
     Eliminated a second time: what rounding leaves of a poorly determined component would look like information.
     """
-    left = [np.zeros((*private.shape[:2], influence.inverse.shape[0])) for private in influence.own]
+    left = [np.zeros((*private.shape[:2], influence.inverse.shape[0])) for private in influence.d_inverses]
     for number, (block, rows) in enumerate(zip(influence.blocks, influence.rows, strict=True)):
         private = influence.own_rows(number)
-        if private is not None and block.of >= 0:
-            left[block.of] += sums_by_component(private, rows, block.sizes)
+        if private is not None and block.class_index >= 0:
+            left[block.class_index] += sums_by_component(private, rows, block.sizes)
     eliminated = [np.asarray(rows) for rows in influence.rows]
     for number, block in enumerate(influence.blocks):
         private = influence.own_rows(number)
-        if private is not None and block.of >= 0:
+        if private is not None and block.class_index >= 0:
             eliminated[number] = eliminated[number] - followed(
-                private, influence.own[block.of] @ left[block.of], block.sizes
+                private, influence.d_inverses[block.class_index] @ left[block.class_index], block.sizes
             )
     return eliminated
 
@@ -206,14 +206,14 @@ _SENTENCES = {
         "omit the coefficient, or let other joints move."
     ),
     "constant": (
-        "Over the {travel} that joint {joint} moves, {names} cannot be separated from the zero offset of this "
-        "joint, because the correction function is nearly constant: let the joint move farther, and record poses "
-        "in more sockets."
+        "{names} cannot be separated from the zero offset of joint {joint}, because the correction function is nearly "
+        "constant over the {travel} that this joint moves; let the joint move farther, and record poses in more "
+        "sockets."
     ),
     "line": (
-        "Over the {travel} that joint {joint} moves, {names} cannot be separated from each other, from the zero "
-        "offset of this joint or from other parameters, because their functions are nearly a straight line: let "
-        "the joint move farther."
+        "{names} cannot be separated from the zero offset of joint {joint} and from other parameters, because the "
+        "correction function is nearly a straight line over the {travel} that this joint moves; let the joint move "
+        "farther."
     ),
 }
 
@@ -261,14 +261,14 @@ def _cause(arm: Arm, q: Float[np.ndarray, "N n"], term: Term, names: tuple[str, 
     if size < _ZERO or np.abs(here).max() < _ZERO * size:
         return "zero"
     offset = f"{'d' if term.joint in arm.prismatic else 'theta'}_{term.joint}"
-    reading, one = q[:, term.joint - 1], np.ones(len(q))
-    if offset in names and _left(here, [one]) < _NEARLY * size:
+    reading, constant = q[:, term.joint - 1], np.ones(len(q))
+    if offset in names and _left(here, [constant]) < _NEARLY * size:
         return "constant"
     lines = [] if isinstance(term.kind, Gravity) else [here]
     if term.name == f"{GearRatio().words[0]}_{term.joint}":  # the line itself, which harmonics may imitate
         waves = {f"cos1_{term.joint}": np.cos(reading), f"sin1_{term.joint}": np.sin(reading)}
         lines = [values for name, values in waves.items() if name in names]
-    return "line" if any(_left(line, [one, reading]) < _NEARLY * np.abs(line).max() for line in lines) else ""
+    return "line" if any(_left(line, [constant, reading]) < _NEARLY * np.abs(line).max() for line in lines) else ""
 
 
 def _left(values: Float[np.ndarray, " N"], rows: list[np.ndarray]) -> float:

@@ -132,7 +132,9 @@ class _Sums(NamedTuple):
     @classmethod
     def of(cls, influence: Influence, matrices: list[Any], weighted: bool) -> "_Sums":
         xp = namespace(influence.inverse, matrices)
-        private, crossed = ([xp.zeros_like(zero) for zero in zeros] for zeros in (influence.own, influence.follow))
+        private, crossed = (
+            [xp.zeros_like(zero) for zero in zeros] for zeros in (influence.d_inverses, influence.follow)
+        )
         head, by_head, by_private = xp.zeros_like(influence.inverse), [], []
         for number, matrix in enumerate(matrices):
             block, a, b = influence.blocks[number], influence.rows[number], influence.own_rows(number)
@@ -142,8 +144,9 @@ class _Sums(NamedTuple):
             by_private.append(None if b is None else products(b, matrix))
             head = head + _outer(by_head[-1], a)
             if b is not None:
-                private[block.of] = private[block.of] + sums_by_component(by_private[-1], b, block.sizes)
-                crossed[block.of] = crossed[block.of] + sums_by_component(by_private[-1], a, block.sizes)
+                k = block.class_index
+                private[k] = private[k] + sums_by_component(by_private[-1], b, block.sizes)
+                crossed[k] = crossed[k] + sums_by_component(by_private[-1], a, block.sizes)
         return cls(matrices, by_head, by_private, head, private, crossed)
 
 
@@ -154,10 +157,10 @@ def _expectation(influence: Influence, form: _Sums, column: _Sums) -> Any:
     for number, block in enumerate(influence.blocks[: len(form.matrices)]):
         total = total + xp.sum(form.matrices[number] * column.matrices[number])
         total = total - 2 * xp.sum(inverse * _outer(form.by_head[number], column.by_head[number]))
-        if block.of >= 0:
+        if block.class_index >= 0:
             both = sums_by_component(form.by_private[number], column.by_private[number], block.sizes)
-            total = total - 2 * xp.sum(influence.own[block.of] * both)
-    classes = zip(influence.own, form.private, form.crossed, column.private, column.crossed, strict=True)
+            total = total - 2 * xp.sum(influence.d_inverses[block.class_index] * both)
+    classes = zip(influence.d_inverses, form.private, form.crossed, column.private, column.crossed, strict=True)
     for inverse_private, form_private, form_crossed, private, crossed in classes:
         total = total + xp.sum((inverse_private @ form_private) * xp.swapaxes(inverse_private @ private, -1, -2))
         total = total + 2 * xp.sum((inverse_private @ crossed @ inverse) * form_crossed)

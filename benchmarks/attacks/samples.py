@@ -65,7 +65,7 @@ def results() -> Results:
     capture = aj.simulate(arm.arm, sockets, poses=14, lengths=[("A", "B", 0.002)], encoder_arcsec=2.0, seed=1)
     recording = aj.Recording(capture, arm, arm, seed=1)
     record = aj.calibration.record_of(aj.calibrate(arm.arm, capture, arm.bounds()), recording)
-    evaluation = aj.acceptance.evaluation_of(record, recording, maxima={"rms_mm": 0.1})
+    evaluation = aj.evaluate_capture(record, recording, maxima={"rms_mm": 0.1})
     noise = aj.Noise(encoder_arcsec=2.0, seating=0.005)
     points = {"A": sockets["A"]}
     observed = aj.simulate(arm.arm, points, poses=8, observations=simulated(), noise=noise, seed=1)

@@ -146,7 +146,7 @@ def _written_files(folder: Path) -> dict[str, Path]:
     aj.files.save_capture(paths["capture"], found["recording"])
     aj.files.save_calibration(paths["calibration"], found["record"])
     recording = aj.Recording(found["two_bars"], found["nominal"])
-    aj.files.save_evaluation(paths["evaluation"], aj.acceptance.evaluation_of(found["record"], recording))
+    aj.files.save_evaluation(paths["evaluation"], aj.evaluate_capture(found["record"], recording))
     return paths
 
 

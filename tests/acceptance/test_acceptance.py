@@ -589,7 +589,7 @@ def calibrated(cheng):
 def test_only_held_out_data_are_tested_with_the_uncertainty_that_is_stated(calibrated):
     record, recording = calibrated
     found = values_of(
-        acceptance.evaluation_of(record, recording, u_test=0.01, standards=STANDARDS).acceptance()["calibrated"]
+        aj.evaluate_capture(record, recording, u_test=0.01, standards=STANDARDS).acceptance()["calibrated"]
     )
     assert {value.where for value in found["Deltam"]} == {"C"}
     assert {value.where.partition(",")[0] for value in found["E_Uni"]} == {"A - C"}
@@ -602,7 +602,7 @@ def test_sockets_that_share_poses_with_the_calibration_are_not_new(calibrated):
     # C is new, B is known except for two poses.
     q = recording.capture.sockets
     more = {"A": q["A"], "B": np.concatenate([q["B"], q["C"][:2] + 0.001]), "C": q["C"]}
-    evaluation = acceptance.evaluation_of(
+    evaluation = aj.evaluate_capture(
         record, recording._replace(capture=aj.Capture(more, recording.capture.lengths)), limits={"Deltam": 1.0}
     )
     assert evaluation.limits == {"Deltam": Limit(1.0)}
@@ -615,7 +615,7 @@ def test_procedures_are_run_where_they_are_asked_for(calibrated, procedure, reco
     record, recording = calibrated
 
     def standards(recording, **options):
-        found = acceptance.evaluation_of(record, recording, **options).acceptance()
+        found = aj.evaluate_capture(record, recording, **options).acceptance()
         nominal, calibrated = ({test.standard for test in found[stage]} for stage in ("nominal", "calibrated"))
         assert nominal == calibrated
         return calibrated
@@ -630,14 +630,14 @@ def test_procedures_are_run_where_they_are_asked_for(calibrated, procedure, reco
 
 def test_what_makes_an_evaluation_doubtful_is_said_first(calibrated):
     record, recording = calibrated
-    seen = acceptance.evaluation_of(record, record.recording, limits={"Deltam": Limit(1.0)})
+    seen = aj.evaluate_capture(record, record.recording, limits={"Deltam": Limit(1.0)})
     words = " ".join(seen.warnings)
     assert "too favourable and are not a test" in words
     assert "No uncertainty was stated for Deltam" in words
     assert all(test.missing for test in seen.acceptance()["calibrated"])
-    failed = acceptance.evaluation_of(record._replace(converged=False, reason="It did not."), recording)
+    failed = aj.evaluate_capture(record._replace(converged=False, reason="It did not."), recording)
     assert "The calibration failed" in failed.warnings[0]
-    simulated = acceptance.evaluation_of(record, recording._replace(true=recording.nominal))
+    simulated = aj.evaluate_capture(record, recording._replace(true=recording.nominal))
     assert "simulated" in simulated.warnings[0]
 
 

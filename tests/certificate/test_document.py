@@ -127,7 +127,7 @@ def evaluation(record) -> aj.acceptance.EvaluationRecord:
     sphere = aj.data.ProbedSphere("s & S", "effective-diameter", (touched + np.linspace(0, 0.03, 25)[:, None],), 25.0)
     recording = aj.Recording(capture, record.recording.nominal, spheres=(sphere,))
     warm = aj.acceptance.Influences(u_relative=1e-6, artefact=aj.acceptance.Expansion(11.5e-6, 1e-6, 21.0, 0.2))
-    return aj.acceptance.evaluation_of(
+    return aj.evaluate_capture(
         record,
         recording,
         limits={"Deltam": 5.0, "E_Uni": 0.05},

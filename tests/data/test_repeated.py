@@ -37,7 +37,7 @@ def test_copies_change_nothing(paper_arm, noisy_capture, copied):
             np.testing.assert_array_equal(one, other)
     specification = aj.kinematics.ArmSpecification(paper_arm, "test")
     record = aj.calibration.record_of(once, aj.Recording(noisy_capture, specification))
-    evaluated = aj.acceptance.evaluation_of(record, aj.Recording(copied, specification))
+    evaluated = aj.evaluate_capture(record, aj.Recording(copied, specification))
     assert sum(warning.startswith("Duplicates ignored") for warning in evaluated.warnings) == 2
     pairs = ((aj.evaluate(paper_arm, c), aj.fix_scale(paper_arm, c)) for c in (noisy_capture, copied))
     for one, other in zip(*map(numbers_of, pairs), strict=True):

@@ -100,7 +100,7 @@ def test_a_pose_that_was_not_seated(paper_arm, noisy_capture):
 def test_redundant_and_too_few(paper_arm, noisy_capture):
     sockets = noisy_capture.sockets
     few = aj.Capture({"A": sockets["A"][:8], "B": sockets["B"][:2]}, noisy_capture.lengths)
-    assert "Only 4 more equations than unknowns" in warnings_of(few, paper_arm)[1]
+    assert "There are only 4 more equations than unknowns" in warnings_of(few, paper_arm)[1]
     specification = aj.kinematics.ArmSpecification(
         paper_arm, "test", held=("theta_1", "d_1", "a_6", "probe_x", "probe_y")
     )
@@ -108,7 +108,7 @@ def test_redundant_and_too_few(paper_arm, noisy_capture):
         result = aj.calibrate(paper_arm, noisy_capture, specification.bounds())
     record = aj.calibration.record_of(result, aj.Recording(noisy_capture, specification))
     text = " ".join(sentences(findings_of(record)))
-    assert "No measurement of this kind can separate: alpha_6 and d_6 trade off." in text
+    assert "Not determined by any measurement of this kind: alpha_6 and d_6 trade off." in text
 
 
 def test_readings_outside_the_limits():
@@ -117,7 +117,7 @@ def test_readings_outside_the_limits():
     lengths = [aj.ReferenceLength("A", "B", 50.0)]
     right = aj.Capture({"A": q, "B": q + 0.1}, lengths)
     assert [finding.says for finding in of_recording(aj.Recording(right, panda))] == [
-        "Taken as exact, because u is 0: A - B."
+        "These lengths are treated as exact, because their u is 0: A - B."
     ]
     near = q.copy()
     near[0, 3] = panda.arm.limits[3][1] + np.deg2rad(0.009)  # as far beyond a limit as noise may take it
@@ -137,8 +137,8 @@ def test_readings_outside_the_limits():
         (0.02, []),
         (1e-4, []),
         (1.0, []),
-        (20e-6, ["u < 0.1 um is implausibly small: {} (u = 0.02 um). u is in mm; was it given in m?"]),
-        (20.0, ["u > 1 mm is implausibly large: {} (u = 20,000 um). u is in mm; was it given in um?"]),
+        (20e-6, ["u < 0.1 um is implausibly small: {} (u = 0.02 um). u must be in mm; was it given in m?"]),
+        (20.0, ["u > 1 mm is implausibly large: {} (u = 20,000 um). u must be in mm; was it given in um?"]),
     ],
 )
 def test_uncertainties_in_another_unit_are_named(paper_arm, u, said):

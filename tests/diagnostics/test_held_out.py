@@ -27,7 +27,7 @@ def test_the_placement_that_disagrees_is_named():
     assert "some groups disagree with the others by more than predicted: high (0.38 mm RMS, 3.8 times" in text
     assert "the remaining 8 agree" in text
     text = said(group("a"), group("b"), group("place_1", error=0.05))
-    assert "place_1 (lengths off by 0.05 mm, 5.0 times their u)" in text
+    assert "place_1 (length error 0.05 mm RMS, 5.0 times its u)" in text
     # Where most of them do, the model is at fault and not a placement.
     assert "each placement is held out in turn, the errors are larger than predicted" in said(
         *(group(f"place_{i}", 0.2) for i in range(3))
@@ -64,7 +64,7 @@ def test_a_remounted_probe_is_named():
     """Where most of the excess is gone once the place of the probe is fitted, and only there."""
     bad = agreement(0.25, 90, 180.0)
     (text,) = sentences(surprise(bad, NOTHING, {}, lambda: agreement(0.1)))
-    assert "fitted to these data, the poses are 0.1 mm RMS from their geometry: the tip was remounted" in text
+    assert "fitted to these data, the poses are only 0.1 mm RMS from their geometry: the tip was remounted" in text
     (text,) = sentences(surprise(bad, NOTHING, {}, lambda: agreement(0.2)))
     assert "the tip was remounted" not in text
     assert "a remounted tip" in text

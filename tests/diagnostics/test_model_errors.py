@@ -95,7 +95,7 @@ def test_nothing_wrong(paper_arm, captured, given):
         (eccentric, {("first harmonic", 2), ("first harmonic", 3)}, 10 * ARCSEC, "an eccentric encoder"),
         (tilted, {("second harmonic", 2)}, 10 * ARCSEC, "a tilted or oval encoder"),
         (geared, {("gear ratio", 3)}, 1e-4, "a wrong gear ratio"),
-        (warming, {("drifting zero", 3)}, 10 * ARCSEC, "a zero that drifts"),
+        (warming, {("drifting zero", 3)}, 10 * ARCSEC, "a zero offset that drifts"),
     ],
 )
 def test_what_the_model_lacks_is_named(paper_arm, captured, given, errors, expected, amplitude, cause):
@@ -198,7 +198,7 @@ def test_observations_and_their_division_into_chunks(paper_arm, monkeypatch):
     wrong = changed(eccentric, 0.02)
     found, said = checked(paper_arm, wrong, True)
     assert [one.name for one in found.noisy_observations][:1] == ["camera"]
-    assert any("camera (" in text and "their u" in text for text in said)
+    assert any("camera (" in text and "their stated standard uncertainties" in text for text in said)
     monkeypatch.setattr(equations, "_CHUNK", 25)
     divided, _ = checked(paper_arm, wrong, True)
     assert divided.misfit.ratio == pytest.approx(found.misfit.ratio)

@@ -19,7 +19,7 @@ def problem(rng):
     ]
     rows, own = np.concatenate([block.shared for block in blocks]), np.zeros((sum(SIZES), 2 * len(SIZES)))
     for i, (block, end) in enumerate(zip(blocks, np.cumsum(SIZES), strict=True)):
-        own[end - SIZES[i] : end, 2 * i : 2 * i + 2] = block.own
+        own[end - SIZES[i] : end, 2 * i : 2 * i + 2] = block.private
     return blocks, np.concatenate([rows, own], axis=1)
 
 

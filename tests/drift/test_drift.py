@@ -122,8 +122,8 @@ def test_parameters_against_numbers_worked_out_by_hand(old, new):
     assert found.joint_test.p == pytest.approx(stats.chi2.sf((9.9**2 + 9.7**2) / 25, 21), rel=1e-6)
     assert found.by_chance == pytest.approx(1.05)
     assert (
-        "1 of 21 parameters changed by more than its uncertainty (95 %; 1 expected by chance): theta_4 by +2.04 arcsec"
-        in " ".join(found.sentences())
+        "1 of 21 parameters changed by more than its expanded uncertainty (95 %; 1 expected by chance): theta_4 by "
+        "+2.04 arcsec" in " ".join(found.sentences())
     )
 
 
@@ -191,7 +191,7 @@ def test_on_a_bound_or_fixed_there_is_no_uncertainty_of_change(old, new):
         assert found.joint_test.rank == 19
         assert len(found.joint_test.names) == 19
         assert found.by_chance == pytest.approx(19 * 0.05)
-        assert f"Free in the {other} calibration only: d_6." in " ".join(found.warnings)
+        assert f"Parameters free only in the {other} calibration: d_6." in " ".join(found.warnings)
         rows = {row["parameter"]: row for row in drift_summary(found)["parameters"]}
         assert rows["d_6"]["u"] is rows["d_6"]["moved"] is None
         assert rows["d_6"]["change"] == pytest.approx(float(pair[1].calibrated.arm.d[5] - pair[0].calibrated.arm.d[5]))
@@ -240,7 +240,7 @@ def test_an_arm_without_corrections_is_compared_with_one_that_has_some(old):
         2e-4,
         "fixed at 0 by the model in the old calibration",
     )
-    assert "Free in the new calibration only: cos1_3, gear_2, compliance3_2" in " ".join(drift.warnings)
+    assert "Parameters free only in the new calibration: cos1_3, gear_2, compliance3_2" in " ".join(drift.warnings)
 
 
 def test_lengths_follow_the_scale(paper_arm, specification):
@@ -498,7 +498,8 @@ def test_command(run, files, calibrated):
     assert printed.exit_code == 0, printed.exception
     words = " ".join(printed.stdout.split())
     assert words.startswith(
-        "Cheng 2018, simulated arm: c.h5 (2026-03-01) compared with a.h5 (2026-01-01) Together, the changes of 21"
+        "Cheng 2018, simulated arm: c.h5 (2026-03-01) compared with a.h5 (2026-01-01) Tested together, the "
+        "changes of 21"
     )
     assert "Warning" not in words
     assert "* beyond U" in words

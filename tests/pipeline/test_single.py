@@ -342,7 +342,7 @@ def test_what_does_not_converge_names_what_trades_off(paper_arm, noisy_capture, 
     record = aj.calibration.record_of(found, aj.Recording(noisy_capture, aj.kinematics.ArmSpecification(paper_arm)))
     assert not record.converged
     sentence = (
-        r"Not converged: the step limit was reached; (.*) trade off; hold one of these parameters, or give it a prior\."
+        r"Not converged: the step limit was reached; (.*) trade off; fix one of these parameters, or give it a prior\."
     )
     names = re.fullmatch(sentence, record.reason)[1].split(", ")
     assert 2 <= len(names) <= 4

@@ -50,7 +50,7 @@ def written(tmp_path_factory, observed_record):
     bounds = aj.Bounds.around(nominal.arm, space, length=10.0, angle=0.0175, override={"d_5": 0.2})
     record = aj.calibration.record_of(aj.calibrate(nominal.arm, seen.capture, bounds), seen)
     aj.files.save_calibration(folder / "calibration.h5", record)
-    evaluation = aj.acceptance.evaluation_of(
+    evaluation = aj.evaluate_capture(
         record, recording, limits={"Deltam": aj.acceptance.Limit(5.0), "E_Uni": aj.acceptance.Limit(1e-4)}, u_test=0.001
     )
     doubts = {"warnings": (*evaluation.warnings, f"Beware of {HOSTILE}"), "calibration_warnings": (f"Not {HOSTILE}",)}

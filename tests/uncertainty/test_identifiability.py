@@ -56,7 +56,7 @@ def test_rank_and_null_space_of_the_paper(paper_arm, single, paper_capture, case
         paper_arm, paper_capture if lengths else single, aj.Parameters.free_of(paper_arm, held=held), noise=noise
     )
     assert seen.rank == rank
-    assert {text.replace(" (changes nothing that is measured)", "") for text in seen.undetermined} == directions
+    assert {text.replace(" (has no effect on the measurements)", "") for text in seen.undetermined} == directions
     structural = {text for text, never in zip(seen.undetermined, seen.structural, strict=True) if never}
     assert not any("scale" in text for text in structural)
     assert len(structural) == len(directions) - ("all lengths together: the scale" in directions)

@@ -89,7 +89,7 @@ def test_a_target_takes_the_place_of_the_probe(paper_arm):
     assert set(seen.undetermined) == {
         "d_6 and offset of T6 trade off",
         "theta_6, orientation of T6 and offset of T6 trade off",
-        "probe_z (changes nothing that is measured)",
+        "probe_z (has no effect on the measurements)",
     }
 
 

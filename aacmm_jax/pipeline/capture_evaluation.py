@@ -1,0 +1,230 @@
+"""A calibration evaluated on a capture, and points judged, as ``aacmm evaluate`` does it.
+
+One call each, whose options state their defaults once.
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..acceptance.judgement import Influences, Limit, Rule
+from ..acceptance.record import (
+    NO_INFLUENCES,
+    SIMULATED,
+    EvaluationRecord,
+    Millimetres,
+    PointsRecord,
+    check_geometry,
+    checked_limits,
+    same_arm,
+    unstated_uncertainty_warning,
+)
+from ..acceptance.results import Measured
+from ..acceptance.standards import OF_SPHERES, STANDARDS, checked_standards
+from ..calibration.record import CalibrationRecord, uncertainty_of
+from ..core.arguments import NotNegative, checked_arguments, with_options
+from ..core.errors import InputError
+from ..core.text import shorten
+from ..data.capture import Capture
+from ..data.recording import Recording
+from ..diagnostics.findings import findings_of, sentences
+from ..kinematics.arm import Arm
+
+
+class EvaluationOptions(NamedTuple):
+    """How `evaluate_capture` and `evaluate_points` judge: their keyword arguments, described there, and their defaults.
+
+    Example:
+        >>> options = aj.pipeline.EvaluationOptions(only=["A", "B"], limits={"Deltam": 0.1})
+        >>> evaluation = aj.evaluate_capture(record, aj.Recording(two_bars, nominal), **options._asdict())
+        >>> print(evaluation.recording.capture.names)
+        ('A', 'B')
+    """
+
+    only: Sequence[str] | str | None = None
+    without: Sequence[str] | str = ()
+    limits: Mapping[str, Limit | float] = MappingProxyType({})
+    u_test: Millimetres = 0.0
+    influences: Influences = NO_INFLUENCES
+    rule: Rule | None = None
+    standards: Sequence[str] | None = None
+    measuring_range: float | None = None
+    maxima: Mapping[str, NotNegative] = MappingProxyType({})
+    calibration_warnings: Sequence[str] | None = None
+
+
+@checked_arguments
+@with_options(EvaluationOptions)
+def evaluate_capture(record: CalibrationRecord, recording: Recording, **options: Any) -> EvaluationRecord:
+    """Evaluate a calibration on a capture: what ``aacmm evaluate`` does, with the same defaults.
+
+    A socket counts as identified from if the calibration used any of its poses. Of another observation, the poses that
+    it did not use are held out, as far as they determine their geometry: that is fitted to the arm.
+
+    Args:
+        record: the calibration.
+        recording: the capture; its nominal arm should be that of the calibration.
+        only: names or shell patterns of the sockets and observations to evaluate, as for `Capture.select`; None, all.
+        without: names or shell patterns of those to leave out.
+        limits: MPE of metrics, mm, as for `acceptance.run`.
+        u_test: standard uncertainty that seat and fixture add to every test value, mm.
+        influences: what else adds to it, as for `acceptance.run`.
+        rule: decision rule, as for `acceptance.run`.
+        standards: standards whose acceptance tests are run: "jjf", "asme", "iso". By default those whose procedure the
+            recording was made for. Tests with a limit are run in any case.
+        measuring_range: diameter of the measuring volume as the maker states it, mm; by default the recording's.
+        maxima: limits of the quantities in `acceptance.record.MAXIMA`, mm.
+        calibration_warnings: what should be read about the calibration itself; by default it is tested again
+            (`diagnostics.findings_of`).
+
+    Returns:
+        The record, from which errors and acceptance tests follow; it has warnings on what makes it doubtful.
+
+    Raises:
+        InputError: an impossible limit, or one whose metric nothing can be measured for; observations that do not
+            determine their own unknown geometry; options of acceptance tests where none is run.
+
+    Example:
+        >>> limits = {"Length": 0.1}
+        >>> evaluation = aj.evaluate_capture(record, aj.Recording(two_bars, nominal), limits=limits)
+        >>> for test in evaluation.acceptance()["calibrated"]:
+        ...     print(test.title, test.decision)
+        single point and length, as in Cheng et al. 2018 conforms
+    """
+    chosen = EvaluationOptions(**options)
+    used = {row.tobytes() for row in np.asarray(record.recording.capture.readings)}
+    capture = recording.capture.select(chosen.only, chosen.without)
+    capture = _divided(record.calibrated.arm, capture, used)
+    check_geometry(record.calibrated.arm, capture)
+    readings = dict(capture.sockets) | {part.name: part.q for part in capture.observations}
+    shared = {name: sum(row.tobytes() in used for row in np.asarray(q)) for name, q in readings.items()}
+    made_for = (*recording.acceptance, *(OF_SPHERES[sphere.test] for sphere in recording.spheres))
+    noted = chosen.calibration_warnings
+    evaluation = EvaluationRecord(
+        recording._replace(
+            capture=capture,
+            nominal=record.recording.nominal,
+            measuring_range=chosen.measuring_range or recording.measuring_range,
+        ),
+        record.calibrated,
+        frozenset(name for name, count in shared.items() if count),
+        limits=checked_limits(chosen.limits),
+        u_test=chosen.u_test,
+        maxima=dict(chosen.maxima),
+        standards=checked_standards(made_for if chosen.standards is None else chosen.standards),
+        uncertainty=uncertainty_of(record),
+        calibration_warnings=tuple(sentences(findings_of(record)) if noted is None else noted),
+        influences=chosen.influences,
+        rule=chosen.rule,
+    )
+    tests = evaluation.acceptance()["calibrated"]
+    if not tests:
+        _refuse_options_of_tests(chosen)
+    partly = [
+        f"{name} ({count} of {len(readings[name])} poses)"
+        for name, count in shared.items()
+        if 0 < count < len(readings[name])
+    ]
+    warnings = [*_warnings(record, recording, evaluation, partly), *unstated_uncertainty_warning(tests)]
+    return evaluation._replace(warnings=tuple(warnings))
+
+
+@checked_arguments
+@with_options(EvaluationOptions)
+def evaluate_points(measured: Measured, **options: Any) -> PointsRecord:
+    """Judge points that were measured elsewhere: what ``aacmm evaluate`` does with a manifest of points.
+
+    Args:
+        measured: the points of sockets and spheres, and the reference lengths, mm.
+        options: as for `evaluate_capture`, like all arguments that are not named here; those that concern a calibration
+            do not apply, and the acceptance tests of all standards are run by default.
+
+    Returns:
+        The record, from which the acceptance tests follow.
+
+    Raises:
+        InputError: options that do not apply, or a standard that is unknown.
+
+    Example:
+        >>> cone = aj.acceptance.Measured({"cone": result.arm.position(capture.sockets["A"])})
+        >>> judged = aj.evaluate_points(cone, limits={"SPAT": 0.05}, rule="simple")
+        >>> print([(metric.name, metric.decision) for test in judged.acceptance() for metric in test.metrics])
+        [('Deltam', None), ('SPAT', 'conforms'), ('SPAT_2s', None)]
+    """
+    chosen = EvaluationOptions(**options)
+    if chosen.maxima or chosen.only is not None or chosen.without or chosen.calibration_warnings is not None:
+        raise InputError(
+            "--max-..., --only and --without (maxima, only, without) do not apply to a manifest of points; name a "
+            "calibration and a capture, or leave these options out."
+        )
+    return PointsRecord(
+        measured._replace(measuring_range=chosen.measuring_range or measured.measuring_range),
+        limits=chosen.limits,
+        u_test=chosen.u_test,
+        standards=checked_standards(STANDARDS if chosen.standards is None else chosen.standards),
+        influences=chosen.influences,
+        rule=chosen.rule,
+    )
+
+
+def _refuse_options_of_tests(chosen: EvaluationOptions) -> None:
+    """Raise `InputError` where options are given that only acceptance tests use."""
+    influences = chosen.influences
+    given = {
+        "--rule (rule)": chosen.rule is not None,
+        "--test-u-mm (u_test)": chosen.u_test > 0 or influences.u > 0 or influences.u_relative > 0,
+        "--expansion (influences)": influences.artefact is not None or influences.arm is not None,
+        "--range-mm (measuring_range)": chosen.measuring_range is not None,
+    }
+    if any(given.values()):
+        raise InputError(
+            f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only, but this "
+            "capture supports none, or none was requested; request one with --acceptance (standards), or leave the "
+            "option out."
+        )
+
+
+def _warnings(
+    record: CalibrationRecord, recording: Recording, evaluation: EvaluationRecord, partly: Sequence[str]
+) -> Iterator[str]:
+    """What makes an evaluation doubtful; ``partly`` names what has poses that the calibration used, and others."""
+    if not record.converged or not record.plausible_scale:
+        reason = record.reason if not record.converged else f"k = {record.k:.6g} is not a plausible scale."
+        yield f"The calibration failed, so the results are meaningless: {reason}"
+    if recording.true is not None:
+        yield SIMULATED
+    yield from evaluation.recording.capture.repeated.sentences()
+    if partly:
+        yield (
+            f"The arm was identified from some poses of {', '.join(partly)}; the other poses of these sockets and "
+            "observations count as used, too."
+        )
+    if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
+        yield (
+            f"The capture is of '{recording.nominal.name}', but the calibration is of "
+            f"'{record.recording.nominal.name}'; check that the arm is the same."
+        )
+    if not evaluation.independent:
+        yield (
+            "The calibration used all data of this capture, so the results are too favourable and are not a test; "
+            "measure sockets or lengths that the calibration does not use."
+        )
+
+
+def _divided(arm: Arm, capture: Capture, used: Collection[bytes]) -> Capture:
+    """With the poses of an observation that were not used as an observation of their own, where others were."""
+    observations = []
+    for observation in capture.observations:
+        seen = np.array([row.tobytes() in used for row in np.asarray(observation.q)])
+        parts = [observation]
+        if seen.any() and not seen.all() and not any(observation.name in (r.start, r.end) for r in capture.lengths):
+            unseen = observation.select(np.flatnonzero(~seen)).changed(name=f"{observation.name}, held out")
+            try:
+                check_geometry(arm, Capture({}, [], [unseen]))
+                parts = [observation.select(np.flatnonzero(seen)), unseen]
+            except InputError:
+                pass  # too few poses: the observation counts as identified from
+        observations += parts
+    return Capture(capture.sockets, capture.lengths, observations, capture.repeated)
