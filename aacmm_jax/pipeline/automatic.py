@@ -10,32 +10,33 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.record import CalibrationRecord, record_of
+from ..calibration.record import CalibrationRecord
 from ..calibration.results import Calibration, Identification
 from ..core.distributions import f_tail
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..core.units import DEG
 from ..data.capture import Capture
-from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.contradictions import remove_contradicting
 from ..diagnostics.usability import on_bounds
 from ..kinematics.arm import is_length
 from ..kinematics.parameters import ArmSpecification
+from ..kinematics.priors import default_prior
 from .model_ladder import ComparedModels, compare_models, default_models
 
 Solve = Callable[[Recording], Calibration | Identification]
-Stage = Callable[[str, Callable[[], Any]], Any]
+Record = Callable[[Calibration | Identification, Recording], CalibrationRecord]
 
 _WIDER, _ROUNDS = 5.0, 4  # factor by which bounds that were reached are widened, and how often
 _WIDEST = np.pi / 2  # rad
 _BY_CHANCE = 0.01  # probability of so much smaller residuals by chance, below which wider bounds are kept
 _PLAIN = "dh"
-_BETTER = 1.0  # log evidence by which gravity must make the data more probable
+_SOME, _FUNCTIONS = "harmonics=1-6", "functions"
+_WORTH = 10.0  # log evidence that a richer model must add for a still richer one to be tried
 
 
-def with_wider_bounds(record: CalibrationRecord, solve: Solve) -> CalibrationRecord:
+def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
     """The calibration with wider bounds where parameters ended on one that nobody stated, and the residuals are smaller
     by more than chance explains; else as it is."""
     first, nominal = on_bounds(record), record.recording.nominal
@@ -51,7 +52,7 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve) -> CalibrationRec
             result = solve(recording)
         except InputError:  # with such bounds the data do not determine the arm
             break
-        wider = record_of(result, recording, robust=record.robust)
+        wider = recorded(result, recording)
         if wider.converged and _is_better(wider, best, len(reached)):
             best = wider
     if best is record:
@@ -66,7 +67,7 @@ def with_wider_bounds(record: CalibrationRecord, solve: Solve) -> CalibrationRec
         f"Default bounds were widened where the fit reached them: {shorten(texts, 4)}. The residuals fell from "
         f"{record.observed.rms:.3g} to {best.observed.rms:.3g} mm RMS."
     )
-    return best._replace(others=record.others, decisions=(*record.decisions, says))
+    return best._replace(decisions=(*record.decisions, says))
 
 
 def _half_width(nominal: ArmSpecification, name: str) -> float:
@@ -88,31 +89,40 @@ def _is_better(wider: CalibrationRecord, record: CalibrationRecord, widened: int
     return f_tail(max(before - after, 0.0) * freedom / widened / after, widened, freedom) < _BY_CHANCE
 
 
-def without_contradicting(record: CalibrationRecord, solve: Solve) -> CalibrationRecord:
+def without_contradicting(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
     """The calibration without groups that contradict all others, where the data show which groups these are."""
 
-    kept = remove_contradicting(record, lambda capture: solve(record.recording._replace(capture=capture)))
+    def solved(capture: Capture) -> CalibrationRecord:
+        part = record.recording._replace(capture=capture)
+        return recorded(solve(part), part)
+
+    kept = remove_contradicting(record, solved)
     return kept._replace(decisions=record.decisions)
 
 
-def with_best_model(record: CalibrationRecord, noise: Noise | None, stage: Stage) -> CalibrationRecord:
+def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -> CalibrationRecord:
     """The calibration with the model of the joints that predicts held-out regions best; as it is where that is the arm
     alone, or where there are too few poses to hold some out."""
     recording = record.recording
     nominal, capture = recording.nominal, recording.capture
     bounds = nominal.bounds()
 
-    def compared(models: tuple[str, ...]) -> ComparedModels:
-        return compare_models(nominal.arm, capture, bounds, models=models, noise=noise)
+    def compared(models: list[str]) -> ComparedModels:
+        return compare_models(nominal.arm, capture, bounds, models=models, noise=options.noise)
 
+    models = [model for model in default_models(nominal.arm, capture) if _FUNCTIONS not in model]
     try:
-        ladder = stage("Comparing models", lambda: compared(_simple_models(nominal, capture)))
-    except InputError:
+        ladder = options.stage("Comparing models", lambda: compared(models))
+        # Models with more functions of each joint take longer, and the next is tried only where the last explains more.
+        for functions in (_SOME, _FUNCTIONS):
+            before = max(ladder.models, key=lambda model: model.log_evidence)
+            richer = _with_functions(before.model, functions)
+            added = options.stage(f"Comparing models ({richer})", lambda model=richer: compared([model]))
+            ladder = ComparedModels((*ladder.models, *added.models))
+            if added.models[0].log_evidence < before.log_evidence + _WORTH:
+                break
+    except InputError:  # too few poses to hold some out
         return record
-    rich = _rich_model(ladder)
-    if rich is not None:
-        more = stage(f"Comparing models ({rich})", lambda: compared((rich,)))
-        ladder = ComparedModels((*ladder.models, *more.models))
     chosen, plain = ladder.recommended, ladder.models[0]
     if chosen.model == _PLAIN or not chosen.result.converged:
         return record
@@ -121,22 +131,13 @@ def with_best_model(record: CalibrationRecord, noise: Noise | None, stage: Stage
         f"Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
         f"compared, {len(chosen.regions)} regions)."
     )
-    modelled = recording._replace(nominal=nominal._replace(arm=chosen.result.space.base))
-    again = record_of(chosen.result, modelled)
-    return again._replace(others=record.others, removed=record.removed, decisions=(*record.decisions, says))
+    corrected = chosen.result.space.base
+    modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
+    again = recorded(chosen.result, modelled)
+    return again._replace(removed=record.removed, decisions=(*record.decisions, says))
 
 
-def _simple_models(nominal: ArmSpecification, capture: Capture) -> tuple[str, ...]:
-    models = default_models(nominal.arm, capture)
-    return tuple(model for model in models if "functions" not in model)
-
-
-def _rich_model(ladder: ComparedModels) -> str | None:
-    """The model with many functions of each joint, which takes seconds; with gravity where that makes the data more
-    probable; None where a simple model leaves nothing to explain."""
-    by_name = {model.model: model for model in ladder.models}
-    gravity = max(
-        by_name["gravity"].log_evidence - by_name["dh"].log_evidence,
-        by_name["gravity,harmonics=1"].log_evidence - by_name["harmonics=1"].log_evidence,
-    )
-    return "gravity,functions" if gravity > _BETTER else "functions"
+def _with_functions(model: str, functions: str) -> str:
+    """A model with these functions of each joint in place of its own."""
+    kinds = [kind for kind in model.split(",") if kind != _PLAIN and not kind.startswith("harmonics")]
+    return ",".join([*kinds[:1], functions, *kinds[1:]] if kinds[:1] == ["gravity"] else [functions, *kinds])
