@@ -34,7 +34,7 @@ OPTIMISED := XLA_FLAGS=
 OPTIMISED_FILES = $(shell grep -rlw --include "test_*.py" mark.optimised tests)
 # Numerics, differentiation, storage and the command line on real captures: what a change of a dependency breaks first.
 SELECTION := tests/test_package.py tests/kinematics tests/solver \
-	tests/pipeline/test_single.py tests/files/test_storage.py tests/test_real_captures.py
+	tests/pipeline/test_single.py tests/files/test_hdf5.py tests/test_real_captures.py
 PANDA := aacmm-demo/panda
 SUMMARY := sed '/^Warning/,$$d'
 # As a processor of 2008 rounds: SSE4.2 and the linear algebra of that time (without effect on other architectures).

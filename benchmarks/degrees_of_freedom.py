@@ -1,4 +1,4 @@
-"""Coverage of lengths where errors that poses share were learned from few placements, against an oracle.
+"""Coverage of lengths where shared errors were learned from few placements, against an oracle.
 
 ``python benchmarks/degrees_of_freedom.py [--trials N]`` writes ``results/degrees-of-freedom-DATE.json``: the paper's
 arm (2 arcsec, 5 um), and a bar of 300 mm that stands in 3, 5 or 8 places, 12 poses at each of its ends, which share an

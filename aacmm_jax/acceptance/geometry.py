@@ -82,7 +82,8 @@ def fit_sphere(points: Numbers) -> FittedSphere:
     size = float(np.linalg.norm(centred, axis=1).max())
     if size == 0 or np.linalg.svd(centred / size, compute_uv=False)[2] < 1e-6:
         raise InputError(
-            "the points on a sphere lie in one plane, which determines no sphere; touch the sphere on all sides."
+            "the points on a sphere lie in one plane, so they do not determine the sphere; touch the sphere on all "
+            "sides."
         )
     # |p|^2 = 2 c.p + (r^2 - |c|^2) is linear in the centre; with lengths of about 1 it is also well conditioned.
     scaled = centred / size

@@ -102,7 +102,8 @@ def checked_limit(limit: Limit, what: str) -> Limit:
     """The same limit, or `InputError` where it is impossible."""
     if not (0 <= limit.fixed <= MOST and limit.divisor >= LEAST_DIVISOR):
         raise InputError(
-            f"{what} is {limit} mm; in A+L/K, A must be zero or positive and finite, and K at least {LEAST_DIVISOR:g}."
+            f"{what} is {limit} mm; in A+L/K, A must be finite and not negative, and K must be at least "
+            f"{LEAST_DIVISOR:g}."
         )
     return limit
 
@@ -115,7 +116,9 @@ def limit_of_text(text: str, given: str) -> Limit:
             raise ValueError(text)
         limit = Limit(number(match["fixed"]), number(match["divisor"]) if match["divisor"] else math.inf)
     except ValueError as error:
-        raise InputError(f"{given} is not A or A+L/K with numbers in mm; give, for example, 0.002+L/500000.") from error
+        raise InputError(
+            f"{given} is not of the form A or A+L/K with numbers in mm; give, for example, 0.002+L/500000."
+        ) from error
     return checked_limit(limit, given)
 
 
@@ -127,11 +130,13 @@ def read_limits(texts: list[str], metrics: Mapping[str, str]) -> dict[str, Limit
         given, equals, value = text.partition("=")
         name = names.get(given.strip().lower())
         if not equals:
-            raise InputError(f"--mpe '{text}' is not NAME=A or NAME=A+L/K, in mm; for example E_Uni=0.025+L/40000.")
+            raise InputError(
+                f"--mpe '{text}' is not of the form NAME=A or NAME=A+L/K in mm; give, for example, E_Uni=0.025+L/40000."
+            )
         if name is None:
             raise InputError(f"--mpe '{text}' names the unknown metric '{given}'{without_test(given, metrics)}")
         if name in limits:
-            raise InputError(f"--mpe gives two limits for {name}; give one.")
+            raise InputError(f"--mpe gives two limits for {name}; give one limit.")
         limits[name] = limit_of_text(value, f"--mpe {name}={value}")
     return limits
 

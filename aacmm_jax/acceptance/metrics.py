@@ -51,7 +51,9 @@ def spat(points: Numbers) -> tuple[float, float]:
     """
     given = points_of(points, "points of a socket")
     if len(given) < 2:
-        raise InputError("one point has no scatter; articulate the arm about the socket and take at least two points.")
+        raise InputError(
+            "one point has no scatter; articulate the arm about the socket and record at least two points."
+        )
     distances = np.linalg.norm(given - given.mean(axis=0), axis=1)
     return float(distances.max()), 2 * math.sqrt(float(distances @ distances) / (len(given) - 1))
 

@@ -123,12 +123,13 @@ def plan_procedure(
     search, reach = search_region(arm, None, margin, above, seed), arm_reach(arm)
     if reach.radius < 10 * diameter:
         raise InputError(
-            f"a reach of {reach.radius:.0f} mm is too small for a sphere of {diameter:g} mm; take a smaller sphere."
+            f"a reach of {reach.radius:.0f} mm is too small for a sphere of {diameter:g} mm; use a smaller sphere."
         )
     size = 2 * reach.radius if measuring_range is None else float(measuring_range)
     if not reach.radius / 2 <= size <= 4 * reach.radius:
         raise InputError(
-            f"a measuring range of {size:g} mm does not suit a reach of {reach.radius:.0f} mm; give its diameter in mm."
+            f"a measuring range of {size:g} mm does not suit a reach of {reach.radius:.0f} mm; give the diameter of "
+            "the measuring range in mm."
         )
     if standard == "asme":
         default = [round(float(np.mean(bar)) * size / 2) for bar in BARS]
@@ -165,7 +166,7 @@ def _unsuitable_bars(standard: Planned, size: float, lengths: Sequence[float]) -
         sentence = f"The longest bar, {lengths[-1]:g} mm, is shorter than 66 % of the measuring range ({least:.0f} mm)."
         return [sentence] if lengths[-1] < least else []
     return [
-        f"A bar of {length:g} mm is outside the range of {bar_range(bar, size / 2)}."
+        f"A bar of {length:g} mm is outside the required range of {bar_range(bar, size / 2)}."
         for bar, length in zip(BARS, lengths, strict=True)
         if not bar[0] <= length / (size / 2) <= bar[1]
     ]
@@ -193,7 +194,7 @@ class _Planner:
             try:
                 point, q = self._socket_in_zone(zone, SPAT_POSES)
             except _OutOfReach as error:
-                left_out.append(f"{error} The test leaves out this zone.")
+                left_out.append(f"{error} This zone is left out of the test.")
                 continue
             middle = point if name == "middle" else middle
             q = q[_both_sides(elbow_sides(self.search.arm, q, self.reach), q)]
@@ -201,7 +202,8 @@ class _Planner:
             self.sockets.append(ProcedureItem("single-point articulation", f"spat/{name}", 1, points, q))
         if middle is None:
             raise InputError(
-                f"{left_out[0]} Nothing can be tested without the middle zone; give a lower table or a smaller margin."
+                f"{left_out[0]} Without the middle zone, no test is possible; give a lower --above-mm or a smaller "
+                "--margin-deg."
             )
         sphere = self._sphere("sphere", "effective-diameter", middle)
         for number in range(1, 4):
@@ -250,8 +252,8 @@ class _Planner:
                 best = int(counts.argmax())
                 return points[best], q[owner == best]
         raise _OutOfReach(
-            f"No point at {percent(zone)} of the reach was found that {poses} poses within the joint limits and above "
-            "the table can reach."
+            f"No point at {percent(zone)} of the reach was found at which {poses} poses are possible within the joint "
+            "limits and above the table."
         )
 
     def _bar(self, name: str, length: float, positions: int, repeats: int, test: str) -> None:
@@ -364,8 +366,8 @@ def simulate_procedure(
         q, arrived = project_to_targets(true.arm, item.q, targets)
         if not np.all(arrived):
             raise InputError(
-                f"{item.test} '{item.name}': the true arm does not reach it; let the true arm differ less from the "
-                "nominal arm."
+                f"the true arm does not reach '{item.name}' of the test '{item.test}'; use a true arm that differs "
+                "less from the nominal arm."
             )
         return q + scatter * random.normal(size=q.shape)
 

@@ -110,7 +110,10 @@ def run(
     tests = [result for test in TESTS if (result := test.run(measured, influences)) is not None]
     tests = [test._replace(rule=rule or DEFAULT_RULES[test.standard]) for test in tests]
     if measured.none_held_out:
-        held_out = "All data were used to identify the arm; measure sockets and lengths that were not used."
+        held_out = (
+            "All data were used to calibrate the arm; measure sockets and lengths that were not used for the "
+            "calibration."
+        )
         tests = [test._replace(missing=(held_out, *test.missing)) for test in tests]
     present = {metric.name for test in tests for metric in test.metrics}
     for name in given:
@@ -276,8 +279,8 @@ def unstated_uncertainty_warning(tests: Sequence[AcceptanceTest]) -> list[str]:
     metrics = (metric for test in tests for metric in test.metrics)
     names = [metric.name for metric in metrics if metric.decision is not None and metric.worst.expanded == 0]
     sentence = (
-        f"No uncertainty was stated for {', '.join(names)}, so the decision takes U as 0; state the contribution "
-        "of seat and fixture (--test-u-mm) and the temperatures (--expansion)."
+        f"No uncertainty was stated for {', '.join(names)}, so the decision uses U = 0; state the contribution of "
+        "seat and fixture (--test-u-mm) and the temperatures (--expansion)."
     )
     return [sentence] if names else []
 

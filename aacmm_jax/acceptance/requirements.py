@@ -98,13 +98,16 @@ def _orientations(measured: Measured) -> str | None:
         if test == "articulation":
             means = geometry.unit_rows(np.array([directions.mean(axis=0) for directions in groups]))
             if any(mean @ other > math.cos(_LEAST_PROBE_TURN) for mean, other in itertools.combinations(means, 2)):
-                return f"The orientations of the probe must differ; on sphere '{name}' two are nearly the same."
+                return (
+                    f"The orientations of the probe must differ; on sphere '{name}', two orientations are nearly "
+                    "the same."
+                )
     return None
 
 
 def _zones(measured: Measured) -> str | None:
     if measured.reach is None:
-        return "The reach and the shoulder of the arm are unknown, so its zones cannot be determined."
+        return "The reach and the shoulder of the arm are unknown, so the zones of the reach cannot be determined."
     radius = (measured.size or 0.0) / 2
     zones = {zone_of(measured, points) for points in articulated(measured).values()}
     absent = [
@@ -127,7 +130,10 @@ def _elbow(measured: Measured) -> str | None:
         ):
             bad.append(name)
     few = f"{_LEAST_ELBOW} poses"
-    sentence = f"The elbow must be on the left in {few} and on the right in {few} of every socket ({', '.join(bad)})."
+    sentence = (
+        f"Every socket must have {few} with the elbow on the left and {few} with the elbow on the right (fewer "
+        f"in: {', '.join(bad)})."
+    )
     return sentence if bad else None
 
 
@@ -136,7 +142,7 @@ def _two_bars(measured: Measured, positions: int) -> str | None:
     if len(bars) != len(BARS):
         return f"Exactly two bars are required ({len(bars)} given)."
     fewest = min(len(bar.lengths) for bar in bars)
-    return None if fewest >= positions else f"Each bar is required in {positions} positions."
+    return None if fewest >= positions else f"Each bar must be measured in {positions} positions."
 
 
 def _bar_lengths(measured: Measured) -> str | None:
@@ -165,11 +171,11 @@ def _places(measured: Measured, by_bar: bool) -> str | None:
     """Of bars over the measuring volume; not judged where its size is unknown."""
     size = measured.size
     if size is None:
-        return "The size of the measuring volume is unknown, so the places of the bars cannot be checked."
+        return "The size of the measuring volume is unknown, so the positions of the bars cannot be checked."
     narrowest = min(bar.spread(size) for bar in _bars(measured, by_bar))
     sentence = (
-        f"The bars must be spread over the measuring volume: their midpoints scatter by {100 * narrowest:.1f} % of its "
-        f"size; at least {100 * _LEAST_SPREAD:.0f} % is required."
+        f"The bars must be spread over the measuring volume: their midpoints scatter by {100 * narrowest:.1f} % of "
+        f"the size of the volume; at least {100 * _LEAST_SPREAD:.0f} % is required."
     )
     return None if narrowest >= _LEAST_SPREAD else sentence
 
@@ -193,7 +199,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
     "spread of touches": (
         "touches spread over at least a hemisphere: no gap more than 8 degrees wider than in the recommended pattern",
         "The touches must be spread over a hemisphere (not spread: {0}).",
-        # Of groups that are too small, the number of touches speaks.
+        # Groups that are too small are named under the number of touches.
         lambda m, test, points: _groups(
             m, test, lambda group: len(group) >= points and not geometry.covers_hemisphere(group, points)
         ),
@@ -206,15 +212,16 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         ),
     ),
     "rings": (
-        "each ring of touches rotated by at least 22.5 deg against the ring above it (15 deg accepted if by hand)",
-        "The rings of touches must be rotated by at least 22.5 deg relative to each other (not in {0}).",
+        "each ring of touches rotated by at least 22.5 deg against the ring above it (15 deg is accepted for touches "
+        "made by hand)",
+        "The rings of touches must be rotated by at least 22.5 deg relative to each other (not the case in {0}).",
         lambda m, test, points: _groups(
             m, test, lambda group: len(group) >= points and geometry.least_turn(group) < _LEAST_RING_TURN, "repeat"
         ),
     ),
     "places of the sphere": (
         "the sphere in {2} positions at least 10 % of the range apart; the worse result counts",
-        "The sphere must be measured in {2} positions far apart; it was measured in {0}.",
+        "The sphere must be measured in {2} positions that are far apart; the number of positions measured is {0}.",
         _sphere_positions,
     ),
     "orientations": ("five orientations of the probe that differ by at least 10 degrees", "{0}", _orientations),
@@ -229,7 +236,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         _elbow,
     ),
     "two bars": ("two bars, each in at least {1} positions", "{0}", _two_bars),
-    "lengths of the bars": ("bars of 50 to 75 % and of 120 to 150 % of the reach", "{0}", _bar_lengths),
+    "lengths of the bars": ("one bar of 50 to 75 % and one of 120 to 150 % of the reach", "{0}", _bar_lengths),
     "longest": ("a longest length of at least 66 % of the measuring range", "{0}", _longest),
     "lengths": (
         "{1} different calibrated lengths",
@@ -242,18 +249,18 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         lambda m, needed: min(geometry.bar_positions(m).readings.tolist(), default=0),
     ),
     "positions": (
-        "{1} positions of the bars that differ by at least 10 degrees in direction or 5 % of the range in place",
+        "{1} positions of the bars that differ by at least 10 degrees in direction or 5 % of the range in location",
         "{1} different positions are required ({0} given).",
         lambda m, needed: sum(bar.distinct(m.size) for bar in _bars(m)),
     ),
     "positions of each": (
-        "{1} positions of every length that differ by at least 10 degrees in direction or 5 % of the range in place",
-        "{1} different positions of every length are required (one has {0}).",
+        "{1} positions of every length that differ by at least 10 degrees in direction or 5 % of the range in location",
+        "{1} different positions of every length are required (one length has {0}).",
         lambda m, needed: min(bar.distinct(m.size) for bar in _bars(m)),
     ),
     "directions": (
         "bar directions spread over three dimensions: their RMS angle to every plane is at least 10 degrees",
-        "The directions must be horizontal, vertical and inclined, not in one plane.",
+        "The directions of the bars must be horizontal, vertical and inclined, not all in one plane.",
         lambda m, by_bar: None if all(bar.in_all_directions for bar in _bars(m, by_bar)) else "",
     ),
     "places": (
@@ -262,7 +269,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         _places,
     ),
     "socket": (
-        "a socket in at least {1} poses (70 in the paper's Table 3)",
+        "a socket in at least {1} poses (70 in Table 3 of Cheng et al. 2018)",
         "A socket measured in {1} poses or more is required.",
         lambda m, poses: None if any(len(points) >= poses for points in m.tested.values()) else "",
     ),

@@ -96,7 +96,7 @@ def identify_many(
         prior: What is known of the parameters, as in `identify`; where no mean is given, that of each problem's arm.
         covariance: Whether the covariances of the parameters are computed too: of captures with observations besides
             sockets, and of robust or joint solves or those with a prior. They are by the noise alone: a batch looks
-            for no encoder that is noisier than the others and for no errors that poses share, as `calibrate` does.
+            for no encoder that is noisier than the others and for no shared errors, as `calibrate` does.
 
     Returns:
         Parameters, metrics and reasons, problem by problem.

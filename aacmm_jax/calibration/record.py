@@ -119,7 +119,7 @@ class CalibrationRecord(NamedTuple):
     removed: tuple[Removed, ...] = ()
     prior: PriorMetrics | None = None  # with arrays of NumPy
     noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected
-    shared: SharedErrors | None = None  # errors that poses share, likewise
+    shared: SharedErrors | None = None  # shared errors, likewise
     components: Components | None = None  # parts of the covariance that do not rest on the scatter of single poses
     surplus_k: float = 0.0  # of u_k^2, by lengths that disagree
     decisions: tuple[str, ...] = ()  # what was decided by default, a sentence each

@@ -37,7 +37,7 @@ from .task import configurations
 
 
 class DrawnErrors(NamedTuple):
-    """Errors that poses share, in some trials: of all M poses, those of sockets first."""
+    """Shared errors, in some trials: of all M poses, those of sockets first."""
 
     tips: Float[np.ndarray, "t M 3"]  # mm
     joints: Float[np.ndarray, "t M n"]  # what the readings are too large by, rad or mm
@@ -89,7 +89,7 @@ def places_of(capture: Capture) -> Float[np.ndarray, "M p"]:
 def covariance_of_lengths(
     shared: SharedErrors, arm: Arm, names: tuple[str, ...], capture: Capture
 ) -> Float[np.ndarray, "l l"]:
-    """Covariance of reference lengths as a calibrated arm measures them, by errors that poses share, mm^2; ``names``
+    """Covariance of reference lengths as a calibrated arm measures them, by shared errors, mm^2; ``names``
     are its parameters that were free.
 
     Errors of the tip move the mean of an end; how parameters follow these is left out, as it is small.
@@ -114,7 +114,7 @@ def covariance_of_lengths(
 
 
 def variances_in_places(shared: SharedErrors | None, capture: Capture) -> Float[np.ndarray, " s"]:
-    """What errors that poses share add to the variance of a coordinate of each socket's mean, beside the mean of so
+    """What shared errors add to the variance of a coordinate of each socket's mean, beside the mean of so
     many independent errors, mm^2."""
     if shared is None:
         return np.zeros(len(capture.sizes))
@@ -178,7 +178,7 @@ class SocketTruth(NamedTuple):
     exact: Float[np.ndarray, "M n"]
     moves: Float[np.ndarray, "M n 3"]  # the least change of the joints for each mm that the tip shall move
     lengths: Float[np.ndarray, " l"]  # between the tips, mm
-    shared: DrawShared | None = None  # errors that poses share
+    shared: DrawShared | None = None  # shared errors
 
     @classmethod
     def of(cls, arm: Arm, capture: Capture) -> "SocketTruth":

@@ -188,7 +188,7 @@ class AbstractSingleResult(AbstractResult):
     @property
     def implausible_residual(self) -> bool:
         """Whether the residual is larger than that of an arm of this size with such noise, so that data and arm do not
-        belong together. What is usual for a class of arms only a record knows (`calibration.record_of`)."""
+        belong together. Only a record has what is usual for a class of arms (`calibration.record_of`)."""
         self._check_single()
         return float(self.after.rms) > largest_plausible_residual(self.arm, self.given_noise)
 
@@ -256,7 +256,7 @@ class Calibration(AbstractSingleResult):
     # Whether the result is stage 1 divided by k; not where a bound or a fixed length stood against that, and everything
     # was solved at once, as with the method "joint".
     divided: Bool[AnyArray, ""]
-    shared: SharedErrors | None = None  # errors that poses share, which the covariance contains; None: none were found
+    shared: SharedErrors | None = None  # shared errors, which the covariance contains; None: none were found
 
     @property
     def noise_model(self) -> NoiseModel:

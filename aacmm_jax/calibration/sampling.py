@@ -105,7 +105,7 @@ def monte_carlo(
     """Propagation of distributions (JCGM 101:2008): the whole calibration is repeated on readings drawn anew.
 
     Readings are drawn about poses in which the calibrated arm meets its sockets exactly, certified values with their u.
-    Errors that poses share (``result.shared``) are drawn too. Of captures with other observations, residuals are drawn
+    Shared errors (``result.shared``) are drawn too. Of captures with other observations, residuals are drawn
     about 0: readings, seat and measured values have new errors, by the geometry that was found. Blocks of
     max(100 / (1 - level), 10,000) trials are added until mean, u and both ends of the interval of every quantity are
     stable to a fifth of the tolerance (section 7.9). Bounds act in every trial as they did in the calibration, so the

@@ -67,7 +67,7 @@ def dcc_xml(
     if not record.plausible_scale:
         raise InputError(
             f"a certificate cannot be issued: k = {record.k:.6g} is not a plausible scale of an arm; correct the "
-            "reference lengths and calibrate again."
+            "values of the reference lengths and calibrate again."
         )
     _check_evaluation(record, administrative_data, evaluation)
     try:
@@ -182,7 +182,7 @@ def _statements(record: CalibrationRecord, given: AdministrativeData, sources: S
         scale = ", ".join(scale_sources(record))
         traceable = "the certified values of these artefacts and the measuring instruments"
     says = f"The scale of the arm comes from {scale}. Measurements of the arm are traceable to the metre"
-    yield _statement("Scale", f"{says} only as far as {traceable} are.")
+    yield _statement("Scale", f"{says} only to the extent that {traceable} are traceable.")
     yield _statement("Uncertainty", uncertainty_statement(record), norm="JCGM 100:2008")
     if record.sampled_says:
         yield _statement("Monte Carlo", record.sampled_says, norm="JCGM 101:2008")
@@ -208,7 +208,11 @@ def _statement(name: str, words: str, verdict: Element | None = None, *, norm: s
 
 def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
     """The measurement results of the acceptance tests of an evaluation, if it has any."""
-    which = "not used." if record.independent else "used: there are no others."
+    which = (
+        "not used for the calibration."
+        if record.independent
+        else "also used for the calibration, because there are no other poses."
+    )
     # With the uncertainties of their own certificates.
     lengths = [record.recording.capture.lengths[i] for i in record.held_out_lengths()]
     values = {f"Length {x.start} - {x.end}": (float(x.value), float(x.u)) for x in lengths}
@@ -223,7 +227,10 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
             continue
         status = {"nominal": "beforeAdjustment", "calibrated": "afterAdjustment"}[stage]
         formulas = "Formulas and requirements are taken from secondary sources."
-        contributions = "Only the contributions of the tester (ISO 14253-5), combined as independent."
+        contributions = (
+            "The uncertainty includes only the contributions of the tester (ISO 14253-5), combined as independent "
+            "contributions."
+        )
         data = element("data", english("text", _influences(record)))
         condition = named("influenceCondition", "Uncertainty of the test", element("status", status), data)
         editions = dict.fromkeys(test.called for test in tests)
@@ -240,7 +247,7 @@ def _acceptance_results(record: EvaluationRecord) -> Iterator[Element]:
             artefacts,
             element("influenceConditions", condition),
             element("results", (_test(test, judged=record.recording.true is None) for test in tests)),
-            says=f"Computed from single readings in poses that the calibration has {which}",
+            says=f"Computed from single readings in poses that were {which}",
         )
 
 
@@ -253,9 +260,9 @@ def _influences(record: EvaluationRecord) -> str:
         if body is not None:
             parts.append(
                 f"the {name} expands by {body.coefficient:.4g} / K (u = {body.u_coefficient:.2g} / K), at "
-                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this"
+                f"{body.temperature:g} C (u = {body.u_temperature:g} C); lengths are corrected for this expansion"
             )
-    return "; ".join(parts) + ". The arm's own scatter is what is tested, so it is not included."
+    return "; ".join(parts) + ". The arm's own scatter is not included, because it is what is tested."
 
 
 def _test(test: AcceptanceTest, judged: bool) -> Element:
@@ -286,7 +293,9 @@ def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, 
             "metaData",
             f"Conformity of {test.symbol(metric)}",
             element("norm", RULES[test.rule]),
-            english("declaration", f"|value| compared with the maximum permissible error: {value.decision}."),
+            english(
+                "declaration", f"Decision from comparing |value| with the maximum permissible error: {value.decision}."
+            ),
             element("conformity", _conformity(value)),
             element("data", limit),
         )

@@ -22,8 +22,8 @@ from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
 _METHODS = {
-    "two-stage": "first from repeatability, and then the scale from the lengths",
-    "joint": "from repeatability and lengths together",
+    "two-stage": "first from the repeatability in the sockets, and then the scale from the reference lengths",
+    "joint": "from the repeatability in the sockets and the reference lengths together",
 }
 _METRICS = {
     "DE": ("de", "Mean distance of the tip from its mean position in the socket"),
@@ -49,7 +49,7 @@ def results_of(record: CalibrationRecord, given: AdministrativeData, command: st
         (
             "calibrated",
             "after",
-            "The same readings, evaluated with the calibrated parameters, which were identified from them.",
+            "The same readings, evaluated with the calibrated parameters, which were identified from these readings.",
         ),
     ):
         status, data = element("status", f"{status}Adjustment"), element("data", temperature)
@@ -81,13 +81,13 @@ def uncertainty_statement(record: CalibrationRecord) -> str:
     if record.calibrated.arm.corrections is not None:
         model += " with the joint corrections below"
     return (
-        "Each expanded uncertainty is the standard uncertainty times the coverage factor stated with it. This factor "
-        f"is that of Student's t distribution for a coverage probability of {LEVEL_IN_PERCENT} and the effective "
-        "degrees of freedom of the quantity, which follow from what each part of its variance rests on. The standard "
-        f"uncertainties follow, by the law of propagation of uncertainty, from the noise of the readings, {noise}, and "
-        f"from the {sources}. Uncertainties apply to each parameter alone; the covariance matrix gives the "
-        "correlations. Expanded uncertainties are rounded to two digits, and values to the same decimal place. "
-        f"Errors that the {model} does not describe are not included."
+        "Each expanded uncertainty is the standard uncertainty times the coverage factor stated beside it. This "
+        f"factor follows from Student's t distribution for a coverage probability of {LEVEL_IN_PERCENT} and the "
+        "effective degrees of freedom of the quantity, which are computed from the contributions to its variance. "
+        "The standard uncertainties follow, by the law of propagation of uncertainty, from the noise of the "
+        f"readings, {noise}, and from the {sources}. Each uncertainty is for one parameter alone; the covariance "
+        "matrix gives the correlations. Expanded uncertainties are rounded to two digits, and values to the same "
+        f"decimal place. Errors that the {model} does not describe are not included."
     )
 
 
@@ -110,7 +110,7 @@ def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, .
     if record.robust:
         words += (
             f" The robust loss '{record.robust}' reduced the weight of poses with large residuals; "
-            f"{len(less_weight(residuals))} poses have half of their weight or less."
+            f"{len(less_weight(residuals))} poses have half of the full weight or less."
         )
     if record.removed:
         groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
@@ -203,7 +203,7 @@ def _results(
         k = real(record.k, ONE, u, None if u is None else uncertainty.expanded_k(LEVEL) / u)
         yield _result(
             "Scale",
-            "Reference lengths that the arm measured before its scale was set, divided by their calibrated values.",
+            "Reference lengths as measured by the arm before its scale was set, divided by their calibrated values.",
             named("quantity", "k", k),
         )
 
@@ -242,8 +242,8 @@ def _lengths(record: CalibrationRecord, evaluation: Evaluation, calibrated: bool
         rows.append(element("list", text("name", _length_name(number, length)), construction, quantities))
     return _result(
         "Reference lengths",
-        "An error is the measured value minus the calibrated one; its uncertainty includes that of the calibrated "
-        "value and the scatter of the poses at both ends.",
+        "An error is the measured value minus the calibrated one; the uncertainty of the error includes the "
+        "uncertainty of the calibrated value and the scatter of the poses at both ends.",
         *rows,
     )
 

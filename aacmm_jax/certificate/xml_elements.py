@@ -203,7 +203,7 @@ def parse_dcc(text: str) -> dict[tuple[str, ...], CertifiedValue]:
     try:
         root = ElementTree.fromstring(text, ElementTree.XMLParser(target=_NoDocumentType()))
     except (ElementTree.ParseError, UnicodeError) as error:
-        raise InputError(f"the certificate is not valid XML: {error}; export it again.") from error
+        raise InputError(f"the certificate is not valid XML: {error}; export the certificate again.") from error
     if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
         raise InputError(f"the XML is a '{root.tag}', not a digital calibration certificate; give a DCC.")
     values: dict[tuple[str, ...], CertifiedValue] = {}

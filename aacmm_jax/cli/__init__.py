@@ -88,8 +88,8 @@ def main() -> None:
                 1,
             )
         _fail(
-            f"aacmm failed unexpectedly ({type(error).__name__}: {error}); repeat the command with --debug and "
-            "report what it prints.",
+            f"aacmm failed unexpectedly ({type(error).__name__}: {error}); repeat the command with --debug and report "
+            "its output.",
             1,
         )
     finally:

@@ -90,7 +90,7 @@ def check_numbers(arguments: Sequence[str]) -> None:
         except ValueError:
             continue  # what Python cannot read as a number, typer refuses
         if option in numeric and not (finite and is_number(value)):
-            raise InputError(f"{option} {quoted(value)} is not a finite number; write plain decimal digits.")
+            raise InputError(f"{option} {quoted(value)} is not a finite number; give a number in decimal digits.")
 
 
 def examples(*commands: str) -> str:
@@ -163,5 +163,5 @@ def _printable(item: Any) -> Any:
 def warn_of_unusable(calibration: Path, record: Any) -> None:
     """Say on standard error that a calibration did not converge, or ended with a residual that no arm has."""
     if not record.converged or record.implausible_residual:
-        reason = "its residuals are too large for this arm; see aacmm show." if record.converged else record.reason
+        reason = "the residuals are too large for this arm; see aacmm show." if record.converged else record.reason
         typer.echo(f"Warning: the calibration in {calibration} is not usable: {reason}", err=True)

@@ -32,45 +32,46 @@ def arm(
         "A TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM", None
     ),
     new: Path | None = option(
-        "Write a template of an arm file that explains every key. No existing file is replaced.", "FILE.toml"
+        "Write a template arm file in which every key is explained. An existing file is never replaced.", "FILE.toml"
     ),
-    joints: int | None = option("Number of joints of the template. Default: 6.", "N", min=1, max=20),
+    joints: int | None = option("Number of joints in the template. Default: 6.", "N", min=1, max=20),
     check: Path | None = option(
         "Compare recorded readings with the arm. The file is a manifest (TOML), a capture (HDF5) or a table (CSV). A "
-        "table has the readings in columns q_1, q_2, ... If the tip positions are known, they are in columns x, y, z "
-        "(mm, unless the header states another unit), and orientations in qw, qx, qy, qz or rx, ry, rz. If they are "
-        "not known, a column socket names the socket of each pose; without this column, all poses are of one socket.",
+        "table has the readings in columns q_1, q_2, ... Measured tip positions are in columns x, y, z (mm, unless "
+        "the header states another unit), and measured orientations in qw, qx, qy, qz or rx, ry, rz. If the table has "
+        "no positions, a column socket names the socket of each pose; without this column, all poses are assumed to "
+        "be in one socket.",
         "POSES",
     ),
     unit: Literal["deg", "rad"] | None = option(
-        "Unit of the readings in a table. Default: the unit in the header; without one, the unit follows from the "
-        "size of the readings."
+        "Unit of the readings in a table. Default: the unit in the header; if the header states none, the unit is "
+        "inferred from the size of the readings."
     ),
     figure: Path | None = option(
-        "Draw the arm at zero readings, and its reach, to this file (.png, .svg or .pdf).", "FILE.png"
+        "Draw the arm with all readings zero, and its reach, to this file (.png, .svg or .pdf).", "FILE.png"
     ),
     encoder_arcsec: float | None = options.USUAL_ENCODER_NOISE,
     seating_mm: float | None = options.USUAL_SEATING_NOISE,
     model: str | None = option(
-        "Model of the joints, as for calibrate --model; for example gravity,harmonics=1.", "MODEL"
+        "Model of non-geometric joint errors, as for calibrate --model; for example gravity,harmonics=1.", "MODEL"
     ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
     probe: str | None = option(
-        "Position (mm) of the tip of a tool in the last link of a URDF or kinematics.yaml.", "X,Y,Z"
+        "Position (mm) of the tool tip in the frame of the last link, for a URDF or kinematics.yaml.", "X,Y,Z"
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Analyse an arm before its first calibration.
 
-    The command prints the axes at zero readings and the reach of the arm; which parameters are redundant, and with
-    which others; how many parameters sockets, reference lengths and a tracker determine; and how many poses a first
-    capture needs.
+    The command prints the axes with all readings zero, the reach of the arm, the redundant parameters, the number of
+    parameters that sockets, reference lengths and a tracker determine, and the number of poses that a first capture
+    needs.
 
-    --check finds the order, signs, zeros and units of the columns with which recorded readings fit the arm, and prints
-    the table [angles] that a manifest then needs. Positions in a table are in the base frame (for a URDF: in its base
-    link). The frame of a tracker in a manifest is found from the data. The exit code is 1 if the readings cannot be
-    made to fit the arm.
+    --check finds the order, signs, zero offsets and units of the columns with which recorded readings fit the arm, and
+    prints the table [angles] for the manifest. Positions in a table must be in the base frame (for a URDF: in its base
+    link). The frame of a tracker in a manifest is determined from the data. The exit code is 1 if no order, signs, zero
+    offsets and units make the readings fit the arm.
     """
     from ..files.arm_tables import arm_template, with_model
 
@@ -84,11 +85,11 @@ def arm(
                 raise InputError(f"{new} already exists; give another name, or remove the file.")
             write_text(new, arm_template(joints or 6))
         summary = {"kind": "arm template", "joints": joints or 6, "written": str(new)}
-        show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. Look at it: aacmm arm {new}"])
+        show_summary(summary, as_json, lambda shown: [f"Written: {shown['written']}. View this arm: aacmm arm {new}"])
         return
     if file is None:
         raise InputError(
-            "no arm is named; name an arm file or a shipped arm, or write a template with --new my-arm.toml."
+            "no arm is given; name an arm file or a shipped arm, or write a template with --new my-arm.toml."
         )
     if joints is not None:
         raise InputError("--joints applies to a template only; give --new too.")
@@ -107,7 +108,7 @@ def arm(
             raise typer.Exit(1)
         return
     if unit is not None:
-        raise InputError("--unit applies to the table of --check only; leave it out.")
+        raise InputError("--unit applies only to a table that --check reads; leave out --unit.")
     specification = specification if model is None else with_model(specification, model)
     frame = first_frame(specification)
     with together(figure):
@@ -134,14 +135,14 @@ def _checked(specification: Any, path: Path, unit: str | None) -> dict[str, Any]
         return _checked_table(specification, path, unit)
     if unit is not None:
         raise InputError(
-            f"--unit applies to tables only, and {path} states the unit of its readings; leave --unit out."
+            f"--unit applies to tables only, but {path} itself states the unit of the readings; leave out --unit."
         )
     recording = files.read_manifest(path) if suffix == ".toml" else files.load_capture(InputFile(path))
     joints = recording.nominal.arm.joints
     if joints != specification.arm.joints:
         raise InputError(
             f"{path} has readings of {joints} joints, but the arm has {specification.arm.joints} joints; name the arm "
-            "of these readings."
+            "with which these readings were recorded."
         )
     return checked_recording(specification, recording, path if suffix == ".toml" else None)
 
@@ -214,7 +215,7 @@ def reading_check(summary: dict[str, Any]) -> View:
     outside = (summary["found"] or summary["given"])["readings_outside_limits"]
     yield from filter(None, (
         summary["tip"],
-        summary["unit"] and f"The readings are taken to be in {summary['unit']}.",
+        summary["unit"] and f"The readings are assumed to be in {summary['unit']}.",
         outside and f"Outside the joint limits: {pluralise(outside, 'reading')}.",
         alternatives_sentence(summary["alternatives"], summary["known_positions"]),
         *(Styled(row["says"], "yellow") for row in summary["standing"]),
@@ -224,8 +225,8 @@ def reading_check(summary: dict[str, Any]) -> View:
         if summary[key] is not None:
             yield f"\nWrite in the manifest{where}:\n{summary[key]}".rstrip("\n")
     yield (
-        f"\n{pluralise(summary['poses'], 'pose')}; {summary['hypotheses']:,} combinations of order, signs, zeros and "
-        "units were tried."
+        f"\n{pluralise(summary['poses'], 'pose')}; {summary['hypotheses']:,} combinations of column order, signs, "
+        "zero offsets and units were tried."
     )
 
 
@@ -259,28 +260,32 @@ def survey(summary: dict[str, Any]) -> View:
 
 def _determined(summary: dict[str, Any]) -> View:
     """What data can and cannot determine of the arm."""
-    yield ["\n", Styled("Redundant"), f", whatever data are recorded ({summary['parameters']} parameters in total):"]
+    yield [
+        "\n",
+        Styled("Redundant"),
+        f" parameters, which no data determine (of {summary['parameters']} parameters in total):",
+    ]
     yield from (f"  {text}" for text in summary["redundant"])
     if summary["weak"]:
-        yield [Styled("Poorly determined"), ", even by poses all over the workspace:"]
+        yield [Styled("Poorly determined"), " (even with poses spread over the whole workspace):"]
         yield from (f"  {text}" for text in summary["weak"])
     why = [text for row in summary["determined"][1:2] for text in row["corrections"]]
     if summary["corrections_left_out"] or why:
         yield [Styled("Joint corrections"), ":"]
         yield from (f"  {text}" for text in (*summary["corrections_left_out"], *why))
     for i in summary["parallel"]:
-        yield f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} is used instead of d_{i}."
+        yield f"  Axes {i} and {i + 1} are nearly parallel: beta_{i} is identified instead of d_{i}."
     columns = {"data": "data", "parameters": "determined", "well": "well_determined", "scale": "scale"}
     yield listed("Number of parameters that each kind of data can determine", summary["determined"], columns)
     yield (
         f"Parameters to identify from sockets and a reference length ({len(summary['free'])}): "
         f"{', '.join(summary['free'])}."
     )
-    yield ["\n", Styled("If one joint does not move in any pose")]
+    yield ["\n", Styled("Effect if one joint does not move in any pose")]
 
     def lost(row: dict[str, Any]) -> str:
         if row["lost"] is None:
-            return "(too few joints are left to turn the arm about a socket)"
+            return "(too few moving joints are left to turn the arm about a socket)"
         return ", ".join(row["lost"]) or "-"
 
     yield listed("", summary["still"], {"joint": "joint", "no longer well determined": lost})
@@ -288,7 +293,7 @@ def _determined(summary: dict[str, Any]) -> View:
 
 def _needed(arm_class: dict[str, Any]) -> View:
     """What a first capture with so many poses reaches."""
-    title = "U that a calibration from random poses adds to a measured length"
+    title = "Contribution of the calibration (from random poses) to U of a measured length"
     yield ["\n", Styled(title), f" [mm, k = 2]: {arm_class['class']}"]
     columns: dict[str, Any] = {"data": "data"}
     for count in arm_class["rows"][0]["u_mm"]:
@@ -296,13 +301,13 @@ def _needed(arm_class: dict[str, Any]) -> View:
     columns["enough"] = lambda row: row["enough_poses"] or None
     yield listed("", arm_class["rows"], columns)
     yield (
-        f"Medians over the volume, for encoders with {arm_class['encoder_arcsec']:.3g} arcsec and a seat with "
-        f"{arm_class['seating_mm']:.3g} mm ({arm_class['noise_source']}), reference lengths with u = "
-        f"{arm_class['u_length_mm']:g} mm, and a tracker with u = {arm_class['u_tracker_mm']:g} mm per coordinate. "
-        "Two sockets with a reference length are equivalent to a ball bar in one placement."
+        f"Medians over the working volume. Assumed: standard deviations of {arm_class['encoder_arcsec']:.3g} arcsec "
+        f"(encoders) and {arm_class['seating_mm']:.3g} mm (seating; {arm_class['noise_source']}); standard "
+        f"uncertainties u = {arm_class['u_length_mm']:g} mm (reference lengths) and u = {arm_class['u_tracker_mm']:g} "
+        "mm per coordinate (tracker). Two sockets with a reference length are equivalent to a ball bar in one "
+        "placement."
     )
     yield (
-        "Enough: the smallest number of poses for which this U is less than the U that the noise of the readings alone "
-        "causes, "
-        f"{formatted(2 * arm_class['u_reading_mm'])} mm."
+        "Enough: the smallest number of poses for which this contribution is smaller than the contribution of the "
+        f"reading noise, {formatted(2 * arm_class['u_reading_mm'])} mm."
     )

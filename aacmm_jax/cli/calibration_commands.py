@@ -27,12 +27,14 @@ from .options import argument, flag, names_option, option, output, seed
     "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
 )
 def calibrate(
-    capture: list[Path] = argument("Capture, or captures of one arm in several sessions.", "CAPTURE.h5 ..."),
+    capture: list[Path] = argument(
+        "One capture, or several captures of the same arm (one per session).", "CAPTURE.h5 ..."
+    ),
     output: Path = output("Calibration to write (HDF5).", "FILE.h5"),
     method: Literal["two-stage", "joint"] | None = option(
-        "two-stage: identify from repeatability, then set the scale by the reference lengths; joint: one "
-        "least-squares fit of all data. Default: joint if there are observations other than sockets, a robust loss or "
-        "a prior; otherwise two-stage."
+        "two-stage: identify the parameters from the repeatability in each socket, then set the scale with the "
+        "reference lengths; joint: one least-squares fit of all data. Default: joint if there are observations other "
+        "than sockets, a robust loss or a prior; otherwise two-stage."
     ),
     robust: LossName | None = option(
         "Use this robust loss, which down-weights outlying poses and lists them. It turns off the search for noisy "
@@ -40,38 +42,44 @@ def calibrate(
     ),
     model: str | None = option(
         "Model these non-geometric errors of the joints, for example dh,gravity,harmonics=1+2,gear,coupled=2-3; dh "
-        "alone models none. Default: the model of the arm file; if it has none, the model that predicts held-out "
-        "regions best.",
+        "alone includes none of them. Default: the model of the arm file; if it has none, the model that predicts "
+        "held-out regions best.",
         "KINDS",
     ),
     prior: str | None = option(
         "Prior standard deviations of parameters about their nominal values, for example 'length=0.5mm,angle=0.05deg' "
-        "or 'd_3=750.2+-0.1mm'. 'alpha=learn' estimates the standard deviation of a group from the data, and 'learn' "
-        "those of all groups; 'none' uses no prior. Default: the prior of the arm file.",
+        "or 'd_3=750.2+-0.1mm'. 'alpha=learn' estimates the standard deviation of the group alpha from the data, and "
+        "'learn' estimates the standard deviations of all groups; 'none' uses no prior. Default: the prior of the arm "
+        "file.",
         "GROUP=SD,...",
     ),
     scale: Literal["measured", "nominal"] = option(
-        "nominal: solve stage 1 only and keep the scale of the nominal arm, for a capture in which nothing fixes the "
-        "scale.",
+        "nominal: solve stage 1 only and keep the scale of the nominal arm, for a capture with no measurement that "
+        "fixes the scale.",
         default="measured",
     ),
-    same_probe: bool = flag("--same-probe", "The probe was not remounted between sessions."),
+    same_probe: bool = flag(
+        "--same-probe", "Use one probe position for all sessions, because the probe was not remounted."
+    ),
     only_poses: int | None = option(
-        "Calibrate with N poses drawn at random, and test the result on the others.", "N", min=1
+        "Calibrate with N poses drawn at random, and test the result on the remaining poses.", "N", min=1
     ),
     seed: int = seed("--only-poses"),
     hold: str = option(
-        "Scale anchor of stage 1, which is held constant: the name of a length parameter, 'longest', or 'none' as in "
-        "the paper.",
+        "Length parameter that stage 1 holds constant (scale anchor): its name, 'longest', or 'none' as in Cheng et "
+        "al. 2018.",
         "NAME",
         default="longest",
     ),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     held: str | None = option(
-        "Fix these parameters, separated by commas. Default: the list in the arm's file.", "NAMES"
+        "Hold these parameters at their nominal values (names separated by commas). Default: the list in the arm file.",
+        "NAMES",
     ),
-    free: str | None = option("Identify further parameters, separated by commas (beta_2: Hayati's angle).", "NAMES"),
+    free: str | None = option(
+        "Also identify these parameters (names separated by commas), for example the Hayati angle beta_2.", "NAMES"
+    ),
     length_bound_mm: float | None = option("Half-width of the bounds of length parameters.", min=0),
     angle_bound_deg: float | None = option("Half-width of the bounds of angle parameters.", min=0),
     bound: list[str] | None = option(
@@ -84,23 +92,26 @@ def calibrate(
         "--keep-noise", "Do not re-estimate the noise of an encoder found to be noisier than stated."
     ),
     shared_errors: bool = option(
-        "Look for errors that several poses have in common, and include them in the uncertainties.", default=True
+        "Look for errors shared by several poses, and include these errors in the uncertainties.", default=True
     ),
     cross_validate: bool | None = option(
         "Hold out each placement, station or other group of observations in turn, calibrate with the others, and test "
-        "the result on the group held out. If all observations are one group, regions of joint space are held out "
-        "instead. Default: yes for a recorded capture with several placements of the reference length, unless "
-        "--model, --prior or --robust is given."
+        "the result on the group held out. If there is only one group, regions of joint space are held out instead. "
+        "Default: yes for a recorded capture with several placements of the reference length, unless --model, --prior "
+        "or --robust is given."
     ),
     leave_out: list[str] | None = option(
-        "With --cross-validate: hold out, as one group, everything whose name matches ('monday/*'); may be given "
-        "several times.",
+        "With --cross-validate: hold out, as one group, all sockets and observations whose names match ('monday/*'); "
+        "may be given several times.",
         "PATTERN",
     ),
     monte_carlo: bool = flag(
-        "--monte-carlo", "Check the uncertainties by Monte Carlo (JCGM 101); takes a minute or two."
+        "--monte-carlo", "Check the uncertainties by Monte Carlo simulation (JCGM 101), which takes a minute or two."
     ),
-    strict: bool = flag("--strict", "Reject free parameters that these data could not determine even without noise."),
+    strict: bool = flag(
+        "--strict",
+        "Stop with an error if there are free parameters that the data could not determine even without noise.",
+    ),
     remove_contradicting: bool = flag(
         "--remove-contradicting",
         "Leave out a socket, placement or station that contradicts all others, even with --no-automatic.",
@@ -111,7 +122,9 @@ def calibrate(
         default=True,
     ),
     figure: Path | None = option("Plot the residual of every pose to this file (.png, .svg or .pdf).", "FILE"),
-    max_steps: int = option("Largest number of steps per solve.", "N", default=300, min=1, max=1_000_000),
+    max_steps: int = option(
+        "Maximum number of solver steps in each least-squares fit.", "N", default=300, min=1, max=1_000_000
+    ),
     as_json: bool = options.JSON,
 ) -> None:
     """Identify the parameters of an arm from captures.
@@ -159,7 +172,7 @@ def calibrate(
 def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
     """The recording of a file, or of several as the sessions of one arm, with the digests of the files."""
     if same_probe and len(paths) == 1:
-        raise InputError("--same-probe applies to several captures only; name all captures, or leave the option out.")
+        raise InputError("--same-probe applies to several captures only; name all captures, or leave out --same-probe.")
     sessions = {}
     for path in paths:
         recording = files.load_capture(read := InputFile(path))
@@ -206,7 +219,9 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
         return None
     if encoder_arcsec is None or seating_mm is None:
         missing = "--seating-mm" if seating_mm is None else "--encoder-arcsec"
-        raise InputError(f"{missing} is missing; give both standard deviations, or neither to have both estimated.")
+        raise InputError(
+            f"{missing} is missing; give both standard deviations, or leave out both to have them estimated."
+        )
     return data.Noise(encoder_arcsec=encoder_arcsec, seating=seating_mm, linear_encoder=linear_encoder_mm)
 
 
@@ -217,17 +232,17 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
     name="compare-models",
 )
 def compare_models(
-    capture: Path = argument("Capture, written by import or simulate.", "CAPTURE.h5"),
+    capture: Path = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5"),
     models: str | None = option(
-        "Models from simple to rich, separated by semicolons, each as for calibrate --model. Default: dh; gravity; "
-        "harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); gravity,functions; for a capture with "
-        "temperatures, each of these models with expansion too.",
+        "Models to compare, from the simplest to the most complex, separated by semicolons; each is written as for "
+        "calibrate --model. Default: dh; gravity; harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); "
+        "gravity,functions; if the capture contains temperatures, also each of these models with expansion.",
         "MODELS",
     ),
     leave_out: list[str] | None = option(
-        "Hold out, as one group, everything whose name matches ('monday/*'); may be given several times. Default: "
-        "each placement, station or other group in turn if there are at least three; otherwise each half of every "
-        "joint's travel.",
+        "Hold out, as one group, all sockets and observations whose names match ('monday/*'); may be given several "
+        "times. Default: each placement, station or other group in turn if there are at least three; otherwise, in "
+        "turn, the lower and the upper half of the travel of each joint.",
         "PATTERN",
     ),
     only_poses: int | None = option("Use N poses drawn at random, to save time.", "N", min=1),
@@ -244,8 +259,8 @@ def compare_models(
 ) -> None:
     """Compare models of the joints on held-out regions.
 
-    Each model is calibrated with all poses, from which its prior is learned. It then predicts each region from all
-    other regions.
+    The prior of each model is learned from all poses. Each region is then held out in turn, and predicted by the model
+    fitted to the other regions.
     """
     from ..data.capture import draw_poses
     from ..files.arm_tables import masses_of
@@ -284,17 +299,17 @@ def compare_models(
 )
 def compare(
     paths: list[Path] = argument(
-        "Calibrations of one arm, written by calibrate. Two are compared in the order given; three or more are "
+        "Calibrations of one arm, written by aacmm calibrate. Two are compared in the order given; three or more are "
         "ordered by date.",
         "OLD.h5 NEW.h5 [MORE.h5 ...]",
     ),
     level: float = option("Coverage probability of the expanded uncertainties.", "P", default=LEVEL),
     length_mm: float | None = option(
-        "Compute the change of lengths of this size all over the volume. Default: 300, or half the reach of a small "
-        "arm."
+        "Compute the changes of lengths of this size throughout the working volume. Default: 300, or half the total "
+        "link length if that is shorter."
     ),
     figure: Path | None = option(
-        "Plot the changes, for three or more calibrations over time, to this file (.png, .svg or .pdf).", "FILE"
+        "Plot the changes to this file (.png, .svg or .pdf); for three or more calibrations, against time.", "FILE"
     ),
     csv: Path | None = option("Write every parameter of every calibration to this file (CSV).", "FILE"),
     max_length_change_mm: float | None = option(
@@ -349,8 +364,9 @@ def _compared(records: list, created: list[str], settings: dict[str, Any]) -> An
     if list(by_date.order) == sorted(by_date.order):
         return by_date
     warning = (
-        f"The calibrations are ordered by date, not as named: {', '.join(labels[i] for i in by_date.order)}. The date "
-        "is that of the measurement if the manifest states it, otherwise that of the file."
+        "The calibrations are compared in the order of their dates, not in the order given: "
+        f"{', '.join(labels[i] for i in by_date.order)}. The date is the date of measurement if the manifest states "
+        "one, otherwise the date of the file."
     )
     first, *others = by_date.drifts
     return by_date._replace(drifts=(first._replace(warnings=(warning, *first.warnings)), *others))

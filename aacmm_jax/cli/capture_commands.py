@@ -25,7 +25,7 @@ def demo(
     seed: int = seed("the noise"),
     as_json: bool = options.JSON,
 ) -> None:
-    """Calibrate a simulated arm and compare it with the truth.
+    """Calibrate a simulated arm and compare the result with the true arm.
 
     The simulated arm is that of Cheng et al. 2018, with realistic noise.
     """
@@ -59,12 +59,14 @@ def simulate(
     ),
     seating_mm: float = options.SEATING_NOISE,
     temperature_c: str | None = option(
-        "Temperature (C) of an arm with a thermometer; with two values, the temperatures are drawn between them. "
-        "Default: 20.",
+        "Temperature (C), for an arm with a temperature sensor; if two values are given, random temperatures between "
+        "them are simulated. Default: 20.",
         "LOWEST[,HIGHEST]",
     ),
     true_arm: str | None = option(
-        "Simulate with this true arm: a TOML file, a URDF or a name. Default: the nominal arm.", "ARM"
+        "Simulate with this true arm: a TOML file, a URDF, or the name of an arm that ships with aacmm. Default: the "
+        "nominal arm.",
+        "ARM",
     ),
     deviate_length_mm: float = option(
         "Simulate with a random true arm whose lengths differ from the nominal ones by at most this.",
@@ -75,8 +77,8 @@ def simulate(
         "Simulate with a random true arm whose angles differ from the nominal ones by at most this.", default=0.0, min=0
     ),
     acceptance: Literal["asme", "iso"] | None = option(
-        "Instead of sockets, simulate the acceptance test to ASME B89.4.22 or ISO 10360-12 that 'aacmm plan "
-        "--acceptance' plans; artefacts have u = 0.001 mm."
+        "Simulate the acceptance test to ASME B89.4.22 or ISO 10360-12 that 'aacmm plan --acceptance' plans, instead "
+        "of poses in sockets; the artefacts have u = 0.001 mm."
     ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
@@ -133,22 +135,22 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any], usual: Any) -> 
 @command("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check", name="import")
 def import_(
     manifest: Path = argument(
-        "Manifest, which states which files contain the poses and measured values, in which columns and units.",
+        "Manifest: names the files with the poses and measured values, and states their columns and units.",
         "MANIFEST.toml",
     ),
     output: Path | None = output("Capture to write (HDF5).", "FILE.h5", None),
     check: bool = flag(
         "--check",
-        "Compare the readings with the arm: find the order, signs, zeros and units of the columns, and joints that do "
-        "not move, and compare commanded with measured readings if the tables contain both. Exit with code 1 if the "
-        "readings cannot be made to fit the arm.",
+        "Check the readings against the arm: find the order, signs, zero offsets and units of the columns, and the "
+        "joints that do not move. If the tables contain both commanded and measured readings, compare them. Exit with "
+        "code 1 if no order, signs, zero offsets and units make the readings fit the arm.",
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Read recorded joint readings into a capture."""
     if output is None and not check:
         raise InputError(
-            "no output is named; name the capture to write with -o FILE.h5, or check the readings with --check."
+            "no output file is given; give -o FILE.h5 to write a capture, or --check to check the readings only."
         )
     with together(output):
         recording = files.read_manifest(manifest)

@@ -31,10 +31,10 @@ _OF_ONE_ARM = ("toml", "urdf", "table", "ur", "python")
 def export(
     calibration: Path = options.CALIBRATION_FILE,
     form: Literal["toml", "json", "csv", "dcc", "urdf", "table", "offsets", "ur", "python"] | None = option(
-        "toml: the arm; json: the whole summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf: "
-        "the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: zero offsets of the "
-        "joints only, refitted; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy. "
-        "Default: as the extension of the output says (.urdf, .json, .csv, .yaml, .py), otherwise toml.",
+        "toml: arm file; json: complete summary; csv: parameters; dcc: Digital Calibration Certificate (XML); urdf: "
+        "the URDF of the nominal arm, with calibrated origins; table: D-H table (CSV); offsets: refitted zero offsets "
+        "of the joints only; ur: kinematics.yaml of Universal Robots; python: a program that needs only NumPy. "
+        "Default: the format of the output's extension (.urdf, .json, .csv, .yaml, .py), otherwise toml.",
         None,
         "--format",
     ),
@@ -44,8 +44,8 @@ def export(
         None,
         "--arm",
     ),
-    convention: Literal["standard", "craig"] | None = option("Convention of --format table. Default: standard."),
-    units: Literal["mm-deg", "m-rad"] | None = option("Units of --format table. Default: mm-deg."),
+    convention: Literal["standard", "craig"] | None = option("D-H convention for --format table. Default: standard."),
+    units: Literal["mm-deg", "m-rad"] | None = option("Units for --format table. Default: mm-deg."),
     output: Path | None = output("File to write. Default: standard output.", "FILE", None),
     about: Path | None = options.ABOUT,
     evaluation: Path | None = option(
@@ -72,7 +72,8 @@ def export(
         specification = arms[which or "calibrated"]
         if specification is None:
             raise InputError(
-                f"{calibration} is not a calibration of simulated data, so it has no true arm; choose another --arm."
+                f"{calibration} is not a calibration of simulated data, so it has no true arm; choose another value "
+                "for --arm."
             )
         warn_of_unusable(calibration, record)
         if written_as == "dcc":
@@ -130,7 +131,7 @@ def _left_out_of_table(record: Any, arm: Any) -> list[str]:
     moved = np.linalg.norm(np.asarray(arm.position(q)) - np.asarray(without_corrections(arm).position(q)), axis=1)
     return [
         f"The table contains the {np.count_nonzero(arm.coefficients)} coefficients of joint corrections as comments "
-        "only. Without these corrections, the tip positions in the poses of the calibration differ by up to "
+        "only. Without these corrections, the tip positions in the poses of the calibration change by up to "
         f"{moved.max():.3g} mm."
     ]
 
@@ -142,8 +143,8 @@ def _urdf(record: Any, specification: Any) -> tuple[str, list[str]]:
     return result.text, [
         f"Joints whose origin changed: {shorten(result.changed, 12) or 'none'}.",
         *(note[0].upper() + note[1:] for note in result.notes),
-        "The base, and the position of each frame along its axis and its angle about the axis, are left unchanged as "
-        "far as possible, because data on the tip do not determine them.",
+        "The base, and the position of each frame along its joint axis and its angle about this axis, are left "
+        "unchanged as far as possible, because measurements of the tip do not determine them.",
     ]
 
 
@@ -160,7 +161,8 @@ def _certificate(calibration: InputFile, record: Any, about: Path | None, evalua
         tested = files.load_evaluation(read := InputFile(evaluation))
         if not isinstance(tested, EvaluationRecord):
             raise InputError(
-                f"{evaluation} is an evaluation of points; name an evaluation of the calibrated arm on a capture."
+                f"{evaluation} is an evaluation of recorded points; name an evaluation of this calibration on a "
+                "capture."
             )
         sources += [fingerprint(read), *tested.recording.sources]
     return dcc_xml(
@@ -185,41 +187,41 @@ def correct(
         "(rotation vector).",
         "POSES.csv",
     ),
-    output: Path = output("Table with corrected readings to write.", "FILE.csv"),
+    output: Path = output("File to write the table of corrected readings to (CSV).", "FILE.csv"),
     unit: Literal["deg", "rad"] | None = option(
         "Unit of joint readings and rotation vectors if the header does not state it (as q_1_deg does). Readings of "
         "prismatic joints are in mm."
     ),
     columns: str | None = option(
         "Columns of the joint readings if they are not named q_1, q_2, ...: names, a pattern, or column numbers from "
-        "1, separated by commas. Default: all columns of a table that has one column per joint.",
+        "1, separated by commas. Default: all columns, if the table has exactly one column per joint.",
         "NAMES",
     ),
     length_unit: Literal["mm", "m", "um", "inch"] | None = option(
         "Unit of positions if the column header does not state it (as x_m does). Default: mm."
     ),
     near: str | None = option(
-        "For positions with orientations: search for joint readings near these. Default: the columns q_1, q_2, ... of "
-        "the table.",
+        "For positions with orientations: start the search for the joint readings from these readings. Default: the "
+        "columns q_1, q_2, ... of the table.",
         "Q1,Q2,...",
     ),
     probe: str | None = option(
-        "Position (mm) of the tip of the tool in the last frame, used for both arms. Default: the nominal and the "
-        "calibrated probe; their difference is then corrected too.",
+        "Position (mm) of the tool tip in the last frame, both of the nominal and of the calibrated arm. Default: the "
+        "nominal and the calibrated position of the probe, whose difference is then corrected too.",
         "X,Y,Z",
     ),
     temperature: float | None = option(
-        "Temperature (C) of an arm that was calibrated with thermal expansion. Default: the column temperature_C of "
-        "the table.",
+        "Temperature (C) of the arm, if the arm was calibrated with thermal expansion. Default: the column "
+        "temperature_C of the table.",
         "C",
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Turn commanded poses into corrected joint readings.
 
-    A controller that uses the nominal parameters expects the pose that the nominal arm has at the commanded joint
-    readings. The corrected readings bring the calibrated arm to this pose: to its position and orientation in the base
-    frame, which both arms have in common. Positions with orientations in POSES.csv are in this frame too (for a URDF:
+    A controller that uses the nominal parameters expects the tip in the pose that the nominal arm has at the commanded
+    joint readings. The corrected readings bring the tip of the calibrated arm to this pose. The nominal and the
+    calibrated arm have the same base frame; positions and orientations in POSES.csv are in this frame too (for a URDF:
     in its base link). With seven or more joints, the readings change as little as possible; with fewer than six
     joints, only the position is corrected. Rotations of the tool that the calibration data do not determine stay
     nominal.
@@ -228,7 +230,8 @@ def correct(
     capture are not applied.
 
     The output table has the columns and the unit of the input table. If the pose of a row cannot be reached within the
-    joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm there.
+    joint limits of the nominal arm, its readings are left empty and the exit code is 1. Do not send an arm to such a
+    pose.
     """
     from ..core.numpy_or_jax import to_numpy
     from ..files.table_columns import corrected_csv, read_poses

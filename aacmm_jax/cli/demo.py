@@ -98,7 +98,8 @@ def _prepare(folder: Path, true_name: str) -> None:
         foreign = there
     if foreign:
         raise InputError(
-            f"{folder} contains files that no demonstration wrote ({shorten(foreign)}); name a new or an empty folder."
+            f"{folder} contains files that aacmm demo did not write ({shorten(foreign)}); name a new or an empty "
+            "folder."
         )
 
 

@@ -43,27 +43,30 @@ def seed(subject: str) -> Any:
 JSON = flag("--json", "Print one JSON object on standard output, and nothing else.")
 ONLY = option("Use only the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
 WITHOUT = option("Leave out the sockets whose names match this shell pattern; may be given several times.", "PATTERN")
-CALIBRATION_FILE = argument("Calibration, written by calibrate.", "CALIBRATION.h5")
+CALIBRATION_FILE = argument("Calibration, written by aacmm calibrate.", "CALIBRATION.h5")
 NOMINAL_ARM = argument(
     "Nominal arm: a TOML file, a URDF, a kinematics.yaml, or the name of an arm that ships with aacmm.", "ARM"
 )
 ABOUT = option("Administrative data of a certificate: laboratory, customer, item, persons, dates.", "FILE.toml")
-BASE_LINK = option("Link of a URDF that serves as the fixed base. Default: the root of the URDF.", "LINK", "--base")
+BASE_LINK = option("Fixed base link of the arm, for a URDF. Default: the root link of the URDF.", "LINK", "--base")
 TIP_LINK = option(
-    "Link of a URDF at which the arm ends. Default: the only link that no other link follows.", "LINK", "--tip"
+    "Last link of the arm, for a URDF. Default: the only link of the URDF without a child link.", "LINK", "--tip"
 )
 _ENCODER = "the standard deviation of a joint reading"
 _SEATING = "the standard deviation of the tip in its socket, for each coordinate"
-_ESTIMATED, _OF_CLASS = "Default: estimated.", "Default: as in [noise] of the arm file, else as for the arm's class."
+_ESTIMATED, _OF_CLASS = (
+    "Default: estimated.",
+    "Default: the value in [noise] of the arm file, otherwise the value for the class of the arm.",
+)
 ENCODER_NOISE = option(f"Set {_ENCODER}.", default=0.0, min=0)
 SEATING_NOISE = option(f"Set {_SEATING}.", default=0.0, min=0)
-KNOWN_ENCODER_NOISE = option(f"State {_ENCODER}, for the weights. {_ESTIMATED}", min=0)
+KNOWN_ENCODER_NOISE = option(f"State {_ENCODER}, for weighting the data. {_ESTIMATED}", min=0)
 KNOWN_SEATING_NOISE = option(f"State {_SEATING}. {_ESTIMATED}", min=0)
 USUAL_ENCODER_NOISE = option(f"Assume {_ENCODER}. {_OF_CLASS}", min=0)
 USUAL_SEATING_NOISE = option(f"Assume {_SEATING}. {_OF_CLASS}", min=0)
 LINEAR_ENCODER_NOISE = option(
-    "Standard deviation of a reading of a prismatic joint. Default: the displacement that the other encoders' "
-    "standard deviation causes at a distance of 1 m.",
+    "Standard deviation of a reading of a prismatic joint. Default: the displacement at a distance of 1 m that "
+    "corresponds to the standard deviation of the rotary encoders.",
     min=0,
 )
 REFERENCE_LENGTHS = option(

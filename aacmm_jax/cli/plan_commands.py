@@ -47,11 +47,12 @@ def plan(
     context: _CONTEXT,  # pyright: ignore[reportInvalidTypeForm]
     arm: str = options.NOMINAL_ARM,
     output: Path = output(
-        "File to write the plan to: one row per pose, in the order in which to take the poses.", "FILE.csv"
+        "File to write the plan to: one row per pose, in the order in which the poses are to be recorded.", "FILE.csv"
     ),
     poses: int = option("Total number of poses.", "N", default=30, min=2, max=10_000),
     sockets: int | None = option(
-        f"Plan the positions of this many sockets, in pairs at the ends of the reference length. Default: {_SOCKETS}.",
+        "Number of sockets whose positions are planned, in pairs at the ends of the reference length. Default: "
+        f"{_SOCKETS}.",
         "N",
         min=1,
         max=1000,
@@ -61,54 +62,61 @@ def plan(
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     length_mm: str = option(
-        "Reference length whose position is planned; from a range, the best length is chosen.", "L[:M]", default="500"
+        "Size of the reference length to be placed by the plan; if a range is given, the best size in this range is "
+        "chosen.",
+        "L[:M]",
+        default="500",
     ),
-    u_mm: float = option("Standard uncertainty of the reference length whose position is planned.", default=0.002),
+    u_mm: float = option("Standard uncertainty of the reference length of --length-mm.", default=0.002),
     model: str | None = option(
-        "Model of the joints, as for calibrate --model. The poses are chosen to determine its coefficients too.",
+        "Model of non-geometric joint errors, as for calibrate --model. The poses are chosen to determine its "
+        "coefficients too.",
         "MODEL",
     ),
     held: str | None = option(
-        "Fix these parameters, as for calibrate, separated by commas. Default: the list in the arm's file.", "NAMES"
+        "Hold these parameters at their nominal values, as for calibrate --held (names separated by commas). Default: "
+        "the list in the arm file.",
+        "NAMES",
     ),
     encoder_arcsec: float | None = options.USUAL_ENCODER_NOISE,
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     seating_mm: float | None = options.USUAL_SEATING_NOISE,
     cone_deg: list[str] | None = option(
-        "Largest tilt of the tool from the normal of all sockets, or of the named socket; 180 allows any direction. "
-        "The option may be given several times. Default: 60 for robots, any direction for measuring arms. With --kit, "
-        "set half_angle_deg in the tables of the kit instead.",
+        "Largest angle between the tool and the normal of the socket, for all sockets or for the named socket; 180 "
+        "allows any direction. The option may be given several times. Default: 60 for robots, any direction for "
+        "measuring arms. With --kit, set half_angle_deg in the tables of the kit instead.",
         "[NAME=]DEG",
     ),
     normal: list[str] | None = option(
-        "Direction that points out of all sockets, or out of the named socket; may be given several times. Default: "
-        "0,0,1.",
+        "Outward normal of all sockets, or of the named socket; may be given several times. Default: 0,0,1.",
         "[NAME=]X,Y,Z",
     ),
     tool_axis: str = option(
-        "Axis of the last frame that points from the tool into a socket: x, y, z, -x, -y or -z.",
+        "Axis of the last frame along which the tool points into a socket: x, y, z, -x, -y or -z.",
         "AXIS",
         default="z",
     ),
     retract_mm: float | None = option(
-        "Distance of the approach point of each pose from the socket, along its normal; 0 for no approach points. "
-        "Default: 50 for robots, 0 for measuring arms.",
+        "Add an approach point to each pose, at this distance from the socket along its normal; 0 adds none. Default: "
+        "50 for robots, 0 for measuring arms.",
         min=0,
     ),
     cell: Path | None = option("Keep the arm clear of the boxes, walls and posts in this file.", "FILE.toml"),
     collisions: bool = flag(
         "--collisions",
-        "Keep the arm's body (collision shapes of its URDF, otherwise capsules along its links) clear of the table, "
-        "and its parts clear of each other. Implied by --cell and --link-radius-mm.",
+        "Keep the arm's body (collision shapes of its URDF, otherwise capsules along its links) clear of the table "
+        "and of itself. Implied by --cell and --link-radius-mm.",
     ),
     link_radius_mm: float | None = option("Use capsules of this radius along the links as the arm's body.", min=0),
     unconstrained: bool = flag(
-        "--unconstrained", "Also predict the uncertainty of a plan without cones, obstacles and approach points."
+        "--unconstrained",
+        "Also predict the uncertainty of a plan without obstacles, approach points and limits of the tool "
+        "direction (--cone-deg).",
     ),
     angles: Literal["deg", "rad"] = option("Unit of the joint readings in the plan and its manifest.", default="deg"),
     criterion: Literal["length", "A", "D", "E"] = option(
-        "Criterion to minimise: length, the largest uncertainty of a length in the volume; or the A, D or E criterion "
-        "of the parameters.",
+        "Criterion to minimise. length: the largest uncertainty of a length in the volume; A, D or E: the criterion "
+        "of optimal design with this name, for the parameters.",
         default="length",
     ),
     region: list[str] | None = option(
@@ -117,21 +125,25 @@ def plan(
         "AXIS=LOW:HIGH",
     ),
     margin_deg: float = option("Keep joints at least this far from their limits.", default=5.0, min=0),
-    above_mm: float = option("Height of the table in the base frame: every joint and tip stays above it.", default=0.0),
-    candidates: int = option("Number of poses to choose from.", "N", default=3000, min=100, max=1_000_000),
+    above_mm: float = option(
+        "Height of the table in the base frame: all joints and the tip must stay above this height.", default=0.0
+    ),
+    candidates: int = option(
+        "Number of candidate poses from which the plan is chosen.", "N", default=3000, min=100, max=1_000_000
+    ),
     check_length_mm: float | None = option(
-        "Predict the uncertainty of lengths of this size all over the volume. Default: 300, or half the reach of a "
-        "small arm."
+        "Predict the uncertainty of lengths of this size throughout the working volume. Default: 300, or half the "
+        "total link length if that is shorter."
     ),
     farthest: float | None = option(
         f"Place nothing farther from the shoulder than this fraction of the reach. Default: {_FARTHEST}.", "FRACTION"
     ),
     kit: Path | None = option(
-        "Plan with the artefacts and instruments in this file, and with their uncertainties, instead of sockets.",
+        "Plan for the artefacts and instruments in this file, with their uncertainties, instead of sockets.",
         "FILE.toml",
     ),
     acceptance: Literal["asme", "iso"] | None = option(
-        "Plan the poses of an acceptance test to ASME B89.4.22 or ISO 10360-12 instead."
+        "Plan the poses of an acceptance test to ASME B89.4.22 or ISO 10360-12 instead of the poses of a calibration."
     ),
     sphere_mm: float = option("Diameter of the sphere of an acceptance test.", default=25.0),
     stylus_mm: float = option("Diameter of the probe's ball in an acceptance test.", default=6.0, min=0),
@@ -139,10 +151,12 @@ def plan(
         "Length of an available bar for an acceptance test; give the option twice for asme, five times for iso."
     ),
     range_mm: float | None = option(
-        "Measuring range (a diameter) that the maker states, for an acceptance test. Default: twice the reach.",
+        "Measuring range (a diameter) stated by the maker, for an acceptance test. Default: twice the reach.",
         min=0,
     ),
-    manifest: Path | None = option("Write a manifest with which the recorded readings can be imported.", "FILE.toml"),
+    manifest: Path | None = option(
+        "Write a manifest to this file; aacmm import reads the recorded readings with it.", "FILE.toml"
+    ),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
     seed: int = seed("the random choices"),
@@ -150,8 +164,8 @@ def plan(
 ) -> None:
     """Plan the poses of a measurement.
 
-    For a calibration, the poses and the positions of sockets and reference lengths are planned; for an acceptance test,
-    its poses.
+    For a calibration, the command plans the poses and the positions of sockets and reference lengths. For an acceptance
+    test, it plans the poses and the positions of the artefacts.
     """
     from ..files.arm_tables import with_model
     from ..files.plans import plan_csv, plan_manifest
@@ -198,11 +212,13 @@ def _check_options(context: Any, kit: bool, acceptance: bool) -> None:
     names = listed(ignored)
     if acceptance:
         raise InputError(
-            f"--acceptance sets its own poses, sockets and bars, so {names} would have no effect; leave out {names}."
+            f"--acceptance itself determines the poses, sockets and bars, so {names} would have no effect; leave out "
+            f"{names}."
         )
     if kit:
         raise InputError(
-            f"--kit states what is used and where it is placed, so {names} would have no effect; leave out {names}."
+            f"--kit itself determines the artefacts and their placement, so {names} would have no effect; leave out "
+            f"{names}."
         )
     raise InputError(
         f"{names} {'applies' if len(ignored) == 1 else 'apply'} to acceptance tests only; give --acceptance too."
@@ -215,14 +231,18 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
     from ..data.noise import CLASSES
 
     if given["socket"] and given["sockets"] is not None:
-        raise InputError("--sockets asks for planned positions, but --socket gives the positions; give one of the two.")
+        raise InputError(
+            "--sockets plans the positions of the sockets, but --socket states them; give only one of these options."
+        )
     if given["length"] and not given["socket"]:
         raise InputError(
             "--length needs two sockets given with --socket; to plan the position of a reference length, use "
             "--length-mm."
         )
     if given["region"] and given["socket"]:
-        raise InputError("--region applies to sockets whose positions are planned; leave it out with --socket.")
+        raise InputError(
+            "--region applies only if the positions of the sockets are planned; leave out either --region or --socket."
+        )
     points, count = options.sockets_option(given["socket"]), given["sockets"] or _SOCKETS
     names = list(points) or [chr(ord("A") + i) for i in range(min(count, 26))]
     cell, radius, axis = given["cell"], given["link_radius_mm"], given["tool_axis"]

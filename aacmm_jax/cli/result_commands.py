@@ -34,15 +34,17 @@ _KINDS = {
 )
 def evaluate(
     calibration: Path = argument(
-        "Calibration, written by calibrate; or a manifest of points (TOML), without a capture.", "CALIBRATION.h5"
+        "Calibration, written by aacmm calibrate; or a manifest of recorded points (TOML), for which no capture is "
+        "given.",
+        "CALIBRATION.h5",
     ),
-    capture: Path | None = argument("Capture, written by import or simulate.", "CAPTURE.h5", None),
-    output: Path | None = output("Evaluation to write (HDF5), for aacmm report.", "FILE.h5", None),
+    capture: Path | None = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5", None),
+    output: Path | None = output("File to write the evaluation to (HDF5); aacmm report reads it.", "FILE.h5", None),
     only: list[str] | None = options.ONLY,
     without: list[str] | None = options.WITHOUT,
     mpe: list[str] | None = option(
-        "Maximum permissible error of an acceptance test, mm (L: the length); may be given several times. The exit "
-        "code is 1 if a value does not conform by the decision rule.",
+        "Maximum permissible error (mm) of an acceptance test; L is the measured length. May be given several times. "
+        "The exit code is 1 if a value does not conform by the decision rule.",
         "NAME=A[+L/K]",
     ),
     acceptance: list[str] | None = option(
@@ -52,25 +54,30 @@ def evaluate(
         "[jjf|asme|iso]",
     ),
     test_u_mm: str = option(
-        "Standard uncertainty (mm) that seat and fixture add to every test value (L: the length).",
+        "Standard uncertainty (mm) that seat and fixture add to every test value; L is the measured length.",
         "A[+L/K]",
         default="0",
     ),
     expansion: list[str] | None = option(
         "Thermal expansion of the artefact or the arm in an acceptance test: coefficient (1e-6/K) and temperature "
         "(C), each followed by its standard uncertainty, for example 'artefact=11.5,1,20.8,0.2'. Lengths are "
-        "corrected for expansion. Give the expansion of the arm only if the arm does not compensate it itself.",
+        "corrected for this expansion. Give the expansion of the arm only if the arm does not compensate for its "
+        "temperature.",
         "OF=C,U,T,U",
     ),
     rule: Literal["iso-2017", "iso-2013", "simple"] | None = option(
-        "Decision rule: ISO 14253-1:2017 (95 % probability), its guard band of 2013, or simple acceptance (ASME "
-        "B89.7.3.1, 4:1). Default: simple for ASME, otherwise iso-2017."
+        "Decision rule: ISO 14253-1:2017 (95 % probability), ISO 14253-1:2013 (guard band U), or simple acceptance "
+        "(ASME B89.7.3.1, 4:1). Default: simple for ASME, otherwise iso-2017."
     ),
     range_mm: float | None = option(
-        "Measuring range (a diameter) that the maker states. Default: the range in the files.", min=0
+        "Measuring range (a diameter) stated by the maker. Default: the range stated in the capture or manifest.", min=0
     ),
-    max_rms_mm: float | None = option("Exit with code 1 if the RMS distance is larger than this.", min=0),
-    max_deltam_mm: float | None = option("Exit with code 1 if Deltam is larger than this.", min=0),
+    max_rms_mm: float | None = option(
+        "Exit with code 1 if the RMS distance of the poses from their geometry is larger than this.", min=0
+    ),
+    max_deltam_mm: float | None = option(
+        "Exit with code 1 if Deltam (largest half range of a coordinate in a socket) is larger than this.", min=0
+    ),
     max_length_error_mm: float | None = option(
         "Exit with code 1 if the error of any length is larger than this.", min=0
     ),
@@ -135,8 +142,12 @@ def _points(manifest: Path) -> Any:
 
 @command("aacmm report calibration.h5 -o report.html")
 def report(
-    file: Path = argument("File to report: a calibration, evaluation, study or model comparison.", "FILE.h5"),
-    output: Path = output("Report to write: one HTML file that needs no network connection.", "FILE.html"),
+    file: Path = argument(
+        "File to write a report of: a calibration, evaluation, study or model comparison.", "FILE.h5"
+    ),
+    output: Path = output(
+        "File to write the report to: one HTML file, which can be read without a network connection.", "FILE.html"
+    ),
     about: Path | None = options.ABOUT,
     as_json: bool = options.JSON,
 ) -> None:
@@ -159,7 +170,7 @@ def show(
         "URDF, kinematics.yaml, or the name of an arm that ships with aacmm).",
         "FILE",
     ),
-    cell: int | None = option("Show this cell of a study in full.", "N", min=1),
+    cell: int | None = option("Show all results of this cell of a study.", "N", min=1),
     figures: Path | None = option("Write the figures of a study (PNG) to this folder.", "FOLDER"),
     base: str | None = options.BASE_LINK,
     tip: str | None = options.TIP_LINK,
@@ -176,7 +187,9 @@ def show(
         show_summary(summary, as_json, views.arm)
         return
     if base is not None or tip is not None:
-        raise InputError(f"--base and --tip name links of a URDF, but {file} is not a URDF; leave them out.")
+        raise InputError(
+            f"--base and --tip name links of a URDF, but {file} is not a URDF; leave out --base and --tip."
+        )
     attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study", "model comparison"))
     kind = attributes["kind"]
     if kind == "study":

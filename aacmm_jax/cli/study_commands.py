@@ -24,32 +24,32 @@ from .options import argument, flag, option, output
     "aacmm study --resume -o study.h5",
 )
 def study(
-    output: Path = output("Study to write, or to continue (HDF5).", "FILE.h5"),
+    output: Path = output("File to write the study to, or study to continue (HDF5).", "FILE.h5"),
     specification: str | None = argument(
         "Specification: a TOML file, or the name of a study that ships with aacmm.", "SPEC.toml", None
     ),
     resume: bool = flag("--resume", "Continue the study in the output file."),
-    trials: int | None = option("Number of trials per cell. Default: that of the specification.", "N", min=1),
-    seed: int | None = option("Seed. Default: that of the specification.", "N", min=0),
+    trials: int | None = option("Number of trials per cell. Default: the number in the specification.", "N", min=1),
+    seed: int | None = option("Seed of the random numbers. Default: the seed in the specification.", "N", min=0),
     chunk: int | None = option(
         "Number of trials computed at a time; results do not depend on it. Default: 1000.", "N", min=1
     ),
     dask: str | None = option(
         "Run on the Dask cluster whose scheduler has this address. With tcp://, everybody who can reach the port can "
-        "run programs with your rights; tls:// requires certificates (see docs/scaling.md).",
+        "run programs with your user rights; tls:// requires certificates (see docs/scaling.md).",
         "ADDRESS",
     ),
     workers: int | None = option("Number of threads of this process. Default: one per core.", "N", min=1),
     shards: bool = flag(
         "--shards",
-        "Let the Dask workers write their trials themselves, to the folder of the output, which all of them "
-        "must share.",
+        "Let the Dask workers write their trials directly to the folder of the output; all workers must have access "
+        "to this folder.",
     ),
     as_json: bool = options.JSON,
 ) -> None:
     """Run a Monte Carlo study of simulated calibrations.
 
-    The same command continues a study that was interrupted.
+    Repeat the command to continue a study that was interrupted.
     """
     from ..study.definition import Study
     from ..study.runner import dask_executor, run_study
@@ -58,12 +58,15 @@ def study(
 
     if resume and not os.path.exists(output):  # where `Path.exists` raises, of a name too long to be one
         raise InputError(
-            f"{output} does not exist, so there is nothing to resume; leave --resume out to start a study."
+            f"{output} does not exist, so there is nothing to resume; leave out --resume to start a study."
         )
     changes = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
     if specification is None:
         if not resume:
-            raise InputError("name a specification, or use --resume to continue the study in the output file.")
+            raise InputError(
+                "no specification is given; name a specification, or use --resume to continue the study in the output "
+                "file."
+            )
         if changes:
             raise InputError(
                 "a resumed study keeps its trials and its seed; leave out --trials and --seed with --resume."
@@ -80,10 +83,10 @@ def study(
                 asked = Study(changed, asked.nominal, asked.recording)
     if shards and dask is None:
         raise InputError(
-            "--shards applies to the workers of a Dask cluster only; leave it out, or name a cluster with --dask."
+            "--shards applies to the workers of a Dask cluster only; leave out --shards, or name a cluster with --dask."
         )
     if workers is not None and dask is not None:
-        raise InputError("a running Dask cluster has its own workers; leave --workers out.")
+        raise InputError("a Dask cluster determines its own workers; leave out --workers.")
     with _leaving_threads():
         here = nullcontext((None, workers))
         with _progress_display() as show, here if dask is None else dask_executor(dask) as (executor, count):
@@ -100,8 +103,8 @@ def study(
         show_summary(summary, as_json, _ended)
         if not outcome.finished:
             raise Stopped(
-                f"Stopped; {outcome.done:,} of {outcome.total:,} trials are kept. "
-                f"Continue with: aacmm study --resume -o {shlex.quote(str(output))}"
+                f"Stopped; {outcome.done:,} of {outcome.total:,} trials are saved. Continue with: aacmm study "
+                f"--resume -o {shlex.quote(str(output))}"
             )
 
 
@@ -139,7 +142,7 @@ def _progress_display() -> Iterator[Any]:
                 number = state.programs - state.compiling + 1
                 description = f"Compiling program {number} of {state.programs} ..."
             elif state.stopping:
-                description = "Stopping when running blocks are done; Ctrl-C again discards them"
+                description = "Stopping when the running blocks are finished; press Ctrl-C again to discard them"
             bar.update(task, description=description, total=state.total, completed=state.done)
 
         yield show
@@ -148,7 +151,7 @@ def _progress_display() -> Iterator[Any]:
 def _ended(summary: dict[str, Any]) -> list[str]:
     if not summary["finished"]:
         return []
-    ran = f"{summary['trials_this_run']:,} trials run" if summary["trials_this_run"] else "no trials were left to run"
+    ran = f"{summary['trials_this_run']:,} trials run" if summary["trials_this_run"] else "no trials remained to be run"
     written = summary["written"]
     return [
         f"Written: {written} ({summary['trials']:,} trials, {ran}).",
@@ -163,7 +166,10 @@ def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool
 
     results = Results.of(file)
     if cell is not None and cell > len(results.study.cells):
-        raise InputError(f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; name another.")
+        raise InputError(
+            f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; choose a cell from 1 to "
+            f"{len(results.study.cells)}."
+        )
     summary = with_spinner("Reading", lambda: study_summary(results, cell))
     if figures is not None:
         with together():
@@ -185,7 +191,7 @@ def study_view(summary: dict[str, Any]) -> View:
     if any(cell["trials_run"] for cell in summary["results"]):
         yield cell_table(summary)
         yield from metric_tables(summary)
-        yield "Length and angle errors are the largest of all parameters."
+        yield "Length error and angle error: the largest error of any length parameter and of any angle parameter."
         if len(summary["results"]) == 1:
             yield parameter_table(summary)
         else:

@@ -15,7 +15,7 @@ from ..uncertainty.coverage_level import LEVEL_IN_PERCENT, U_AT_LEVEL
 _MOST_PARTS = 12  # rows of a table
 _ARMS = {"nominal": "nominal", "calibrated": "calibrated"}
 _GROUPS = {
-    "held_out": "Held-out data, which the calibration has not used",
+    "held_out": "Held-out data, which were not used for the calibration",
     "identified_from": "Data used for identification",
 }
 
@@ -43,8 +43,8 @@ def arm(summary: dict[str, Any]) -> View:
         "limits of the reading" if slides else "limits [deg]": limits,
     })  # fmt: skip
     yield (
-        f"Probe {', '.join(formatted(x) for x in summary['probe_mm'])} mm. Fixed parameters: "
-        f"{', '.join(summary['held'])}."
+        f"Position of the probe in the last frame: ({', '.join(formatted(x) for x in summary['probe_mm'])}) mm. Fixed "
+        f"parameters: {', '.join(summary['held'])}."
     )
     calibrated = [row for row in summary["corrections"] if row["value"] != 0]
     if calibrated:
@@ -144,7 +144,7 @@ def calibration(summary: dict[str, Any]) -> View:
     yield tables.parameter_table("Parameters", apart)
     if harmonics:
         yield tables.harmonics_table(harmonics)
-        yield "All coefficients: --json, or aacmm export --format csv."
+        yield "All coefficients are written with --json and by aacmm export --format csv."
     if summary["held"]:
         yield f"Fixed at their nominal values: {', '.join(summary['held'])}."
     if summary.get("prior"):
@@ -161,7 +161,7 @@ def solve(summary: dict[str, Any]) -> Line:
     """How the solve ended; a residual that no arm has is not called converged, whatever the solver says."""
     ended = Styled("converged", "green") if summary["converged"] else Styled("did not converge", "red")
     if summary["converged"] and not summary["residual_plausible"]:
-        ended = Styled("ended with residuals too large for this arm,", "red")
+        ended = Styled("ended with residuals that are too large for this arm,", "red")
     rows = summary["observations"]  # with observations of other kinds, or a probe for each session: sockets too
     sockets = {*summary["sockets_used"], *(row["observation"] for row in rows if row["kind"] == "socket")}
     observed = words.observed_words(len(sockets), sum(row["kind"] != "socket" for row in rows))
@@ -179,12 +179,17 @@ def _observations(summary: dict[str, Any]) -> View:
             yield tables.geometry_table(parts, factor)
         hidden = len(summary["geometry"]) - len(parts)
         if hidden:
-            yield f"{pluralise(hidden, 'more part')} of the geometry, including positions of sockets: --json."
+            yield (
+                f"{pluralise(hidden, 'more part')} of the geometry, including the positions of the sockets, with "
+                "--json."
+            )
     if summary.get("base"):
         yield base(summary["base"], factor)
     if summary["robust"]:
         rows = summary["less_weight"]
-        least = f"; the {_MOST_PARTS} with the least weight are listed (all: --json)" if len(rows) > _MOST_PARTS else ""
+        least = (
+            f"; the {_MOST_PARTS} with the least weight are listed (all with --json)" if len(rows) > _MOST_PARTS else ""
+        )
         yield (
             f"Robust loss {summary['robust']}: {pluralise(len(rows), 'pose')} with half of the full weight or "
             f"less{least}."
@@ -207,7 +212,7 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
             pairs = list(zip(frame[quantity.format("")], expanded, strict=True))
             rows.append((name, title, *(number(scale * x, decimals_for(u), rounded=True) for x, u in pairs)))
             rows.append(("", "U", *(number(u, decimals_for(u)) for u in expanded)))
-    title = f"Base frame in each frame with known coordinates, with {U_AT_LEVEL}"
+    title = f"Pose of the base frame in each frame with known coordinates, with {U_AT_LEVEL}"
     return listed(title, rows, ("in", "", "x", "y", "z"))
 
 
@@ -217,7 +222,7 @@ def _uncertainty(summary: dict[str, Any]) -> View:
     factors = ", ".join(filter(None, (LEVEL_IN_PERCENT, words.factor_words(part["volume"]))))
     yield tables.volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
     yield (
-        "U is propagated from the uncertainties of the parameters to 400 positions, those of random poses within the "
+        "U is propagated from the uncertainties of the parameters to the tip positions of 400 random poses within the "
         "joint limits."
     )
     if part.get("tried"):
@@ -253,7 +258,7 @@ def demo(summary: dict[str, Any]) -> View:
     yield tables.truth_table(summary)
     yield (
         f"k = {summary['scale_k']:.7f}, u(k) = {summary['scale_u']:.1e}: stage 1 uses repeatability only, so all "
-        "lengths are wrong by this common factor; stage 2 divides them by it."
+        "lengths are wrong by this common factor; stage 2 divides all lengths by this factor."
     )
     yield f"Files in {summary['folder']}: {', '.join(summary['files'])}"
     yield from (f"Not written: {reason}" for reason in summary["left_out"].values())
@@ -290,7 +295,7 @@ def evaluation(summary: dict[str, Any]) -> View:
     yield from words.limits_of(summary)
     if summary["acceptance"] or summary["standards"]:
         yield from _acceptance(summary)
-    yield from words.warnings_of(summary, "Warning of the calibration:", "calibration_warnings")
+    yield from words.warnings_of(summary, "Warning from the calibration:", "calibration_warnings")
     for group, text in _GROUPS.items():
         part = summary[group]
         if part is None:
@@ -311,7 +316,7 @@ def evaluation(summary: dict[str, Any]) -> View:
             yield tables.observations_table(title, part["observations"])
         for row in part["observations"]:
             if row["rms_angle_rad"] is not None:
-                yield f"Orientation of {row['observation']}: RMS {row['rms_angle_rad'] / DEG:.4f} deg."
+                yield f"Orientation residuals of {row['observation']}: RMS {row['rms_angle_rad'] / DEG:.4f} deg."
         if predicted:
             yield from _predicted(part)
         if part["lengths"]:
@@ -327,12 +332,12 @@ def _predicted(part: dict[str, Any]) -> View:
     if len(kinds) > 1 and part["observations"]:
         yield listed("By kind [mm]", kinds, {"kind": "kind"} | numbers)
     if len(groups) > 1 and any(len(row["members"]) > 1 for row in groups):
-        title = "Groups that share a length or an unknown geometry [mm]"
+        title = "Groups of observations that share a length or an unknown geometry [mm]"
         yield listed(title, groups, {"group": "group"} | numbers)
     if poses["rms_mm"] is not None:
         prediction = poses["rms_predicted_mm"]
         predicted = (
-            "no prediction, because the data do not determine everything that it needs"
+            "no prediction, because the data do not determine all the parameters that a prediction needs"
             if prediction is None
             else f"{formatted(prediction)} mm predicted from the uncertainty of the calibration and the noise"
         )

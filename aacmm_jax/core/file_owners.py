@@ -61,7 +61,7 @@ def may_replace(path: str | os.PathLike) -> bool:
 
 
 def _is_private(group: int, user: int) -> bool:
-    """Whether a group is that of one user alone: it bears the user's name, or is the first group of nobody else."""
+    """Whether a group is that of one user alone: it bears the user's name, or is the first group of no other user."""
     import grp
     import pwd
 
@@ -75,7 +75,8 @@ def _is_private(group: int, user: int) -> bool:
 
 def keeps_owners(folder: str | os.PathLike) -> bool:
     """Whether a file system keeps owners and modes (some shares and drives of other systems show all files alike): a
-    file that is made in the folder, for nobody else, is ours and nobody else's. True where none can be made."""
+    file that is made in the folder with access for its owner alone is ours and has that access. True where none can be
+    made."""
     try:
         with tempfile.TemporaryFile(dir=folder) as probe:
             status = os.fstat(probe.fileno())

@@ -22,8 +22,8 @@ from jaxtyping import Array
 from ._compat import is_traced
 from .jax_setup import check_x64
 
-# An array of either library; NumPy's sums over all axes are scalars, `np.generic`, that a type checker knows no
-# arithmetic of.
+# An array of either library; NumPy's sums over all axes are scalars, `np.generic`, for which type
+# checkers have no arithmetic.
 if TYPE_CHECKING:
     AnyArray = Array | np.ndarray
 else:

@@ -72,6 +72,15 @@ def finding_rows(findings: Iterable[Finding]) -> list[dict[str, Any]]:
     return [finding._asdict() | {"concerns": list(finding.concerns)} for finding in findings]
 
 
+_BY_EQUATIONS: set[Callable] = set()  # functions of a case whose values follow from its equations
+
+
+def by_equations(compute: Callable[["Case"], Value]) -> Callable[["Case"], Value]:
+    """Decorator of a function of a case whose value follows from the equations alone, not from the covariance."""
+    _BY_EQUATIONS.add(compute)
+    return compute
+
+
 class Case:
     """A calibration, and what several diagnostics need of it, computed once when first asked for."""
 
@@ -119,8 +128,32 @@ class Case:
         weights = self.record.observed.weights
         return self.scatters and not any(bool(np.any(np.asarray(part) < 1)) for part in weights)
 
+    def take_over(self, earlier: "Case") -> None:
+        """Keep what an earlier case has computed of the same equations."""
+        if _same_equations(self.record, earlier.record):
+            vars(self).update({name: value for name, value in vars(earlier).items() if name not in vars(self)})
+            self._kept |= {compute: value for compute, value in earlier._kept.items() if compute in _BY_EQUATIONS}
+
+
+# Fields of a record from which its equations follow, and what is made of these, besides its arm and its capture.
+_FIELDS = (
+    *("names", "hold", "scale_set_by", "method", "against_division", "noise", "reduced_chi"),
+    *("observed", "prior"),
+)
+
+
+def _same_equations(first: CalibrationRecord, second: CalibrationRecord) -> bool:
+    parts = [
+        (record.calibrated.arm, record.recording.capture, *(getattr(record, name) for name in _FIELDS))
+        for record in (first, second)
+    ]
+    if jax.tree.structure(parts[0]) != jax.tree.structure(parts[1]):
+        return False
+    return all(map(np.array_equal, *map(jax.tree.leaves, parts)))
+
 
 _last: list[Case] = []  # the case of the record that was asked for last
+_solved: list[Case] = []  # that of the result that was solved last, before its uncertainty was amended
 
 
 def case_of(
@@ -128,7 +161,10 @@ def case_of(
     capture: Capture | None = None,
     class_noise: Noise | None = None,
 ) -> Case:
-    """The case of a result, or the same one again for the same record: what it has computed is kept."""
+    """The case of a result, or the same one again for the same record: what it has computed is kept.
+
+    The case of another record of the same solution takes over what follows from the equations.
+    """
     if not isinstance(result, CalibrationRecord):
         if capture is None:
             raise InputError(
@@ -139,18 +175,25 @@ def case_of(
     if class_noise is not None:
         return Case(result, class_noise)
     if not _last or _last[0].record is not result:
-        _last[:] = [Case(result)]
+        case = Case(result)
+        for earlier in (*_last, *_solved):
+            case.take_over(earlier)
+        _last[:] = [case]
     return _last[0]
 
 
 def amendable(result: Calibration | Identification, capture: Capture) -> Case | None:
     """The case of a result whose noise and uncertainty may be amended; None where its values are traced, where it did
-    not converge, or where data and arm do not belong together."""
+    not converge, or where data and arm do not belong together.
+
+    What it computes of the equations is kept for the record of the amended result, whose covariance alone is another.
+    """
     if inside_trace() or not is_concrete(*jax.tree.leaves((result, capture))):
         return None
     if not bool(result.converged) or result.implausible_residual:
         return None
-    return case_of(to_numpy(result), to_numpy(capture))
+    _solved[:] = [case_of(to_numpy(result), to_numpy(capture))]
+    return _solved[0]
 
 
 @lru_cache(maxsize=1)

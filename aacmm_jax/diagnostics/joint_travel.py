@@ -170,10 +170,10 @@ class TriedPoses(NamedTuple):
 def tried_poses(arm: Arm, calibrated: Numbers, q: Numbers) -> TriedPoses:
     """How far poses are from those of a calibration, and these from one another.
 
-    What a model lacks depends on the readings, so a calibration has seen such errors only near its own poses. Elsewhere
-    an uncertainty that follows from the model alone says nothing of them. ``calibrated`` are the readings that the arm
-    was calibrated with, ``(N, n)``, and ``q`` those of other poses, rad (slides: mm); a temperature after them is left
-    out. Raises `InputError` for fewer than two poses.
+    What a model lacks depends on the readings, so the data of a calibration contain such errors only near its own
+    poses. Elsewhere, an uncertainty that follows from the model alone does not include them. ``calibrated`` are the
+    readings that the arm was calibrated with, ``(N, n)``, and ``q`` those of other poses, rad (slides: mm); a
+    temperature after them is left out. Raises `InputError` for fewer than two poses.
     """
     units = np.asarray(reading_units(arm.geometry))
     poses, others = (np.asarray(values, dtype=float)[:, : arm.joints] / units for values in (calibrated, q))

@@ -22,7 +22,7 @@ from ..kinematics.corrected_arm import function_values
 from ..kinematics.corrections import Term, all_sought, model_of, model_with, terms_of
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import Block, Rows, wider
-from .findings import Case, Finding, chance_text, rounded
+from .findings import Case, Finding, by_equations, chance_text, rounded
 from .residual_tests import LEVEL, Residuals, ScoreTest, score_tests
 
 ORDER, NEEDS = 60, "fit"
@@ -99,6 +99,7 @@ def test(case: Case) -> list[Finding]:
     ]
 
 
+@by_equations
 def missing(case: Case) -> tuple[FoundTerm, ...]:
     """The terms that the model of a calibration lacks."""
     if not case.scatters:
@@ -106,6 +107,7 @@ def missing(case: Case) -> tuple[FoundTerm, ...]:
     return found_terms(case.record.calibrated.arm, np.asarray(case.record.recording.capture.readings), *case.chunks)
 
 
+@by_equations
 def explained(case: Case) -> tuple[list[Rows], list[Block]]:
     """The equations of a calibration, with these terms as further unknowns."""
     (rows, relations), terms = case.chunks, case.once(missing)

@@ -26,7 +26,7 @@ from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.noise import Noise, one_arcsec
 from .equations import Block, Rows
-from .findings import Case, Finding, chance_text, reading_text
+from .findings import Case, Finding, by_equations, chance_text, reading_text
 from .missing_terms import MOST_TERMS, explained, found_terms, missing
 from .residual_tests import LEVEL, Residuals, chance_above_zero
 
@@ -37,7 +37,7 @@ _FACTOR = 1.5  # largest change of a log variance in one round
 _LEAST = 1e-6  # part of the residuals that a variance explains, below which it is 0
 _CLEAR = 1e-4  # probability of a missing term, below which the model is wrong rather than the noise
 _FEWEST = 20  # degrees of freedom below which no variance is estimated by joint
-_FAR_MORE = 100.0  # ratio of noise beyond which the number says nothing
+_FAR_MORE = 100.0  # ratio of noise beyond which the number has no meaning
 
 Result = TypeVar("Result", Calibration, Identification)
 
@@ -224,7 +224,15 @@ def noisiest_joint(case: Case) -> NoisyJoint | None:
     lacks taken into account; where even these do not explain the residuals, what they miss looks like noise."""
     if not case.shows_noise or len(case.once(missing)) == MOST_TERMS:
         return None
+    if not case.once(missing):
+        return case.once(_without_terms)[0]
     return _noisiest(case.record, _Equations.of(case.record, *case.once(explained)))[0]
+
+
+@by_equations
+def _without_terms(case: Case) -> tuple[NoisyJoint | None, _Equations]:
+    """The joint by the equations of the calibration as they are, and these as the test weighted them."""
+    return _noisiest(case.record, _Equations.of(case.record, *case.chunks))
 
 
 def _noisiest(record: CalibrationRecord, equations: _Equations) -> tuple[NoisyJoint | None, _Equations]:
@@ -248,11 +256,11 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
     record = case.record
     if not case.scatters or case.left.degrees_of_freedom < _FEWEST:
         return None
-    equations = _Equations.of(record, *case.chunks)
-    given, joints = record.given_noise is not None, len(equations.unit)
-    noisiest, now = _noisiest(record, equations)
+    noisiest, now = case.once(_without_terms)
     if noisiest is None or noisiest.probability >= LEVEL:
         return None
+    equations = _Equations.of(record, *case.chunks)
+    given, joints = record.given_noise is not None, len(equations.unit)
     # A zero that is off in some observations, as after a slip, moves all of their poses alike: these contradict the
     # others, and that is what has to be said. So the joint must be noisy where its zero may differ between them.
     j = noisiest.joint - 1

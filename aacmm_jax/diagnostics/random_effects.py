@@ -1,7 +1,7 @@
-"""Errors that poses share, as random effects: how large they are by the residuals.
+"""Shared errors, as random effects: how large they are by the residuals.
 
 The model of a calibration leaves residuals r = M e of whitened errors e, M the projector onto what its unknowns cannot
-explain (`residual_tests`). Errors that poses share are e = w + sum_g Z_g c_g: independent ones w of one variance s, and
+explain (`residual_tests`). Shared errors are e = w + sum_g Z_g c_g: independent ones w of one variance s, and
 columns Z_g (the tips of all poses of a visit move alike; a joint turns by an unknown coefficient times a known
 function) times coefficients of variance v_g. The likelihood of r depends on the variances through D_g = M Z_g alone
 (REML: Patterson and Thompson 1971, Biometrika 58, 545-554). The calibration stays as it is. Its parameters follow a

@@ -200,7 +200,7 @@ def form_test(left: Residuals, kernels: Kernels, relative: bool) -> FormTest:
 
 
 def alike(columns: Float[np.ndarray, "m r c"], poses: Float[np.ndarray, "m m"]) -> Float[np.ndarray, "1 R R"]:
-    """The block of errors that poses share by some columns each, as much as ``poses`` says of each two."""
+    """The block of shared errors by some columns each, as much as ``poses`` says of each two."""
     flat, rows = columns.reshape(-1, columns.shape[2]), columns.shape[1]
     return (np.kron(poses, np.ones((rows, rows))) * (flat @ flat.T))[None]
 

@@ -156,7 +156,7 @@ def lengths_of(case: Case) -> Lengths | None:
     """Lengths and certified values against the arm as the poses alone determine it, but for its scale; None where there
     are too few to contradict each other.
 
-    Errors that poses share, where the calibration has found them, are part of what is expected, unless a single length
+    Shared errors, where the calibration has found them, are part of what is expected, unless a single length
     is what all others contradict.
     """
     if not case.testable:

@@ -1,4 +1,4 @@
-"""Errors that poses share, found in the residuals of a calibration and added to its uncertainty.
+"""Shared errors, found in the residuals of a calibration and added to its uncertainty.
 
 Looked for are, each only where a test of the residuals says so with a probability below 10 %: errors of the tip that
 all poses of a visit share (marked in the capture, or successive poses where none are), and functions of the readings

@@ -305,7 +305,7 @@ def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True
 def undamaged(path: str | os.PathLike) -> Iterator[None]:
     """While the content of a file is interpreted: what cannot be read there was not written so.
 
-    What fails for another reason (no memory, a JAX that cannot start or is told to stop) says nothing about the file.
+    What fails for another reason (no memory, a JAX that cannot start or is told to stop) is no fault of the file.
     """
     try:
         yield

@@ -18,7 +18,7 @@ from ..core.errors import InputError
 _LOW: Any = h5py  # whose type hints lack some of its modules
 _SEAL = b"\naacmm_jax: SHA-256 of all bytes before this line: %s\n"
 _SEAL_SIZE = len(_SEAL % (64 * b"0"))
-# An honest file's arrays exceed its size little; a few repeated numbers are compressed a thousand times.
+# The arrays of a file that aacmm wrote exceed its size little; a few repeated numbers are compressed a thousand times.
 _ALWAYS_READ, _MOST_COMPRESSED = 64 * 2**20, 100
 _BUFFER = 16 * 2**20  # bytes of an array that are read at a time
 # Numbers, truth values (an enumeration) and text; no compound, reference or array types, nor lists of lists.

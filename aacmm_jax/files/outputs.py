@@ -1,7 +1,7 @@
 """Files that are written: whole or not at all, all those of a command together, and none that the command reads.
 
-Whatever is written goes to a temporary file in the same folder, which is locked while its writer lives and is renamed
-at the end. So a temporary file that nobody has locked was left by a process that was killed, and is removed.
+Whatever is written goes to a temporary file in the same folder, which is locked while its writer runs and is renamed
+at the end. So a temporary file without a lock was left by a process that was killed, and is removed.
 
 A command replaces a file only where aacmm wrote it, as it says itself or as its beginning shows (`asking`).
 """

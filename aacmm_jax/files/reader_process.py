@@ -177,7 +177,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def serve() -> None:
-    """What the child does: read one file after the other, until one cannot be read or nobody can ask any more."""
+    """What the child does: read one file after the other, until one cannot be read or the parent has ended."""
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what a library prints is no answer
     from .hdf5_content import check

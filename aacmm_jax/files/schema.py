@@ -15,7 +15,7 @@ from .hdf5 import Entries, Stored, StoredTable, check_sense, is_moment, read_tab
 from .records import Field, Fields, check_fields, count, mapping, number, part, text, truth
 
 _ROUNDING = 1e-6  # of k
-_LARGEST_U = 0.1  # of k: a larger one says nothing about it
+_LARGEST_U = 0.1  # of k: beyond it the scale is as good as unknown
 _BOTH = "see unit"
 _EITHER = "mm or rad"
 
@@ -224,7 +224,7 @@ def _law(dimension: str) -> Field:
 
 
 SHARED_ERRORS: Fields = {
-    "kinds": text("kind of error that poses share", "shared_kind", name="shared_kind"),
+    "kinds": text("kind of shared error", "shared_kind", name="shared_kind"),
     "units": text("unit of the standard deviation", "shared_kind"),
     "names": text("coefficient of a function", "coefficient", name="coefficient"),
     "sd": number("standard deviation, learned from the residuals", "mm or rad, see units", "shared_kind"),

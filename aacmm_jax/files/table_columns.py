@@ -286,7 +286,7 @@ def read_poses(
 def corrected_csv(commanded: PoseTable, q: Float[np.ndarray, "N n"], reached: Bool[np.ndarray, " N"]) -> str:
     """The table with corrected readings in place of those commanded, or after the other columns, in the same unit.
 
-    The readings (rad and mm) of rows that are not ``reached`` are left empty, so that nobody sends an arm there.
+    The readings (rad and mm) of rows that are not ``reached`` are left empty, so that no arm is sent there.
     """
     table, arm = commanded.table, commanded.arm
     rows = (q / np.array(by_joint(arm, _ANGLES[commanded.unit], 1.0))).T

@@ -138,7 +138,7 @@ def are_units(cells: list[str], alone: bool) -> bool:
 def unit_in(name: str) -> str | None:
     """The unit in a column's name; None where it states none.
 
-    What stands in square brackets is a unit, also where nobody knows it; so is what is nearly one in round brackets.
+    What stands in square brackets is a unit, even an unknown one; so is what is nearly one in round brackets.
     Brackets come before words.
     """
     name = name.casefold()
@@ -223,7 +223,7 @@ def names_of_columns(
     chosen = names[0][1] if names else [""] * width if units else []
     if not units:
         return chosen
-    # A unit that nobody knows is refused where its column is picked.
+    # An unknown unit is refused where its column is picked.
     return [f"{name} [{_inside(cell)}]" if cell else name for name, cell in zip(chosen, units[-1], strict=True)]
 
 

@@ -3,9 +3,9 @@
 The format's specification: wiki.ros.org/urdf/XML. Only direct children of ``<robot>`` count, since transmissions,
 controllers and simulators have elements of the same names.
 
-A misspelt ``<origin>`` or ``xyz=`` would count as one that is missing, and the arm would silently be another one. So
-in elements that are read, names that nearly are, or elsewhere are, those of the format are refused, and in those
-without room for other tools' data every other name as well. Names with a prefix (``drake:...``) pass.
+A misspelt ``<origin>`` or ``xyz=`` would count as one that is missing, and the arm would be another one without any
+message. So in elements that are read, names that nearly are, or elsewhere are, those of the format are refused, and in
+those without room for other tools' data every other name as well. Names with a prefix (``drake:...``) pass.
 
 The parser is expat: it says where each tag is in bytes, which edits need, and in which line, which messages need. A
 document type is refused: its entities could name other files, or grow to any size.

@@ -39,7 +39,7 @@ _UNIT = 1000.0  # mm: a slide of 1 mm counts as much as a rotation of 1 mrad, li
 class JointKinds:
     """Which joints of a chain are prismatic: a node without leaves, so that it is static in every program.
 
-    A chain of revolute joints has None in its place: its programs are then those of an arm that knows no other joints.
+    A chain of revolute joints has None in its place: its programs are then those without the terms of prismatic joints.
     """
 
     prismatic: tuple[bool, ...]

@@ -1,7 +1,7 @@
 """What joints do besides their Denavit-Hartenberg motion: the kinds of corrections, and their coefficients by name.
 
 Each coefficient multiplies a known function of the readings (`chain`). A new kind is one class here, added to
-`KINDS`: whatever else the package does with kinds, it asks them.
+`KINDS`: whatever else the package does with kinds follows from these classes.
 """
 
 import abc

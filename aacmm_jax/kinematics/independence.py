@@ -1,7 +1,7 @@
 """Which parameters data determine: a choice of independent columns of derivatives, without near-degenerate ones.
 
 A matrix of derivatives has full rank as soon as no combination of parameters leaves the tips exactly where they are.
-That says nothing of how well the combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank
+Full rank does not show how well a combination is determined: a probe 0.6 mm off the last axis gives ``theta_6`` a rank
 of its own, but 1 mrad of it moves no tip by more than 0.3 um once ``a_6`` and the probe have followed. So directions
 are judged by size.
 

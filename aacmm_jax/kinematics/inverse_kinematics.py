@@ -247,7 +247,7 @@ class ReadingsAtPoses(NamedTuple):
 
 
 def corrected_readings(nominal: Arm, calibrated: Arm, q: Numbers, limits: Limits | None = None) -> ReadingsAtPoses:
-    """Readings that put the calibrated arm where a controller with the nominal arm believes it to be at ``q``.
+    """Readings that put the calibrated arm where a controller with the nominal arm computes it to be at ``q``.
 
     What the controller means by the readings ``q`` is the pose ``nominal.pose(q)``; the readings found make
     ``calibrated.pose`` equal to it, in the base frame that both arms have in common (`readings_at_poses`). `InputError`
@@ -257,7 +257,7 @@ def corrected_readings(nominal: Arm, calibrated: Arm, q: Numbers, limits: Limits
         nominal: The arm that the controller has.
         calibrated: The calibrated arm.
         q: Commanded joint readings ``(..., n)``, rad; ``(..., n + 1)`` with the temperature of an arm that has a
-            thermometer, C, of which a controller knows nothing.
+            thermometer, C, which a controller does not use.
         limits: Lowest and highest reading of each joint, n pairs, rad; by default those of the nominal arm, if any.
 
     Example:
@@ -317,7 +317,9 @@ def readings_at_poses(
     scale, xp = length_scale(geometry, rows), namespace(geometry, rows, wanted)
     wanted = set_at(wanted, (slice(None), slice(3), 3), wanted[:, :3, 3] / scale[:, None])
 
-    solved: Any = lambda rows: _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)  # noqa: E731
+    def solved(rows: Any) -> Any:
+        return _solve_to_poses(geometry, rows[:, :n].T, rows[:, n:].reshape(-1, 4, 4), allowed)
+
     both = xp.concatenate([rows[:, :n], wanted.reshape(count, 16)], axis=1)
     solution = in_chunks(solved, both, ROWS) if xp is np else solved(both)
     readings, distance, angle = solution[:, :-2], scale * solution[:, -2], solution[:, -1]

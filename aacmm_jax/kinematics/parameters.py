@@ -108,7 +108,7 @@ class Parameters(eqx.Module):
         reference length these are its 21; without one, the longest link is fixed too. Where neighbouring axes are
         nearly parallel, d of the first is fixed and Hayati's beta is free instead. Observations besides sockets count
         as positions of the tip in an unknown frame, which is the most that spheres, planes and distances may say;
-        `observability` knows what each kind determines. `InputError` where the capture has another number of joints, or
+        `observability` tells what each kind determines. `InputError` where the capture has another number of joints, or
         determines nothing.
 
         Args:

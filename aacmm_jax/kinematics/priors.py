@@ -88,7 +88,7 @@ class Prior(eqx.Module):
                 raise InputError(f"the prior names '{group}', but the arm has no such parameter{hint}")
 
     def of(self, names: tuple[str, ...], nominal: Float[AnyArray, " p"]) -> "ParameterPrior | None":
-        """The prior of the named parameters, mm and rad; None where it says nothing of any of them."""
+        """The prior of the named parameters, mm and rad; None where none of them has one."""
         given, nominal = to_numpy((self, nominal))
         xp, steps = namespace(given, nominal), natural_steps(names)
         # Each parameter belongs to the closest of the groups that hold it, and has its standard deviation.
@@ -179,7 +179,7 @@ def default_prior(arm: Arm) -> Prior:
     Learned from the data, each expected to a factor of 4.5: lengths (1 mm), angles (1 mrad), gravity (1 mrad for links
     with levers of 1 m, or for 100 N m), gear and coupled (0.02 %), thermal expansion (20 um/(m K)), and one group for
     each octave of harmonics (0.05 mrad), of which all joints share one scale: the error of an encoder or a gear is a
-    function whose harmonics fade with their order at a rate that nobody knows beforehand. A scale for each joint fails
+    function whose harmonics fade with their order at a rate that is not known beforehand. A scale for each joint fails
     where a joint moves little, since high orders imitate anything there (`benchmarks/NOTES.md`).
 
     Args:

@@ -16,6 +16,7 @@ from ..core.errors import IdentifiabilityWarning, InputError
 from ..data.capture import draw_poses, join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
+from ..diagnostics.findings import case_of
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
@@ -78,7 +79,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         hold: the scale anchor of stage 1, as for `identify`.
         noise: standard deviations of readings and seat, as for `identify`.
         replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
-        shared_errors: add errors that poses share to the covariance, as for `calibrate`.
+        shared_errors: add shared errors to the covariance, as for `calibrate`.
         cross_validate: calibrate without each group, as `cross_validate` does. By default where a real arm was recorded
             in several placements of the reference length, and there is neither a prior nor a robust loss.
         leave_out: groups that cross-validation leaves out, as names or shell patterns.
@@ -124,7 +125,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     stated = (chosen.model, chosen.robust, chosen.method, nominal.prior, nominal.arm.corrections)
 
     def recorded(result: Calibration | Identification, part: Recording) -> CalibrationRecord:
-        return record_of(result, part, robust=chosen.robust, others=others)
+        record = record_of(result, part, robust=chosen.robust, others=others)
+        case_of(record)  # takes over what the calibration has computed to test its noise, before others are tested
+        return record
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)

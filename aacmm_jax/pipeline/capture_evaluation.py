@@ -181,8 +181,8 @@ def _refuse_options_of_tests(chosen: EvaluationOptions) -> None:
     if any(given.values()):
         raise InputError(
             f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only, but this "
-            "capture supports none, or none was requested; request one with --acceptance (standards), or leave the "
-            "option out."
+            "capture supports none, or none was requested; request a test with --acceptance (standards), or leave "
+            "this option out."
         )
 
 
@@ -198,8 +198,8 @@ def _warnings(
     yield from evaluation.recording.capture.repeated.sentences()
     if partly:
         yield (
-            f"The arm was identified from some poses of {', '.join(partly)}; the other poses of these sockets and "
-            "observations count as used, too."
+            f"The calibration used some of the poses of {', '.join(partly)}; the other poses of these sockets and "
+            "observations are treated as used, too."
         )
     if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
         yield (

@@ -80,8 +80,8 @@ def simulate_capture(
         of_sockets = chosen.poses != SimulationOptions().poses, chosen.lengths, chosen.temperature is not None
         if sockets or any(of_sockets) or np.any(chosen.resolution_arcsec):
             raise InputError(
-                "--acceptance sets the sockets, poses and lengths itself, at 20 C; leave out --socket, --poses, "
-                "--length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
+                "--acceptance determines the sockets, poses, lengths and temperature (20 C) itself; leave out "
+                "--socket, --poses, --length, --resolution-arcsec, --linear-resolution-mm and --temperature-c."
             )
         procedure = plan_procedure(nominal.arm, chosen.acceptance)
         u = {"u_length": _U_ARTEFACT, "u_diameter": _U_ARTEFACT}
@@ -107,7 +107,7 @@ def _true_arm(nominal: ArmSpecification, chosen: SimulationOptions) -> ArmSpecif
     if true.arm.joints != nominal.arm.joints:
         raise InputError(
             f"the true arm '{true.name}' has {true.arm.joints} joints, but '{nominal.name}' has {nominal.arm.joints} "
-            "joints; choose a true arm with as many joints."
+            "joints; choose a true arm with the same number of joints."
         )
     if not (chosen.deviate_length or chosen.deviate_angle):
         return true

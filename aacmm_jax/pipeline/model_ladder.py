@@ -77,7 +77,7 @@ class ComparedModel(NamedTuple):
     def ratio(self) -> float:
         """Mean of (error / predicted standard deviation)^2 outside; about 1 where noise and prior are right.
 
-        Errors that poses share are not in this prediction, which is to show what a model lacks; they are in the
+        Shared errors are not in this prediction, which is to show what a model lacks; they are in the
         uncertainty of ``result``.
         """
         return float(np.mean([region.ratio for region in self.regions]))

@@ -168,7 +168,7 @@ def calibrate(arm: Arm, capture: Capture, bounds: Bounds | None = None, **option
         robust: a robust loss, as for `identify`.
         prior: what is known of the parameters, as for `identify`; of a model, by default `kinematics.default_prior`.
         replace_noise: estimate the noise of encoders that prove noisier, as for `identify`.
-        shared_errors: add errors that poses share, as far as residuals show any, to the covariance (`SharedErrors`).
+        shared_errors: add shared errors, as far as residuals show any, to the covariance (`SharedErrors`).
         undetermined: what to do where these data do not determine free parameters: "warn", "raise" (`InputError`) or
             "ignore", which leaves out the check; it takes about as long as the calibration.
         max_steps: most evaluations of each solve.

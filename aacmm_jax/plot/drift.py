@@ -61,7 +61,7 @@ def drift_trend(trend: Trend, axes: Any = None) -> Any:
         form = "%Y-%m-%d" if span > 86400 else "%m-%d %H:%M"
         dates = [f"{date:{form}}{'*' if file else ''}" for date, file in zip(trend.dates, by_file, strict=True)]
         title = "calibration" + (", evenly spaced" if even else "")
-        title += " (*: date of its file; the manifest states no date)" if any(by_file) else ""
+        title += " (*: date of the file, because the manifest states no date)" if any(by_file) else ""
         ticks = tuple(zip(positions.tolist(), dates, strict=True))
         x = linear(title, positions, margin=0.03)._replace(ticks=ticks, named=True)
         # The dates stand below the lower axes alone.
@@ -91,8 +91,8 @@ def _changes_over_time(trend: Trend, x: Axis, positions: np.ndarray) -> Plot:
         marks.append(Marks(name, positions, ratio[:, i], joined=True, **style))
     title = (
         f"Change of {len(trend.names)} parameters from the first calibration; band: expanded uncertainty "
-        f"({in_percent(drift.level)})\nnamed: beyond the band at the last date (at most {len(SERIES)}); "
-        "open circles: other values beyond the band"
+        f"({in_percent(drift.level)})\nnamed curves: parameters beyond the band at the last date (at most "
+        f"{len(SERIES)}); open circles: other values beyond the band"
     )
     return Plot(x, _ratio_axis(ratio), tuple(marks), title + _not_shown(drift))
 
@@ -133,8 +133,8 @@ def _changes_of_two(drift: Drift) -> Plot:
         Marks("", x[moved], ratio[moved], "square", size=7),
     )
     title = (
-        f"New minus old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band "
-        f"(their expanded uncertainty, {in_percent(drift.level)})"
+        f"New minus old calibration: {int(moved.sum())} of {len(chosen)} parameters beyond the band (expanded "
+        f"uncertainty of the change, {in_percent(drift.level)})"
     )
     return Plot(axis, _ratio_axis(ratio), marks, title + _not_shown(drift))
 

@@ -76,7 +76,7 @@ def check_format(path: Path) -> str:
     """The format of a figure by its file name; `InputError` for any but PNG, SVG and PDF, or without matplotlib."""
     suffix = path.suffix.lower().removeprefix(".")
     if suffix not in ("png", "svg", "pdf"):
-        raise InputError(f"a figure cannot be written as {path}; end its name in .png, .svg or .pdf.")
+        raise InputError(f"a figure cannot be written as {path}; use a file name that ends in .png, .svg or .pdf.")
     require("plot", "a figure")
     return suffix
 

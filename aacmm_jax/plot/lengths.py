@@ -109,7 +109,7 @@ def reference_length_errors(record: CalibrationRecord, axes: Any = None) -> Any:
     """
     capture, evaluations = record.recording.capture, record.evaluations()
     if not capture.lengths:
-        raise InputError("the calibration has no reference lengths, so there are no errors of lengths to draw.")
+        raise InputError("the calibration has no reference lengths, so there are no length errors to draw.")
     rows = metrics_by_socket_and_length(capture, evaluations["calibrated"], uncertainty_of(record))["lengths"]
     earlier = {"stage 1": np.asarray(evaluations["stage1"].error)} if record.stage1_apart else {}
     return draw(length_chart(rows, earlier).plots[0], axes)
@@ -125,8 +125,8 @@ def metrics_chart(tests: Sequence[AcceptanceTest]) -> Chart:
         metrics, y, lines, title = limited, "|value| / MPE", [1.0], "Metrics against their limits"
         divisors = np.array([max(metric.worst.limit or 0.0, _LEAST) for metric in metrics])
         description = (
-            "The value of each metric divided by its limit, with U. The decisions are in the tables. They follow the "
-            "decision rule stated above; its guard band may be smaller than U."
+            "The value of each metric divided by its limit, with U. The decisions in the tables follow the decision "
+            "rule stated above, whose guard band may be smaller than U."
         )
     values = np.array([abs(metric.value) for metric in metrics]) / divisors
     bars = np.array([metric.worst.expanded for metric in metrics]) / divisors
@@ -175,7 +175,7 @@ def volume_chart(volume: VolumetricUncertainty) -> Chart:
     said = [f"U = {format_number(u, decimals_for(u))} mm" for u in expanded.tolist()]
     marks = _section(volume.start[finite], (shade, limits if np.any(finite) else ()), said, name, unit="mm")
     axes = linear(_ACROSS, np.hypot(volume.start[:, 0], volume.start[:, 1]), [0.0]), linear(_UP, volume.start[:, 2])
-    description = "Height against distance from the first axis; the larger the mark, the larger U."
+    description = "Height against distance from the first axis; a larger mark shows a larger U."
     return Chart("volume", f"{name} over the volume", description, (Plot(*axes, (marks,), height=380),))
 
 
@@ -212,9 +212,9 @@ def tried_chart(volume: VolumetricUncertainty, tips: np.ndarray, poses: TriedPos
     axes = linear(_ACROSS, random.x, across, [0.0]), linear(_UP, volume.start[:, 2], tips[:, 2])
     plot = Plot(*axes, marks, height=380)
     description = (
-        "Random poses over the whole volume. The size of a mark shows the distance in joint space from the nearest "
-        "calibration pose, in multiples of the spacing of the calibration poses. Random poses with a distance of up to "
-        "1 are covered by the calibration."
+        "Tip positions of random poses over the whole volume. The size of a mark shows the distance in joint space "
+        "from the nearest calibration pose, in multiples of the spacing of the calibration poses. Random poses with a "
+        "distance of up to 1 are covered by the calibration."
     )
     return Chart("tried", "Coverage of the working volume", description, (plot,))
 

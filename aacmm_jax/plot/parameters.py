@@ -48,12 +48,15 @@ def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
     axis = linear(f"calibrated − nominal [{label}]", *ends, [0.0])
     if not np.all(finite):
         at = np.clip(change[~finite], axis.low, axis.high)
-        name = "determined only with others, or on a bound"
+        name = "on a bound, or determined only together with other parameters"
         marks.append(Marks(name, x[~finite], at, "cross", "accent", words[~finite].tolist()))
     plot = Plot(names("", [row["parameter"] for row in parameters]), axis, (*marks, level(0.0)), height=260)
     description = "Calibrated minus nominal value. Bars show U; where no bar is visible, U is smaller than the mark."
     if outside := int(np.sum((change < axis.low) | (change > axis.high))):
-        description += f" At the edge: {pluralise(outside, 'value')} without U that would lie outside; see the table."
+        description += (
+            f" {pluralise(outside, 'value')} without U drawn at the edge of the chart, because outside its range; "
+            "see the table."
+        )
     kind = "length" if unit == "mm" else "angle"
     return Chart(f"change-{unit}", f"Change of {kind} parameters", description, (plot,))
 
@@ -102,7 +105,9 @@ def length_parameter_errors(record: CalibrationRecord, axes: Any = None) -> Any:
 def error_plot(record: CalibrationRecord) -> Plot:
     """Errors of the length parameters of a simulated arm, by stage."""
     if record.recording.true is None:
-        raise InputError("the calibration is not of a simulated arm, so the true arm and the errors are not known.")
+        raise InputError(
+            "the calibration is not of a simulated arm, so the true parameters and their errors are not known."
+        )
     vectors, chosen = record.vectors(), [i for i, name in enumerate(record.names) if is_length(name)]
     stages = {"nominal": ("nominal", "dot", "soft"), "stage 1": ("stage1", "triangle", "accent"),
               "calibrated": ("calibrated", "square", "main")}  # fmt: skip
@@ -157,7 +162,7 @@ def correlation_plot(labels: list[str], table: np.ndarray, title: str = "") -> P
 def correlation_chart(uncertainty: Uncertainty) -> Chart:
     """Correlations of the parameters; of very many, of those that are correlated most."""
     labels, chosen = list(uncertainty.names), uncertainty.most_correlated()
-    most = f"the {len(chosen)} of {len(labels)} parameters with the strongest correlations"
+    most = f"{len(chosen)} of {len(labels)} parameters, those with the strongest correlations"
     part = np.asarray(uncertainty.correlation)[np.ix_(chosen, chosen)]
     plot = correlation_plot([labels[i] for i in chosen], part, most if len(chosen) < len(labels) else "")
     return Chart(
@@ -195,7 +200,7 @@ def singular_chart(observed: Observability) -> Chart:
     if rank < len(values):
         marks.append(Marks("not determined", order[rank:], values[rank:], "cross", "accent", words[rank:]))
     plot = Plot(linear("number", order), logarithmic("singular value", values), tuple(marks), height=240)
-    what = "Sensitivity of the data to each independent combination of parameters, in steps of 1 mm and 1 mrad."
+    what = "Sensitivity of the data to each independent combination of parameters, for changes of 1 mm and 1 mrad."
     return Chart("singular", "Singular values", what, (plot,))
 
 
@@ -225,11 +230,11 @@ def models_chart(summary: Mapping[str, Any]) -> Chart:
     low, high, right = outside - u, outside + u, left + _WIDTH
     marks = (
         Marks("poses that were fitted", left, inside, "boxes", "soft", words, box=box),
-        Marks("regions left out, ± one standard error", right, outside, "boxes", "main", words, low, high, box=box),
+        Marks("held-out regions, ± one standard error", right, outside, "boxes", "main", words, low, high, box=box),
     )
     named = [f"{label} (recommended)" if label == summary["recommended"] else label for label in labels]
     y = linear("RMS distance from the geometry [mm]", inside, outside, high, [0.0], zero=True)
-    description = "RMS distance of poses from their geometry, from the simplest model to the most complex."
+    description = "RMS distance of poses from their geometry; models from the simplest to the most complex."
     return Chart("models", "Errors by model", description, (Plot(names("", named), y, marks, height=260),))
 
 
@@ -260,10 +265,11 @@ def functions_chart(record: CalibrationRecord) -> Chart | None:
     words = [dict.fromkeys(kind.description for kind in kinds if kind.of_own_reading is by) for by in (True, False)]
     drawn, others = map(", ".join, words)
     description = (
-        f"Curve: the corrections of each joint that depend on its own reading ({drawn}), minus their mean"
+        f"Curve: the corrections of each joint that depend only on the reading of this joint ({drawn}), minus their "
+        "mean"
         + (f"; not included: {others}" if others else "")
-        + ". Marks: the curve plus the further change that the residuals of neighbouring poses suggest, with twice its "
-        "standard error. Dashed lines: ends of the measured travel."
+        + ". Marks: the curve plus the additional correction that the residuals of neighbouring poses suggest, with "
+        "twice the standard error of this correction. Dashed lines: ends of the measured travel."
     )
     return Chart("functions", "Non-geometric errors of the joints", description, tuple(plots))
 

@@ -139,7 +139,7 @@ def pose_chart(
     )
     median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
     description = f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
-    description += " A pose that is alone in its socket has no distance." if len(finite) < len(last) else ""
+    description += " The only pose of a socket has no distance and is not drawn." if len(finite) < len(last) else ""
     description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
     return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
 
@@ -149,7 +149,7 @@ def _pose_table(groups: Groups, residuals: np.ndarray, unit: str, far: Marked) -
     chosen, caption = np.arange(len(residuals)), "Every pose"
     if len(chosen) > _LISTED:
         chosen = np.argsort(-np.nan_to_num(residuals))[:_LISTED]
-        caption = f"The {_LISTED} poses with the largest residuals, of {len(residuals)}"
+        caption = f"The {_LISTED} poses with the largest residuals, out of {len(residuals)} poses"
     owner, says = groups.owner, Cell(far[0], None, "outlier")
     columns = {
         groups.word: [groups.names[i] for i in owner[chosen]],
@@ -234,7 +234,7 @@ def kinds_chart(
     values = np.concatenate([np.asarray(_UNITS[unit][2](part)) for _, part in parts])
     if far is None or unit == "deg":
         weights = np.concatenate([part.weight for _, part in parts])
-        far = "half of its weight or less", np.flatnonzero(weights <= 0.5)
+        far = "half of the full weight or less", np.flatnonzero(weights <= 0.5)
     groups = Groups(names, sizes, kinds, word)  # type: ignore
     return pose_chart(*_UNITS[unit][:2], groups, {"calibrated": values}, unit=unit, far=far, most=most)
 
@@ -276,7 +276,7 @@ def residual_patterns(record: CalibrationRecord) -> Any:
     residuals = signed_residuals(record)
     if residuals is None:
         raise InputError(
-            "no residual has a direction, because no socket has several poses; record several poses per socket."
+            "there are no residuals to draw, because no socket has several poses; record several poses per socket."
         )
     charts = _pattern_charts(record, residuals, len(residuals.poses))
     return draw_all([plot for chart in charts for plot in chart.plots], 4)
@@ -326,7 +326,7 @@ def _pattern_charts(record: CalibrationRecord, residuals: SignedResiduals, most:
         (
             "histogram",
             "Histogram of the residuals",
-            "All coordinates of all poses; the outermost boxes include all residuals beyond 4.5 standard deviations.",
+            "All coordinates of all poses; the outermost bars include all residuals beyond 4.5 standard deviations.",
             (Plot(x, linear("coordinates", counts, normal, zero=True), marks, height=220),),
         ),
     )

@@ -119,9 +119,11 @@ def _data(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
         f"Fixed at their nominal values: {', '.join(record.held) or 'none'}."
     )
     if record.hold and record.method == REPEATABILITY:
-        introduction += f" {record.hold} sets the scale, since no observation does."
+        introduction += f" No observation determines the scale, so {record.hold} was held constant."
     elif record.hold:
-        introduction += f" {record.hold} was the scale anchor of stage 1, since poses alone do not determine the scale."
+        introduction += (
+            f" Poses alone do not determine the scale, so {record.hold} was held constant in stage 1 (scale anchor)."
+        )
     blocks: list[Block] = [introduction]
     if capture.names or not capture.observations:
         sockets = zip(capture.names, capture.sizes, strict=True)
@@ -178,7 +180,7 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
         caption = "Metrics by arm [mm]"
         if capture.observations:
             counts = pluralise(len(capture.names), "socket"), pluralise(len(capture.lengths), "reference length")
-            caption = f"{counts[0]} of the arm's own probe, {counts[1]} [mm]"
+            caption = f"{counts[0]} measured with the arm's own probe, {counts[1]} [mm]"
         blocks.append(result_tables.metrics_table(caption, summary, stages, fixed_scale=record.fixed_by_one_length))
     blocks.append(arms_chart(capture, distances_by_arm(record), most=DRAWN))
     if "truth" in summary:
@@ -213,19 +215,21 @@ def _scale_sentence(record: CalibrationRecord, summary: dict[str, Any]) -> str:
             else ""
         )
     if math.isnan(k):
-        return f"The scale was fitted together with everything else; it comes from {', '.join(summary['scale_from'])}."
+        return (
+            "The scale was fitted together with all other parameters; it comes from "
+            f"{', '.join(summary['scale_from'])}."
+        )
     if record.final_method == "joint":
         against = shorten(record.against_division)
         why = f", since the division by k was not possible because of {against}" if against else ""
         return (
-            f"Poses and reference lengths were fitted together{why}. With the parameters that the "
-            f"poses alone give, the arm measures k = {k_shown} times the calibrated value of the lengths, with "
-            f"{u_of_k}."
+            f"Poses and reference lengths were fitted together{why}. With the parameters determined from the poses "
+            f"alone, the arm measures k = {k_shown} times the calibrated value of the lengths, with {u_of_k}."
         )
     expanded = 1000 * (summary["scale_expanded"] or math.nan)
     decimals = decimals_for(expanded)
     return (
-        "Repeatability does not determine the size of an arm; the reference lengths do. With the parameters of "
+        "Repeatability does not determine the size of an arm, but the reference lengths do. With the parameters of "
         f"stage 1, the arm measures k = {k_shown} times the calibrated value of the reference lengths, with {u_of_k}. "
         f"The lengths of the arm were divided by k, a change of {abs(k - 1) * 1000:.{decimals}f} mm per metre, known "
         f"to ±\u00a0{expanded:.{decimals}f} mm per metre ({LEVEL_IN_PERCENT})."

@@ -57,9 +57,9 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     """Every parameter with its expanded uncertainty; hundreds of coefficients joint by joint, and on demand."""
     others, harmonics = listed_apart(summary["parameters"])
     introduction = (
-        f"U is the expanded uncertainty ({LEVEL_IN_PERCENT}), with the coverage factor of each parameter's own degrees "
-        "of freedom. A parameter on a bound, or one that the data determine only together with others, has no U of its "
-        "own."
+        f"U is the expanded uncertainty ({LEVEL_IN_PERCENT}), with the coverage factor that follows from the degrees "
+        "of freedom of each parameter. No U is stated for a parameter that is on a bound, or that the data determine "
+        "only together with other parameters."
     )
     by_unit = {unit: [row for row in others if row["unit"] == unit] for unit in ("mm", "rad")}
     functions = functions_chart(record)
@@ -71,8 +71,8 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     ]
     if harmonics:
         blocks += [
-            f"The {len(harmonics)} coefficients of harmonics are not printed. On screen, the table below lists them; "
-            "aacmm export --format csv writes them from the calibration's file.",
+            f"The {len(harmonics)} coefficients of harmonics are not printed. On screen, the table below lists the "
+            "coefficients; aacmm export --format csv writes them to a file.",
             harmonics_table(harmonics),
             parameter_table("Coefficients of harmonics", harmonics)._replace(folded=True),
         ]
@@ -104,9 +104,9 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
     charts = (kinds_chart(record, unit, far, DRAWN) for unit in ("mm", "standard deviations", "deg"))
     blocks = [introduction, *([weights_table(summary)] if summary["robust"] else []), *filter(None, charts)]
     introduction = (
-        "The unknown geometry was determined together with the parameters. Positions and frames are given in "
-        "the base frame, rotations as vectors along their axis. Offsets and orientations of targets are given in the "
-        "last frame, placements on an indexed platform in the platform's frame."
+        "The unknown geometry of the observations was determined together with the parameters. Positions and frames "
+        "are given in the base frame, rotations as vectors along their axis. Offsets and orientations of targets are "
+        "given in the last frame, placements on an indexed platform in the platform's frame."
     )
     factor = summary["uncertainty"]["coverage_factor_geometry_95"]
     return [
@@ -141,7 +141,7 @@ def volume(volume: VolumetricUncertainty, summary: dict[str, Any]) -> Section:
     ends = zip("xyz", volume.start.min(axis=0), volume.start.max(axis=0), strict=True)
     box = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends).replace("-", "−")
     introduction = (
-        f"Expanded uncertainty at {len(volume.start)} positions that random poses within the joint limits reach "
+        f"Expanded uncertainty at the tip positions of {len(volume.start)} random poses within the joint limits "
         f"({box} mm), for a coverage of {LEVEL_IN_PERCENT} ({factor_words(statistics)})."
     )
     positions = {f"{axis} [mm]": numbers(volume.start[:, k], 0) for k, axis in enumerate("xyz")}
@@ -172,7 +172,7 @@ def coverage(record: CalibrationRecord, volume: VolumetricUncertainty) -> list[S
     medians = [float(np.median(volume.expanded_tip[part])) for part in (poses.tried, ~poses.tried) if np.any(part)]
     if len(medians) == 2 and all(map(math.isfinite, medians)):
         near, far = map(two_digits, medians)
-        sentence += f" The median U of a tip is {near} mm in the covered part and {far} mm outside."
+        sentence += f" The median U of a tip is {near} mm in the covered part and {far} mm outside this part."
     return [Section("tried", "Coverage of the working volume", [sentence, chart, _travel(record, readings)])]
 
 
@@ -203,7 +203,7 @@ def _travel(record: CalibrationRecord, readings: np.ndarray) -> Chart:
     )
     axis = linear("reading [deg]" + (" or [mm]" if any(slides) else ""), limits, shown)
     plot = Plot(names("", [f"joint {i + 1}" for i in x]), axis, marks, height=260)
-    description = "The travel of each joint within its limits, and the readings of the calibration."
+    description = "The range of each joint within its limits, and the readings of the calibration poses."
     return Chart("travel", "Travel of the joints", description, (plot,), by_columns("Travel by joint", columns))
 
 
@@ -244,7 +244,11 @@ def observability(observability: Observability) -> Section:
         )
     rows = [
         ("rank", f"{rank} of {count}", "number of independent combinations of parameters that the data determine"),
-        ("condition", f"{observability.condition:.3g}", "of the determined combinations, with scaled columns"),
+        (
+            "condition",
+            f"{observability.condition:.3g}",
+            "condition number for the determined combinations, with scaled columns",
+        ),
         *((name, f"{x:.3g}", f"{_INDICES[name]}; larger is better") for name, x in observability.indices.items()),
     ]
     metrics = by_columns("Metrics", dict(zip(("", "value", "meaning"), zip(*rows, strict=True), strict=True)))
@@ -284,7 +288,7 @@ def bounds(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
     }
     introduction = f"On a bound: {', '.join(on_bound)}." if on_bound else "No bound is active."
     if record.final_method == "two-stage":
-        introduction += " The bounds apply to stage 1; the scale fix comes after stage 1."
+        introduction += " The bounds apply to stage 1 only; the scale is fixed after stage 1."
     width = upper - lower
     with np.errstate(invalid="ignore", divide="ignore"):
         within = np.where(np.isfinite(width) & (width > 0), 2 * (vector - lower) / width - 1, math.nan)[index]

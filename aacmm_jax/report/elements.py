@@ -112,7 +112,7 @@ def view_of_arm(
     return ArmView(
         "scene",
         f"The calibrated arm{points} and its poses",
-        "Drag, or use the arrow keys, to rotate the view; plus and minus change its size. The slider selects the pose.",
+        "Drag, or use the arrow keys, to rotate the view; press plus or minus to zoom. The slider selects the pose.",
         data,
     )
 
@@ -209,7 +209,7 @@ def removed_tables(record: CalibrationRecord) -> list[Table]:
         "F": lambda left_out: number(left_out.ratio, 1),
         "degrees of freedom": lambda left_out: "{} and {}".format(*left_out.degrees_of_freedom),
         "p": lambda left_out: left_out.probability if left_out.probability >= 1e-4 else "< 0.0001",
-        "RMS of the rest, with the group [mm]": lambda left_out: left_out.rms_with,
+        "RMS of the other data, fitted with the group [mm]": lambda left_out: left_out.rms_with,
         "without the group [mm]": lambda left_out: left_out.rms_without,
         "parameter changed most": lambda left_out: f"{left_out.changed_most}, by {format_number(left_out.change, 1)} u",
     }

@@ -89,7 +89,7 @@ def points_report(record: PointsRecord) -> Report:
     counts = [pluralise(summary[f"{word}s"], word) for word in ("socket", "length", "sphere")]
     return Report(
         title="Acceptance test of points",
-        subtitle=f"{pluralise(summary['points'], 'point')} as recorded: {', '.join(counts)}",
+        subtitle=f"{pluralise(summary['points'], 'point')} recorded: {', '.join(counts)}",
         verdict=summary["verdict"]["says"],
         verdict_mark=summary["verdict"]["mark"],
         warnings=summary["warnings"],
@@ -135,16 +135,18 @@ def _acceptance(
     blocks: list[Block] = [
         f"Every metric is computed from single readings. U (coverage factor {COVERAGE_FACTOR:g}) is the contribution "
         f"of the tester: it includes the uncertainty of the artefacts; {stated}. The arm's own scatter is what is "
-        "tested, so U does not include it (ISO 14253-5). The standards' permission to repeat a reading is not applied. "
-        "A test that lacks something its standard requires is labelled 'based on' the standard. Requirements and "
-        "formulas are taken from secondary sources on the editions named.",
+        "tested, so U does not include it (ISO 14253-5). The standards allow a reading to be repeated; this is not "
+        "done here. A test that lacks something its standard requires is labelled 'based on' the standard. "
+        "Requirements and formulas are taken from secondary sources on the editions named.",
     ]
     metrics = [metric for test in rows for metric in test["figures"]]
     limited = any(metric["limit_mm"] is not None for metric in metrics)
     nominal = any(metric["as_found_mm"] is not None for metric in metrics)
     if limited:
         used = dict.fromkeys(f"{test['rule']} (for {test['standard']})" for test in rows if test["decision"])
-        blocks.append(f"Decision rules: {'; '.join(used)}. What a rule does not decide is undecided.")
+        blocks.append(
+            f"Decision rules: {'; '.join(used)}. A value that a rule neither accepts nor rejects is called undecided."
+        )
     for test, metrics_of_test in zip(rows, result_tables.acceptance_tables(rows), strict=True):
         blocks.append(metrics_of_test)
         if test["missing"]:
@@ -198,7 +200,7 @@ def _nominal_and_calibrated(
     blocks.append(arms_chart(capture, distances, most=DRAWN))
     if record.used:
         used = ", ".join(sorted(record.used))
-        blocks.append(f"The calibration was identified from: {used}. All other data were held out.")
+        blocks.append(f"The calibration used: {used}. All other data were held out.")
     return blocks
 
 
@@ -216,7 +218,8 @@ def _lengths(
     caption, before = "Lengths between the mean points of their sockets [mm]", np.asarray(evaluations["nominal"].error)
     means = length_table(caption, rows, {"nominal": before}, record.length_that_fixed_scale())
     note = (
-        "These lengths use the means of all poses and are given for comparison; no acceptance test uses them. U "
-        f"(coverage factor {COVERAGE_FACTOR:g}) also includes the scatter of the poses at both ends."
+        "These lengths are computed from the mean of all poses in each socket. They are given for comparison only "
+        f"and are not part of an acceptance test. U (coverage factor {COVERAGE_FACTOR:g}) also includes the scatter "
+        "of the poses at both ends."
     )
     return [Section("lengths", "Lengths", [*([] if chart is None else [chart]), means, note])]

@@ -22,10 +22,11 @@ _SHOWN = (
 _NAMED = 6
 _PERCENTILES = "Marks are medians; bars reach from the 5th to the 95th percentile of the converged trials."
 _MODELS = (
-    "Each model was calibrated with all poses (inside), and once without each region, which the model then predicted "
-    "(outside). Neighbouring poses have similar errors, so only whole regions that were left out show how a model "
-    "extrapolates. Candidates are the model that is best outside and the simpler models that the regions cannot tell "
-    "from the best one. The simplest candidate that makes the measurement about as probable (evidence) is recommended."
+    "Each model was fitted to all poses (inside). Then each region was held out in turn, and predicted by the model "
+    "fitted to the other regions (outside). Neighbouring poses have similar errors, so only whole held-out regions "
+    "show how well a model extrapolates. Candidates are the model with the smallest outside error and all models "
+    "whose outside error is not significantly larger. The recommended model is the simplest candidate under which the "
+    "measurements are about as probable (evidence) as under the most probable candidate."
 )
 
 
@@ -65,12 +66,12 @@ def _warnings(summary: dict[str, Any]) -> list[str]:
     warnings = []
     if not summary["finished"]:
         warnings.append(
-            "The study is not finished; the same command continues the study. Metrics are computed from the trials run "
-            "so far."
+            "The study is not finished; repeat the command to continue the study. Metrics are computed from the "
+            "trials run so far."
         )
     for key, least, says in (
         ("converged", 0.99, "Not all trials converged; metrics are computed from the converged trials"),
-        ("truth_inside", 1.0, "The true arm lies within the bounds in only some of the trials"),
+        ("truth_inside", 1.0, "The true arm is within the bounds in only some of the trials"),
     ):
         shares = [(cell, cell[key]["value"] or 0.0) for cell in summary["results"] if cell["trials_run"]]
         named = [f"{label(summary, cell)} ({100 * share:.3g} %)" for cell, share in shares if share < least]
@@ -88,7 +89,7 @@ def models_report(summary: dict[str, Any]) -> Report:
     by_name, by_region = model_tables(summary)
     regions, rms = summary["regions"], [[region["rms"] for region in row["regions"]] for row in models]
     rms = np.array(rms, dtype=float)
-    axes = names("region that was left out", regions), linear("RMS error [mm]", rms, zero=True)
+    axes = names("held-out region", regions), linear("RMS error [mm]", rms, zero=True)
     plots = []
     for row, errors in zip(models, rms, strict=True):
         words = [f"{region}: {format_number(value)} mm" for region, value in zip(regions, errors.tolist(), strict=True)]
@@ -103,14 +104,14 @@ def models_report(summary: dict[str, Any]) -> Report:
     return Report(
         title=f"Comparison of joint models, {summary['arm'] or 'an arm'}",
         subtitle=f"{pluralise(len(models), 'model')} on {pluralise(summary['poses'], 'pose')}; "
-        f"{pluralise(len(regions), 'region')} left out one by one",
+        f"{pluralise(len(regions), 'region')} held out in turn",
         verdict=" ".join(summary["findings"]),
         verdict_mark="unsure" if doubtful else "good",
         warnings=list(summary["warnings"]),
         facts=[
             ("Recommended model", chosen["model"]),
-            ("Its RMS error in regions left out", f"{format_number(chosen['rms_outside'])}\u00a0mm"),
-            ("Mean of (error / predicted standard deviation)² outside", number(chosen["ratio"], 2).text),
+            ("RMS error of this model in held-out regions", f"{format_number(chosen['rms_outside'])}\u00a0mm"),
+            ("Mean of (error / predicted standard deviation)² in held-out regions", number(chosen["ratio"], 2).text),
         ],
         sections=[
             Section("models", "Errors inside and outside", [_MODELS, models_chart(summary), by_name, MODELS_MEANING]),

@@ -4,8 +4,8 @@ The file holds what was asked from the beginning, and all results at the end. Un
 of NumPy's arrays in ``FILE.parts``, written under a temporary name and renamed: it is there entirely or not at all, and
 workers on a shared folder may write their blocks themselves. Their zip archives carry a checksum of every array.
 
-Believed are blocks in a folder of the user who runs the study, or who owns the file that is read. That is checked
-before anything in the folder is read or removed: nobody but its owner can replace what has been checked.
+Blocks are read only from a folder of the user who runs the study, or who owns the file that is read. The owner is
+checked before anything in the folder is read or removed: only the owner can replace what has been checked.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ def write_block(file: Path, results: Mapping[str, np.ndarray]) -> None:
     arrays: dict[str, Any] = {name: np.asarray(results[name]) for name in VARIABLES}
     np.savez(content, block=np.array(file.name), **arrays)
     with write_atomically(file, _ADVICE, leftovers=False) as temporary:
-        temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: nobody else may change a block
+        temporary.chmod(temporary.stat().st_mode & ~0o022)  # whatever the umask: only the owner may change a block
         temporary.write_bytes(content.getbuffer())
 
 
@@ -206,7 +206,7 @@ class Results:
         """Make the file of a new study, and the folder of its blocks."""
         folder, _ = parts_of(self.path), self.blocks  # of which too many are refused
         try:
-            folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: nobody else may write blocks
+            folder.mkdir(mode=0o755, exist_ok=True)  # whatever the umask: only the owner may write blocks
             check_owners(self.path)
             for item in folder.glob("*.npz"):  # blocks of a study whose file was removed
                 if not item.name.startswith(f"{self.mark}-"):
@@ -358,7 +358,7 @@ def _check_block(file: Path) -> None:
 
 
 def _refuse(path: Path, sentence: str) -> None:
-    """Raise `InputError`, unless the file system says nothing of owners: then a warning says that none are checked."""
+    """Raise `InputError`, unless the file system keeps no owners: then a warning says that none are checked."""
     if keeps_owners(path.parent):
         raise InputError(sentence)
     warnings.warn(

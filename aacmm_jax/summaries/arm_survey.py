@@ -23,9 +23,10 @@ from .tables import attributes, plain
 _SHORTEST, _LONGEST = 20.0, 20_000.0  # mm: of an arm's links together
 _SHOWN = (15, 30, 60, 120)  # poses
 _NO_MOMENT = (
-    "Gravity has no moment about joint {joint}, because its axis is vertical or meets the load; left out: {names}."
+    "Gravity has no moment about joint {joint}, because the axis of this joint is vertical or passes through the "
+    "load; left out: {names}."
 )
-_OTHERS = "Left out, because constant or a combination of other functions of the same joint: {names}."
+_OTHERS = "Left out, because each is constant or a combination of other functions of the same joint: {names}."
 
 
 def arm_survey(
@@ -60,7 +61,9 @@ def arm_survey(
         "warnings": [],
     }
     if not _SHORTEST <= links <= _LONGEST:
-        summary["warnings"].append(f"The total length of the links is {links:.4g} mm; check the unit of the lengths.")
+        summary["warnings"].append(
+            f"The total length of the links is {links:.4g} mm, which is implausible; check the unit of the lengths."
+        )
     if arm.limits is None:
         summary["warnings"].append(
             "No joint limits are given, so joints are assumed to move from -180 to 180 deg; add the limits."
@@ -86,7 +89,9 @@ def arm_survey(
         needed = _needed(usual, u_reading, expected)
         summary |= {"needed": [needed], "advice": _advice(expected, moving, arm.joints)}
     except InputError as error:
-        summary["warnings"].append(f"The data that a calibration needs cannot be computed for this arm: {error}")
+        summary["warnings"].append(
+            f"The amount of data that a calibration needs cannot be computed for this arm: {error}"
+        )
     return summary
 
 
@@ -148,15 +153,15 @@ def _advice(expected: list[Expected], moving: list[str], joints: int) -> str:
             "Random poses in sockets do not determine this arm well; use a tracker, or let aacmm plan choose the poses."
         )
     poses, _, best = min(rows, key=lambda row: row[:2])
-    to_move = f"These joints must move: {shorten(moving, 20)}." if moving else ""
+    to_move = f"The following joints must move: {shorten(moving, 20)}." if moving else ""
     to_move = "Every joint must move." if len(moving) == joints else to_move
     tracked = "".join(
-        f" With a tracker, record {pluralise(2 * row.enough, 'pose')} all over the workspace."
+        f" With a tracker, record {pluralise(2 * row.enough, 'pose')} spread over the whole workspace."
         for row in expected
         if not row.sockets and row.enough is not None
     )
     return (
-        f"Record {2 * poses} poses, as different as possible, in {best.data}. From {pluralise(poses, 'pose')} on, the "
-        "calibration adds less to the uncertainty of a measured length than the readings themselves; the other poses "
-        f"serve to check the calibration.{tracked} {to_move}"
+        f"Record {2 * poses} poses, as different as possible, in {best.data}. With {pluralise(poses, 'pose')} or "
+        "more, the calibration contributes less to the uncertainty of a measured length than the noise of the "
+        f"readings; the other poses serve to check the calibration.{tracked} {to_move}"
     )

@@ -247,14 +247,17 @@ def prior_sentence(row: Mapping[str, Any]) -> str:
     """One group of a prior in words."""
     spent = f"{row['effective_parameters']:.1f} of {pluralise(row['parameters'], 'parameter')} determined by the data"
     if not row["supported"]:
-        return f"{row['group']}: learned, no deviation from the mean is supported, so it counts as exact; {spent}"
+        return (
+            f"{row['group']}: learned; the data support no deviation from the mean, so the group is treated as "
+            f"exact; {spent}"
+        )
     scale, unit = people_read(row["unit"])
     deviation = f"{row['sd'] * scale:.3g} {unit}".strip()
     return f"{row['group']}: {'learned' if row['learned'] else 'given'}, {deviation}; {spent}"
 
 
 def shared_rows(shared: SharedErrors) -> list[dict[str, Any]]:
-    """Errors that poses share, kind by kind, with their standard deviations in mm, or in the unit of coefficients."""
+    """Shared errors, kind by kind, with their standard deviations in mm, or in the unit of coefficients."""
     return rows_of(kind=shared.kinds, sd=shared.sd, unit=shared.units)
 
 

@@ -31,14 +31,14 @@ def compared_models_summary(compared: ComparedModels, arm: str) -> dict[str, Any
         }
         for model, (difference, u_difference) in zip(compared.models, compared.differences, strict=True)
     ]
-    finding = f"Recommended: {chosen.model}. Of all models, it predicts held-out regions best."
+    finding = f"Recommended: {chosen.model}, which predicts held-out regions best of all models compared."
     if chosen is not best:
         difference, u = rms_difference(rows[compared.models.index(chosen)], best.rms_outside)
         finding = (
-            f"Recommended: {chosen.model}. On held-out regions, its error is not significantly larger than that of "
-            f"the best model ({best.model}): the difference is {difference:.2g} mm, with a standard error of {u:.2g} "
-            "mm from the scatter of the regions. Of the models that are as good, it is the simplest under which the "
-            "measurements are as probable."
+            f"Recommended: {chosen.model}. The error of this model on held-out regions is not significantly larger "
+            f"than the error of the best model ({best.model}): the difference is {difference:.2g} mm, with a standard "
+            f"error of {u:.2g} mm from the scatter of the regions. {chosen.model} is the simplest model for which "
+            "this holds and under which the measurements are about equally probable."
         )
     return {
         "arm": arm,
@@ -56,9 +56,9 @@ def _warnings(compared: ComparedModels) -> list[str]:
     sentences = [f"{model.model} did not converge." for model in compared.models if not model.result.converged]
     if chosen.ratio >= _EXCESS:
         sentences.append(
-            f"With {chosen.model}, errors in held-out regions are {math.sqrt(chosen.ratio):.1f} times as large as its "
-            "noise and prior predict: either all of these models lack an effect, or the poses do not cover the whole "
-            "travel of the joints."
+            f"With {chosen.model}, errors in held-out regions are {math.sqrt(chosen.ratio):.1f} times as large as the "
+            "noise and the prior predict: either all models compared lack an effect, or the poses do not cover the "
+            "whole travel of the joints."
         )
     return sentences
 

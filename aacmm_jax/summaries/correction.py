@@ -64,9 +64,9 @@ def correction_summary(
         rows = shorten([str(row) for row in summary["singular"]])
         warnings.append(
             f"In {pluralise(len(summary['singular']), 'row')} (row {rows}) the nominal arm is at a singularity, or "
-            "close to one: axes align, or the arm is stretched. There, the inverse kinematics of its controller has "
-            "no unique solution and may choose other joint readings than the corrected ones. Command joint readings "
-            "instead of poses there, or avoid these poses."
+            "close to one: axes align, or the arm is fully stretched. At a singularity, the inverse kinematics of "
+            "its controller has no unique solution and may choose other joint readings than the corrected ones. In "
+            "these rows, command joint readings instead of poses, or avoid the poses."
         )
     summary["largest_distance_mm"] = float(distance[reached].max())
     summary["largest_angle_deg"] = float(angle[reached].max() / DEG)
@@ -86,8 +86,8 @@ def correction_summary(
     if len(large):
         warnings.append(
             f"In {pluralise(len(large), 'row')} (row {shorten([str(x) for x in large])}) the correction changes a "
-            f"reading by more than {_LARGE_CHANGE:g} deg: axes of the arm nearly align there, so small corrections "
-            "need large motions. Check these rows before you send an arm there."
+            f"reading by more than {_LARGE_CHANGE:g} deg: axes of the arm nearly align in these poses, so small "
+            "corrections need large motions. Check these rows before you send an arm to the poses."
         )
     return summary
 
@@ -97,11 +97,11 @@ def corrections(summary: dict[str, Any]) -> View:
     yield from warnings_of(summary)
     meant, has = (", ".join(f"{x:.3f}" for x in probe) for probe in summary["probe_mm"])
     if meant == has:
-        yield f"The tip is at ({has}) mm in the last frame."
+        yield f"Position of the tip in the last frame: ({has}) mm."
     else:
         yield (
-            f"In the last frame, the controller assumes the tip at ({meant}) mm, and the calibrated arm has the tip "
-            f"at ({has}) mm. This is right for the probe of the calibration; for another tool, give --probe X,Y,Z."
+            f"Position of the tip in the last frame: ({meant}) mm in the controller, ({has}) mm on the calibrated "
+            "arm. These positions apply to the probe of the calibration; for another tool, give --probe X,Y,Z."
         )
     rows, missed = summary["rows"], summary["not_reached"]
     yield f"{rows - len(missed)} of {pluralise(rows, 'pose')} are reached with corrected readings."
@@ -109,11 +109,14 @@ def corrections(summary: dict[str, Any]) -> View:
         # Of the arithmetic, not of the arm: how far it is really off is what an evaluation with unseen data says.
         distance = formatted(summary["largest_distance_mm"])
         yield (
-            "Largest distance of the tip from its pose with the corrected readings, if the arm is exactly as "
-            f"calibrated: {distance} mm."
+            "Largest distance of the tip from the commanded pose with the corrected readings, if the arm is exactly "
+            f"as calibrated: {distance} mm."
         )
     if summary["largest_distance_before_mm"] is not None:
-        yield f"Largest distance without the correction: {formatted(summary['largest_distance_before_mm'])} mm."
+        yield (
+            "Largest distance of the tip from the commanded pose without the correction: "
+            f"{formatted(summary['largest_distance_before_mm'])} mm."
+        )
     for key, what, unit in (("largest_change", "reading", "deg"), ("largest_slide", "slide", "mm")):
         row = summary[key]
         if row is not None:

@@ -136,7 +136,7 @@ def comparison(summary: dict[str, Any]) -> View:
             "by chance [mm]",
             "largest [mm]",
         )
-        title = "Each calibration compared with the first (every row contains the error of the first)"
+        title = "Each calibration minus the first (the error of the first calibration is contained in every row)"
         yield listed(title, rows, (*headings, "mean [um/m]"))
         yield "For the change of every parameter from the first calibration, use --csv, --json or --figure."
     yield from tables.limits_of(summary)
@@ -157,8 +157,11 @@ def _parameters(summary: dict[str, Any]) -> View:
         change = number(fine * row["change"], small, signed=True, rounded=True)
         mark = row["without"] or Cell("* beyond U" if row["moved"] else "", None, "outlier")
         rows.append((row["parameter"], unit, old, new, small_unit, change, number(fine_u, small), mark))
-    title = f"Parameters: change with its expanded uncertainty U ({in_percent(summary['level'])})"
+    title = f"Parameters: changes, with their expanded uncertainties U ({in_percent(summary['level'])})"
     yield listed(title, rows, ("parameter", "unit", "old", "new", "unit", "change", "U", ""))
     left_out = len(summary["parameters"]) - len(shown)
     if left_out:
-        yield f"Not listed: {left_out} coefficients of harmonics that did not change beyond U; see --json or --csv."
+        yield (
+            f"Not listed: {left_out} coefficients of harmonics, which changed by less than U; --json and --csv "
+            "list them all."
+        )

@@ -23,7 +23,7 @@ _PREDICTED = {
     "loose": "this plan, with joints set only to within about 5 deg",
     "random": "{poses} random poses in the same {where}",
     "more": "this plan and {more_poses} more poses",
-    "unconstrained": "as many poses, planned without cones, obstacles and approach points",
+    "unconstrained": "the same number of poses, planned without cones, obstacles and approach points",
 }
 
 
@@ -155,8 +155,11 @@ def kit_plan(summary: dict[str, Any]) -> View:
         for i, place in enumerate(row["places"]):
             names = (row["observation"], row["kind"]) if i == 0 else ("", "")
             rows.append((*names, *(number(value, 0) for value in place["position_mm"]), place["poses"]))
-    yield listed("", rows, ("observation", "kind", "tip's x [mm]", "y [mm]", "z [mm]", "poses"))
-    yield "For an artefact, the position is that of its points; for anything else, it is the centre of the tips."
+    yield listed("", rows, ("observation", "kind", "x [mm]", "y [mm]", "z [mm]", "poses"))
+    yield (
+        "Positions: for an artefact, the centre of its points; for all other observations, the centre of the tip "
+        "positions."
+    )
     without = {}
     for name, prediction in summary["without"].items():
         # The places of a thing of the kit are named after it.
@@ -170,7 +173,7 @@ def kit_plan(summary: dict[str, Any]) -> View:
 def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | None = None) -> View:
     """U of a length by this plan, and by what it is compared with; the noise it assumes; how the arm moves."""
     length = f"{summary['check_length_mm']:g} mm"
-    yield ["\n", Styled(f"U that the calibration adds to lengths of {length} over the volume [mm, k = 2]")]
+    yield ["\n", Styled(f"Contribution of the calibration to U of lengths of {length} over the volume [mm, k = 2]")]
     titles = {key: text.format(**summary, where=where) for key, text in _PREDICTED.items()}
     predictions = {title: summary[key] for key, title in titles.items() if summary[key] is not None} | (without or {})
     yield listed("", predictions.items(), {
@@ -182,20 +185,20 @@ def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | 
     by_joint = isinstance(encoders, list)
     arcsec = ", ".join(f"{value:.3g}" for value in encoders) if by_joint else f"{encoders:.3g}"
     linear, option = (
-        ("", "") if slide is None else (f", linear encoders of {slide:.3g} mm", f"--linear-encoder-mm {slide:.3g} ")
+        ("", "") if slide is None else (f", {slide:.3g} mm (linear encoders)", f"--linear-encoder-mm {slide:.3g} ")
     )
     model = "" if summary.get("model") is None else f"--model {summary['model']} "
     options = f" (--method joint {model}--encoder-arcsec {arcsec} {option}--seating-mm {seat:g})"
     yield (
-        f"Assumed: a joint calibration with encoders of {arcsec} arcsec{linear} and a seat of {seat:g} "
-        f"mm{'' if by_joint else options}; noise: {summary['noise_source']}."
+        f"Assumed: one least-squares fit of all data{'' if by_joint else options}; noise of {arcsec} arcsec "
+        f"(encoders){linear} and {seat:g} mm (seating; {summary['noise_source']})."
     )
     collisions, retract, tilt = summary["collisions"], summary["retract_mm"], summary["largest_tilt_deg"]
     by_way = f" via approach points {retract:g} mm above the sockets" if retract else ""
     yield (
-        ("" if tilt is None else f"Largest tilt from a normal: {tilt:.0f} deg. ")
-        + f"Joint travel: {summary['travel_deg']:,.0f} deg{by_way} ({summary['unordered_travel_deg']:,.0f} deg "
-        "before ordering; each joint is weighted by the length of the arm beyond it)."
+        ("" if tilt is None else f"Largest angle between tool and socket normal: {tilt:.0f} deg. ")
+        + f"Joint travel: {summary['travel_deg']:,.0f} deg{by_way} ({summary['unordered_travel_deg']:,.0f} deg before "
+        "ordering; each joint is weighted by the length of the arm beyond this joint)."
     )
     if collisions is None:
         yield (
@@ -216,11 +219,11 @@ def _collisions(collisions: dict[str, Any]) -> View:
     )
     if collisions["unchecked"]:
         pairs = "; ".join(" and ".join(pair) for pair in collisions["unchecked"])
-        yield f"Not checked, because these parts touch in every pose of the arm: {pairs}."
+        yield f"Not checked for collisions, because these parts touch in every pose of the arm: {pairs}."
     for row in collisions["blocked_moves"]:
         yield Styled(
             f"The straight joint move to pose {row['before_pose']} ({row['at']}) makes {' and '.join(row['between'])} "
-            "collide; take another path to this pose.",
+            "collide; use another path to this pose.",
             "yellow",
         )
 
@@ -231,7 +234,11 @@ def procedure(summary: dict[str, Any]) -> View:
     def at(point: list[float]) -> str:
         return ", ".join(f"{value:.0f}" for value in point)
 
-    stated = "" if summary["measuring_range_stated"] else " (twice the reach; give the maker's with --range-mm)"
+    stated = (
+        ""
+        if summary["measuring_range_stated"]
+        else " (twice the reach; if the maker states a range, give this range with --range-mm)"
+    )
     yield [
         Styled(summary["arm"]),
         f": {summary['standard']}, {summary['poses']} poses. Measuring range {summary['measuring_range_mm']:.0f} mm"

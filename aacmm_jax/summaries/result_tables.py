@@ -17,10 +17,10 @@ BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
 MODELS_MEANING = (
     "Determined: number of parameters that the data determine. Inside: RMS distance of all poses from their geometry. "
-    "Outside: RMS distance of held-out poses, with each region held out in turn. Above the best: error outside, minus "
-    "that of the best model, from the differences in each region. u: standard errors from the scatter of the regions. "
-    "Ratio: mean of (error / predicted standard deviation)² outside. Evidence: logarithm of the evidence, minus that "
-    "of the most probable model."
+    "Outside: RMS distance of held-out poses, with each region held out in turn. Above the best: outside error minus "
+    "the outside error of the best model, from the differences in each region. u: standard errors from the scatter of "
+    "the regions. Ratio: mean of (error / predicted standard deviation)² of held-out poses. Evidence: logarithm of "
+    "the evidence, minus the value of the most probable model."
 )
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
@@ -81,7 +81,7 @@ def validation_tables(summary: Row) -> list[Table]:
         ("RMS error of reference lengths", "length_error_rms_mm", "length_u_mm"),
     ]
     cells = [(title, summary[value], summary[u]) for title, value, u in pooled if summary[value] is not None]
-    caption = f"Cross-validated: each of {summary['groups']} groups held out once [mm]"
+    caption = f"Cross-validation: each of {summary['groups']} groups held out once [mm]"
     shown = [listed(caption, cells, ("", "residual", "predicted by u"))]
     rows = summary.get("left_out") or []
     if rows:
@@ -93,7 +93,7 @@ def validation_tables(summary: Row) -> list[Table]:
             "predicted": "rms_predicted_mm",
             "RMS length error": "length_error_rms_mm" if lengths else None,
             "u": "length_u_mm" if lengths else None,
-            "by chance [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
+            "probability [%]": lambda row: number(None if row["probability"] is None else 100 * row["probability"], 2),
             "": lambda row: _said(
                 "disagrees" if row["disagrees"] else "" if row["converged"] else "did not converge", "bad"
             ),
@@ -107,9 +107,9 @@ def prior_table(rows: Rows) -> Table:
     def deviation(row: Row) -> str:
         scale, unit = people_read(row["unit"])
         given = f"{row['sd'] * scale:.3g} {unit}".strip()
-        return given if row["supported"] else "0: the data support no deviation, so treated as exact"
+        return given if row["supported"] else "0 (the data support no deviation; treated as exact)"
 
-    return listed("Priors of the parameters, and effective parameters", rows, {
+    return listed("Priors, and number of parameters that the data determine", rows, {
         "group": "group",
         "prior": lambda row: "learned" if row["learned"] else "given",
         "standard deviation": deviation,
@@ -134,7 +134,7 @@ def parameter_table(caption: str, rows: Rows) -> Table:
 
     def state(row: Row) -> Cell:
         if row["bound"]:
-            of_k = " of stage 1; U is that of k" if row["expanded"] else ""
+            of_k = " in stage 1; U is the U of k" if row["expanded"] else ""
             return _said(f"on the {row['bound']} bound{of_k}", "unsure")
         return _said("" if row["expanded"] else "only with others", "unsure")
 
@@ -199,9 +199,9 @@ def volume_table(caption: str, volume: Row) -> Table:
     """Expanded uncertainty of tips and lengths over the working volume."""
     length = f"{volume['length_mm']:g} mm length"
     titles = {
-        "expanded_tip": "tip position (worst direction): from the calibration",
-        "expanded_length": f"{length}: from the calibration",
-        "expanded_length_reading": f"{length}: with the noise of both readings",
+        "expanded_tip": "tip position (worst direction): contribution of the calibration",
+        "expanded_length": f"{length}: contribution of the calibration",
+        "expanded_length_reading": f"{length}: total, with the noise of both readings",
     }
     rows = []
     for key, title in titles.items():
@@ -231,10 +231,7 @@ def agreement_tables(summary: Row) -> list[Table]:
 
 def other_poses_table(others: Row) -> Table:
     """How the calibrated arm agrees with poses that it was not calibrated with."""
-    caption = (
-        f"Poses that were not used for the calibration, drawn at random: {others['poses']}, RMS "
-        f"{others['rms_mm']:.4f} mm"
-    )
+    caption = f"Held-out poses, drawn at random: {others['poses']}; RMS distance {others['rms_mm']:.4f} mm"
     columns: Columns = {"observation": "observation", "poses": "poses", "RMS [mm]": "rms_mm", "RMS [deg]": _in_degrees}
     return listed(caption, others["observations"], columns)
 
@@ -322,7 +319,7 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         "MPE": "limit_mm" if limited else None,
         "nominal": read("as_found_mm") if nominal else None,
         "worst at": "where",
-        "what it is": None if brief else "what",
+        "meaning": None if brief else "what",
     }
     return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
 

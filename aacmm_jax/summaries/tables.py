@@ -247,8 +247,8 @@ def noise_sentence(summary: Mapping[str, Any]) -> str:
         "given": f"Noise as given{replaced}: {noise}; residuals are {part['misfit'] or 0:.2f} times as large as this "
         "noise predicts.",
         "estimated": f"Noise estimated from the residuals: {noise} (only their combination is well determined).",
-        "common": f"One noise for all poses: {seating} per coordinate.",
-        "robust": "The variance of each pose is taken from its own residual (robust noise model).",
+        "common": f"The same noise for all poses: {seating} per coordinate.",
+        "robust": "The variance of each pose is estimated from the residual of this pose (robust noise model).",
     }[part["form"]]
 
 
@@ -275,8 +275,8 @@ def lengths_sentence(row: Mapping[str, Any]) -> str:
 
 
 def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Errors that poses share in words."""
-    words = {PLACES: "poses of a socket", VISITS: "poses of a visit"}
+    """Shared errors in words."""
+    words = {PLACES: "all poses of a socket", VISITS: "all poses of a visit"}
 
     def shown(row: Mapping[str, Any]) -> str:
         scale, unit = (1.0, "mm") if row["unit"] == "mm" else people_read_change(row["unit"])
@@ -286,16 +286,13 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
     functions = [shown(row) for row in rows if row["kind"] not in (PLACES, VISITS, SUCCESSIVE)]
     parts = [shown(row) for row in rows if row["kind"] in (PLACES, VISITS, SUCCESSIVE)]
     parts += [f"functions missing from the model: {', '.join(functions)}"] if functions else []
-    return (
-        "Errors that several poses have in common, included in the uncertainty (standard deviations): "
-        f"{'; '.join(parts)}."
-    )
+    return f"Shared errors of several poses, included in the uncertainty (standard deviations): {'; '.join(parts)}."
 
 
 def tried_sentence(row: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
         f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses, which means "
-        f"that a calibration pose is as near as these poses are to each other ({row['spacing_rad'] / DEG:.2g} deg RMS "
-        "over the joints). Elsewhere, U is an extrapolation by the model."
+        f"that the nearest calibration pose is within the spacing of these poses ({row['spacing_rad'] / DEG:.2g} deg "
+        "RMS over the joints). In the rest of the joint space, U is an extrapolation by the model."
     )

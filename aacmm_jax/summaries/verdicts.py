@@ -97,17 +97,17 @@ def evaluation_verdict(summary: Mapping[str, Any], own_warnings: int = 0) -> Ver
         reasons = [*(f"{name} is over its limit" for name in names), *failed]
         return Verdict("bad", f"Fails: {shorten(reasons, 3)}.")
     if decision == "undecided":
-        return Verdict("unsure", f"Undecided: the measurement is too uncertain for {shorten(names)}.")
+        return Verdict("unsure", f"Undecided: the measurement is too uncertain for a decision on {shorten(names)}.")
     if decision == "conforms":
         incomplete = any(test["missing"] for test in summary["acceptance"] if test["decision"])
         without = dict.fromkeys(metric["name"] for metric in metrics if metric["decision"] is None)
         before = {metric["name"]: metric["as_found_decision"] for metric in metrics}
-        says = f"Conforms{' (calibrated arm)' if any(before.values()) else ''}: every limit given is kept"
+        says = f"Conforms{' (calibrated arm)' if any(before.values()) else ''}: all limits given are met"
         says += f" ({shorten(list(dict.fromkeys(names)))})" if names else ""
         failed = [name for name, decision in before.items() if decision == "fails"]
         says += f"; the nominal arm fails ({shorten(failed)})" if failed else ""
         says += f"; no limit was given for {shorten(list(without))}" if without else ""
-        says += "; a procedure was not complete." if incomplete else "."
+        says += "; the procedure of a test was not complete." if incomplete else "."
         return Verdict("unsure" if incomplete or own_warnings else "good", says)
     if summary.get("held_out") is None:
         return Verdict("neutral", "Measured; no limit was given.")
@@ -130,4 +130,4 @@ def _as_predicted(predicted: Mapping[str, Any]) -> Verdict:
         return Verdict("unsure", f"Errors on held-out data exceed the prediction (p = {chance:.1g}): {rms}.")
     if max(measured / expected if expected else 0.0, ratio or 0.0) > _LARGER:
         return Verdict("unsure", f"Errors on held-out data are larger than predicted, but this may be chance: {rms}.")
-    return Verdict("neutral", f"The calibration holds on held-out data: {rms}. No limit was given.")
+    return Verdict("neutral", f"Errors on held-out data are about as predicted, or smaller: {rms}. No limit was given.")

@@ -59,13 +59,14 @@ def inverse_information(
     seen, lost = xp.where(informed[None, :], vectors, 0.0), xp.where(informed[None, :], 0.0, vectors)
     inner = seen.T @ information @ seen + xp.diag(xp.where(informed, 0.0, 1.0))
     inverse = seen @ inverse_positive_definite(inner) @ seen.T
-    hardly = xp.where((values > _LEAST_INFORMATION)[None, :] & informed[None, :], 0.0, vectors)
-    determined = fixed | (xp.sum(hardly**2, axis=1) < 1e-6)
+    undetermined = xp.where((values > _LEAST_INFORMATION)[None, :] & informed[None, :], 0.0, vectors)
+    determined = fixed | (xp.sum(undetermined**2, axis=1) < 1e-6)
     return xp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined
 
 
 class SharedErrors(eqx.Module):
-    """Errors that poses share and the model of a calibration does not have, as its residuals show them.
+    """Shared errors: errors that several poses have in common and that the model of a calibration does not describe, as
+    its residuals show them.
 
     Its covariance contains them. Functions of the readings that joints follow besides the model ("gravity",
     "harmonics=1") move other poses too: a tip errs by J dz + sum of J_joint phi(q) c, with dz = ``follow`` c.

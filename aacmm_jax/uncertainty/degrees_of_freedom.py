@@ -1,7 +1,7 @@
 """Degrees of freedom of a quantity, by what each part of its variance rests on, and the one coverage factor of every U.
 
 A covariance is a sum of parts: the scatter of single poses, certified lengths and what instruments state, the
-disagreement of the lengths, effects that poses share. A quantity with derivatives g has the variances v_i = g' C_i g of
+disagreement of the lengths, shared errors. A quantity with derivatives g has the variances v_i = g' C_i g of
 these parts, and where each was estimated from nu_i degrees of freedom, those of their sum are (Welch 1947,
 Satterthwaite 1946; JCGM 100, G.4.1)
 

@@ -42,7 +42,7 @@ class ArmErrors(NamedTuple):
 def arm_errors(point: PointRows, observed: Observed) -> list[ArmErrors]:
     """Of every group."""
     forward = point.forward
-    assert isinstance(forward, ForwardPass)  # nobody asks for these where rows are those of a batch
+    assert isinstance(forward, ForwardPass)  # a batch needs no covariance of its arms' errors
     xp = namespace(forward)
     readings, rotations = reading_columns(forward), reading_rotations(forward)  # (n, 3, N)
     # An arm whose tips err by s turns them by about s over its size.
@@ -328,7 +328,8 @@ def alone(influence: Influence, groups: int) -> list[Float[AnyArray, "_ _ _"]]:
             per_pose = influence.d_inverses[block.class_index][np.repeat(np.arange(len(block.sizes)), block.sizes)]
             leverage = leverage + xp.einsum("kam,mkl,lbm->mab", private, per_pose, private)
         identity = xp.asarray(np.eye(a.shape[1]))
-        # Where a pose determines its own geometry nearly alone, its residual says nothing: it has the common variance.
+        # Where a pose determines its own geometry nearly alone, its residual is nearly 0 whatever its variance is: it
+        # has the common variance.
         whitening = inverse_cholesky(identity[None] - leverage)
         determinant = 1 / xp.prod(xp.diagonal(whitening, axis1=1, axis2=2), axis=1) ** 2
         enough = (determinant > _LEAST_REDUNDANCY)[:, None, None]

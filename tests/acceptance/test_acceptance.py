@@ -220,11 +220,11 @@ def test_limits_are_read(text, at_zero, at_metre):
         (["E_Uni"], "NAME=A+L/K"),
         (["E_Uny=1"], "did you mean 'E_Uni'"),
         (["E_Uni=a"], "numbers"),
-        (["E_Uni=-1"], "zero or positive"),
-        (["E_Uni=1+L/0"], "K at least"),
-        (["E_Uni=1+L/1e-320"], "K at least"),
+        (["E_Uni=-1"], "not negative"),
+        (["E_Uni=1+L/0"], "K must be at least"),
+        (["E_Uni=1+L/1e-320"], "K must be at least"),
         (["E_Uni=1e308"], "finite"),
-        (["E_Uni=nan"], "zero or positive"),
+        (["E_Uni=nan"], "not negative"),
         (["E_Uni=1", "e_uni=2"], "two limits"),
     ],
 )
@@ -246,7 +246,7 @@ def test_limits_that_cannot_be_are_refused(texts, said):
         (lambda: unwrap(checked_limits)({"Deltam": "x"}), "limit of Deltam"),
         (lambda: unwrap(checked_limits)({"E_Bi": 0.05}), "opposite directions cannot be recorded"),
         (lambda: run(Measured({"A": np.eye(3)}), {"Delta": 1.0}), "did you mean 'Deltam'"),
-        (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": Limit(1, -1000)}), "K at least"),
+        (lambda: run(Measured({"A": np.eye(3)}), {"Deltam": Limit(1, -1000)}), "K must be at least"),
         (lambda: run(Measured({"A": np.eye(3)}), u_test=-1), "u_test is -1 mm; it must be zero or positive"),
         (
             lambda: run(Measured({}, spheres=(aj.data.ProbedSphere("S", "probing", (PLACE + AXES,), math.nan),))),
@@ -405,15 +405,15 @@ def test_a_probe_that_is_off_scatters_tips_on_a_sphere(cheng):
                     "Exactly two bars are required",
                     "500 to 750 mm) and one of 120 to 150 % of the reach (1200 to 1500 mm",
                     "20 different positions are required (1 given)",
-                    "not in one plane",
-                    "scatter by 0.0 % of its size",
+                    "not all in one plane",
+                    "scatter by 0.0 % of the size of the volume",
                     "measuring range",
                 ],
                 "length error": [
                     "5 different lengths are required (1 given)",
-                    "7 different positions of every length are required (one has 1)",
+                    "7 different positions of every length are required (one length has 1)",
                     "3 readings in each position are required (one position has 1)",
-                    "not in one plane",
+                    "not all in one plane",
                     "at least 10 % is required",
                     "measuring range",
                 ],
@@ -655,7 +655,7 @@ def test_an_evaluation_of_points_is_stored_whole(tmp_path):
     assert again.acceptance() == record.acceptance()
     assert (again.limits, again.u_test, again.measured.measured) == (record.limits, record.u_test, "2026-01-31")
     written = aj.report.write_report(tmp_path / "points.h5", tmp_path / "points.html")
-    assert written["verdict"].startswith("Conforms: every limit given is kept")
+    assert written["verdict"].startswith("Conforms: all limits given are met")
 
 
 def test_bars_at_hand_are_planned_for(cheng):

@@ -1,16 +1,20 @@
-"""Captures drawn anew: every kind of observation scatters as it should, by one piece of code."""
+"""Captures drawn anew: every kind of observation scatters as it should, by one piece of code, and each kind of shared
+error has the covariance over the poses that it states."""
 
 import jax
 import numpy as np
 import pytest
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.redrawn import truth_of
+from aacmm_jax.calibration.redrawn import draw_shared, truth_of
 from aacmm_jax.calibration.sampling import Repeated
 from aacmm_jax.core.numpy_or_jax import to_numpy
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.model.observed import Observed
+from aacmm_jax.uncertainty.covariance import SharedErrors
+from aacmm_jax.uncertainty.degrees_of_freedom import Law
 from aacmm_jax.uncertainty.linearisation import Linearisation
+from aacmm_jax.uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 
 from .test_observed import NOISE, SIMULATED
 
@@ -131,3 +135,30 @@ def test_a_robust_loss_is_for_the_bootstrap(paper_arm, bounds, mixed):
         aj.monte_carlo(result, capture)
     with pytest.raises(aj.InputError, match="reduced the weight of poses"):
         aj.bootstrap(result, capture)
+
+
+POSES, SD, CORRELATION = (3, 2), 0.1, 2.0
+OWNER = np.repeat([0, 1], POSES)
+SAME = OWNER[:, None] == OWNER
+EXPECTED = {
+    PLACES: SAME,
+    VISITS: np.array([0, 0, 1, 2, 2])[:, None] == [0, 0, 1, 2, 2],
+    SUCCESSIVE: SAME * np.exp(-np.abs(np.arange(5)[:, None] - np.arange(5)) / CORRELATION),
+}
+
+
+@pytest.mark.parametrize("kind", EXPECTED)
+def test_covariance_over_the_poses(paper_arm, kind):
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 6))
+    sockets = {"A": q[:3], "B": q[3:]}
+    capture = aj.Capture(sockets, [aj.ReferenceLength("A", "B", value=200.0)], visits={"A": [0, 0, 1], "B": [1, 1]})
+    law = Law(np.array([np.inf]), np.array([[0.5, 1.5]]), np.array([[0.5, 0.5]]))
+    none = np.zeros((0, 0))
+    shared = SharedErrors(
+        (kind,), ("mm",), (), np.array([SD]), none, none, np.array(CORRELATION), np.zeros((1, 0, 0)), none[None], law
+    )
+    drawn = draw_shared(shared, paper_arm, capture, 40_000, np.random.default_rng(1))
+    assert drawn is not None
+    assert not drawn.joints.any()
+    tips = np.moveaxis(drawn.tips, 1, 2).reshape(-1, 5)
+    np.testing.assert_allclose(tips.T @ tips / len(tips), SD**2 * EXPECTED[kind], atol=0.02 * SD**2)

@@ -139,7 +139,7 @@ def test_cross_validation_shows_what_the_uncertainty_misses(arm, bounds, capture
     ]
     bent = aj.Capture(capture.sockets, wrong)
     options = {"method": "joint", "noise": NOISE}
-    assert aj.cross_validate(arm, bent, bounds, **options).excess < 1.5  # errors that poses share are in the prediction
+    assert aj.cross_validate(arm, bent, bounds, **options).excess < 1.5  # shared errors are in the prediction
     checked = aj.cross_validate(arm, bent, bounds, **options, shared_errors=False)
     assert checked.surprising
     assert checked.excess > 3

@@ -692,7 +692,7 @@ def test_any_text_survives_or_is_refused(text):
             {},
             ["too few steps", "calibrate again"],
         ),
-        ({"k": 25.4}, {}, ["25.4", "correct the reference lengths"]),
+        ({"k": 25.4}, {}, ["25.4", "correct the values of the reference lengths"]),
         ({"method": "repeatability"}, {}, ["traceable", "--scale nominal", "another observation"]),
         ({}, {"created": "yesterday"}, ["yesterday", "ISO 8601"]),
         ({}, {"sources": ["a\x07.h5"]}, [r"'a\x07.h5' in the certificate", "U+0007", "remove the character"]),

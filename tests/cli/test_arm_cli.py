@@ -42,8 +42,8 @@ def test_a_template_is_written_looked_at_and_not_overwritten(aacmm, tmp_path, mo
         "sockets and a reference length",
         "enough",
         "Record",
-        "for encoders with 2 arcsec and a seat with 0.005 mm (class measuring arm: ",  # as aacmm plan assumes it
-        "reference lengths with u = 0.002 mm",
+        "of 2 arcsec (encoders) and 0.005 mm (seating; class measuring arm: ",  # as aacmm plan assumes it
+        "u = 0.002 mm (reference lengths)",
     ):
         assert part in printed, part
 

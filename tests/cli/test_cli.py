@@ -268,7 +268,7 @@ def test_what_cannot_be_determined_is_a_warning_or_with_strict_an_error(aacmm):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("--sockets", 2, "--socket", "A=1,2,3"), "give one of the two"),
+        (("--sockets", 2, "--socket", "A=1,2,3"), "give only one of these options"),
         (("--region", "z=1"), "not of the form AXIS=LOW:HIGH"),
         (("--length-mm", "long"), "not of the form L or L:M"),
         (("--length", "A,B"), "--length needs two sockets given with --socket"),

@@ -72,7 +72,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
         "points",
         "sphere",
         "frame of tracker",
-        "Poses that were not used",
+        "Held-out poses, drawn at random",
     ):
         assert part in shown
     assert aacmm("show", "c.h5").stdout in shown
@@ -398,4 +398,4 @@ def test_a_plan_with_a_kit(aacmm, tmp_path):
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 17
     assert 'a = "bar-a.csv"' in (tmp_path / "capture.toml").read_text()
     refused = aacmm("plan", "cheng2018-simulation", "-o", "p.csv", "--kit", "kit.toml", "--sockets", 3, expect=2)
-    assert "--kit states what is used and where it is placed, so --sockets" in refused.stderr
+    assert "--kit itself determines the artefacts and their placement, so --sockets" in refused.stderr

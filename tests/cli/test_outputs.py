@@ -104,10 +104,10 @@ def test_one_path_is_not_two_outputs(aacmm, inputs):
 def test_demo_leaves_other_files_alone(aacmm, inputs):
     """Neither a folder of other files, nor one that holds a capture of the same name."""
     before = content(inputs)
-    assert "contains files that no demonstration wrote (A.csv" in aacmm("demo", ".", expect=2).stderr
+    assert "contains files that aacmm demo did not write (A.csv" in aacmm("demo", ".", expect=2).stderr
     (inputs / "own").mkdir()
     (inputs / "c.h5").rename(inputs / "own" / "capture.h5")
-    assert "no demonstration wrote (capture.h5)" in aacmm("demo", "own", expect=2).stderr
+    assert "aacmm demo did not write (capture.h5)" in aacmm("demo", "own", expect=2).stderr
     assert sorted(content(inputs).values()) == sorted(before.values())
 
 

@@ -53,7 +53,7 @@ def test_a_robot_by_default(aacmm):
         "Franka Emika data sheet",
         "via approach points 50 mm above the sockets",
         "the arm's body with itself and with obstacles (table)",
-        "Not checked, because these parts touch in every pose of the arm: offset d_1 and table.",
+        "Not checked for collisions, because these parts touch in every pose of the arm: offset d_1 and table.",
         "Note: each link is assumed to have a radius of 60 mm",
     ):
         assert text in printed

@@ -41,7 +41,7 @@ def test_what_is_printed(text, shown):
 @pytest.mark.parametrize(
     ("options", "part"),
     [
-        (("--seed", "1_0"), "--seed '1_0' is not a finite number; write plain decimal digits."),
+        (("--seed", "1_0"), "--seed '1_0' is not a finite number; give a number in decimal digits."),
         (("--seed=\u0663",), "--seed '\u0663' is not a finite number"),
         (("--seating-mm", "nan"), "--seating-mm 'nan' is not a finite number"),
         (("--encoder-arcsec", "inf"), "--encoder-arcsec 'inf' is not a finite number"),

@@ -153,7 +153,7 @@ def test_a_residual_that_no_arm_has_is_not_called_converged():
     ("converged", "plausible", "said", "unsaid"),
     [
         (True, True, ": converged in 3 steps", "no arm has"),
-        (True, False, "ended with residuals too large for this arm, in 3 steps", "converged"),
+        (True, False, "ended with residuals that are too large for this arm, in 3 steps", "converged"),
         (False, False, "did not converge in 3 steps", "no arm has"),
     ],
 )

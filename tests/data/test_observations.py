@@ -203,7 +203,7 @@ def test_platform_frames_are_exact_for_exact_data(seed):
         ("sphere", {}, {}),
         ("certified sphere", {"certified diameter": ([100.0], 0.1)}, {"diameter of the tip's ball": ([4.0], "mm")}),
         ("exact sphere", {"certified diameter": ([100.0], 0.0)}, {}),
-        ("plane", {}, {"standard deviation of the surface about its plane": ([0.01], "mm")}),
+        ("plane", {}, {"standard deviation of the surface from an ideal plane": ([0.01], "mm")}),
         (
             "exact planes",
             {"certified distance between the planes": ([50.0], 0.0)},

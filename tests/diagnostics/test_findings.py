@@ -1,5 +1,8 @@
 """The mistakes that a laboratory makes are named before any number is printed."""
 
+from collections import Counter
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -176,3 +179,42 @@ def test_every_diagnostic_says_where_it_stands(noisy_capture, paper_arm):
     assert aj.warnings_of(result, noisy_capture) == sentences(findings)
     assert finding_rows(findings)[0]["concerns"] == ["a_2"]
     assert case_of(record) is case_of(record)
+
+
+def test_equations_and_noise_of_a_calibration_are_tested_once(paper_arm, monkeypatch):
+    """By the calibration, and again for what is said of it; another record has equations of its own."""
+    from aacmm_jax.diagnostics import findings, noisy_encoders
+
+    counts = Counter()
+
+    def counted(module, name):
+        function = getattr(module, name)
+
+        def count(*arguments):
+            counts[name] += 1
+            return function(*arguments)
+
+        monkeypatch.setattr(module, name, count)
+
+    counted(findings, "equations_of")
+    counted(noisy_encoders, "_noisiest")
+    specification = ArmSpecification(paper_arm, "test")
+    sockets = {"A": (400, 200, 300), "B": (600, 200, 300), "C": (500, 400, 400), "D": (300, 400, 600)}
+    lengths, noise = [("A", "B", 0.002), ("C", "D", 0.002)], {"encoder_arcsec": 2.0, "seating": 0.005}
+    capture = aj.simulate(paper_arm, sockets, poses=20, lengths=lengths, seed=1, **noise)
+    record = aj.calibrate_capture(aj.Recording(capture, specification), cross_validate=True)
+    assert record.shared is None
+    folds = len(record.validation.groups)
+    assert counts["_noisiest"] == 1 + folds
+    tests = aj.diagnostics.model_tests(record)
+    assert tests.noisy_joint is not None
+    assert not tests.terms
+    assert counts == {"equations_of": 1 + folds, "_noisiest": 1 + folds}
+    # As tested by itself.
+    findings._last.clear()
+    findings._solved.clear()
+    assert aj.diagnostics.model_tests(record) == tests
+    assert counts == {"equations_of": 2 + folds, "_noisiest": 2 + folds}
+    twice = record._replace(noise=jax.tree.map(lambda value: 2 * value, record.noise))
+    cost = case_of(record).left.cost
+    assert case_of(twice).left.cost == pytest.approx(cost / 4, rel=1e-6)

@@ -1,4 +1,4 @@
-"""Errors that poses share are found, and widen the uncertainty; clean calibrations stay as they are."""
+"""Shared errors are found, and widen the uncertainty; clean calibrations stay as they are."""
 
 import dataclasses
 from pathlib import Path

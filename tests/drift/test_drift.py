@@ -456,7 +456,7 @@ def test_figures_draw_the_numbers(calibrated, tmp_path):
     np.testing.assert_allclose(found.get_xdata(), [2 * 31 / 181, 2])
     assert lower.get_xlabel() == "calibration"
     by_file = drift_figure.drift_trend(table._replace(dated_by_file=(True, False, True)))[1]
-    assert "(*: date of its file" in by_file.get_xlabel()
+    assert "(*: date of the file" in by_file.get_xlabel()
     assert [label.get_text().endswith("*") for label in by_file.get_xticklabels()] == [True, False, True]
     two = drift_figure.drift_trend(trend(given[::2], dates[::2], points=40))
     assert [label.get_text().split()[0] for label in two[0].get_xticklabels()] == list(table.names)
@@ -529,7 +529,7 @@ def test_command_on_three_calibrations(run, files):
     assert len((files / "table.csv").read_text().splitlines()) == 1 + 2 * 21
     assert (files / "trend.svg").stat().st_size > 10_000
     printed = " ".join(run("c.h5", "a.h5", "b.h5").stdout.split())
-    assert "Each calibration compared with the first" in printed
+    assert "Each calibration minus the first" in printed
     assert "For the change of every parameter from the first calibration, use --csv" in printed
 
 
@@ -571,7 +571,7 @@ def test_command_refuses(run, files):
     for arguments, text in (
         (("a.h5",), "a.h5 alone cannot be compared"),
         (("a.h5", "none.h5"), "none.h5 does not exist"),
-        (("a.h5", "b.h5", "--figure", "trend.gif"), "end its name in .png, .svg or .pdf"),
+        (("a.h5", "b.h5", "--figure", "trend.gif"), "a file name that ends in .png, .svg or .pdf"),
         (("a.h5", "b.h5", "--csv", "b.h5"), "b.h5 is one of the files that this command reads"),
         (("a.h5", "b.h5", "--level", 0), "level is 0"),
     ):

@@ -17,7 +17,7 @@ from tests.refusals import assert_refused
 KIND = ("capture",)
 TABLES = {
     "t": Table(
-        columns("row", x=(np.linspace(0, 1, 2000), "mm", "position")) | columns("row", name=(["é"] * 2000, "", "name")),
+        columns("row", x=(np.linspace(0, 1, 2000), "mm", "position"), name=(["é"] * 2000, "", "name")),
         {"note": "text", "pair": [1.0, 2.0]},
     )
 }

@@ -110,7 +110,7 @@ def test_command_line(tmp_path, aacmm, paper_arm):
     assert groups() == ("joint", ["lengths"])
     assert groups("--prior", "learn") == ("joint", ["lengths", "angles"])
     shown = aacmm("show", "r.h5").stdout
-    assert "Priors of the parameters" in shown
+    assert "Priors, and number of parameters" in shown
     assert "learned" in shown
     assert groups("--prior", "none") == ("two-stage", None)
     assert "--prior 'angle=1mm'" in aacmm("calibrate", "c.h5", "-o", "r.h5", "--prior", "angle=1mm", expect=2).stderr

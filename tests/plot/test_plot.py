@@ -73,7 +73,7 @@ def test_residuals_of_observations(observed_record, unit, count):
         found = observed_record.observed
         expected = found.rms_after if unit == "mm" else found.reduced_chi
         assert np.sqrt(np.mean(lines["sphere"].get_ydata() ** 2)) == pytest.approx(expected[3])
-        assert 5 in lines["half of its weight or less"].get_xdata()
+        assert 5 in lines["half of the full weight or less"].get_xdata()
         assert [text.get_text() for text in axes.get_xticklabels()] == list(found.names)
     axes.figure.savefig(io.BytesIO())
     assert axes.get_legend().get_window_extent().y0 >= axes.get_window_extent().y1
@@ -130,7 +130,7 @@ def test_patterns_in_the_residuals(record):
     np.testing.assert_allclose(drawn[inside, 1], found.along_joint[inside, 2])
     single = aj.Capture({name: q[:1] for name, q in record.recording.capture.sockets.items()})
     alone = record._replace(recording=record.recording._replace(capture=single))
-    assert_refused(lambda: aj.plot.residual_patterns(alone), "no residual has a direction")
+    assert_refused(lambda: aj.plot.residual_patterns(alone), "there are no residuals to draw")
 
 
 @pytest.mark.parametrize(

@@ -265,7 +265,7 @@ def test_a_report_of_observations_by_kind_observation_and_pose(observed_record, 
     in_ball = np.array(normalised["sphere"].y)
     assert len(in_ball) == 12
     assert math.sqrt(np.mean(in_ball**2)) == pytest.approx(found.reduced_chi[3], rel=1e-5)
-    assert normalised["half of its weight or less"].x[0] == 5  # the bad pose of A is marked
+    assert normalised["half of the full weight or less"].x[0] == 5  # the bad pose of A is marked
     weights = next(table for caption, table in tables.items() if caption.startswith("Poses to which the robust loss"))
     assert [cell.text for cell in weights.rows[0][:3]] == ["A", "5", "0.000"]
     assert weights.rows[0][3].value > 1

@@ -205,7 +205,7 @@ def test_the_terminal_shows_all_of_it(path, aacmm):
     assert "probe_z" in one.stdout
     machine = json.loads(aacmm("show", path, "--cell", 1, "--json").stdout)
     assert machine["results"][0]["figures"]["de"]["mean"]["se"] > 0
-    assert "no cell 5; name another" in aacmm("show", path, "--cell", 5, expect=2).stderr
+    assert "no cell 5; choose a cell from 1 to 4" in aacmm("show", path, "--cell", 5, expect=2).stderr
 
 
 @pytest.mark.slow
@@ -225,7 +225,7 @@ def test_every_figure_is_drawn(path, aacmm, tmp_path):
     ("arguments", "message"),
     [
         (("-o", "s.h5"), "name a specification, or use --resume"),
-        (("--resume", "-o", "s.h5"), "s.h5 does not exist, so there is nothing to resume; leave --resume out"),
+        (("--resume", "-o", "s.h5"), "s.h5 does not exist, so there is nothing to resume; leave out --resume"),
         (
             ("bound-sensitivty", "-o", "s.h5"),
             "neither a file nor a study that ships with the package; did you mean 'bound-sensitivity'",

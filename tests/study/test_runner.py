@@ -64,7 +64,7 @@ def test_an_interrupt_is_answered_while_programs_compile(home, tmp_path, prepare
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 130, errors
-    expected = f"Stopped; 0 of 96 trials are kept. Continue with: aacmm study --resume -o {path}\n"
+    expected = f"Stopped; 0 of 96 trials are saved. Continue with: aacmm study --resume -o {path}\n"
     assert errors == expected
     assert {item.name for item in tmp_path.iterdir()} == {"s.h5", "s.h5.parts", "started"}
     aj.study.open_study(path).close()
@@ -88,7 +88,9 @@ def test_an_interrupt_lets_submitted_blocks_end(home, tmp_path, prepared):
     _, errors = process.communicate(timeout=600)
     kept = len(list(parts_of(path).glob("*.npz")))
     assert 2 < kept < 12
-    assert errors == (f"Stopped; {kept * CHUNK} of 96 trials are kept. Continue with: aacmm study --resume -o {path}\n")
+    assert errors == (
+        f"Stopped; {kept * CHUNK} of 96 trials are saved. Continue with: aacmm study --resume -o {path}\n"
+    )
     assert process.returncode == 130
 
 
@@ -103,7 +105,7 @@ def test_an_interrupt_is_answered_in_the_middle_of_xla(home, tmp_path):
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 130
     assert "Finished XLA compilation of jit(_draw)" not in errors
-    assert "Stopped; 0 of 96 trials are kept" in errors
+    assert "Stopped; 0 of 96 trials are saved" in errors
 
 
 @pytest.mark.exhaustive

@@ -210,7 +210,7 @@ def test_an_interrupt_finishes_the_blocks_in_work_and_says_how_to_go_on(home, tm
     assert process.returncode == 130, errors
     kept = len(list(parts_of(path).glob("*.npz")))
     assert kept >= 3
-    assert f"Stopped; {4 * kept:,} of 800 trials are kept. Continue with: aacmm study --resume -o {path}" in errors
+    assert f"Stopped; {4 * kept:,} of 800 trials are saved. Continue with: aacmm study --resume -o {path}" in errors
     assert "Traceback" not in errors
     process = subprocess.Popen(
         [sys.executable, "-m", "aacmm_jax", "study", "--resume", "-o", path, "--json"],

@@ -83,20 +83,20 @@ def held_out(probability, predicted=0.1):
 @pytest.mark.parametrize(
     ("summary", "own", "mark", "says"),
     [
-        (evaluated("conforms"), 0, "good", "Conforms: every limit given is kept (E_0)."),
-        (evaluated("conforms", None), 0, "good", "kept (E_0); no limit was given for E_1."),
+        (evaluated("conforms"), 0, "good", "Conforms: all limits given are met (E_0)."),
+        (evaluated("conforms", None), 0, "good", "met (E_0); no limit was given for E_1."),
         (
             evaluated("conforms", found="conforms"),
             0,
             "good",
-            "Conforms (calibrated arm): every limit given is",
+            "Conforms (calibrated arm): all limits given are",
         ),
-        (evaluated("conforms", found="fails"), 0, "good", "kept (E_0); the nominal arm fails (E_0)."),
+        (evaluated("conforms", found="fails"), 0, "good", "met (E_0); the nominal arm fails (E_0)."),
         (evaluated("conforms"), 1, "unsure", "Conforms"),
-        (evaluated("conforms", missing=["more bars"]), 0, "unsure", "a procedure was not complete"),
+        (evaluated("conforms", missing=["more bars"]), 0, "unsure", "the procedure of a test was not complete"),
         (evaluated("conforms", "fails", "undecided"), 0, "bad", "Fails: E_1 is over its limit."),
         (evaluated("conforms", failed=["RMS is 2 mm, over."]), 0, "bad", "Fails: RMS is 2 mm, over."),
-        (evaluated("conforms", "undecided"), 0, "unsure", "too uncertain for E_1"),
+        (evaluated("conforms", "undecided"), 0, "unsure", "too uncertain for a decision on E_1"),
         (evaluated(kept=["RMS is 2 mm."]), 0, "good", "Conforms"),
         (evaluated(), 0, "neutral", "Measured; no limit was given."),
         (

@@ -93,16 +93,22 @@ class Artefact(AbstractObservation):
     names: tuple[str, ...] = declared("point of the artefact", "", "names")
     coordinates: Float[AnyArray, "c 3"] = declared("certified coordinates", "mm", "names", "axis", uncertainty="u")
     u: Float[AnyArray, ""] = declared(
-        "standard uncertainty of a coordinate", "mm", default=0.0, more="its error is the same in every placement"
+        "standard uncertainty of a coordinate",
+        "mm",
+        default=0.0,
+        more="the error of a coordinate is the same in every placement",
     )
     artefact: str = declared(
         "name of the artefact", default=NAME, more="all observations of one artefact share its errors"
     )
     placement: str = declared(
-        "name of its placement", default=NAME, of_session=True, more="all observations of one placement share its frame"
+        "name of the placement of the artefact",
+        default=NAME,
+        of_session=True,
+        more="all observations of one placement share its frame",
     )
     index: str | None = declared(
-        "index of the platform that carries it", default=None, of_session=True,
+        "index of the platform that carries the artefact", default=None, of_session=True,
         more="the placement is then relative to the platform, and the platform has one frame per index",
     )  # fmt: skip
     derived = ("free",)  # whether the coordinates are unknowns with certified values
@@ -283,12 +289,14 @@ class SimulatedArtefact(AbstractSimulated):
     points: dict[str, Float[np.ndarray, "3"]] = declared("true coordinates of each point", "mm")
     poses: int = declared("number of poses")
     frame: Float[np.ndarray, "6"] = declared(
-        "its frame in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6, moves="frame"
+        "frame of the artefact in the base frame: rotation vector (rad) and origin (mm)",
+        default=(0.0,) * 6,
+        moves="frame",
     )
     errors: Float[np.ndarray, "c 3"] | None = declared(
         "errors of the certified coordinates", "mm", default=None, more="all placements have the same errors"
     )
-    u: float = declared("their standard uncertainty", "mm", default=0.0)
+    u: float = declared("standard uncertainty of the certified coordinates", "mm", default=0.0)
     artefact: str = declared("name of the artefact", default=NAME)
     placement: str | None = declared("name of the placement", default=None)
     index: str | None = declared("name of the index of a platform", default=None)

@@ -143,7 +143,7 @@ class MeasuredTransforms(MeasuredPoints):
     u_angle: Float[AnyArray, ""] = declared(
         "standard uncertainty of an orientation about each axis", "rad", positive=True
     )
-    target: str = declared("target that was seen", default=NAME)
+    target: str = declared("target that was measured", default=NAME)
     orientation = Part("orientation of {target}", *FRAME[:3])  # of the target in the last frame
 
     def completed(self, where: str) -> Mapping[str, Any]:
@@ -215,7 +215,7 @@ class Distances(AbstractObservation):
     )
     constant: bool = declared(
         "whether an unknown constant is added to all distances", default=False,
-        more="as for a bar whose zero is unknown",
+        more="for example for a bar whose zero is unknown",
     )  # fmt: skip
     pivot = Part("pivot of {name}", *POINT)
     zero = Part("constant of {name}", "mm", when="constant")
@@ -293,7 +293,7 @@ class SimulatedTransforms(AbstractInBox):
 
     table = "transforms"
     offset_and_orientation: Float[np.ndarray, "6"] = declared(
-        "true place (mm) and rotation vector (rad) of the target in the last frame", default=(0.0,) * 6
+        "true position (mm) and rotation vector (rad) of the target in the last frame", default=(0.0,) * 6
     )
     frame: Float[np.ndarray, "6"] = declared(
         "frame of the instrument in the base frame: rotation vector (rad) and origin (mm)", default=(0.0,) * 6

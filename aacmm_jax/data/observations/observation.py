@@ -84,7 +84,7 @@ class AbstractObservation(Declared):
     linear: ClassVar[bool] = False
     fixes_scale: bool = False  # whether it determines the scale of the arm
     q: Float[AnyArray, "m n"] = declared("joint reading", "rad", "pose", "joint")
-    target: str = declared("tip that was held or seen; empty: the arm's own probe", default="")
+    target: str = declared("tip that was held or measured; empty: the probe of the arm", default="")
 
     # Of a repeated calibration: what is added to the residuals (r, m), and certified values in place of its own.
     shift: Float[AnyArray, "r m"] | None
@@ -320,11 +320,11 @@ class AbstractOfTarget(AbstractSimulated):
     """What may be recorded with a target in place of the arm's own probe."""
 
     target: str = declared("name of the target", default="")
-    place: Float[np.ndarray, "3"] | None = declared("true place of the target in the last frame", "mm", default=None)
+    place: Float[np.ndarray, "3"] | None = declared("true position of the target in the last frame", "mm", default=None)
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if bool(self.target) != (self.place is not None):
-            raise InputError(f"{where} needs either both a target and its place in the last frame, or neither.")
+            raise InputError(f"{where} needs either both a target and its position in the last frame, or neither.")
         return {"offset": self.place}
 
 

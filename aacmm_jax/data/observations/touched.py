@@ -207,8 +207,8 @@ class Cylinder(AbstractRound):
     """
 
     kind, table, noun = "cylinder", "touched_cylinder", "cylinder"
-    inside: bool = declared("whether the ball was inside", default=False)
-    form: Float[AnyArray, ""] = declared("standard deviation of the surface about its cylinder", "mm", default=0.0)
+    inside: bool = declared("whether the ball touched the cylinder from inside", default=False)
+    form: Float[AnyArray, ""] = declared("standard deviation of the surface from an ideal cylinder", "mm", default=0.0)
     geometry = Part("axis of {name}", *AXIS)
     size = Part("radius of {name}", "mm", when="free")
     advice = "distribute the touches around the cylinder at two heights, or give its diameter"
@@ -230,7 +230,7 @@ class Plane(AbstractTouched):
     """
 
     kind, table, noun = "plane", "plane", "plane"
-    form: Float[AnyArray, ""] = declared("standard deviation of the surface about its plane", "mm", default=0.0)
+    form: Float[AnyArray, ""] = declared("standard deviation of the surface from an ideal plane", "mm", default=0.0)
     geometry = Part("plane {name}", *PLANE)
     advice = "record touches that are not on one line"
     distances, closest = staticmethod(heights), staticmethod(fitted_plane)
@@ -255,7 +255,7 @@ class ParallelPlanes(Plane):
     """
 
     kind, table, noun = "parallel planes", "parallel_planes", "planes"
-    side: tuple[str, ...] = declared("plane that was touched: one or other", "", "pose")
+    side: tuple[str, ...] = declared("the plane that was touched: 'one' or 'other'", "", "pose")
     distance: Float[AnyArray, ""] = declared(
         "certified distance between the planes", "mm", uncertainty="u", positive=True
     )
@@ -355,7 +355,7 @@ class SimulatedCylinder(AbstractSimulatedRound):
     ends: Float[np.ndarray, "2 3"] = declared("both ends of the axis in the base frame", "mm", moves="point")
     diameter: float = declared("true diameter", "mm")
     poses: int = declared("number of poses")
-    inside: bool = declared("whether the ball is inside", default=False)
+    inside: bool = declared("whether the ball touches the cylinder from inside", default=False)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         along = self.ends[1] - self.ends[0]
@@ -381,7 +381,7 @@ class SimulatedPlanes(AbstractSimulated):
 
     table = "planes"
     corner: Float[np.ndarray, "3"] = declared("corner of the (first) rectangle in the base frame", "mm", moves="point")
-    sides: Float[np.ndarray, "2 3"] = declared("its two sides as vectors", "mm", moves="vector")
+    sides: Float[np.ndarray, "2 3"] = declared("two sides of the rectangle as vectors", "mm", moves="vector")
     poses: int = declared("number of poses")
     distance: float | None = declared(
         "true distance to the second plane", "mm", default=None,

@@ -1,11 +1,15 @@
-"""A JAX that cannot start has a sentence of its own; a command goes on on the CPU."""
+"""A JAX that cannot start has a sentence of its own, and a command goes on on the CPU; where 64-bit floats were turned
+off after the import, every entry point says so, and none computes in float32."""
 
 import os
 import sys
 from types import SimpleNamespace
 
+import jax
+import numpy as np
 import pytest
 
+import aacmm_jax as aj
 from aacmm_jax.core import jax_setup as backend
 from aacmm_jax.files.hdf5 import undamaged
 from tests.refusals import assert_refused
@@ -81,3 +85,31 @@ def test_commands_without_the_device_that_is_asked_for(aacmm_process, monkeypatc
         assert done.stderr.startswith(f"Warning: JAX cannot start, because {setting} names no device")
         assert "damaged" not in done.stderr
     assert aacmm_process("show", "c.h5").stderr == ""
+
+
+SOCKETS = {"A": (400, 200, 300), "B": (600, 200, 300)}
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        lambda arm, capture, bounds: aj.identify(arm, capture, bounds),
+        lambda arm, capture, bounds: aj.identify(arm, capture, bounds, start=np.zeros(21)),
+        lambda arm, capture, bounds: aj.calibrate(arm, capture, bounds),
+        lambda arm, capture, bounds: aj.evaluate(arm, capture),
+        lambda arm, capture, bounds: aj.observability(arm, capture, bounds.space),
+        lambda arm, capture, bounds: aj.identify_many(arm, capture, bounds, start=np.zeros((2, 21))),
+        lambda arm, capture, bounds: aj.calibrate_many(arm, capture, bounds, start=np.zeros((2, 21))),
+        lambda arm, capture, bounds: aj.simulate(arm, SOCKETS),
+        lambda arm, capture, bounds: arm.position(np.zeros(6)),
+        lambda arm, capture, bounds: aj.perturbed_arm(bounds.space, length=1.0, angle=1e-3),
+        lambda arm, capture, bounds: aj.Arm(alpha=[0.0], a=[1.0], d=[1.0]),
+        lambda arm, capture, bounds: aj.Capture({"A": np.zeros((3, 6))}),
+        lambda arm, capture, bounds: aj.Noise(encoder_arcsec=1.0),
+        lambda arm, capture, bounds: aj.scale_from_lengths([1.0], 1.0),
+    ],
+)
+def test_refused(paper_arm, noisy_capture, entry):
+    bounds = aj.Bounds.around(paper_arm, aj.Parameters.free_of(paper_arm))
+    with jax.enable_x64(False), pytest.raises(aj.InputError, match=r"64-bit floats were turned off .*jax_enable_x64"):
+        entry(paper_arm, noisy_capture, bounds)
