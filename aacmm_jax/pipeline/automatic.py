@@ -19,6 +19,7 @@ from ..core.units import DEG
 from ..data.capture import Capture
 from ..data.recording import Recording
 from ..diagnostics.contradictions import remove_contradicting
+from ..diagnostics.equations import EXACT
 from ..diagnostics.usability import on_bounds
 from ..kinematics.arm import is_length
 from ..kinematics.parameters import ArmSpecification
@@ -105,6 +106,8 @@ def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -
     alone, or where there are too few poses to hold some out."""
     recording = record.recording
     nominal, capture = recording.nominal, recording.capture
+    if record.observed.rms < EXACT:  # simulated without noise
+        return record
     bounds = nominal.bounds()
 
     def compared(models: list[str]) -> ComparedModels:
@@ -121,7 +124,7 @@ def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -
             ladder = ComparedModels((*ladder.models, *added.models))
             if added.models[0].log_evidence < before.log_evidence + _WORTH:
                 break
-    except InputError:  # too few poses to hold some out
+    except (InputError, np.linalg.LinAlgError):  # too few poses to hold some out, or to fit that many functions
         return record
     chosen, plain = ladder.recommended, ladder.models[0]
     if chosen.model == _PLAIN or not chosen.result.converged:
