@@ -9,6 +9,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 from ..core.arguments import Range, checked_arguments, checked_fields
 from ..core.errors import InputError, nearest
 from ..core.text import number
+from ..uncertainty.coverage import COVERAGE_FACTOR
 
 Decision = Literal["fails", "undecided", "conforms"]
 DECISIONS: tuple[Decision, ...] = get_args(Decision)  # the worst first
@@ -23,7 +24,6 @@ RULES: dict[Rule, str] = {
     "iso-2013": "ISO 14253-1:2013, guard band U",
     "simple": "simple acceptance with a ratio of 4:1 (ASME B89.7.3.1)",
 }
-COVERAGE_FACTOR = 2.0  # of every U of a test value
 GUARD_FACTOR = 1.65  # one-sided, 95 %, of a normal distribution: the guard band of 2017 is this times u
 _PROBABILITY, _RATIO = 0.95, 4.0
 MOST, LEAST_DIVISOR = 1e6, 1e-3  # of a limit in mm, and of its divisor
@@ -56,15 +56,15 @@ class Limit(NamedTuple):
 def decide(error: float, limit: _Millimetres, expanded: _Millimetres = 0.0, rule: Rule = "iso-2017") -> Decision:
     """Decide whether an error keeps a limit.
 
-    With u = U / 2, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is within the limit, or
-    beyond it: guard bands of 1.65 u, and more where u is so large that both limits count. "iso-2013" has guard bands
-    of U. "simple" (ASME B89.7.3.1) compares the error alone, if the limit is at least four times U; otherwise it
-    leaves it undecided. The texts of ISO 14253-1 were not available.
+    With u = U / `COVERAGE_FACTOR`, "iso-2017" (ISO 14253-1:2017) asks for a probability of 95 % that the error is
+    within the limit, or beyond it: guard bands of 1.65 u, and more where u is so large that both limits count.
+    "iso-2013" has guard bands of U. "simple" (ASME B89.7.3.1) compares the error alone, if the limit is at least four
+    times U; otherwise it leaves it undecided. The texts of ISO 14253-1 were not available.
 
     Args:
         error: Test value, mm.
         limit: Maximum permissible error (MPE), mm.
-        expanded: Expanded uncertainty U of the test value (coverage factor 2), mm.
+        expanded: Expanded uncertainty U of the test value, u times `COVERAGE_FACTOR`, mm.
         rule: A key of `RULES`.
 
     Example:
@@ -214,13 +214,15 @@ def read_expansions(texts: Sequence[str]) -> dict[str, Expansion]:
             values = []
         if match is None or len(values) != 4:
             raise InputError(
-                f"--expansion '{text}' is not artefact=C,u,T,u or arm=C,u,T,u (coefficient C in 1e-6/K, temperature T "
-                "in degrees Celsius, each with its u); for example artefact=11.5,1,20.8,0.2."
+                f"--expansion '{text}' is not of the form artefact=C,u,T,u or arm=C,u,T,u (coefficient C in 1e-6/K, "
+                "temperature T in degrees Celsius, each with its u); give, for example, artefact=11.5,1,20.8,0.2."
             )
         if 0 < abs(values[0]) < _SMALLEST_GIVEN:
-            raise InputError(f"--expansion '{text}' gives the coefficient in 1/K; give it in 1e-6/K (steel: 11.5).")
+            raise InputError(
+                f"--expansion '{text}' gives the coefficient in 1/K; give the coefficient in 1e-6/K (steel: 11.5)."
+            )
         if match["body"] in expansions:
-            raise InputError(f"--expansion gives two expansions for the {match['body']}; give one.")
+            raise InputError(f"--expansion gives two expansions for the {match['body']}; give one expansion.")
         body = Expansion(1e-6 * values[0], 1e-6 * values[1], *values[2:])
         expansions[match["body"]] = checked_fields(body, f"the {match['body']}")
     return expansions

@@ -249,12 +249,14 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         lambda m, needed: min(geometry.bar_positions(m).readings.tolist(), default=0),
     ),
     "positions": (
-        "{1} positions of the bars that differ by at least 10 degrees in direction or 5 % of the range in location",
+        "{1} positions of the bars that differ by at least 10 degrees in direction or by at least 5 % of the range in "
+        "location",
         "{1} different positions are required ({0} given).",
         lambda m, needed: sum(bar.distinct(m.size) for bar in _bars(m)),
     ),
     "positions of each": (
-        "{1} positions of every length that differ by at least 10 degrees in direction or 5 % of the range in location",
+        "{1} positions of every length that differ by at least 10 degrees in direction or by at least 5 % of the "
+        "range in location",
         "{1} different positions of every length are required (one length has {0}).",
         lambda m, needed: min(bar.distinct(m.size) for bar in _bars(m)),
     ),
@@ -274,7 +276,7 @@ _KINDS: dict[str, tuple[str, str, Callable[..., str | int | None]]] = {
         lambda m, poses: None if any(len(points) >= poses for points in m.tested.values()) else "",
     ),
     "range": (
-        "the measuring range is the one that the maker states",
+        "the measuring range is stated by the maker",
         "The measuring range stated by the maker is missing (measuring_range).",
         lambda m: "" if m.measuring_range is None else None,
     ),
@@ -339,7 +341,7 @@ TESTS = (
         "single-point articulation",
         metrics.articulation,
         _need("zones", _ASME),
-        _need("elbow", ("FARO's public instructions swing the elbow from side to side", "own reading")),
+        _need("elbow", ("in FARO's public instructions, the elbow is swung from side to side", "own reading")),
         _RANGE,
     ),
     _test(

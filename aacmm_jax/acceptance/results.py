@@ -10,7 +10,8 @@ from jaxtyping import Float
 from ..data.capture import ReferenceLength
 from ..data.recording import ProbedSphere
 from ..kinematics.workspace import Reach
-from .judgement import COVERAGE_FACTOR, DECISIONS, Decision, Rule, worst
+from ..uncertainty.coverage import COVERAGE_FACTOR
+from .judgement import DECISIONS, Decision, Rule, worst
 from .standards import EDITIONS, SYMBOLS
 
 # Metrics by name: what each of them is.
@@ -40,7 +41,7 @@ class MetricValue(NamedTuple):
 
     where: str
     value: float
-    expanded: float  # expanded uncertainty U of the value, coverage factor 2
+    expanded: float  # expanded uncertainty U of the value, with `COVERAGE_FACTOR`
     length: float | None = None  # the calibrated length that was measured, if any: a limit may grow with it
     limit: float | None = None  # MPE
     decision: Decision | None = None  # None without a limit

@@ -215,7 +215,7 @@ def _laid_out(
             if given is not None:
                 raise InputError(
                     f"a Bounds object and {what} are both given, but a Bounds object already contains {what}; omit "
-                    "one of the two, and give a start by its name (start=...)."
+                    "one of the two, and give a start by its name: start=..."
                 )
         lower, upper, space = lower.lower, lower.upper, lower.space
     elif upper is None:

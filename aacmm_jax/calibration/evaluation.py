@@ -22,6 +22,7 @@ from ..core.numpy_or_jax import AnyArray, compiled, namespace, to_jax, to_numpy
 from ..data.capture import Capture, ReferenceLength
 from ..data.noise import Noise
 from ..data.observations.held import position_of
+from ..data.observations.observation import OTHER_UNITS
 from ..kinematics.arm import Arm, check_columns
 from ..kinematics.parameters import Bounds, Parameters
 from ..model.observed import Observed
@@ -31,18 +32,18 @@ from ..uncertainty.linearisation import Linearisation
 from .solve import minimised
 from .task import Task, begin, whitening_at
 
-POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
-
 
 class ObservedEvaluation(eqx.Module):
     """How the observations of a capture agree with one arm; in their order, sockets first."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     kinds: tuple[str, ...] = eqx.field(static=True)
-    residuals: tuple[Float[AnyArray, "*batch _ _"], ...]  # rows and poses of each, mm; of orientations rad
+    residuals: tuple[Float[AnyArray, "*batch _ _"], ...]  # rows and poses of each, in the units of the rows of its kind
+    distances: tuple[Float[AnyArray, "*batch _"], ...]  # of the poses of each from the geometry, mm
     normalised: tuple[Float[AnyArray, "*batch _ _"], ...]  # the same in standard deviations, uncorrelated
     rms: Float[AnyArray, "*batch k"]  # root mean square distance of a pose from the geometry, mm
-    rms_angle: Float[AnyArray, "*batch k"]  # root mean square angle, rad; NaN where no orientation was measured
+    rms_angle: Float[AnyArray, "*batch k"]  # of what is measured in rad: root mean square of a pose's residuals, or NaN
+    rms_px: Float[AnyArray, "*batch k"]  # of what is measured in px
     reduced_chi: Float[AnyArray, "*batch k"]  # root mean square in standard deviations of a residual
     sigma: Float[AnyArray, "*batch"]  # standard deviation of a tip coordinate by these residuals, mm
     geometry: dict[str, Float[AnyArray, "*batch _"]]  # part of the unknown geometry -> its numbers, mm and rad
@@ -115,8 +116,7 @@ def evaluate(
     if given and not kept:
         first = next(iter(given))
         raise InputError(
-            f"no part of the given geometry (such as '{first}') belongs to this capture"
-            f"{nearest(first, observed.blocks)}"
+            f"the capture has no '{first}' or other part of the given geometry{nearest(first, observed.blocks)}"
         )
     whole = bool(capture.observations) or bool(kept) or noise is not None
     subject = observed, *to_numpy((capture.lengths, kept, noise))
@@ -165,13 +165,20 @@ def _evaluated(
     if whole:
         parts, normalised = observed.split(geometry), linear.white()
         residuals = observed.by_observation([part.values for part in linear.point.rows])
+        squares = observed.by_observation(observed.squared_distances(linear.point.rows))
+        by_unit = {unit: [] for unit in OTHER_UNITS}
+        for observation, values in zip(observed.observations, residuals, strict=True):
+            for unit, rows in by_unit.items():
+                rows.append(_rms(xp, values[observation.lengths :] if observation.other_unit == unit else values[:0]))
         described = ObservedEvaluation(
             names=tuple(observation.name for observation in observed.observations),
             kinds=tuple(observation.kind for observation in observed.observations),
             residuals=tuple(residuals),
+            distances=tuple(map(xp.sqrt, squares)),
             normalised=tuple(normalised),
-            rms=xp.stack([_rms(xp, values[:POSITION_ROWS]) for values in residuals]),
-            rms_angle=xp.stack([_rms(xp, values[POSITION_ROWS:]) for values in residuals]),
+            rms=xp.stack([xp.sqrt(xp.mean(square)) for square in squares]),
+            rms_angle=xp.stack(by_unit["rad"]),
+            rms_px=xp.stack(by_unit["px"]),
             reduced_chi=xp.stack([xp.sqrt(xp.mean(white**2)) for white in normalised]),
             sigma=fitted.sigma,
             geometry={name: parts[name] for name in observed.names},

@@ -20,15 +20,16 @@ from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import common_labels
 from ..data.capture import Capture
 from ..data.observations.held import position_of
+from ..data.observations.observation import OTHER_UNITS
 from ..model.elimination import flat, followed
 from ..model.observed import Observed, ends_of
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import LEVEL
+from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows
 from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
-from .evaluation import POSITION_ROWS, fit_geometry
+from .evaluation import fit_geometry
 from .redrawn import variances_in_places
 from .task import without_lengths
 
@@ -48,7 +49,8 @@ class Agreement(NamedTuple):
     degrees_of_freedom: float  # effective, of the predicted sum of squares
     noise_degrees_of_freedom: float  # of what the prediction rests on; infinite where the noise was given
     reduced_chi: float = math.nan  # root mean square of a residual in standard deviations of the noise alone
-    rms_angle: float = math.nan  # rad, where orientations were measured
+    rms_angle: float = math.nan  # of residuals in rad, where there are any
+    rms_px: float = math.nan  # in px
 
     @property
     def probability(self) -> float:
@@ -64,8 +66,8 @@ class _Part(NamedTuple):
 
     poses: int  # 0 for the only pose of a socket, which shows no scatter
     squares: float  # mm^2
-    turned: int  # poses with an orientation
-    angles: float  # rad^2
+    others: Float[np.ndarray, " 2"]  # numbers of poses with residuals in each of `OTHER_UNITS`
+    other_squares: Float[np.ndarray, " 2"]  # of these residuals, in these units
     normalised: float  # of the residuals in standard deviations
     rows: int  # of them
     trace: float
@@ -103,6 +105,8 @@ class UnseenErrors(NamedTuple):
         if 0 < whole.trace < math.inf:
             both = whole.shared @ self.common
             effective = whole.trace**2 / (whole.square + float(np.sum(both * both.T)))
+        others = zip(whole.other_squares, whole.others, strict=True)
+        rms_angle, rms_px = (math.sqrt(square / count) if count else math.nan for square, count in others)
         return Agreement(
             count=whole.poses,
             rms=math.sqrt(whole.squares / whole.poses),
@@ -110,7 +114,8 @@ class UnseenErrors(NamedTuple):
             degrees_of_freedom=effective,
             noise_degrees_of_freedom=self.noise_degrees_of_freedom,
             reduced_chi=math.sqrt(whole.normalised / whole.rows),
-            rms_angle=math.sqrt(whole.angles / whole.turned) if whole.turned else math.nan,
+            rms_angle=rms_angle,
+            rms_px=rms_px,
         )
 
     def of_lengths(self, which: Iterable[int] | None = None) -> Agreement:
@@ -217,7 +222,10 @@ def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
     values = np.asarray(part.values)
     r, m = values.shape
     private, joined = (np.moveaxis(np.asarray(rows[number]), -1, 0) for rows in (problem.private, problem.joined))
-    to_mm = np.linalg.inv(np.asarray(part.root))[:, :POSITION_ROWS]
+    observation, by_tip = part.observation, np.asarray(part.by_tip)
+    to_mm = np.moveaxis(np.linalg.inv(np.asarray(part.root)), 0, -1)
+    to_mm = np.moveaxis(np.asarray(observation.in_mm(to_mm, by_tip)), -1, 0)
+    has_unit = np.array([unit == observation.other_unit for unit in OTHER_UNITS], dtype=float)
     weights = np.einsum("mca,mcb->mab", to_mm, to_mm)
     common, p = problem.common, len(problem.uncertainty.space.names)
     by_common = np.einsum("mwa,wv->mva", joined, common)
@@ -229,10 +237,10 @@ def _part_of(problem: _Unseen, number: int, part: ObservationRows) -> _Part:
     square = np.sum(weights**2) + 2 * np.einsum("mab,mbc,mca->", weights, weights, errors)
     square = square + np.sum(alone * alone.T) - 2 * np.sum((crossed @ common) * crossed)
     return _Part(
-        poses=0 if part.observation.kind == "socket" and m == 1 else m,
-        squares=float(np.sum(values[:POSITION_ROWS] ** 2)),
-        turned=m if r > POSITION_ROWS else 0,
-        angles=float(np.sum(values[POSITION_ROWS:] ** 2)),
+        poses=0 if observation.kind == "socket" and m == 1 else m,
+        squares=float(np.sum(observation.in_mm(values, by_tip) ** 2)),
+        others=m * has_unit,
+        other_squares=np.sum(values[observation.lengths :] ** 2) * has_unit,
         normalised=float(np.sum(np.asarray(part.white) ** 2)),
         rows=r * m,
         trace=math.inf if is_open else float(np.einsum("maa->", weights) + np.sum(weights * errors)),

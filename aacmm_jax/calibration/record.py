@@ -47,7 +47,8 @@ class OtherPoses(NamedTuple):
     names: tuple[str, ...]  # sockets and other observations
     poses: np.ndarray
     rms: np.ndarray  # mm
-    rms_angle: np.ndarray  # rad; NaN where no orientation was measured
+    rms_angle: np.ndarray  # of residuals in rad; NaN where there are none
+    rms_px: np.ndarray | None = None  # in px; None where no observation has any
 
     @property
     def rms_of_all(self) -> float:
@@ -228,11 +229,11 @@ def record_of(
         geometry = calibration.observed.geometry if others.observations else None
         evaluation = evaluate(calibration.arm, others, geometry=geometry)
         poses = np.array([*others.sizes, *(observation.q.shape[0] for observation in others.observations)])
-        rms, rms_angle = evaluation.repeatability.socket_rms, np.full(len(poses), np.nan)
+        rms, rms_angle, rms_px = evaluation.repeatability.socket_rms, np.full(len(poses), np.nan), None
         if evaluation.observed is not None:
-            rms, rms_angle = evaluation.observed.rms, evaluation.observed.rms_angle
-        names = tuple(names_in(others))
-        tested = OtherPoses(names, poses, np.asarray(rms), np.asarray(rms_angle))
+            rms, rms_angle, rms_px = (getattr(evaluation.observed, name) for name in ("rms", "rms_angle", "rms_px"))
+            rms_px = None if np.all(np.isnan(rms_px)) else np.asarray(rms_px)
+        tested = OtherPoses(tuple(names_in(others)), poses, np.asarray(rms), np.asarray(rms_angle), rms_px)
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),

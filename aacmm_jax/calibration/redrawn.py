@@ -299,7 +299,7 @@ class ObservedTruth(NamedTuple):
         """
         if self.reading.max() + 1 < len(self.reading):
             raise InputError(
-                "some poses have exactly the same readings (two targets seen at the same time, for example), so "
+                "some poses have exactly the same readings (two targets measured at the same time, for example), so "
                 "poses cannot be drawn independently; use monte_carlo."
             )
         values = self.values(count, random, {name: value for name, (value, _) in self.observed.certified().items()})

@@ -19,7 +19,7 @@ from ..kinematics.arm import Arm
 from ..kinematics.parameters import Parameters
 from ..kinematics.priors import Prior
 from ..model.loss_names import LossName
-from ..uncertainty.coverage_level import LEVEL, in_percent
+from ..uncertainty.coverage import LEVEL, in_percent
 from ..uncertainty.volume import default_length, sample_lengths
 from .batch import calibrate_many
 from .record import uncertainty_of

@@ -219,7 +219,7 @@ def _metrics(
     total = sum(xp.sum(square) for square in squares)
     degrees_of_freedom = xp.maximum(xp.asarray(observed.equations - spent, dtype=float), 1.0)
     before_and_after = (
-        xp.sqrt(observed.mean_by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in point.rows]))
+        xp.sqrt(observed.mean_by_observation(observed.squared_distances(point.rows)))
         for point in (before.point, linear.point)
     )
     parts = observed.split(linear.z[len(linear.space.names) :])

@@ -209,7 +209,7 @@ def against_division(calibration: Calibration) -> tuple[str, ...]:
     names = [f"{space.names[i]} ({'upper' if above[i] else 'lower'} bound)" for i in concerned]
     if anchor.partners is None:
         names += [f"{name} (fixed length)" for name in fixed_lengths(space.base, space)]
-        names += [f"q_{joint} (slide)" for joint in space.base.prismatic]
+        names += [f"q_{joint} (prismatic joint)" for joint in space.base.prismatic]
     return tuple(names)
 
 
@@ -291,14 +291,14 @@ def _divided_metrics(solution: Solution, measured: MeasuredScale, linear: Linear
             mixed = with_k[number][component, first : first + 3][:, None] * by_k[None, :] / k
             matrix = matrix / k**2 - mixed - mixed.T + variance * by_k[:, None] * by_k[None, :]
         covariances[name] = matrix
-    squares = observed.by_observation([xp.sum(rows.values[:3] ** 2, axis=0) for rows in linear.point.rows])
-    white = [xp.sum(rows**2, axis=0) for rows in linear.white()]
+    squares = observed.by_observation(observed.squared_distances(linear.point.rows))
+    white = [(xp.sum(rows**2, axis=0), rows.shape[0]) for rows in linear.white()]
     return dataclasses.replace(
         metrics,
         geometry={name: parts[name] for name in observed.names},
         geometry_covariance=covariances,
         rms_after=xp.stack([xp.sqrt(xp.mean(square)) for square in squares]),
-        reduced_chi=xp.stack([xp.sqrt(xp.mean(square) / 3) for square in white]),
+        reduced_chi=xp.stack([xp.sqrt(xp.mean(square) / count) for square, count in white]),
     )
 
 

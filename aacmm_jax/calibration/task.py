@@ -239,8 +239,8 @@ def check_observed(observed: Observed, space: Parameters, vector: Float[AnyArray
         axes = [np.asarray(forward.frame[i])[:, np.concatenate(parts)] for i in (0, 2)]
         if max(np.ptp(axis, axis=1).max() for axis in axes) < _LEAST_TURN:
             raise InputError(
-                f"target '{target}' was seen in only one orientation of the last frame, so the position of the "
-                "target cannot be distinguished from that of the instrument; record poses with the wrist turned."
+                f"target '{target}' was measured in only one orientation of the last frame, so the position of the "
+                "target cannot be distinguished from that of the instrument; record poses in other orientations."
             )
     geometry = len(observed.steps)
     if observed.equations < count + geometry:
@@ -291,7 +291,7 @@ def begin(task: Task, near: Float[AnyArray, " p"] | None = None) -> Begun:
 
     z = unknowns(task.start[task.free])
     point = rows_at(space, observed, z)
-    before = state = state_at(task, space, z, _root_mean_square(point.rows), point=point)
+    before = state = state_at(task, space, z, _root_mean_square(task.observed, point.rows), point=point)
     if near is not None:
         z = unknowns(xp.clip(near, task.bounds.lower, task.bounds.upper)[task.free])
         state = state_at(task, space, z)
@@ -349,14 +349,15 @@ def state_at(
 def state_after(task: Task, begun: Begun, z: Float[AnyArray, " z"], point: PointRows, last: bool) -> State:
     """At the solution of a least squares; where the noise is given, only the last scatter matters, and its iteration
     costs as much as a few steps."""
-    sigma = _root_mean_square(point.rows) if task.noise is not None and not last else None
+    sigma = _root_mean_square(task.observed, point.rows) if task.noise is not None and not last else None
     return state_at(task, begun.space, z, sigma, point=point)
 
 
-def _root_mean_square(rows: list[Rows]) -> Any:
+def _root_mean_square(observed: Observed, rows: list[Rows]) -> Any:
     """Of the residuals in mm, for the first weights."""
-    xp = namespace([part.values for part in rows])
-    return xp.sqrt(xp.mean(xp.concatenate([xp.reshape(part.values[:3], (-1,)) for part in rows]) ** 2)) + 1e-9
+    xp, pairs = namespace([part.values for part in rows]), zip(observed.stacks, rows, strict=True)
+    in_mm = [stack.in_mm(part.values, part.by_tip) for stack, part in pairs]
+    return xp.sqrt(xp.mean(xp.concatenate([xp.reshape(values, (-1,)) for values in in_mm]) ** 2)) + 1e-9
 
 
 def whitening_at(task: Task, state: State, prior: PriorRows | None = None) -> Whitening:

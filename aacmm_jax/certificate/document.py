@@ -5,7 +5,7 @@ import uuid
 from collections.abc import Iterator, Sequence
 from xml.etree.ElementTree import Element
 
-from ..acceptance.judgement import COVERAGE_FACTOR, RULES, worst
+from ..acceptance.judgement import RULES, worst
 from ..acceptance.record import EvaluationRecord, same_arm
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
 from ..calibration.record import REPEATABILITY, CalibrationRecord
@@ -14,6 +14,7 @@ from ..diagnostics.contradictions import LEFT_OUT
 from ..diagnostics.findings import findings_of
 from ..files.administrative_data import NOT_STATED, AdministrativeData, check_conformity
 from ..summaries.observations import scale_sources
+from ..uncertainty.coverage import COVERAGE_FACTOR
 from . import xml_elements as xml
 from .measurement_results import results_of, uncertainty_statement
 from .xml_elements import MILLIMETRE, element, english, equipment_quantity, named, optional, real, text
@@ -294,7 +295,7 @@ def _value(test: AcceptanceTest, metric: Metric, name: str, value: MetricValue, 
             f"Conformity of {test.symbol(metric)}",
             element("norm", RULES[test.rule]),
             english(
-                "declaration", f"Decision from comparing |value| with the maximum permissible error: {value.decision}."
+                "declaration", f"Decision, from comparing |value| with the maximum permissible error: {value.decision}."
             ),
             element("conformity", _conformity(value)),
             element("data", limit),

@@ -17,7 +17,7 @@ from ..kinematics.parameters import Parameters
 from ..summaries.calibration import metrics_by_socket_and_length, prior_rows, prior_sentence
 from ..summaries.observations import less_weight
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import LEVEL, LEVEL_IN_PERCENT
+from ..uncertainty.coverage import LEVEL, LEVEL_IN_PERCENT
 from . import xml_elements as xml
 from .xml_elements import MILLIMETRE, ONE, RADIAN, element, english, named, real, text
 
@@ -35,7 +35,19 @@ _FIXED_SCALE = (
 )
 _DECIMALS = {MILLIMETRE: 5, ONE: 3, RADIAN: 8}  # of what has no uncertainty
 _SIMPLE, _SQUARED = (MILLIMETRE, RADIAN), r"\tothe{2}"  # units that are squared as one
-_D_SI = {"mm": MILLIMETRE, "rad": RADIAN, "m": r"\metre", "kN": r"\kilo\newton", "K": r"\kelvin"}
+_D_SI = {
+    "mm": MILLIMETRE,
+    "rad": RADIAN,
+    "m": r"\metre",
+    "kN": r"\kilo\newton",
+    "K": r"\kelvin",
+    "px": ONE,
+}  # D-SI has no pixel
+_MEASURED = {
+    "mm": "standard uncertainty of a measured coordinate or distance",
+    "rad": "standard uncertainty of a measured angle or orientation about each axis",
+    "px": "standard uncertainty of a measured image coordinate, in pixels",
+}
 
 
 def results_of(record: CalibrationRecord, given: AdministrativeData, command: str) -> Iterator[Element]:
@@ -115,8 +127,8 @@ def _methods(record: CalibrationRecord, residuals: tuple[ObservationResiduals, .
     if record.removed:
         groups = ", ".join(f"{removed.kind} {removed.group}" for removed in record.removed)
         words += (
-            f" These data were left out because, by an F test, they contradict the rest: {groups}; see the statements "
-            "on data left out."
+            f" The following data were left out, because an F test shows that they contradict the rest: {groups}; see "
+            "the statements on data left out."
         )
     statement = uncertainty_statement(record)
     return element(
@@ -148,11 +160,7 @@ def _equipment(
     for part in residuals:
         observation, certified = part.observation, list(certified_quantities(part.observation))
         # As they were given.
-        stated = {
-            "standard uncertainty of a measured coordinate or distance": (part.u or None, "mm"),
-            "standard uncertainty of a measured orientation about each axis": (part.u_angle, "rad"),
-        }
-        measured = [Quantity(what, np.array([u]), unit) for what, (u, unit) in stated.items() if u is not None]
+        measured = [Quantity(_MEASURED[unit], np.array([u]), unit) for unit, u in part.u.items() if u]
         key = tuple((quantity.says, *np.asarray(quantity.values).tolist(), quantity.u) for quantity in certified)
         if certified or measured:
             where = (observation.kind, *(key if certified and not measured else (observation.name,)))
@@ -253,8 +261,7 @@ def _observation(number: int, part: ObservationResiduals, distances: np.ndarray,
     values = [("RMS residual", rms(part.distance if calibrated else distances), MILLIMETRE)]
     if calibrated:
         values.append(("RMS residual in standard deviations", rms(part.normalised), ONE))
-        if part.angle is not None:
-            values.append(("RMS residual of the orientation", rms(part.angle), RADIAN))
+        values += [(f"RMS residual in {unit}", rms(sizes), _in_d_si(unit)) for unit, sizes in part.other.items()]
     target = f", tip: {part.observation.target}" if part.observation.target else ""
     return element(
         "list",

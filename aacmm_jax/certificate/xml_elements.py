@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element
 from ..core.errors import InputError
 from ..core.text import number, quoted
 from ..files.administrative_data import NOT_STATED, CalibratedItem, Contact, Reference, held_by_xml
-from ..uncertainty.coverage_level import LEVEL
+from ..uncertainty.coverage import LEVEL
 
 DCC, SI, XSI = "https://ptb.de/dcc", "https://ptb.de/si", "http://www.w3.org/2001/XMLSchema-instance"
 MILLIMETRE, RADIAN, ONE, CELSIUS = r"\milli\metre", r"\radian", r"\one", r"\degreecelsius"

@@ -32,15 +32,7 @@ def main() -> None:
     end = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)  # what follows is no option
     debug, overwrite = (option in sys.argv[:end] for option in ("--debug", "--overwrite"))
     sys.argv = [word for i, word in enumerate(sys.argv) if i >= end or word not in ("--debug", "--overwrite")]
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal's encoding does not have
-    # Tracing makes hundreds of thousands of objects that live until the process ends. Looking for garbage among them
-    # would take a sixth of the time of a short command.
-    gc.set_threshold(500_000, 20, 20)
-    # The matrices of one calibration are so small that threads of NumPy's BLAS wait for each other most of the time: a
-    # plan took twice the CPU time. It reads this once, when NumPy is imported.
-    if "OMP_NUM_THREADS" not in os.environ:
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _prepare_process()
     try:
         from ..core.errors import InputError
         from ..files.outputs import asking
@@ -94,6 +86,18 @@ def main() -> None:
         )
     finally:
         gc.freeze()
+
+
+def _prepare_process() -> None:
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names that the terminal's encoding does not have
+    # Tracing makes hundreds of thousands of objects that live until the process ends. Looking for garbage among them
+    # would take a sixth of the time of a short command.
+    gc.set_threshold(500_000, 20, 20)
+    # The matrices of one calibration are so small that threads of NumPy's BLAS wait for each other most of the time: a
+    # plan took twice the CPU time. It reads this once, when NumPy is imported.
+    if "OMP_NUM_THREADS" not in os.environ:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _fail_without_jax() -> None:

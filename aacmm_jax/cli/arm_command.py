@@ -13,10 +13,10 @@ from ..core.text import pluralise
 from ..files.inputs import InputFile
 from ..files.outputs import together, write_text
 from ..summaries.tables import Styled, View, formatted, listed, number, warnings_of, written_of
+from ..uncertainty.coverage import COVERAGE_FACTOR, K_IN_WORDS
 from . import options, views
 from .app import command, show_summary, with_spinner
 from .options import argument, numbers_option, option
-from .plan_commands import assumed_noise
 
 _CAPTURES = (".toml", ".h5")  # others are tables
 
@@ -112,7 +112,7 @@ def arm(
     specification = specification if model is None else with_model(specification, model)
     frame = first_frame(specification)
     with together(figure):
-        usual = assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)
+        usual = options.assumed_noise(file, {"base": base, "tip": tip}, encoder_arcsec, seating_mm)
         look = summaries.arm_survey.arm_survey
         summary = with_spinner("Analysing the arm", lambda: look(specification, usual, base=frame, model=model))
         if frame is not None:
@@ -294,10 +294,10 @@ def _determined(summary: dict[str, Any]) -> View:
 def _needed(arm_class: dict[str, Any]) -> View:
     """What a first capture with so many poses reaches."""
     title = "Contribution of the calibration (from random poses) to U of a measured length"
-    yield ["\n", Styled(title), f" [mm, k = 2]: {arm_class['class']}"]
+    yield ["\n", Styled(title), f" [mm, {K_IN_WORDS}]: {arm_class['class']}"]
     columns: dict[str, Any] = {"data": "data"}
     for count in arm_class["rows"][0]["u_mm"]:
-        columns[f"{count} poses"] = lambda row, count=count: row["u_mm"][count] and 2 * row["u_mm"][count]
+        columns[f"{count} poses"] = lambda row, count=count: row["u_mm"][count] and COVERAGE_FACTOR * row["u_mm"][count]
     columns["enough"] = lambda row: row["enough_poses"] or None
     yield listed("", arm_class["rows"], columns)
     yield (
@@ -309,5 +309,5 @@ def _needed(arm_class: dict[str, Any]) -> View:
     )
     yield (
         "Enough: the smallest number of poses for which this contribution is smaller than the contribution of the "
-        f"reading noise, {formatted(2 * arm_class['u_reading_mm'])} mm."
+        f"reading noise, {formatted(COVERAGE_FACTOR * arm_class['u_reading_mm'])} mm."
     )

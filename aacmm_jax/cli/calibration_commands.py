@@ -14,7 +14,7 @@ from ..files.hdf5 import read_tables
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import reading, together, write_text
 from ..model.loss_names import LossName
-from ..uncertainty.coverage_level import LEVEL
+from ..uncertainty.coverage import LEVEL
 from . import options, views
 from .app import command, show_summary, with_spinner
 from .options import argument, flag, names_option, option, output, seed

@@ -52,10 +52,10 @@ def simulate(
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     encoder_arcsec: float = options.ENCODER_NOISE,
-    resolution_arcsec: float = option("Round joint readings to multiples of this.", default=0.0, min=0),
+    resolution_arcsec: float = option("Round joint readings to multiples of this value.", default=0.0, min=0),
     linear_encoder_mm: float | None = options.LINEAR_ENCODER_NOISE,
     linear_resolution_mm: float = option(
-        "Round readings of prismatic joints to multiples of this.", default=0.0, min=0
+        "Round readings of prismatic joints to multiples of this value.", default=0.0, min=0
     ),
     seating_mm: float = options.SEATING_NOISE,
     temperature_c: str | None = option(
@@ -69,12 +69,14 @@ def simulate(
         "ARM",
     ),
     deviate_length_mm: float = option(
-        "Simulate with a random true arm whose lengths differ from the nominal ones by at most this.",
+        "Simulate with a random true arm whose lengths differ from the nominal lengths by at most this value.",
         default=0.0,
         min=0,
     ),
     deviate_angle_deg: float = option(
-        "Simulate with a random true arm whose angles differ from the nominal ones by at most this.", default=0.0, min=0
+        "Simulate with a random true arm whose angles differ from the nominal angles by at most this value.",
+        default=0.0,
+        min=0,
     ),
     acceptance: Literal["asme", "iso"] | None = option(
         "Simulate the acceptance test to ASME B89.4.22 or ISO 10360-12 that 'aacmm plan --acceptance' plans, instead "
@@ -135,7 +137,7 @@ def _poses_option(texts: Sequence[str], sockets: dict[str, Any], usual: Any) -> 
 @command("aacmm import capture.toml -o capture.h5", "aacmm import capture.toml --check", name="import")
 def import_(
     manifest: Path = argument(
-        "Manifest: names the files with the poses and measured values, and states their columns and units.",
+        "Manifest (TOML) that names the files with the poses and measured values, and states their columns and units.",
         "MANIFEST.toml",
     ),
     output: Path | None = output("Capture to write (HDF5).", "FILE.h5", None),

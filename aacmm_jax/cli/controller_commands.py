@@ -143,8 +143,8 @@ def _urdf(record: Any, specification: Any) -> tuple[str, list[str]]:
     return result.text, [
         f"Joints whose origin changed: {shorten(result.changed, 12) or 'none'}.",
         *(note[0].upper() + note[1:] for note in result.notes),
-        "The base, and the position of each frame along its joint axis and its angle about this axis, are left "
-        "unchanged as far as possible, because measurements of the tip do not determine them.",
+        "Left unchanged as far as possible, because measurements of the tip do not determine them: the base, and the "
+        "position of each frame along its joint axis and its angle about this axis.",
     ]
 
 
@@ -206,8 +206,8 @@ def correct(
         "Q1,Q2,...",
     ),
     probe: str | None = option(
-        "Position (mm) of the tool tip in the last frame, both of the nominal and of the calibrated arm. Default: the "
-        "nominal and the calibrated position of the probe, whose difference is then corrected too.",
+        "Position (mm) of the tool tip in the last frame, the same for the nominal and the calibrated arm. Default: "
+        "the probe of each arm; the difference between the two probes is then corrected too.",
         "X,Y,Z",
     ),
     temperature: float | None = option(
@@ -273,7 +273,7 @@ def correct(
 def _at_temperature(commanded: Any, calibrated: Any, temperature: float | None) -> np.ndarray:
     """The readings, with the temperature of an arm that expands."""
     from ..data.capture_data import check_temperatures
-    from ..files.manifest_rows import with_temperature
+    from ..files.manifest_readings import with_temperature
     from ..kinematics.arm import correction_names
     from ..kinematics.corrections import Expansion
 

@@ -2,12 +2,13 @@
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
 
+from .. import data, files
 from ..core.errors import InputError
 from ..core.jax_setup import LARGEST_INTEGER
 from ..core.text import is_control, number, quoted
@@ -143,3 +144,17 @@ def length_option(text: str) -> tuple:
     if len(names) not in (2, 3) or not all(names[:2]):
         bad_option("--length", text, form)
     return (*names[:2], *(_numbers("--length", text, u, form, 1)[0] for u in names[2:]))
+
+
+def assumed_noise(
+    arm: str, links: Mapping[str, Any], encoder: float | None, seating: float | None, linear: float | None = None
+) -> Any:
+    """The noise of an arm that has not been calibrated (`ArmNoise`): what options give, arcsec and mm, else what its
+    file states, else that of its class."""
+    assumed = files.load_noise(arm, **links)
+    stated = data.Noise(
+        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
+        seating=assumed.noise.seating if seating is None else seating,
+        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
+    )
+    return assumed._replace(noise=stated, source=assumed.source if encoder is None else "as given")

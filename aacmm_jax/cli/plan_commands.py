@@ -9,7 +9,7 @@ from typing import Any, Literal
 import typer
 
 from .. import acceptance as acceptance_tests
-from .. import data, files, kinematics, planning, summaries
+from .. import files, kinematics, planning, summaries
 from ..core.errors import InputError
 from ..core.text import listed, number
 from ..core.units import DEG
@@ -51,7 +51,7 @@ def plan(
     ),
     poses: int = option("Total number of poses.", "N", default=30, min=2, max=10_000),
     sockets: int | None = option(
-        "Number of sockets whose positions are planned, in pairs at the ends of the reference length. Default: "
+        "Number of sockets to plan; the sockets are placed in pairs, at the ends of the reference length. Default: "
         f"{_SOCKETS}.",
         "N",
         min=1,
@@ -62,12 +62,11 @@ def plan(
     ),
     length: list[str] | None = options.REFERENCE_LENGTHS,
     length_mm: str = option(
-        "Size of the reference length to be placed by the plan; if a range is given, the best size in this range is "
-        "chosen.",
+        "Value (mm) of the reference length to plan for; if a range is given, the best value in the range is chosen.",
         "L[:M]",
         default="500",
     ),
-    u_mm: float = option("Standard uncertainty of the reference length of --length-mm.", default=0.002),
+    u_mm: float = option("Standard uncertainty of the reference length given with --length-mm.", default=0.002),
     model: str | None = option(
         "Model of non-geometric joint errors, as for calibrate --model. The poses are chosen to determine its "
         "coefficients too.",
@@ -248,7 +247,7 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
     cell, radius, axis = given["cell"], given["link_radius_mm"], given["tool_axis"]
     with together(given["output"], given["manifest"]):
         things = None if given["kit"] is None else files.read_kit(given["kit"])
-        noise = assumed_noise(
+        noise = options.assumed_noise(
             given["arm"], links, given["encoder_arcsec"], given["seating_mm"], given["linear_encoder_mm"]
         )
         to_check = given["collisions"] or cell is not None or radius is not None
@@ -286,20 +285,6 @@ def _planned(specification: Any, given: Mapping[str, Any], links: Mapping[str, A
         placed = {"sockets": points or count, "length": _range(given["length_mm"]), "u": given["u_mm"]}
         placed |= {"lengths": [options.length_option(text) for text in given["length"] or ()], "cone": cones}
         return planning.plan(specification.arm, **placed, **settings), stated
-
-
-def assumed_noise(
-    arm: str, links: Mapping[str, Any], encoder: float | None, seating: float | None, linear: float | None = None
-) -> Any:
-    """The noise of an arm that has not been calibrated (`ArmNoise`): what options give, arcsec and mm, else what its
-    file states, else that of its class."""
-    assumed = files.load_noise(arm, **links)
-    stated = data.Noise(
-        encoder_arcsec=assumed.noise.encoder_arcsec if encoder is None else encoder,
-        seating=assumed.noise.seating if seating is None else seating,
-        linear_encoder=assumed.noise.linear_encoder if linear is None else linear,
-    )
-    return assumed._replace(noise=stated, source=assumed.source if encoder is None else "as given")
 
 
 def _cones(given: Mapping[str, Any], default: float, sockets: list[str]) -> Any:

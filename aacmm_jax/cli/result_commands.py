@@ -7,12 +7,12 @@ from typing import Any, Literal
 import typer
 
 from .. import acceptance as acceptance_tests
-from .. import files, pipeline, summaries
+from .. import files, pipeline, plot, summaries
 from ..core.errors import InputError
 from ..files.hdf5 import read_summary
 from ..files.inputs import InputFile, fingerprint
 from ..files.outputs import together
-from ..files.schema import check_shown
+from ..files.stored_checks import check_shown
 from . import options, views
 from .app import command, prepare_jax, show_summary, with_spinner
 from .arm_command import first_frame
@@ -193,10 +193,8 @@ def show(
     attributes, summary = read_summary(path, ("capture", "calibration", "evaluation", "study", "model comparison"))
     kind = attributes["kind"]
     if kind == "study":
-        from .study_commands import show_study
-
         prepare_jax()
-        show_study(path, cell, figures, as_json)
+        _show_study(path, cell, figures, as_json)
         return
     if cell is not None or figures is not None:
         raise InputError(f"{file} is not a study but a file of the kind '{kind}'; leave out --cell and --figures.")
@@ -213,3 +211,23 @@ def show(
     else:
         check_shown(path, kind, summary)
     show_summary(summary, as_json, view)
+
+
+def _show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
+    """Print a study's results, and draw its figures."""
+    from ..study.results import study_summary
+    from ..study.store import Results
+    from ..study.tables import study_view
+
+    results = Results.of(file)
+    if cell is not None and cell > len(results.study.cells):
+        raise InputError(
+            f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; choose a cell from 1 to "
+            f"{len(results.study.cells)}."
+        )
+    summary = with_spinner("Reading", lambda: study_summary(results, cell))
+    if figures is not None:
+        with together():
+            paths = with_spinner("Drawing", lambda: plot.save_study_figures(results, figures))
+        summary["figures_written"] = [str(path) for path in paths]
+    show_summary(summary, as_json, study_view)

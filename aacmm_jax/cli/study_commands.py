@@ -9,12 +9,10 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from .. import plot
 from ..core.errors import InputError
 from ..files.outputs import together
-from ..summaries.tables import Styled, View
 from . import INTERRUPTED, INTERRUPTED_SENTENCE, options
-from .app import Stopped, command, progress_bar, show_summary, with_spinner
+from .app import Stopped, command, progress_bar, show_summary
 from .options import argument, flag, option, output
 
 
@@ -32,7 +30,7 @@ def study(
     trials: int | None = option("Number of trials per cell. Default: the number in the specification.", "N", min=1),
     seed: int | None = option("Seed of the random numbers. Default: the seed in the specification.", "N", min=0),
     chunk: int | None = option(
-        "Number of trials computed at a time; results do not depend on it. Default: 1000.", "N", min=1
+        "Number of trials computed at a time; the results do not depend on this number. Default: 1000.", "N", min=1
     ),
     dask: str | None = option(
         "Run on the Dask cluster whose scheduler has this address. With tcp://, everybody who can reach the port can "
@@ -157,45 +155,3 @@ def _ended(summary: dict[str, Any]) -> list[str]:
         f"Written: {written} ({summary['trials']:,} trials, {ran}).",
         f"Show the results with: aacmm show {written}",
     ]
-
-
-def show_study(file: Path, cell: int | None, figures: Path | None, as_json: bool) -> None:
-    """Print a study's results, and draw its figures."""
-    from ..study.results import study_summary
-    from ..study.store import Results
-
-    results = Results.of(file)
-    if cell is not None and cell > len(results.study.cells):
-        raise InputError(
-            f"{file} has {len(results.study.cells)} cells, so there is no cell {cell}; choose a cell from 1 to "
-            f"{len(results.study.cells)}."
-        )
-    summary = with_spinner("Reading", lambda: study_summary(results, cell))
-    if figures is not None:
-        with together():
-            paths = with_spinner("Drawing", lambda: plot.save_study_figures(results, figures))
-        summary["figures_written"] = [str(path) for path in paths]
-    show_summary(summary, as_json, study_view)
-
-
-def study_view(summary: dict[str, Any]) -> View:
-    """What people see of a study, or of one cell with every parameter."""
-    from ..study.tables import cell_table, metric_tables, parameter_table
-
-    yield [
-        Styled(summary["name"] or "Study"),
-        f" of {summary['arm']}: {summary['cells']} cells of {summary['trials']:,} trials, seed {summary['seed']}",
-    ]
-    if not summary["finished"]:
-        yield [Styled("Not finished:", "yellow"), f" {summary['trials_run']:,} trials so far."]
-    if any(cell["trials_run"] for cell in summary["results"]):
-        yield cell_table(summary)
-        yield from metric_tables(summary)
-        yield "Length error and angle error: the largest error of any length parameter and of any angle parameter."
-        if len(summary["results"]) == 1:
-            yield parameter_table(summary)
-        else:
-            yield "--cell N shows one cell with the bias of every parameter; --figures FOLDER writes the figures."
-    else:
-        yield "No trial has ended yet."
-    yield from (f"Written: {path}" for path in summary.get("figures_written", ()))

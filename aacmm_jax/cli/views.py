@@ -10,7 +10,7 @@ from ..summaries import result_tables as tables
 from ..summaries import tables as words
 from ..summaries.result_tables import BY_CONSTRUCTION, STAGES, listed_apart
 from ..summaries.tables import Line, Styled, Table, View, decimals_for, formatted, listed, number
-from ..uncertainty.coverage_level import LEVEL_IN_PERCENT, U_AT_LEVEL
+from ..uncertainty.coverage import LEVEL_IN_PERCENT, U_AT_LEVEL
 
 _MOST_PARTS = 12  # rows of a table
 _ARMS = {"nominal": "nominal", "calibrated": "calibrated"}
@@ -136,7 +136,7 @@ def calibration(summary: dict[str, Any]) -> View:
     stages = {stage: name for stage, name in STAGES.items() if stage != "stage1" or summary["method"] != "joint"}
     fixed_scale = summary["fixed_by_one_length"]
     if summary["nominal"]:
-        title = "On the poses used for identification [mm]"
+        title = "Errors in the poses used for identification [mm]"
         yield tables.metrics_table(title, summary, stages, fixed_scale=fixed_scale)
     if "truth" in summary:
         yield tables.truth_table(summary["truth"])
@@ -314,9 +314,6 @@ def evaluation(summary: dict[str, Any]) -> View:
         if part["observations"]:
             title = "Observations, RMS distance of poses from their geometry [mm]"
             yield tables.observations_table(title, part["observations"])
-        for row in part["observations"]:
-            if row["rms_angle_rad"] is not None:
-                yield f"Orientation residuals of {row['observation']}: RMS {row['rms_angle_rad'] / DEG:.4f} deg."
         if predicted:
             yield from _predicted(part)
         if part["lengths"]:

@@ -356,7 +356,7 @@ def check_finite(**trees: Any) -> None:
     for what, tree in trees.items():
         arrays = [leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray | np.generic)]
         if not all(np.all(np.isfinite(np.asarray(array))) for array in arrays if is_concrete(array)):
-            raise InputError(f"the {what} contains a value that is not finite; create the {what} from finite numbers.")
+            raise InputError(f"the {what} contains a value that is not finite; give finite numbers only.")
 
 
 def shown(value: Any) -> str:

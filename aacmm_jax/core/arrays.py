@@ -30,7 +30,7 @@ def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
     It is NumPy's where ``value`` and ``like``, an array or a tree with at least one, are NumPy's; else JAX's.
     """
     if _is_masked(value):
-        raise InputError(f"{what} contains masked values; the mask would be ignored. Remove them.")
+        raise InputError(f"{what} contains masked values, but the mask would be ignored; remove the masked values.")
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and jax.tree.leaves(like) and namespace(like) is np:
         return np.asarray(value)
     check_x64()
@@ -41,7 +41,9 @@ def as_array(value: Any, what: str, like: Any = ()) -> AnyArray:
     except ValueError as error:
         raise InputError(f"{what} has rows of unequal length; give rows of equal length.") from error
     if not jnp.issubdtype(array.dtype, jnp.number) or jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise InputError(f"{what} must be real numbers, but contains {_KINDS.get(array.dtype.kind, 'something else')}.")
+        raise InputError(
+            f"{what} must contain real numbers, but contains {_KINDS.get(array.dtype.kind, 'something else')}."
+        )
     return jnp.asarray(array, dtype=jnp.float64)
 
 

@@ -75,4 +75,4 @@ def nearest(word: str, names: Iterable[str], most: int = 12) -> str:
     if matches:
         return f"; did you mean {quoted(matches[0])}?"
     shown = ", ".join(quoted(name)[1:-1] for name in names[:most]) + (", ..." if len(names) > most else "")
-    return f"; known are {shown}." if names else "."
+    return f"; choose one of {shown}." if names else "."

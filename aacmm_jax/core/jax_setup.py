@@ -145,9 +145,9 @@ def set_up() -> None:
         os.environ.pop(_FOLDER, None)
         os.environ[_TURNED_OFF] = "0"  # for processes started from here
         warnings.warn_explicit(
-            f"the compilation cache {folder} is not used, because {unsafe}, and programs read from the cache are "
-            f"run; remove the folder (it is then created again), or set {_FOLDER} to a folder that only you can "
-            "write to.",
+            f"the compilation cache {folder} is not used, because {unsafe}, and aacmm_jax would run programs that "
+            f"others may have put there; remove the folder (aacmm_jax then creates a new one), or set {_FOLDER} to a "
+            "folder that only you can write to.",
             UserWarning,
             "aacmm_jax",
             1,
@@ -167,7 +167,7 @@ def set_up() -> None:
 def _unsafe(folder: Path) -> str:
     """Why others could put programs into a folder, which is made if there is none; empty where only the user can."""
     if not folder.is_absolute():
-        return "its path is relative, so the folder depends on where a program is started"
+        return "its path is relative, so the folder depends on the current directory"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not POSIX:
         return ""

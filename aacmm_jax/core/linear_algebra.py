@@ -45,8 +45,25 @@ def products_by_column(
         return flat.reshape(len(flat), *columns.shape[1:])
     rows, components, p = matrices.shape
     matrices = matrices.reshape(rows, components, *(1,) * (columns.ndim - 2), p)
-    products = [matrices[:, i] * columns[i][None] for i in range(components)]
-    return sum(products[1:], products[0])
+    first, *others = (matrices[:, i] * columns[i][None] for i in range(components))
+    return sum(others, first)
+
+
+def squares(rows: Float[AnyArray, "r c m"]) -> Float[AnyArray, "m r r"]:
+    """A matrix a pose times its own transpose."""
+    return namespace(rows).moveaxis(products(rows, rows), -1, 0)
+
+
+def products(left: Float[AnyArray, "r c m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r s m"]:
+    """A matrix a pose times the transpose of another, as sums: XLA computes many products of small matrices several
+    times as slowly."""
+    first, *others = (left[:, None, c] * right[None, :, c] for c in range(left.shape[1]))
+    return sum(others, first)
+
+
+def matrix_products(left: Float[AnyArray, "r s m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
+    """The product of two matrices a pose."""
+    return products(left, namespace(right).swapaxes(right, 0, 1))
 
 
 def solve_positive_definite(matrix: Square, right: Rows) -> Rows:

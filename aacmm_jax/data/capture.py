@@ -170,7 +170,7 @@ class Capture(eqx.Module):
         dropped = _matching(names, without, "without")
         kept = [name for name in kept if name not in dropped]
         if not kept:
-            raise InputError("the selection leaves no socket; select more.")
+            raise InputError("the selection contains no socket and no other observation; select at least one.")
         poses, lengths = self.repeated
         copies = tuple((start, end) for start, end in lengths if start in kept and end in kept)
         return part_of(self, kept, repeated=Repeated(tuple(row for row in poses if row[0] in kept), copies))
@@ -236,7 +236,7 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
     sizes = {part.name: part.q.shape[0] for part in capture.parts}
     total = sum(sizes.values())
     if not 0 < count < total:
-        raise InputError(f"{count} of {total} poses cannot be drawn; give a number from 1 to {total - 1}.")
+        raise InputError(f"{count} of {total} poses cannot be selected at random; give a number from 1 to {total - 1}.")
     drawn = np.zeros(total, dtype=bool)
     drawn[random_generator(seed).choice(total, count, replace=False)] = True
     of_parts = dict(zip(sizes, np.split(drawn, np.cumsum(list(sizes.values()))[:-1]), strict=True))
@@ -311,10 +311,10 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
     """
     captures = items_of(captures, "captures")
     if not captures:
-        raise InputError("there is no capture to stack; give at least one.")
+        raise InputError("the list of captures is empty; give at least one capture.")
     for capture in captures:
         if not isinstance(capture, Capture):
-            raise InputError(f"a capture to stack is a {type(capture).__name__}; give a list of aj.Capture.")
+            raise InputError(f"one of the captures is a {type(capture).__name__}; give a list of aj.Capture.")
         check_one_capture(capture)
     # Copies that were left out, sessions and visits may differ; those of the first are kept.
     first, shapes = captures[0], set()
@@ -324,7 +324,8 @@ def stack_captures(captures: Iterable[Capture]) -> Capture:
         shapes.add((capture.names, capture.sizes, structure, tuple(np.shape(leaf) for leaf in leaves)))
     if len(shapes) != 1:
         raise InputError(
-            "captures of a batch must have the same sockets, numbers of poses, joints, lengths and observations."
+            "all captures of a batch must have the same sockets, reference lengths and observations, and the same "
+            "numbers of poses and joints."
         )
 
     def stacked(*leaves: Any) -> Any:

@@ -57,7 +57,7 @@ class ReferenceLength(eqx.Module):
         self.start, self.end = start, end
         where = f"reference length '{start}' to '{end}'"
         if start == end:
-            raise InputError(f"{where} joins a socket to itself; name two different sockets.")
+            raise InputError(f"{where} joins a socket to itself; give two different sockets.")
         self.value = checked(value, _LENGTH, where)
         self.u = checked(u, _UNCERTAINTY, f"u of {where}")
 
@@ -107,9 +107,9 @@ class Repeated(NamedTuple):
             number = pluralise(sum(count for _, count in self.poses), "pose")
             sockets = shorten([f"{name} ({count})" for name, count in self.poses])
             sentences.append(
-                f"Duplicates ignored: {number} with exactly the readings and values of another pose of the same "
+                f"Duplicates ignored: {number} with exactly the same readings and values as another pose of the same "
                 f"socket or observation: {sockets}. A copy is not an independent measurement. Was the arm recorded "
-                "at rest, or was a file pasted twice?"
+                "while at rest, or was a file pasted twice?"
             )
         if self.lengths:
             ends = shorten([f"{start} - {end}" for start, end in self.lengths])
@@ -133,7 +133,7 @@ def checked_parts(sockets: Mapping[str, Numbers], observations: Any) -> tuple[Ab
     if not isinstance(sockets, Mapping):
         raise InputError(
             f"the sockets are a {type(sockets).__name__}; give a dictionary of names and readings: "
-            '{"A": q}, q of shape (poses, joints).'
+            '{"A": q}, with q of shape (poses, joints).'
         )
     for name in sockets:
         checked_name(name, "a socket")
@@ -158,7 +158,7 @@ def checked_parts(sockets: Mapping[str, Numbers], observations: Any) -> tuple[Ab
         if part.q.shape[-1] != width:
             raise InputError(
                 f"{described(part)} has {part.q.shape[-1]} columns, but {described(parts[0])} has {width}; give one "
-                "column per joint, followed by the temperature either everywhere or nowhere."
+                "column per joint, and the temperature as last column either everywhere or nowhere."
             )
     return parts
 
@@ -259,8 +259,8 @@ def check_revolutions(where: str, readings: AnyArray, arm: Arm, advice: str) -> 
     if size.size and size.max() > _MOST_RADIANS:
         row, column = np.argwhere(size == size.max())[0] + 1
         raise InputError(
-            f"{where} pose {row} joint {column} is {size.max():g} rad, more than four revolutions: these look like "
-            f"degrees; {advice}."
+            f"{where} pose {row} joint {column} is {size.max():g} rad, more than four revolutions, so the readings are "
+            f"probably in degrees; {advice}."
         )
 
 

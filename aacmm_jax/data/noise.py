@@ -85,7 +85,7 @@ class Noise(eqx.Module):
         given = self._given()
         if is_concrete(*given.values()) and not any(np.any(np.asarray(values)) for values in given.values()):
             raise InputError(
-                "every standard deviation of the noise is zero, so the noise cannot weight poses; give a positive "
+                "every standard deviation of the noise is zero, so the poses cannot be weighted; give a positive "
                 "standard deviation, or omit the noise."
             )
         # Not in the constructor: residuals of a failed calibration may be as large, and its file must still be read.
@@ -223,7 +223,7 @@ def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEAT
         InputError: The repeatability is not above 0.
     """
     if not (math.isfinite(repeatability) and repeatability > 0):
-        raise InputError(f"the repeatability is {repeatability:g} mm; it must be positive.")
+        raise InputError(f"the repeatability is {repeatability:g} mm; give a positive number.")
     limits = np.asarray(joint_limits(arm, None))
     q = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (_SAMPLES, arm.joints))
     geometry = to_numpy(arm.geometry)
@@ -232,6 +232,7 @@ def noise_of_repeatability(arm: Arm, repeatability: float, seating: float = SEAT
     lever = math.sqrt(float(np.mean(np.trace(scattered))) / 3)
     if lever == 0:
         raise InputError(
-            "no joint moves the tip of this arm, so the noise of the readings cannot be derived from its repeatability."
+            "no joint moves the tip of this arm, so the noise of the readings cannot be derived from its "
+            "repeatability; correct the arm."
         )
     return noise_of(np.asarray(repeatability / _REPEATABILITY / lever), np.asarray(seating))

@@ -83,10 +83,12 @@ def simulate(
     short = {"encoder_arcsec": encoder_arcsec, "seating": seating}
     given = {name: value for name, value in short.items() if value is not None}
     if noise is not None and given:
-        raise InputError(f"simulate is given both noise and {' and '.join(given)}; give everything in noise.")
+        raise InputError(
+            f"simulate is given both noise and {' and '.join(given)}; state all standard deviations in noise."
+        )
     noise = Noise(**given) if noise is None else noise
     if not is_single(arm):
-        raise InputError("simulate takes one arm, not a batch; select one arm of the batch.")
+        raise InputError("simulate needs a single arm, but this is a batch; select one arm of the batch.")
     check_finite(arm=arm, noise=noise)
     noise.check_joints(arm.joints)
     temperatures = _checked_temperatures(arm, temperature)
@@ -203,7 +205,7 @@ def _reference_lengths(points: Mapping[str, AnyArray], lengths: Iterable, key: A
             continue
         if not isinstance(length, tuple | list) or len(length) not in (2, 3):
             raise InputError(
-                f"reference length {shown(length)} must be (socket, socket) or (socket, socket, u), u in mm."
+                f"reference length {shown(length)} must be (socket, socket) or (socket, socket, u), with u in mm."
             )
         (start, end), u = length[:2], length[2] if len(length) == 3 else 0.0
         where = f"reference length '{start}' to '{end}'"

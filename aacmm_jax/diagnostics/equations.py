@@ -194,7 +194,8 @@ class Rows(NamedTuple):
     shared: Float[np.ndarray, "m r s"]  # derivatives by the parameters, and by the geometry of several observations
     private: Float[np.ndarray, "m r k"]  # by the geometry of this observation alone
     extra: Float[np.ndarray, "m r e"]  # by what may be wrong in some of the poses: `Equations.extra`
-    in_mm: Float[np.ndarray, "m 3 r"]  # the residual's position in mm
+    # What makes of the residual a vector in mm whose length is the tip's distance from the geometry.
+    in_mm: Float[np.ndarray, "m c r"]
     by_tip: Float[np.ndarray, "m r 3"]  # derivatives by the tip's position
     poses: Int[np.ndarray, " m"]  # their numbers among all poses: sockets first, then other observations
 
@@ -262,6 +263,8 @@ def equations_of(record: CalibrationRecord) -> Equations:
         # A socket with one pose shows no scatter; only lengths in the solve need it.
         if not in_solve and len(weight) == 1 and np.sum(~among) == 3:
             continue
+        to_rows = np.moveaxis(np.linalg.pinv(root), 0, -1)
+        in_mm = np.asarray(part.observation.in_mm(to_rows, np.asarray(part.by_tip)))
         shared = np.zeros((*by.shape[:2], free + len(common)))
         shared[..., :free] = by[..., :free]
         shared[..., free : free + observed.layout.shared] = by[..., p:]
@@ -273,7 +276,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
                 shared,
                 by_private[..., ~among],
                 by[..., columns],
-                np.linalg.pinv(root)[:, :3],
+                np.moveaxis(in_mm, -1, 0),
                 root @ np.moveaxis(np.asarray(part.by_tip), -1, 0),
                 np.arange(part.poses.start, part.poses.stop),
             )

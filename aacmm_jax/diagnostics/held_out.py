@@ -32,7 +32,7 @@ def contradicted_prediction(validation: CrossValidation) -> list[Finding]:
         else:
             error = float(np.sqrt(np.mean(np.square(group.length_error))))
             texts.append(f"{label} (length error {error:.3g} mm RMS, {group.length_ratio:.1f} times its u)")
-    named, doubt = shorten(texts, 3), "held-out data disagree by more than predicted"
+    named, doubt = shorten(texts, 3), "errors on held-out data are larger than predicted"
     concerns = tuple(validation.labels[i] for i in validation.disagreeing)
     if 0 < count < len(validation.groups) / 2:
         finding = Finding(
@@ -83,7 +83,9 @@ def surprise(
         )
         worst = [name for _, name in improbable[:3]]
         most = [
-            f"{name} ({parts[name].rms:.3g} mm, {parts[name].rms / parts[name].predicted:.1f} times)" for name in worst
+            f"{name} ({parts[name].rms:.3g} mm RMS, {parts[name].rms / parts[name].predicted:.1f} times the predicted "
+            "value)"
+            for name in worst
         ]
         texts.append(
             f"poses are {poses.rms:.3g} mm RMS from their geometry, {poses.rms / poses.predicted:.1f} times the "

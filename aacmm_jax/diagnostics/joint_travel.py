@@ -78,7 +78,7 @@ def standing_rows(arm: Arm, capture: Capture, nominal: ArmSpecification | None =
     the free parameters that a calibration of the capture would take, where there is one."""
     still = standing_joints(arm, np.asarray(capture.readings))
     joints = [standing.joint for standing in still]
-    remedy = "move this joint" if len(still) == 1 else "move the joints that stand still"
+    remedy = "move this joint" if len(still) == 1 else "let every joint move"
     if nominal is not None and still:
         space = nominal.space()
         added = _open_parameters(space, capture, joints)

@@ -17,7 +17,6 @@ from .equations import equations_of, linearisation_of
 from .findings import Case, Finding
 
 ORDER, NEEDS = 90, "scale"
-_POSITION_ROWS = 3  # of a kind that also has orientations; these rows come after the position
 _LEAST_LEVER = 1e-6  # mm per rad: a joint whose axis the tip is on explains nothing
 
 
@@ -46,12 +45,11 @@ class ObservationResiduals(NamedTuple):
 
     observation: AbstractObservation
     distance: Float[np.ndarray, " m"]  # mm
-    angle: Float[np.ndarray, " m"] | None  # rad; None where no orientation was measured
+    other: dict[str, Float[np.ndarray, " m"]]  # unit, rad or px -> size of the residuals that are measured in it
     # Root mean square over the pose's rows in standard deviations: about 1, whatever the kind.
     normalised: Float[np.ndarray, " m"]
     weight: Float[np.ndarray, " m"]  # below 1 where a robust loss took weight from the pose
-    u: float  # standard uncertainty of a coordinate or distance that was measured, RMS over the poses, mm
-    u_angle: float | None  # of an orientation about each axis, rad
+    u: dict[str, float]  # unit, mm, rad or px -> standard uncertainty of what was measured in it, RMS over the poses
     by_joint: Float[np.ndarray, "n m"]  # change of each reading that alone would explain most of the residual, rad
     lever: Float[np.ndarray, "n m"]  # what the tip moves with that reading, mm per rad; a slide: mm, mm per mm
 
@@ -64,20 +62,25 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
     """
     residuals = []
     for part in linearisation_of(record, record.names, noise=record.given_noise).parts():
-        position, angles = np.split(np.asarray(part.values), [_POSITION_ROWS])
-        moved = np.asarray(part.by_readings)[:_POSITION_ROWS]
-        u, u_angle = np.split(np.diagonal(np.asarray(part.measured), axis1=1, axis2=2), [_POSITION_ROWS], axis=1)
+        observation, by_tip = part.observation, np.asarray(part.by_tip)
+        position = observation.in_mm(np.asarray(part.values), by_tip)
+        moved = observation.in_mm(np.asarray(part.by_readings), by_tip)
+        variances = np.diagonal(np.asarray(part.measured), axis1=1, axis2=2)
+        of_unit = {unit: np.array(observation.row_units) == unit for unit in dict.fromkeys(observation.row_units)}
         lever = np.linalg.norm(moved, axis=0)
         white = np.einsum("mab,bm->am", part.root, part.values)
         residuals.append(
             ObservationResiduals(
-                observation=part.observation,
+                observation=observation,
                 distance=np.linalg.norm(position, axis=0),
-                angle=np.linalg.norm(angles, axis=0) if len(angles) else None,
+                other={
+                    unit: np.linalg.norm(np.asarray(part.values)[rows], axis=0)
+                    for unit, rows in of_unit.items()
+                    if unit != "mm"
+                },
                 normalised=np.sqrt(np.mean(white**2, axis=0)),
                 weight=np.asarray(part.weight),
-                u=float(np.sqrt(np.mean(u))),
-                u_angle=float(np.sqrt(np.mean(u_angle))) if len(angles) else None,
+                u={unit: float(np.sqrt(np.mean(variances[:, rows]))) for unit, rows in of_unit.items()},
                 by_joint=-np.einsum("rm,rnm->nm", position, moved) / np.maximum(lever, _LEAST_LEVER) ** 2,
                 lever=lever,
             )
@@ -88,8 +91,7 @@ def observation_residuals(record: CalibrationRecord) -> tuple[ObservationResidua
 def distances_of(capture: Capture, evaluation: Evaluation) -> tuple[Float[np.ndarray, " m"], ...]:
     """Distances of all poses from their geometry in an evaluation, mm: of each socket, then of each observation."""
     if evaluation.observed is not None:
-        rows = (np.asarray(values)[:_POSITION_ROWS] for values in evaluation.observed.residuals)
-        return tuple(np.linalg.norm(values, axis=0) for values in rows)
+        return tuple(map(np.asarray, evaluation.observed.distances))
     return tuple(np.split(np.asarray(evaluation.distances), np.cumsum(capture.sizes)[:-1]))
 
 

@@ -100,7 +100,8 @@ def _implausible_uncertainties(capture: Capture) -> list[Finding]:
     stated = [(f"[[length]] {length.start} - {length.end}", length.u) for length in capture.lengths]
     for observation in capture.observations:
         stored = observation.stored()
-        u = stored.get("u")
+        in_mm = any(entry.name == "u" and entry.unit == "mm" for entry in observation.entries)
+        u = stored.get("u") if in_mm else None
         if stored.get("covariance") is not None:
             u = np.sqrt(np.diagonal(np.asarray(stored["covariance"]), axis1=-2, axis2=-1))
         if u is not None:
@@ -188,10 +189,12 @@ def _rms(arm: Arm, observed: Observed) -> float:
         z = np.concatenate([vector, *(start[name] for name in observed.blocks)])
         for _ in range(_ROUNDS):
             point, roots = rows_at(space, observed, z), []
-            for rows in point.rows:
-                size, poses = rows.values.shape
-                root = np.diag([1.0] * min(size, 3) + [lever] * (size - 3))
-                roots.append(np.broadcast_to(root, (poses, size, size)))
+            for stack, rows in zip(observed.stacks, point.rows, strict=True):
+                # Of a kind without lengths, a residual counts as it moves the tip.
+                moves = np.maximum(np.linalg.norm(rows.by_tip, axis=1).T, 1e-300)
+                weights = [1.0] * stack.lengths + [lever] * (stack.rows - stack.lengths) if stack.lengths else 1 / moves
+                size = np.broadcast_to(weights, moves.shape)
+                roots.append(size[:, :, None] * np.eye(stack.rows))
             whitening = Whitening(tuple(roots), np.zeros(0), {name: 0 * value for name, value in certified.items()})
             linear = Linearisation.of(observed, space, z, point, [], whitening, None)
             squares = sum(float(np.sum(white**2)) for white in linear.white())

@@ -12,7 +12,7 @@ from ..core.arguments import Range, checked_arguments
 from ..core.errors import InputError
 from ..core.text import shorten
 from ..kinematics.arm import DOWN, Arm, parameter_names, parameter_unit, value_of
-from ..uncertainty.coverage_level import LEVEL
+from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import coverage_factor, degrees_of_freedom
 from ..uncertainty.volume import default_length, sample_lengths
 from .results import Drift, Trend
@@ -245,6 +245,6 @@ def _warnings(old: CalibrationRecord, new: CalibrationRecord, labels: tuple[str,
     for record, other, label in ((old, new, labels[0]), (new, old, labels[1])):
         if alone := [name for name in record.names if name not in other.names]:
             yield (
-                f"Parameters free only in {label}: {shorten(alone)}. In the other calibration, the free parameters may "
-                "compensate for the errors of these; lengths can still be compared."
+                f"Parameters free only in {label}: {shorten(alone)}. These parameters are fixed in the other "
+                "calibration, so its other parameters may differ for this reason; compare lengths instead."
             )

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ..core.text import shorten
 from ..core.units import people_read_change
-from ..uncertainty.coverage_level import in_percent
+from ..uncertainty.coverage import in_percent
 from .statistics import JointTest, LengthChange, ProbeTest
 
 

@@ -33,7 +33,7 @@ def _text(text: str) -> str:
     """Text without blanks around it, as the schema of the DCC requires."""
     text = held_by_xml(text, "the text").strip(" \t\n\r")
     if not text:
-        raise ValueError("the text is empty; enter a text or remove the key.")
+        raise ValueError("the text is empty; enter text or remove the key.")
     return text
 
 
@@ -114,7 +114,7 @@ class Certificate(Strict):
         given = [(name, date) for name, date in dates if date is not None]
         for (earlier, first), (later, second) in itertools.pairwise(given):
             if first > second:
-                raise ValueError(f"{earlier} ({first}) is after {later} ({second}); correct one of the two dates.")
+                raise ValueError(f"{earlier} ({first}) is after {later} ({second}); correct one of these dates.")
         if self.temperature_u_celsius is not None and self.temperature_celsius is None:
             raise ValueError("temperature_u_celsius is given without temperature_celsius; give both.")
         return self
@@ -181,5 +181,5 @@ def check_conformity(
     if tested and decision not in passes:
         raise InputError(
             f"conformity.verdict is '{verdict}', but in this evaluation "
-            f"{results.get(decision or '', 'no limit was given')}; correct the statement."
+            f"{results.get(decision or '', 'no limit was given')}; correct the verdict."
         )

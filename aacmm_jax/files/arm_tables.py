@@ -69,7 +69,8 @@ class NoiseTable(Strict):
     def _one_statement(self) -> "NoiseTable":
         if self.repeatability_mm is not None and self.encoder_arcsec is not None:
             raise ValueError(
-                "give either repeatability_mm or encoder_arcsec, because both state the precision of the readings."
+                "repeatability_mm and encoder_arcsec both state the precision of the readings; give only one of the "
+                "two."
             )
         return self
 
@@ -100,14 +101,17 @@ class CorrectionsTable(Strict):
     @model_validator(mode="after")
     def _one_of_both(self) -> "CorrectionsTable":
         if (self.model is None) == (not self.coefficients):
-            raise ValueError("give either model, such as 'gravity,harmonics=1', or coefficients by name.")
+            raise ValueError(
+                "exactly one of model and coefficients is needed; give model = 'gravity,harmonics=1', for example, or "
+                "the coefficients by name."
+            )
         if self.nominal and not self.coefficients:
-            raise ValueError("nominal belongs to coefficients; remove nominal where a model is given.")
+            raise ValueError("nominal applies only to coefficients, but a model is given; remove nominal.")
         unknown = set(self.nominal) - {*GEOMETRY}
         if unknown:
             raise ValueError(
-                f"nominal has the unknown key '{min(unknown)}'; its keys are alpha, a, d, theta, beta and probe, each "
-                "with a list."
+                f"nominal has the unknown key '{min(unknown)}'; the allowed keys are alpha, a, d, theta, beta and "
+                "probe, each with a list of numbers."
             )
         return self
 
@@ -177,13 +181,16 @@ class ArmFile(Strict):
     @model_validator(mode="after")
     def _rows_or_urdf(self) -> "ArmFile":
         if bool(self.joint) == (self.urdf is not None):
-            raise ValueError("give either joint (one row per joint) or urdf (the name of a URDF file).")
+            raise ValueError(
+                "exactly one of joint and urdf is needed; give joint (one row per joint) or urdf (the name of a URDF "
+                "file)."
+            )
         if self.urdf is None and (self.base is not None or self.tip is not None):
-            raise ValueError("base and tip name links of a URDF; remove both, or give urdf.")
+            raise ValueError("base and tip apply only to a URDF, whose links they name; remove both, or give urdf.")
         if self.urdf is not None and self.prismatic:
             raise ValueError(
-                "prismatic applies to rows of joints; a URDF states which of its joints are prismatic, so remove "
-                "prismatic."
+                "prismatic applies only to an arm without urdf, because a URDF itself states which of its joints are "
+                "prismatic; remove prismatic."
             )
         return self
 
@@ -200,8 +207,8 @@ class ArmFile(Strict):
         quarters = [twist / (math.pi / 2) for twist in twists]
         if self.angle_unit == "deg" and twists and all(abs(x - round(x)) < 1e-3 and 1 <= abs(x) < 3 for x in quarters):
             raise ValueError(
-                f"every alpha is a multiple of pi/2 (for example {twists[0]:g}), which is unusual in degrees; are the "
-                "angles in rad? Correct angle_unit or alpha."
+                f"every alpha that is not 0 is a multiple of pi/2 (for example {twists[0]:g}), which is unusual for "
+                "angles in degrees; are the angles in rad? Correct angle_unit or alpha."
             )
         return self
 
@@ -216,17 +223,18 @@ class ArmFile(Strict):
             raise ValueError(f"prismatic names joint {max(self.prismatic)}, but the arm has {len(self.joint)} joints.")
         if self.prismatic and first.limits is None:
             raise ValueError(
-                f"joint {min(self.prismatic)} is prismatic, but its travel is not stated; give limits for every joint "
-                "(for prismatic joints in length_unit)."
+                f"joint {min(self.prismatic)} is prismatic, but has no limits; give limits for every joint (in "
+                "length_unit for prismatic joints)."
             )
         if self.convention == "craig" and (first.alpha or first.a):
             raise ValueError(
-                "joint 1 has a twist or a length before its axis (alpha_0, a_0), which the standard convention "
-                "cannot represent; place the base frame on the first axis, so that both are 0."
+                "joint 1 has a twist or a length before its axis (alpha_0, a_0), which the standard convention cannot "
+                "represent; choose a base frame whose z axis is the first joint axis, so that both are 0."
             )
         if self.convention == "craig" and any(joint.beta for joint in self.joint):
             raise ValueError(
-                "beta (Hayati's angle) belongs to the standard convention; remove beta from a craig table."
+                "beta (Hayati's angle) is possible only with convention = 'standard', but the convention is 'craig'; "
+                "remove beta."
             )
         return self
 
@@ -263,7 +271,7 @@ def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
     """The specification with another model of its joints; masses are those of its URDF, where it has one. Raises
     `InputError` where the model names an unknown kind."""
     if not model.strip():
-        raise InputError("the model is empty; for an arm without joint corrections, give the model dh.")
+        raise InputError("the model is empty; give the model dh for an arm without joint corrections.")
     arm = with_corrections(specification.arm, model, **masses_of(specification))
     gone = {*correction_names(specification.arm)} - {*correction_names(arm)}
     held = specification.held
@@ -296,7 +304,7 @@ def prior_of_text(text: str, arm: Arm) -> Prior | None:
         group, _, value = (word.strip() for word in part.rpartition("="))  # harmonics=2-3=learn
         group = {"length": "lengths", "angle": "angles"}.get(group, group)
         if group in sd or group in learn:
-            raise InputError(f"--prior names '{group}' twice; name it once.")
+            raise InputError(f"--prior names '{group}' twice; give each group once.")
         if group:
             Prior(learn=[group]).check(arm)
         if value == _LEARN:

@@ -165,7 +165,7 @@ def read_arm(
     if suffix in _ROBOTS:
         return read_urdf(path, base=base, tip=tip, probe=probe), False
     if base is not None or tip is not None:
-        raise InputError(f"{source} is not a URDF, so it has no links; omit base and tip.")
+        raise InputError(f"{source} is not a URDF, but base and tip name links of a URDF; omit base and tip.")
     if suffix in _OTHER_FORMATS:
         return read_ur_kinematics(path, probe=probe), False
     if suffix != ".toml" and not os.path.exists(path):
@@ -177,7 +177,8 @@ def read_arm(
     model = read_toml(path, ArmFile)
     if probe is not None and any(model.probe):
         raise InputError(
-            f"{path} already states the probe; change the probe in that file, or with arm.replace(probe=...)."
+            f"{path} already states the probe, so no other probe can be given; change the probe in that file, or with "
+            "arm.replace(probe=...)."
         )
     with naming(path):
         return _specification(path, model, probe), model.identification is not None

@@ -19,7 +19,7 @@ from . import schema
 from .captures import arm_table, recording_attributes, recording_of, recording_tables, specification_of
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Within, records_within, rows_in, rows_table, table_of, tables_within, values_in
-from .schema import read_checked
+from .stored_checks import read_checked
 
 # Records within the record that are a table each.
 _RECORDS = {
@@ -53,7 +53,7 @@ def save_calibration(
     """
     tables, evaluations = recording_tables(record.recording), record.evaluations()
     measured = {
-        f"measured_{stage}": (np.asarray(evaluation.measured), "mm", f"length as the {stage} arm measures it")
+        f"measured_{stage}": (np.asarray(evaluation.measured), "mm", f"length measured by the {stage} arm")
         for stage, evaluation in evaluations.items()
     }
     tables["reference"] = Table(tables["reference"].variables | columns("length", **measured))
@@ -159,9 +159,13 @@ def _observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> O
     check_sense(
         path,
         {
-            "its results are of other observations": tuple(row["name"] for row in rows) != expected,
-            "its geometry is that of other observations": {name: len(part) for name, part in parts.items()} != sizes,
-            "the covariance of its geometry has the wrong size": not square,
+            "the names of its results are not those of its observations": tuple(row["name"] for row in rows)
+            != expected,
+            "its estimated geometry does not belong to its observations": {
+                name: len(part) for name, part in parts.items()
+            }
+            != sizes,
+            "the covariance of the estimated geometry has the wrong size": not square,
             "a weight is above 1": np.any(table["weights"] > 1),
         },
     )

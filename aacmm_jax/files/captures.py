@@ -22,7 +22,8 @@ from ..kinematics.priors import Prior
 from .arm_tables import GEOMETRY, with_coefficients
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, undamaged, write_tables
 from .records import Field, attribute_name, record_in, row_values, rows_table, table_of, values_in
-from .schema import ARM, LENGTHS, RECORDING, SPHERES, USUAL_NOISE, read_checked
+from .schema import ARM, LENGTHS, RECORDING, SPHERES, USUAL_NOISE
+from .stored_checks import read_checked
 
 _OBSERVATION = "observation_"
 
@@ -74,7 +75,10 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket that held the tip"))
     if capture.visits is not None:
         visits = np.array(capture.visits)
-        poses |= columns("pose", visit=(visits, "1", "number of the visit to the socket; -1 if unknown"))
+        poses |= columns(
+            "pose",
+            visit=(visits, "1", "number of the visit to the socket during which the pose was recorded; -1 if unknown"),
+        )
     # Copies that were left out: poses by socket, and lengths by their ends.
     (sockets, counts), (starts, ends) = (tuple(zip(*rows, strict=True)) or ((), ()) for rows in capture.repeated)
     attributes = {
@@ -91,7 +95,7 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     }
     if urdf is not None:  # so that an export does not need the file
         lines = urdf.text.splitlines(keepends=True)
-        variables = columns("urdf_line", text=(lines, "", "line of the URDF, with its end"))
+        variables = columns("urdf_line", text=(lines, "", "line of the URDF, including its line break"))
         tables["urdf"] = Table(variables, {"base": urdf.base, "tip": urdf.tip})
     if recording.true is not None:
         tables["true_arm"] = arm_table(recording.true)
@@ -161,7 +165,7 @@ def _observation(path: str | os.PathLike, table: StoredTable) -> AbstractObserva
     kind = kinds().get(attributes["kind"])
     if kind is None:
         raise InputError(
-            f"{path} contains an observation of the unknown kind '{attributes['kind']}'; update aacmm_jax, or make "
+            f"{path} contains an observation of the unknown kind '{attributes['kind']}'; update aacmm_jax, or create "
             "the file again."
         )
     values: dict[str, Any] = {}
@@ -204,7 +208,12 @@ def sphere_table(spheres: Sequence[ProbedSphere], arm: Arm | None = None) -> Tab
     ]
     values = np.array([touched for *_, touched in rows])
     variables = rows_table("touch", (sphere for sphere, *_ in rows), SPHERES).variables | columns(
-        "touch", group=([number for _, number, _ in rows], "1", "repeat, or orientation of the wrist")
+        "touch",
+        group=(
+            [number for _, number, _ in rows],
+            "1",
+            "number of the group of touches: a repetition, or an orientation of the wrist",
+        ),
     )
     if arm is None:
         return Table(variables | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")})

@@ -125,8 +125,8 @@ def load_cell(
         if body is None:
             if radius is None:
                 notes = (
-                    f"each link is assumed to have a radius of {slender:.0f} mm (5 % of the total length of the "
-                    "links); state the radius.",
+                    f"every link is assumed to be a capsule with a radius of {slender:.0f} mm (5 % of the total length "
+                    "of the links); give the true radius.",
                 )
             stated = slender if radius is None else radius
             body = body_along_links(specification.arm, stated, content.body.tool_radius)
@@ -176,11 +176,11 @@ def _urdf_body(
     rows.sort(key=lambda row: row.end_frame)
     notes = []
     for partly, instead in (
-        (False, "capsules along their D-H rows are used instead"),
-        (True, "only the other shapes of their joints are used"),
+        (False, "each of these links is modelled as capsules along its D-H lengths"),
+        (True, "only the other collision shapes that move with the same joints are checked"),
     ):
         if links := [link for frame, link in missing.items() if (frame in with_shape) == partly]:
-            notes.append(f"the meshes of {', '.join(links)} are not available as STL or OBJ; {instead}.")
+            notes.append(f"the meshes of {', '.join(links)} are not available as STL or OBJ files; {instead}.")
     # Not of one or successive links may they touch, of which those without a shape do not count.
     rank = np.unique([row.end_frame for row in rows], return_inverse=True)[1]
     checked = {frozenset((simple.names[i], simple.names[j])) for i, j in simple.pairs}
@@ -349,14 +349,14 @@ def read_kit(path: str | os.PathLike) -> list[KitItem]:
             half_angle, normal = math.radians(stated.pop("half_angle_deg")), stated.pop("normal")
             with naming(f"{path}: [[{table}]] '{stated['name']}'"):
                 if not any(normal):
-                    raise InputError("its normal is (0, 0, 0); give a direction.")
+                    raise InputError("the normal is (0, 0, 0); give a direction.")
                 # Tried once, so that what cannot be recorded is refused here.
                 simulated = kind(**stated)
                 tips = simulated.tips(np.random.default_rng(0))
                 if not np.all(np.isfinite(tips)):
                     raise InputError(
-                        "its numbers contradict each other (for example, both ends are at the same point); correct "
-                        "them."
+                        "the numbers contradict each other (for example, both ends are at the same point); correct the "
+                        "numbers."
                     )
                 transforms = np.tile(np.eye(4), (len(tips), 1, 1))
                 transforms[:, :3, 3] = tips

@@ -176,9 +176,10 @@ def zero_offsets_csv(zeros: ZeroOffsets) -> str:
     """
     lines = [
         "# Add these offsets to the joint readings of the nominal arm.",
-        f"# Distance from the tip of the calibrated arm, with the offsets: RMS {zeros.rms:.4f} mm, largest "
-        f"{zeros.largest:.4f} mm",
-        f"# (RMS {zeros.rms_nominal:.4f} mm without the offsets). Tip in the last frame: {_row(zeros.probe, ' ')} mm.",
+        "# Distance between the tips of the nominal arm with these offsets and of the calibrated arm: RMS "
+        f"{zeros.rms:.4f} mm, largest {zeros.largest:.4f} mm",
+        f"# (RMS {zeros.rms_nominal:.4f} mm without the offsets). Position of the tip in the last frame: "
+        f"{_row(zeros.probe, ' ')} mm.",
     ]
     units = ["deg", "rad", *(["mm"] if "mm" in zeros.units else [])]
     lines.append(",".join(["joint", *(f"offset_{unit}" for unit in units)]))
@@ -241,7 +242,7 @@ def read_ur_kinematics(path: str | os.PathLike, *, probe: Numbers | None = None)
         try:
             text = file.text
         except UnicodeDecodeError as error:
-            raise InputError("it is not UTF-8 text; name a YAML file.") from error
+            raise InputError("the file is not UTF-8 text; give a YAML file.") from error
         entries = _entries(text)
         if any(name in entries for name in _DH):
             theta, a, d, alpha = (_numbers_of(entries, name, len(_JOINTS)) for name in _DH)
@@ -302,15 +303,15 @@ def _of_origins(entries: dict[str, str]) -> Geometry:
         points.append(frame[:3, 3])
     base, geometry = dh_of_axes(Axes(np.array(directions), np.array(points), frame))
     if np.abs(inverse(base)[:3, :] - np.eye(4)[:3, :]).max() > 1e-9:
-        raise InputError("the first axis is not the z axis of the base; correct kinematics.shoulder.")
+        raise InputError("the axis of the first joint is not the z axis of the base; correct kinematics.shoulder.")
     return geometry
 
 
 def _numbers_of(entries: dict[str, str], name: str, count: int) -> Float[np.ndarray, " k"]:
     """The numbers of an entry, m and rad."""
     if name not in entries:
-        of_joints = "; a kinematics.yaml has this entry for each of its six joints." if count == 1 else "; add it."
-        raise InputError(f"'{name}' is missing{of_joints}")
+        of_joints = ", which a kinematics.yaml has for each of its six joints" if count == 1 else ""
+        raise InputError(f"'{name}' is missing; add this entry{of_joints}.")
     parts = entries[name].strip("[] ").replace(",", " ").split()
     numbers = np.array([number(part) if is_number(part) else math.nan for part in parts])
     if len(parts) != count or not np.all(np.abs(numbers) < _LARGEST):

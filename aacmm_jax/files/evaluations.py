@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import COVERAGE_FACTOR, Expansion, Influences, Limit, Rule, checked_influences
+from ..acceptance.judgement import Expansion, Influences, Limit, Rule, checked_influences
 from ..acceptance.record import MAXIMA, EvaluationRecord, PointsRecord, checked_limits
 from ..acceptance.results import Measured
 from ..core.arguments import checked
@@ -17,11 +17,12 @@ from ..kinematics.arm import parameter_names
 from ..kinematics.workspace import Reach
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import SharedErrors
+from ..uncertainty.coverage import COVERAGE_FACTOR
 from ..uncertainty.degrees_of_freedom import Components
 from . import captures, schema
 from .hdf5 import Stored, StoredTable, Table, Variable, check_sense, columns, opened, undamaged, write_tables
 from .records import Fields, Within, number, records_within, rows_table, table_of, tables_within, text, truth, values_in
-from .schema import read_checked
+from .stored_checks import read_checked
 
 _RECORDS = {
     "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
@@ -153,7 +154,7 @@ def _judged(table: StoredTable, cls: type, fields: schema.Fields) -> dict[str, A
     expansions = (None if body is None else Expansion(*body) for body in bodies)
     values["influences"] = checked_influences(Influences(u, u_relative, *expansions))
     values["limits"] = checked_limits({name: Limit(*limit) for name, limit in values["limits"].items()})
-    check_sense(table.path, {"the uncertainty of the test is not finite": not math.isfinite(values["u_test"])})
+    check_sense(table.path, {"the standard uncertainty of the test is not finite": not math.isfinite(values["u_test"])})
     checked(values["rule"], Rule | None, "rule")
     return values
 
@@ -162,12 +163,12 @@ KIND = "model comparison"
 _MODELS: Fields = {
     "parameters": number("free parameters", "1"),
     "effective_parameters": number("parameters that the data determine", "1"),
-    "rms_inside": number("RMS distance from the geometry, of the poses to which the model was fitted", "mm"),
+    "rms_inside": number("RMS distance of the fitted poses from their geometry", "mm"),
     "rms_outside": number("RMS error in held-out regions", "mm"),
-    "u_outside": number("standard error of rms_outside, from the scatter between regions", "mm"),
+    "u_outside": number("standard error of rms_outside, estimated from the scatter between regions", "mm"),
     "ratio": number("mean of (error / predicted standard deviation)^2 in held-out regions", "1"),
-    "log_evidence": number("log of the evidence, without the terms that are the same for all models", "1"),
-    "difference": number("mean square error in held-out regions, minus that of the best model", "mm2"),
+    "log_evidence": number("natural logarithm of the evidence, without the terms that are equal for all models", "1"),
+    "difference": number("mean square error in held-out regions, minus the mean square error of the best model", "mm2"),
     "u_difference": number("standard error of the difference", "mm2"),
     "cpu_seconds": number("CPU time", "s"),
 }
@@ -250,6 +251,8 @@ def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
             "a model lacks a region": uneven,
             "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
             "a number is impossibly large": any(abs(value) > _LARGEST for value in numbers if value is not None),
-            "a number that cannot be negative is negative": any(value is not None and value < 0 for value in positive),
+            "a number is negative where only 0 or more is possible": any(
+                value is not None and value < 0 for value in positive
+            ),
         },
     )

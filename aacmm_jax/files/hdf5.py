@@ -208,7 +208,9 @@ class Entries(dict[str, Any]):
         self.path, self._what = path, what
 
     def __missing__(self, name: str) -> Any:
-        raise InputError(f"{self.path} has no {self._what} '{name}', so it is damaged or was edited; make it again.")
+        raise InputError(
+            f"{self.path} has no {self._what} '{name}', so the file is damaged or was edited; create it again."
+        )
 
 
 class StoredTable(Entries):
@@ -238,7 +240,7 @@ def read_tables(path: str | os.PathLike, kinds: Sequence[str], without: Sequence
         size = sum(data.size * data.dtype.itemsize for group in groups.values() for data in group.values())
         if size > largest_file():
             raise InputError(
-                f"{path} contains arrays of {size / 2**20:,.0f} MiB, more than the limit for reading; name another "
+                f"{path} contains arrays of {size / 2**20:,.0f} MiB, more than the limit for reading; give another "
                 "file."
             )
         tables = {
@@ -275,7 +277,7 @@ def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True
         size, largest = stream.seek(0, os.SEEK_END), largest_file()
         stream.seek(0)
         if stream.read(8) != b"\x89HDF\r\n\x1a\n":
-            raise InputError(f"{path} is not an HDF5 file, or it is damaged; name a file written by aacmm.")
+            raise InputError(f"{path} is not an HDF5 file or is damaged; give a file written by aacmm.")
         stream.seek(0)
         source = stream.read() if size <= _IN_MEMORY else stream
         if verify and "h5py" not in sys.modules:
@@ -287,13 +289,13 @@ def opened(path: str | os.PathLike, kinds: Sequence[str], *, verify: bool = True
             seal = seal_of(io.BytesIO(source) if isinstance(source, bytes) else source)
             if seal is None:
                 raise InputError(
-                    f"{path} was not written by aacmm, or it is damaged, incomplete or was changed by another "
-                    f"program: the SHA-256 at its end is missing; name {wanted} file as aacmm wrote it, or make it "
-                    "again."
+                    f"{path} does not end with the SHA-256 that aacmm writes, so it is incomplete or damaged, was "
+                    f"changed by another program, or was not written by aacmm; give {wanted} file that aacmm wrote, or "
+                    "create it again."
                 )
             if not seal:
                 raise InputError(
-                    f"{path} is damaged or was edited: its content does not match its SHA-256; make it again."
+                    f"{path} is damaged or was edited: its content does not match its SHA-256; create it again."
                 )
             read_through(path, source, size, largest, seal)
         with file_of(source) as file:
@@ -312,7 +314,9 @@ def undamaged(path: str | os.PathLike) -> Iterator[None]:
     except (InputError, ImportError):
         raise
     except MemoryError as error:
-        raise InputError(f"{path} cannot be read: this process has no memory left; free some memory.") from error
+        raise InputError(
+            f"{path} cannot be read: the process has run out of memory; free some memory and try again."
+        ) from error
     except Exception as error:  # a single wrong byte surfaces as almost any exception of HDF5, h5py and NumPy
         check_backend()
         if is_from_jax(error) or isinstance(error, AssertionError | FloatingPointError):
@@ -327,7 +331,7 @@ def _check_kind(attributes: Entries, kinds: Sequence[str], wanted: str) -> None:
         path,
         {
             "an attribute that must be text has another type": not all(isinstance(text, str) for text in texts),
-            "it was not written by aacmm": attributes["format"] != FORMAT,
+            "the format is unknown": attributes["format"] != FORMAT,
             f"its format version is {version!r}": not isinstance(version, int) or version < 1,
             "the time of writing is not a date": not is_moment(attributes["created"]),
         },
@@ -335,12 +339,13 @@ def _check_kind(attributes: Entries, kinds: Sequence[str], wanted: str) -> None:
     if version != FORMAT_VERSION:
         later = isinstance(version, int) and version > FORMAT_VERSION
         what = "newer" if later else "older"
-        todo = "update aacmm_jax" if later else "make it again with this version, from the manifest or the capture"
+        todo = "update aacmm_jax" if later else "create it again with this version from the manifest or the capture"
         raise InputError(
-            f"{path} has format version {version}, {what} than this package reads ({FORMAT_VERSION}); {todo}."
+            f"{path} has format version {version}, {what} than the version that this package reads ({FORMAT_VERSION}); "
+            f"{todo}."
         )
     if attributes["kind"] not in kinds:
-        raise InputError(f"{path} contains {_with_article(attributes['kind'])}; name {wanted} file.")
+        raise InputError(f"{path} contains {_with_article(attributes['kind'])}; give {wanted} file.")
 
 
 def _with_article(name: str) -> str:
@@ -359,4 +364,4 @@ def check_sense(path: str | os.PathLike, problems: Mapping[str, Any]) -> None:
     """Raise `InputError` where values of a file make no sense: with the first of ``problems`` that is true."""
     for problem, present in problems.items():
         if present:
-            raise InputError(f"{path} is damaged or was edited: {problem}; make it again.")
+            raise InputError(f"{path} is damaged or was edited: {problem}; create it again.")

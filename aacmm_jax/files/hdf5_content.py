@@ -87,12 +87,12 @@ class _Check:
 
     def _refuse(self, name: bytes, what: str) -> InputError:
         where = f"{self._path}: '{name.decode()}'"
-        return InputError(f"{where} is {what}, which aacmm does not read; name a file written by aacmm.")
+        return InputError(f"{where} is {what}, so aacmm does not read this file; give a file written by aacmm.")
 
     def _check_size(self, name: bytes, item: Any, size: float) -> None:
         if size > self._credible:
             sizes = " x ".join(map(str, item.shape)) or "1"
-            raise self._refuse(name, f"an array of {sizes}, far more than the file contains")
+            raise self._refuse(name, f"an array of {sizes} values, far more than the file can contain")
 
     def item(self, group: Any, name: bytes) -> Any:
         """A member of a group."""
@@ -114,7 +114,7 @@ class _Check:
         self._check_size(name, item, size)
         text = bool(h5py.check_string_dtype(kind))
         if text and len(shape) > 1:
-            raise self._refuse(name, "a table of texts in several dimensions")
+            raise self._refuse(name, "an array of texts with more than one dimension")
         if not shape or not size:
             data[()]
             return

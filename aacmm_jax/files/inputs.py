@@ -65,7 +65,7 @@ def open_input(path: str | os.PathLike, times: float = 1) -> Iterator[Any]:
     def check_ordinary(status: os.stat_result) -> None:
         if not stat.S_ISREG(status.st_mode):
             folder = stat.S_ISDIR(status.st_mode)
-            kind = "a folder; name a file" if folder else "a pipe or a device; name an ordinary file"
+            kind = "a folder; give a file" if folder else "a pipe or a device; give an ordinary file"
             raise InputError(f"{path} is {kind}.")
 
     try:
@@ -78,13 +78,13 @@ def open_input(path: str | os.PathLike, times: float = 1) -> Iterator[Any]:
         raise
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; name another file.") from error
+        raise InputError(f"{str(path)!r} cannot be read: {reason.lower()}; give another file.") from error
     with open(descriptor, "rb") as stream:
         status = os.fstat(descriptor)
         check_ordinary(status)
         if status.st_size > limit:
             raise InputError(
-                f"{path} has {status.st_size / 2**20:,.0f} MiB, more than the limit of {limit / 2**20:,.0f} MiB; name "
+                f"{path} has {status.st_size / 2**20:,.0f} MiB, more than the limit of {limit / 2**20:,.0f} MiB; give "
                 f"another file, or raise the limit with the environment variable {LARGEST_FILE}."
             )
         yield stream

@@ -19,7 +19,8 @@ from ..data.recording import ProbedSphere, Recording, checked_sphere
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile
-from .manifest_rows import Readings, Source, name_of, parts, points_of
+from .manifest_readings import Readings, points_of
+from .manifest_rows import Source, name_of, parts
 from .manifest_tables import TABLES, Length, PointsManifest, PosesManifest, Recorded
 from .outputs import as_path
 from .patterns import check_fields, check_name, fields_of, fill, in_braces, matches
@@ -82,10 +83,12 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
                         named = f"{name}/{part.group}" if entry.group is not None else name
                         observed.append((part.session, kind.rebuilt(named, part.rows)))
         if not observed:
-            raise InputError("there is neither a [[socket]] nor another observation; add one.")
+            raise InputError("the manifest contains no [[socket]] and no other observation; add at least one.")
         probe = "remounted" if model.sessions is None else model.sessions.probe
         if model.sessions is not None and not any(session for session, _ in observed):
-            raise InputError("[sessions] applies to tables with a session, but no table has one; remove [sessions].")
+            raise InputError(
+                "[sessions] applies only to tables with a session, but no table has a session; remove [sessions]."
+            )
         capture = _capture(lengths, observed, probe == "remounted")
         if capture.columns == nominal.arm.joints + 1:
             nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
@@ -134,7 +137,9 @@ def read_points(path: str | os.PathLike) -> Measured:
                         f"'{end}'{nearest(end, seated)}"
                     )
         if not seated and not spheres:
-            raise InputError("there is neither a [[socket]] nor a [[sphere]], so nothing can be tested; add one.")
+            raise InputError(
+                "the manifest contains no [[socket]] and no [[sphere]], so nothing can be tested; add at least one."
+            )
         return Measured(
             {name: socket.poses for name, socket in seated.items()},
             tuple(lengths),
@@ -199,7 +204,7 @@ def _capture(lengths: Sequence[ReferenceLength], observed: Sequence[tuple[str, A
     if len(by_session) > 1 and "" in by_session:
         without = [item.name for item in by_session[""]]
         raise InputError(
-            f"{shorten(without)} has no session, but other tables have one; state the session in every table."
+            f"{shorten(without)} has no session, but other tables have a session; state the session in every table."
         )
     lengths_of: dict[str, list[ReferenceLength]] = {session: [] for session in by_session}
     for length in lengths:  # named session/name
@@ -209,8 +214,8 @@ def _capture(lengths: Sequence[ReferenceLength], observed: Sequence[tuple[str, A
             lengths_of[""].append(length)
         elif session is None:
             raise InputError(
-                f"length from '{length.start}' to '{length.end}' is not between two sockets of one session; name the "
-                "sockets as session/name."
+                f"length from '{length.start}' to '{length.end}' is not between two sockets of the same session; write "
+                "the names of the sockets as session/name."
             )
         else:
             start, end = (end.removeprefix(f"{session}/") for end in ends)
@@ -240,7 +245,10 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
     of_session = fields_of(getattr(entry, "session", None) or "") & fields
     if not name and fields:
         line = "/".join(f"{{{field}}}" for field in sorted(fields - of_session))
-        raise InputError(f"file '{first}' has {in_braces(fields)}, so add name = \"{line}\" in [[{table}]].")
+        raise InputError(
+            f"file '{first}' has {in_braces(fields)}, so its table needs a name with the same fields; add name = "
+            f'"{line}" to [[{table}]].'
+        )
     for what, text, of_others in (("name", name, of_session), *(("file", file, set()) for file in entry.paths[1:])):
         if fields_of(text) | of_others != fields:
             raise InputError(
@@ -249,7 +257,8 @@ def _fields(folder: Path, entry: Any, table: str) -> Iterator[dict[str, str]]:
             )
     if entry.exclude and not fields:
         raise InputError(
-            f"exclude applies to file names with a field in braces, but '{first}' has none; remove exclude."
+            f"exclude applies only to file names with a field in braces, but '{first}' has no such field; remove "
+            "exclude."
         )
     yield from matches(folder, first, entry.exclude) if fields else [{}]
 
@@ -266,8 +275,8 @@ def _lengths(
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
         if not choices and names:
             raise InputError(
-                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; use the same "
-                "field names."
+                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; use the fields of "
+                "the sockets' names."
             )
         choices = choices if names else {()}
         pairs = [(fill(entry.start, dict(choice)), fill(entry.end, dict(choice))) for choice in sorted(choices)]

@@ -1,171 +1,29 @@
-"""What the text tables of a manifest hold: joint readings or points, in rad and mm, and the entries of observations.
+"""What the text tables of a manifest hold besides readings and points: the entries of observations, row by row.
 
 Nothing here depends on a kind: `AbstractObservation.entries` says what each needs.
 """
 
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from ..core.errors import InputError, nearest
 from ..core.text import quoted, shorten
 from ..core.units import ANGLE_UNITS, LENGTH_UNITS
-from ..data.capture import check_revolutions
 from ..data.observations.declared import Entry
 from ..data.observations.observation import AbstractObservation
-from ..kinematics.arm import Arm
 from .inputs import InputFile, fingerprint
-from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Angles, PointsTable, Preset, as_list
+from .manifest_readings import Wanted, checked_unit
+from .manifest_tables import NUMBERS_OF_ROTATION, PRESETS, Preset, as_list
 from .patterns import check_name, fields_of, fill
-from .table_columns import LINE, TEMPERATURE, header_units, position_columns, proposed_columns, reading_columns
 from .text_lines import TABLE_SHARE, Column
 from .text_table import TextTable
 
-
-class Wanted(NamedTuple):
-    """What the manifest states of the readings, or points, in a table."""
-
-    columns: Sequence[Column] | None = None
-    unit: str | None = None
-    usual_unit: str | None = None  # of the preset, where neither the manifest nor the header states one
-    taken: Sequence[int] = ()  # columns, from 0, that hold something else
-    temperature: float | None = None
-
-
-def checked_unit(
-    where: object, what: str, header: str | None, stated: str | None, usual: str | None, units: Iterable[str]
-) -> str | None:
-    """The unit that the manifest states, or the header, or the preset. Raises `InputError` where the first two differ,
-    or it is none of ``units``."""
-    if header is not None and stated not in (None, header):
-        raise InputError(
-            f"{where}: the header of the {what} says {quoted(header)[1:-1]}, but the manifest says {stated}; correct "
-            "one of the two."
-        )
-    unit = stated or header or usual
-    if unit is not None and unit not in units:
-        raise InputError(f"{where}: the {what} are in {quoted(unit)}; use one of {', '.join(units)}.")
-    return unit
-
-
-class Readings:
-    """Joint readings of tables, in rad and mm, with the arm's temperature as a last column where there is one.
-
-    Raises `InputError` where columns are missing or not clear, units are missing or differ, or one table has
-    temperatures and another not.
-    """
-
-    def __init__(self, arm: Arm, angles: Angles | None):
-        self._arm, self._angles = arm, angles
-        self._first: tuple[int, str | os.PathLike] | None = None  # columns of readings of the first table, and its file
-        self.columns: list[int] = []  # of the joints in the first table, from 1
-        self.header: list[str] = []  # of the first table
-        self.angles: Angles | None = None  # with which the first table was read, its header and units considered
-
-    def __call__(self, text: TextTable, wanted: Wanted) -> Float[np.ndarray, "N n"]:
-        """The readings of one table."""
-        stated = wanted.columns
-        if stated is None and self._angles is not None and self._angles.columns is not None:
-            stated = as_list(self._angles.columns)
-        picked = reading_columns(text, self._arm.joints, wanted.taken, stated)
-        thermometer = text.pick([TEMPERATURE]) if text.has([TEMPERATURE]) else []
-        if set(thermometer) & set(picked):
-            raise InputError(
-                f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; remove it from "
-                "columns."
-            )
-        numbers = text.numbers(picked, measured=True, stated=stated is not None)
-        angles = self._angles_of(text, picked, wanted)
-        q = angles.converted(numbers, self._arm)
-        check_revolutions(str(text.path), q, self._arm, 'correct the header, or write unit = "deg" in [angles]')
-        temperature = text.numbers(thermometer)[:, 0] if thermometer else None
-        readings = with_temperature(q, temperature, wanted.temperature, str(text.path))
-        if self._first is None:
-            self._first, self.columns = (readings.shape[1], text.path), [i + 1 for i in picked]
-            self.header, self.angles = list(text.header), angles
-        if self._first[0] != readings.shape[1]:
-            (_, without), (_, other) = sorted((self._first, (readings.shape[1], text.path)), key=lambda table: table[0])
-            raise InputError(
-                f"{without} has no temperatures, but {other} has; add a column {TEMPERATURE} to {without}, or state "
-                f"{TEMPERATURE} in its table."
-            )
-        return readings
-
-    def _angles_of(self, text: TextTable, picked: Sequence[int], wanted: Wanted) -> Angles:
-        """How these readings are written: what the table states comes first, then [angles], the header, the preset.
-
-        What the manifest states must not contradict the header.
-        """
-        angles = self._angles
-        unit = wanted.unit or (None if angles is None else angles.unit)
-        angular, linear = header_units(text, picked, self._arm, unit)
-        if angular == "counts" and unit is None:
-            raise InputError(
-                f'{text.path} has readings in counts; add [angles] with unit = "counts" and counts_per_turn = [...].'
-            )
-        possible = (*ANGLE_UNITS, "counts") if angles is not None and angles.unit == "counts" else ANGLE_UNITS
-        unit = checked_unit(text.path, "readings", angular, unit, wanted.usual_unit, possible)
-        if unit is None:
-            raise InputError(
-                "'angles' is missing, so the unit of the readings is not known; add [angles] with unit = "
-                '"deg" or "rad", or state the unit in the header of the table, for example J1 [deg].'
-            )
-        stated = {} if angles is None else angles.model_dump(exclude_unset=True)
-        if angles is None or unit != angles.unit:
-            stated.pop("counts_per_turn", None)
-        if linear is not None:
-            units = (*LENGTH_UNITS, "counts")
-            checked_unit(text.path, "prismatic joints", linear, stated.setdefault("linear_unit", linear), None, units)
-        if linear == "counts" and "counts_per_mm" not in stated:
-            raise InputError(
-                f'{text.path} has readings in counts; add linear_unit = "counts" and counts_per_mm = [...].'
-            )
-        return Angles(**{**stated, "unit": unit})
-
-
-def with_temperature(
-    q: Float[np.ndarray, "N n"], column: Float[np.ndarray, " N"] | None, stated: float | None, where: str
-) -> Float[np.ndarray, "N m"]:
-    """Readings with the temperature as a last column: of a table, or stated once for all, but not both; as they are
-    without either."""
-    if column is not None and stated is not None:
-        raise InputError(
-            f"{where} has a column {TEMPERATURE}, but the manifest also states {TEMPERATURE}; give only one of the two."
-        )
-    if stated is not None:
-        column = np.full(len(q), float(stated))
-    return q if column is None else np.concatenate([q, column[:, None]], axis=1)
-
-
-def points_of(text: TextTable, wanted: Wanted, points: PointsTable) -> Float[np.ndarray, "N 3"]:
-    """The points of a table, mm."""
-    columns = wanted.columns
-    if columns is None and points.columns is not None:
-        columns = as_list(points.columns)
-    named = position_columns(text) if columns is None else None
-    if columns is not None:
-        picked = text.pick(columns)
-    elif named is not None:
-        picked = named[0]
-    else:
-        picked = [i for i in range(text.width) if i not in wanted.taken]
-        text.check_ascending(picked)
-    if len(picked) != 3:
-        line = LINE.format(", ".join(str(i + 1) for i in proposed_columns(text, 3, wanted.taken)) or "...")
-        raise InputError(
-            f"{text.path} has {text.shown()}, but it is not clear which columns are x, y and z; add {line} with these "
-            "three columns."
-        )
-    header = text.unit(picked, key="points") if named is None else named[1]
-    unit = checked_unit(text.path, "points", header, wanted.unit or points.unit, wanted.usual_unit, LENGTH_UNITS)
-    if unit is None:
-        raise InputError(f'{text.path} does not state the unit of its points; add unit = "mm" to [points].')
-    return text.numbers(picked, measured=True, stated=columns is not None) * LENGTH_UNITS[unit]
+# The units in which a manifest or table may state an entry, by the entry's own; of all others, lengths.
+_UNITS = {"rad": ANGLE_UNITS, "1": ANGLE_UNITS, "px": {"px": 1.0}}
 
 
 class Source:
@@ -223,8 +81,8 @@ def parts(
         different = sorted(tables[0].keys() ^ rows.keys())
         if different:
             raise InputError(
-                f"{where}: only one of {files_read[0]} and {file} has '{different[0]}'; add '{different[0]}' to all "
-                "files of the table, or make a separate table for each file."
+                f"{where}: {files_read[0]} and {file} differ, because only one of the two has '{different[0]}'; add "
+                f"'{different[0]}' to all files of the table, or make a separate table for each file."
             )
     by_pose = {key: np.concatenate([rows[key] for rows in tables]) for key in tables[0]}
     groups, sessions = by_pose.pop("group"), by_pose.pop("session")
@@ -246,7 +104,10 @@ def _filled(text: str, values: Mapping[str, str], what: str) -> str:
     """A text whose fields in braces are filled in."""
     unknown = fields_of(text) - values.keys()
     if unknown:
-        raise InputError(f"{what} uses the unknown field {shorten(sorted(unknown))}.")
+        raise InputError(
+            f"{what} uses the field {shorten(sorted(unknown))}, which the file names do not have; use only fields of "
+            "the file names."
+        )
     return fill(text, values)
 
 
@@ -269,10 +130,16 @@ class _Reader:
         labels = [e.name for e in kind.entries if e.dimensions == ("pose",) and e.content == "text"]
         self._label = labels[0] if labels else None
         if isinstance(table.files, dict) and self._label is None:
-            raise InputError(f"{where} has named files, but its poses have no names; give files as a list.")
+            raise InputError(
+                f"{where} has files with names, but its kind of observation has no named points or sides; give files "
+                "as a list."
+            )
         self._own_file = getattr(table, "readings", None)
         if self._own_file is not None and len(table.paths) > 1:
-            raise InputError(f"{where} has its readings in a separate file, so it needs exactly one file of values.")
+            raise InputError(
+                f"{where} has its readings in a separate file, so it needs exactly one file of measured values; give "
+                "one file."
+            )
 
     def read(self, label: str, file: str, session: str) -> dict[str, Any]:
         """Of each pose of a file what its columns hold, its group and its session."""
@@ -331,7 +198,10 @@ class _Reader:
 
     def _column(self, text: TextTable, entry: Entry, wanted: Sequence[Column]) -> np.ndarray:
         if not entry.of_poses:
-            raise InputError(f"{self._where}: {entry.name} has one value for all poses; state it outside columns.")
+            raise InputError(
+                f"{self._where}: {entry.name} has one value for all poses, so it cannot be a column; remove it from "
+                f"columns and write {entry.name} = ... in the table."
+            )
         if entry.content == "text":
             if len(wanted) != 1:
                 raise InputError(f"{self._where}: {entry.name} needs one column; pick one column.")
@@ -341,9 +211,9 @@ class _Reader:
         header = text.unit(picked, self._table.units.get(entry.name) or self._preset.units.get(entry.name), entry.name)
         if entry.unit == "1":
             return self._rotations(entry, numbers, header)
-        shape = (3,) * (len(entry.dimensions) - 1)
+        shape = entry.row_shape
         count = math.prod(shape)
-        of_all_axes = entry.name == "u" and count == 3
+        of_all_axes = entry.name == "u" and len(shape) == 1
         self._check_count(entry.name, numbers.shape[1], (1, 3) if of_all_axes else (count,))
         numbers = numbers * self._unit(entry, header)
         if entry.name == "u":
@@ -353,11 +223,13 @@ class _Reader:
     def _check_count(self, name: str, given: int, counts: Sequence[int]) -> None:
         if given not in counts:
             wanted = " or ".join(map(str, counts))
-            raise InputError(f"{self._where}: {name} needs {wanted} columns, but {given} are picked; pick {wanted}.")
+            raise InputError(
+                f"{self._where}: {name} needs {wanted} columns, but {given} are picked; pick {wanted} columns."
+            )
 
     def _unit(self, entry: Entry, header: str | None = None) -> float:
         """What a number of the table or manifest is multiplied by; ``header``: the unit that the table states."""
-        units = ANGLE_UNITS if entry.unit in ("rad", "1") else LENGTH_UNITS
+        units = _UNITS.get(entry.unit, LENGTH_UNITS)
         name, usual = entry.name, self._preset.units.get(entry.name)
         unit = checked_unit(self._where, name, header, self._table.units.get(name), usual, units)
         if unit is None and entry.unit == "1":
@@ -378,7 +250,10 @@ class _Reader:
             return numbers.reshape(-1, 3, 3)
         if convention.startswith("quaternion"):
             if not np.allclose(np.linalg.norm(numbers, axis=1), 1, atol=1e-3):
-                raise InputError(f"{self._where} has quaternions whose length is not 1; pick their four columns.")
+                raise InputError(
+                    f"{self._where} has quaternions whose length is not 1; check that the right four columns are "
+                    "picked."
+                )
             return Rotation.from_quat(numbers, scalar_first=convention.endswith("wxyz")).as_matrix()
         numbers = numbers * self._unit(entry, header)
         vector = convention == "vector"

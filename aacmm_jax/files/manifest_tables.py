@@ -115,9 +115,9 @@ class Angles(Strict):
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
         if (self.unit == "counts") != (self.counts_per_turn is not None):
-            raise ValueError("counts_per_turn and unit = 'counts' must be given together.")
+            raise ValueError("counts_per_turn and unit = 'counts' need each other; give both or neither.")
         if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
-            raise ValueError("counts_per_mm and linear_unit = 'counts' must be given together.")
+            raise ValueError("counts_per_mm and linear_unit = 'counts' need each other; give both or neither.")
         return self
 
     def converted(self, readings: Float[np.ndarray, "N n"], arm: Arm) -> Float[np.ndarray, "N n"]:
@@ -181,9 +181,12 @@ class SocketTable(_Named):
     @model_validator(mode="after")
     def _has_name(self) -> "SocketTable":
         if self.files is not None and self.name is None and self.group is None:
-            raise ValueError("a socket with several files needs a name.")
+            raise ValueError("a socket with several files needs a name; add name.")
         if self.visits is not None and self.target:
-            raise ValueError("visits apply to the arm's own probe; remove visits from a socket with a target.")
+            raise ValueError(
+                "visits apply only to sockets measured with the arm's own probe, but this socket has a target; remove "
+                "visits."
+            )
         return self
 
 
@@ -264,8 +267,8 @@ class PointsTable(Strict):
     def _both(self) -> "PointsTable":
         if (self.reach is None) != (self.shoulder is None):
             raise ValueError(
-                "give reach and shoulder together: zones are ranges of the distance from the shoulder, which is "
-                "stated in the frame of the points."
+                "reach and shoulder are needed together, because the zones of the test are ranges of distance from the "
+                "shoulder; give both or neither (shoulder in the frame of the points)."
             )
         return self
 
@@ -314,7 +317,7 @@ class PointsManifest(Recorded):
             seated = isinstance(entry, SocketTable) and (entry.target or entry.session)
             if seated or entry.temperature_C is not None:
                 raise ValueError(
-                    "target, session and temperature_C apply to manifests of poses, but "
+                    "target, session and temperature_C apply only to manifests of joint readings, but "
                     f"'{entry.name or entry.paths[0]}' has points, which are positions of the tip; remove these keys."
                 )
         return self

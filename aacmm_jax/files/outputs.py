@@ -43,7 +43,9 @@ def as_path(path: Any) -> Path:
 def storable(text: str) -> str:
     """The same text, or `InputError` where HDF5 and TOML cannot hold it (NUL, or a file name that is not UTF-8)."""
     if "\0" in text or text.encode(errors="ignore").decode() != text:
-        raise InputError(f"the name {text!r} contains a character that files cannot store; rename it.")
+        raise InputError(
+            f"the name {text!r} contains a character that cannot be stored in a file; choose another name."
+        )
     return text
 
 
@@ -142,8 +144,7 @@ class OutputFile:
             "it is read-only": exists and not (target.stat().st_mode & 0o222 and os.access(target, os.W_OK)),
             "not a directory": folder.stat() and not folder.is_dir(),  # there must be one
             "its folder is read-only": not os.access(folder, os.W_OK | os.X_OK),
-            "it belongs to another user, and only that user can replace it in its folder": exists
-            and not may_replace(target),
+            "it belongs to another user, and only that user may replace it": exists and not may_replace(target),
         }
         for problem, present in problems.items():
             if present:
@@ -318,7 +319,7 @@ def together(*paths: str | os.PathLike | None) -> Iterator[None]:
             output.check()
         output.check_replaced()
         if any(_same(output.target, other.target) for other in outputs[:number]):
-            raise InputError(f"{output.named} is named for two outputs; choose another file for one of the two.")
+            raise InputError(f"{output.named} is given for two outputs; choose a different file for one of the two.")
     group = _Outputs(outputs, {}, [])
     token = _current.set(group)
     try:

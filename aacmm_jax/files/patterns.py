@@ -31,7 +31,10 @@ def check_fields(text: str) -> None:
     names = _FIELD.findall(text)
     for name in names:
         if not name[0].isalpha():
-            raise InputError(f"the field {{{name}}} in {quoted(text)} has no valid name; begin the name with a letter.")
+            raise InputError(
+                f"the field {{{name}}} in {quoted(text)} has a name that does not begin with a letter; rename the "
+                "field."
+            )
     if len(names) > _MOST_FIELDS:
         raise InputError(
             f"{quoted(text)} has more than {_MOST_FIELDS} fields; use fewer fields and write out more of the name."
@@ -45,7 +48,7 @@ def check_fields(text: str) -> None:
 def check_name(name: str) -> None:
     """Refuse a name with characters that act on a terminal or end a text (NUL, ESC), and one longer than a line."""
     if any(map(is_control, name)):
-        raise InputError(f"the name {quoted(name)} contains a control character; rename it.")
+        raise InputError(f"the name {quoted(name)} contains a control character; remove the character.")
     if len(name) > _LONGEST_NAME:
         raise InputError(
             f"the name {quoted(name)} has {len(name):,} characters, more than {_LONGEST_NAME}; shorten the name."
@@ -92,18 +95,18 @@ def matches(folder: Path, pattern: str, exclude: Sequence[str] = ()) -> list[dic
     near = [f"'{path}'" for path in kept if loose.fullmatch(path)]
     if near:
         raise InputError(
-            f"{where}. Nearest: {shorten(near, _SHOWN)}. Next to other text in a name, a field stands for letters, "
-            "digits and '-' only; write out more of the name."
+            f"{where}. The most similar names are {shorten(near, _SHOWN)}. If a file or folder name has other text "
+            "beside a field, the field matches only letters, digits and '-'; write out more of the name."
         )
     if left_out:
         shown = shorten([f"'{path}'" for path in left_out], _SHOWN)
-        raise InputError(f"{where} except {shown}, which the key exclude rules out; change exclude.")
+        raise InputError(f"{where} except {shown}, but the key exclude leaves these files out; change exclude.")
     # Files as deep in the folders as the pattern, with names like it.
     fixed = _FIELD.split(pattern)[0].rpartition("/")[0]
     deeper = "/".join("*" for _ in pattern.removeprefix(fixed).strip("/").split("/"))
     files = [path for path in below(glob.escape(fixed) + "/" * bool(fixed) + deeper) if os.path.isfile(before + path)]
     alike = [f"'{path}'" for path in difflib.get_close_matches(pattern, files, n=_SHOWN, cutoff=0.3)]
-    raise InputError(f"{where}" + (f"; there is {', '.join(alike)}" if alike else "") + "; check the path.")
+    raise InputError(f"{where}" + (f"; similar names: {', '.join(alike)}" if alike else "") + "; check the path.")
 
 
 def _expression(pattern: str, partial: str) -> str:

@@ -1,6 +1,7 @@
 """Plans as files: the poses of a calibration or of an acceptance test as CSV, and the manifest for the readings."""
 
 import json
+import math
 import os
 import textwrap
 from collections.abc import Mapping
@@ -126,9 +127,9 @@ _WHAT = {
     Plan: "Manifest of a planned calibration. Fill in the calibrated lengths and uncertainties (k = 1), record one "
     "file per socket " + _ROWS.format("", "capture"),
     KitPlan: "Manifest of a planned calibration. Fill in certified values and uncertainties (k = 1), record the files "
-    + _ROWS.format(": joint readings, then what was measured", "capture"),
-    Procedure: "{}, as planned. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, record one "
-    "file per socket and per group of touches " + _ROWS.format("", "acceptance"),
+    + _ROWS.format(": the joint readings first, then the measured values", "capture"),
+    Procedure: "{}: manifest of the plan. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, "
+    "record one file per socket and per group of touches " + _ROWS.format("", "acceptance"),
 }
 
 
@@ -153,7 +154,7 @@ def plan_manifest(plan: Planned, arm: str, urdf: UrdfSource | None = None, angle
             f"measuring_range = {plan.measuring_range:.0f}   # mm: diameter of the measuring volume, as the maker "
             "states it"
         )
-        size = [stated if plan.range_stated else f"# {stated}; the plan uses twice the reach"]
+        size = [stated if plan.range_stated else f"# {stated} (the plan assumes twice the reach)"]
         tables = _of_procedure(plan)
     date = "# date = 2026-01-31   # day of the measurement"
     comment = textwrap.fill(what, 118, initial_indent="# ", subsequent_indent="# ")
@@ -212,7 +213,7 @@ def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any
             table[entry.name] = round(float(np.asarray(value)), 9), says
         elif entry.dimensions[0] == "pose" and entry.required:
             # A rotation is recorded as a quaternion.
-            count = 4 if entry.unit == "1" else 3 ** (len(entry.dimensions) - 1)
+            count = 4 if entry.unit == "1" else math.prod(entry.row_shape)
             columns[entry.name] = list(range(next_column, next_column + count)) if count > 1 else next_column
             next_column += count
             table |= {"rotation": "quaternion wxyz"} if entry.unit == "1" else {}
@@ -222,7 +223,8 @@ def _observation(observation: AbstractObservation, joints: int) -> dict[str, Any
     if columns:
         covariance = getattr(observation, "covariance", None)
         u = np.sqrt(covariance) if covariance is not None else getattr(observation, "u", 0.0)
-        table |= {"columns": columns, "u": (round(float(np.max(u)), 9), "mm: standard uncertainty (k = 1)")}
+        unit = next((entry.unit for entry in observation.entries if entry.name == "u"), "mm")
+        table |= {"columns": columns, "u": (round(float(np.max(u)), 9), f"{unit}: standard uncertainty (k = 1)")}
     return table
 
 

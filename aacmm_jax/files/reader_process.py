@@ -33,7 +33,7 @@ _COMMAND = "import sys; sys.path[:] = sys.argv[1:]; from aacmm_jax.files.reader_
 
 def damaged(path: str | os.PathLike) -> InputError:
     """What is said of a file that cannot be read to its end."""
-    return InputError(f"{path} is damaged or incomplete, or was edited; make it again.")
+    return InputError(f"{path} is damaged or incomplete, or was edited; create it again.")
 
 
 def vouch_for(seal: str) -> None:
@@ -138,8 +138,8 @@ class _Reader:
         except (OSError, TypeError, ValueError) as error:  # an interpreter that is not there, has no name, or fails
             reason = (getattr(error, "strerror", None) or str(error)).lower()
             raise InputError(
-                f"{path} cannot be read, because the process that tests HDF5 files before they are opened does not "
-                f"start: {reason}; check whether {sys.executable} -c 'import h5py' works."
+                f"{path} cannot be read, because the process that checks HDF5 files before they are opened does not "
+                f"start ({reason}); check whether {sys.executable} -c 'import h5py' works."
             ) from error
         self._started, answer = True, b""
         with contextlib.suppress(OSError):  # it has ended
@@ -154,8 +154,12 @@ class _Reader:
         if status is None:
             return json.loads(answer)
         killed = status == -getattr(signal, "SIGKILL", 0)
-        ended = f"{path} cannot be read: the operating system ended the process that reads the file; free some memory."
-        return ended if killed else None
+        if not killed:
+            return None
+        return (
+            f"{path} cannot be read: the operating system ended the process that reads the file, probably because "
+            "memory was short; free some memory and try again."
+        )
 
 
 def _after_fork() -> None:

@@ -60,7 +60,7 @@ def angles_toml(explanation: Explanation, unit: str | None, manifest: str | os.P
                 line = _pick(table, reordered(picked))
                 paths = table.get("files", [table.get("file")])
                 file = next(iter(paths.values() if isinstance(paths, dict) else paths))
-                comments.append(f"# In [[{key}]] ({file}), replace its columns by:\n# {line}\n")
+                comments.append(f"# In [[{key}]] ({file}), replace the picked columns with:\n# {line}\n")
     stated = as_read.model_dump(exclude_defaults=True, exclude={"sign", "offset", "columns"})
     entries: dict[str, Any] = {
         key: [value[i] for i in order] if isinstance(value, list) else value for key, value in stated.items()
@@ -172,14 +172,14 @@ def reading_sets_sentence(rows: Sequence[dict[str, Any]], poses: int) -> str:
         return ""
     best, other = sorted(rows, key=lambda row: row["rms_mm"])
     figures = (
-        f"a calibration with the {best['role']} readings leaves {best['rms_mm']:.3g} mm RMS, one with the "
-        f"{other['role']} readings {other['rms_mm']:.3g} mm"
+        f"a calibration with the {best['role']} readings leaves residuals of {best['rms_mm']:.3g} mm RMS, and a "
+        f"calibration with the {other['role']} readings leaves {other['rms_mm']:.3g} mm RMS"
     )
     # Each residual has a relative standard error of about 1 / sqrt(2 m) of m coordinates.
     if math.log(other["rms_mm"] / max(best["rms_mm"], 1e-12)) < _APART * math.sqrt(2 / (2 * 3 * poses)):
-        verdict = f", which fit equally well: {figures}"
+        verdict = f", and both fit equally well: {figures}"
     elif best["taken"]:
-        verdict = f", and the manifest uses those that fit better: {figures}"
+        verdict = f", and the manifest uses the readings that fit better: {figures}"
     else:
-        verdict = f": {figures}, so use the {best['role']} readings: {shorten(best['lines'], 3)}"
-    return f"The tables have both commanded and measured readings{verdict}."
+        verdict = f": {figures}. Use the {best['role']} readings, with {shorten(best['lines'], 3)}"
+    return f"The tables contain both commanded and measured readings{verdict}."

@@ -117,7 +117,7 @@ def rows_table(dimension: str, records: Iterable[Any], fields: Fields) -> Table:
         dimensions = field.dimensions or (dimension,)
         if field.dimensions:
             row = np.repeat(np.arange(len(records)), [len(value) for value in values])
-            says = f"index of its row of '{dimension}', counted from 0"
+            says = f"row of the dimension '{dimension}' to which the value belongs, counted from 0"
             variables[_index(dimension, field)] = Variable(dimensions, row, "1", says)
             values = [entry for value in values for entry in value]
         variables[field.name or name] = Variable(dimensions, _array(values, field), field.unit, field.says)

@@ -1,21 +1,11 @@
-"""What the HDF5 files of captures, calibrations and evaluations hold: every field with its unit, said once; and whether
-the values of a file make sense, whoever wrote it: checked whenever it is loaded, and before it is shown.
+"""What the HDF5 files of captures, calibrations and evaluations hold: every field with its unit, said once.
 
 Nothing here needs JAX, so that ``aacmm show`` checks a file and prints the summary in it quickly.
 """
 
-import os
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-import numpy as np
-
 from ..acceptance.standards import STANDARDS
-from .hdf5 import Entries, Stored, StoredTable, check_sense, is_moment, read_tables, undamaged
-from .records import Field, Fields, check_fields, count, mapping, number, part, text, truth
+from .records import Field, Fields, count, mapping, number, part, text, truth
 
-_ROUNDING = 1e-6  # of k
-_LARGEST_U = 0.1  # of k: beyond it the scale is as good as unknown
 _BOTH = "see unit"
 _EITHER = "mm or rad"
 
@@ -72,7 +62,7 @@ ARM: Fields = {
     "angle": number("half-width of the bounds of angles", "rad", name="half_width_angle_rad"),
     "override": mapping("half-widths of single parameters, mm or rad"),
     "held": text("fixed parameters"),
-    "free": text("parameters that are free in addition"),
+    "free": text("parameters that are free in addition to those that are free by default"),
     "stated": text("what a person chose: parameters, bounds", among=("parameters", "bounds")),
     **_GEOMETRY,
     "coefficient": text("name of the coefficient", "coefficient"),
@@ -81,21 +71,21 @@ ARM: Fields = {
     "gravity": number("direction of gravity in the base frame", "1", "axis"),
     **{
         f"nominal_{kind}": field._replace(
-            says=f"{field.says}, nominal arm at which the correction functions are evaluated"
+            says=f"{field.says}, of the nominal arm for which the correction functions are evaluated"
         )
         for kind, field in _GEOMETRY.items()
     },
     "mass": number("mass of the link", "kg", "joint"),
-    "centre": number("centre of mass in its frame", "mm", "joint", "axis"),
+    "centre": number("centre of mass of the link in the frame of the link", "mm", "joint", "axis"),
     "lowest": number("lowest reading of the joint", "rad", "joint"),
     "highest": number("highest reading of the joint", "rad", "joint"),
     "prismatic": count("prismatic joints"),
-    "thermometer": truth("whether the temperature is recorded after the readings"),
+    "thermometer": truth("whether the last column of the readings is the temperature"),
     "prior_groups": text("groups of parameters with a prior"),
-    "prior_sd": number("standard deviations of these groups, mm or rad", ""),
+    "prior_sd": number("standard deviation of each group with a prior, mm or rad", ""),
     "prior_learned": text("groups whose standard deviation is learned"),
-    "prior_mean_of": text("parameters or groups with a mean"),
-    "prior_mean": number("means of these parameters or groups, mm or rad", ""),
+    "prior_mean_of": text("parameters or groups whose prior states a mean"),
+    "prior_mean": number("means stated by the prior, mm or rad", ""),
 }
 
 _SQUARE = ("parameter", "parameter_2")
@@ -104,22 +94,25 @@ CALIBRATION: Fields = {
     "lower": number("lower bound of the identification", _BOTH, "parameter"),
     "upper": number("upper bound of the identification", _BOTH, "parameter"),
     "active_stage1": count(
-        "-1 on the lower bound, +1 on the upper, in stage 1", "parameter", least=None, among=(-1, 0, 1)
+        "bound that the parameter reached in stage 1: -1 the lower, +1 the upper, 0 none",
+        "parameter",
+        least=None,
+        among=(-1, 0, 1),
     ),
-    "active": count("-1 on the lower bound, +1 on the upper", "parameter", least=None, among=(-1, 0, 1)),
-    "determined": truth("whether the parameter is determined, and not only in combination with others", "parameter"),
-    "open": number("projector onto the combinations that are not determined, in mm and mrad", "1", *_SQUARE),
+    "active": count("bound reached: -1 the lower, +1 the upper, 0 none", "parameter", least=None, among=(-1, 0, 1)),
+    "determined": truth("whether the data determine the parameter itself, not only a combination", "parameter"),
+    "open": number("projector onto the combinations that the data do not determine, in mm and mrad", "1", *_SQUARE),
     "covariance": number("covariance", "products of units", *_SQUARE),
     "held": text("fixed parameters"),
     "hold": text("scale anchor of stage 1"),
-    "scale_set_by": text("fixed lengths that set the scale"),
-    "k": number("scale factor: measured divided by certified lengths", "1"),
+    "scale_set_by": text("lengths held constant, or readings of prismatic joints, that set the scale"),
+    "k": number("scale factor: measured lengths divided by certified lengths", "1"),
     "u_k": number("standard uncertainty of k", "1", least=0),
-    "surplus_k": number("part of the variance of k that comes from the disagreement of the lengths", "1", least=0),
+    "surplus_k": number("part of the variance of k due to disagreement between reference lengths", "1", least=0),
     "noise": part(NOISE),
     "noise_model": text("model of the tip errors"),
-    "degrees_of_freedom": number("degrees of freedom of the scatter of single poses", "1", least=0),
-    "reduced_chi": number("size of the residuals, in units of the given noise", "1", least=0),
+    "degrees_of_freedom": number("degrees of freedom of the estimated scatter of poses", "1", least=0),
+    "reduced_chi": number("RMS of the residuals, in units of their stated standard deviations", "1", least=0),
     "method": text("method", among=("two-stage", "joint", "repeatability")),
     "steps": count("number of evaluations"),
     "converged": truth("whether the solve converged"),
@@ -133,54 +126,54 @@ CALIBRATION: Fields = {
 
 SAMPLED: Fields = {
     "quantity": text("parameter, k or length", "quantity"),
-    "estimate": number("value found by the calibration", "mm or rad; 1 for k", "quantity"),
-    "u": number("standard uncertainty by Monte Carlo", "mm or rad; 1 for k", "quantity"),
-    "low": number("lower end of the Monte Carlo interval", "mm or rad; 1 for k", "quantity"),
-    "high": number("upper end of the Monte Carlo interval", "mm or rad; 1 for k", "quantity"),
-    "linear_u": number("standard uncertainty by the law of propagation", "mm or rad; 1 for k", "quantity"),
-    "agrees": truth("whether the linear interval is within the tolerance of JCGM 101", "quantity"),
+    "estimate": number("value estimated by the calibration", "mm or rad; k has no unit", "quantity"),
+    "u": number("standard uncertainty by Monte Carlo", "mm or rad; k has no unit", "quantity"),
+    "low": number("lower end of the Monte Carlo interval", "mm or rad; k has no unit", "quantity"),
+    "high": number("upper end of the Monte Carlo interval", "mm or rad; k has no unit", "quantity"),
+    "linear_u": number("standard uncertainty by the law of propagation", "mm or rad; k has no unit", "quantity"),
+    "agrees": truth("whether propagation and Monte Carlo agree within the tolerance of JCGM 101", "quantity"),
 }
 
 NOISY_ENCODERS: Fields = {
     "joint": count("joint whose encoder is noisier than expected", least=1),
-    "expected": number("standard deviation as given, or that of the other encoders", "rad, or mm of a prismatic joint"),
+    "expected": number("expected standard deviation: stated, or of other encoders", "rad, or mm of a prismatic joint"),
     "found": number("estimated standard deviation", "rad, or mm of a prismatic joint"),
     "u": number("standard uncertainty of the estimate", "rad, or mm of a prismatic joint"),
     "probability": number("probability of such residuals if the noise were as expected", "1"),
 }
 
 LEFT_OUT: Fields = {
-    "sockets": text("sockets left out together", "left_out_socket"),
-    "poses": count("number of poses in sockets with more than one pose"),
+    "sockets": text("sockets or observations held out together", "left_out_socket"),
+    "poses": count("number of held-out poses in sockets with more than one pose"),
     "rms": number("RMS distance from the centroid, observed", "mm"),
     "rms_predicted": number("RMS distance from the centroid, predicted", "mm"),
-    "length_error": number("error of a length that was left out", "mm", "left_out_length"),
-    "length_u": number("predicted standard uncertainty of this error", "mm", "left_out_length"),
-    "converged": truth("whether the calibration with the others converged"),
+    "length_error": number("error of a reference length that was held out", "mm", "left_out_length"),
+    "length_u": number("predicted standard uncertainty of length_error", "mm", "left_out_length"),
+    "converged": truth("whether the calibration from all other groups converged"),
     "rms_degrees_of_freedom": number("effective degrees of freedom of rms_predicted", "1"),
     "length_degrees_of_freedom": number("effective degrees of freedom of length_u", "1"),
-    "noise_degrees_of_freedom": number("degrees of freedom of the noise, used by both predictions", "1"),
+    "noise_degrees_of_freedom": number("degrees of freedom of the estimated noise", "1"),
 }
 
 REMOVED: Fields = {
     "kind": text("kind of group"),
-    "group": text("group left out, because it contradicts the rest"),
+    "group": text("group of data that was left out because it contradicts the other data"),
     "members": text("socket or observation left out", "removed_member"),
-    "ratio": number("F: mean square that the group added, divided by that of the rest", "1"),
+    "ratio": number("F: mean square added by the group, divided by the mean square of the other data", "1"),
     "degrees_of_freedom": count("degrees of freedom of numerator and denominator", "fraction"),
-    "probability": number("probability of an F this large if nothing is wrong", "1"),
-    "rms_with": number("RMS distance of the other poses from their geometry, if the group is used", "mm"),
-    "rms_without": number("RMS distance of the other poses from their geometry, without the group", "mm"),
+    "probability": number("probability of an F at least this large if the data are consistent", "1"),
+    "rms_with": number("RMS distance of the other poses from their geometry, calibrated with the group", "mm"),
+    "rms_without": number("RMS distance of the other poses from their geometry, calibrated without the group", "mm"),
     "changed_most": text("parameter that changed most"),
-    "change": number("change of this parameter, in standard uncertainties", "1"),
+    "change": number("change of the parameter that changed most, in standard uncertainties", "1"),
 }
 
 OBSERVED: Fields = {
     "name": text("observation", name="observation"),
     "kind": text("kind of the observation"),
-    "rms_before": number("root mean square distance from the geometry, nominal arm", "mm", least=0),
-    "rms_after": number("root mean square distance from the geometry, calibrated arm", "mm", least=0),
-    "reduced_chi": number("root mean square of the residuals, in standard deviations", "1"),
+    "rms_before": number("RMS distance of the poses from their geometry, nominal arm", "mm", least=0),
+    "rms_after": number("RMS distance of the poses from their geometry, calibrated arm", "mm", least=0),
+    "reduced_chi": number("RMS of the residuals, in units of their standard deviations", "1"),
     "weights": number("weight of a pose; below 1 if a robust loss reduced it", "1", "pose", least=0),
 }
 
@@ -188,24 +181,25 @@ GEOMETRY: Fields = {
     "part": text("part of the unknown geometry"),
     "unit": text("unit"),
     "value": number("value", "mm or rad, see unit"),
-    "covariance": number("row of the covariance matrix of the values of this part", "products of units", "entry"),
+    "covariance": number("row of the covariance matrix of all values of the part", "products of units", "entry"),
 }
 
 OTHER_POSES: Fields = {
     "names": text("observation", "observation", name="observation"),
     "poses": count("number of poses that were not used in the calibration", "observation"),
-    "rms": number("root mean square distance of these poses from the estimated geometry", "mm", "observation"),
-    "rms_angle": number("root mean square angle of these poses from the estimated geometry", "rad", "observation"),
+    "rms": number("RMS distance of the unused poses from the estimated geometry", "mm", "observation"),
+    "rms_angle": number("RMS of the residuals of the unused poses in rad, such as orientations", "rad", "observation"),
+    "rms_px": number("RMS of the residuals of the unused poses in px", "px", "observation"),
 }
 
 PRIOR: Fields = {
-    "groups": text("group of parameters with one prior", "prior_group", name="prior_group"),
+    "groups": text("group of parameters that share a prior", "prior_group", name="prior_group"),
     "learned": truth("whether the standard deviation of the group was learned from the data", "prior_group"),
     "units": text("unit of the standard deviation", "prior_group"),
     "parameters": count("number of free parameters in the group", "prior_group"),
     "sd": number("standard deviation, given or learned", "mm or rad, see unit", "prior_group"),
-    "effective": number("number of parameters of the group that the data determine (effective)", "1", "prior_group"),
-    "supported": truth("whether the data support a deviation from the mean", "prior_group"),
+    "effective": number("effective number of parameters of the group that the data determine", "1", "prior_group"),
+    "supported": truth("whether the data support a deviation of the group from its mean", "prior_group"),
     "names": text("free parameter", "prior_parameter", name="prior_parameter"),
     "mean": number("mean", _EITHER, "prior_parameter"),
     "weight": number("reciprocal of the standard deviation; 0 without a prior", "1/mm or 1/rad", "prior_parameter"),
@@ -227,7 +221,7 @@ SHARED_ERRORS: Fields = {
     "kinds": text("kind of shared error", "shared_kind", name="shared_kind"),
     "units": text("unit of the standard deviation", "shared_kind"),
     "names": text("coefficient of a function", "coefficient", name="coefficient"),
-    "sd": number("standard deviation, learned from the residuals", "mm or rad, see units", "shared_kind"),
+    "sd": number("standard deviation, estimated from the residuals", "mm or rad, see units", "shared_kind"),
     "moments": number("second moments of the coefficients about 0", "products of units", *_COEFFICIENTS),
     "follow": number(
         "derivatives of the parameters with respect to the coefficients",
@@ -235,7 +229,7 @@ SHARED_ERRORS: Fields = {
         "shared_parameter",
         "coefficient",
     ),
-    "correlation_length": number("correlation length of successive poses", "1"),
+    "correlation_length": number("correlation length of the errors of successive poses, in poses", "1"),
     "added": number(
         "part of the covariance", "products of units", "tip_kind", "shared_parameter", "shared_parameter_2"
     ),
@@ -247,7 +241,7 @@ SHARED_ERRORS: Fields = {
 }  # fmt: skip
 
 COMPONENTS: Fields = {
-    "names": text("source of a part of the covariance", "component", name="component"),
+    "names": text("source of uncertainty that contributes to the covariance", "component", name="component"),
     "matrices": number(
         "part of the covariance", "products of units", "component", "component_parameter", "component_parameter_2"
     ),
@@ -257,24 +251,24 @@ COMPONENTS: Fields = {
 UNCERTAINTY: Fields = {
     "names": text("free parameter", "parameter", name="parameter"),
     "covariance": number("covariance", "products of units", *_SQUARE),
-    "open": number("projector onto the combinations that are not determined, in mm and mrad", "1", *_SQUARE),
+    "open": number("projector onto the combinations that the data do not determine, in mm and mrad", "1", *_SQUARE),
     "noise": part(NOISE),
     "scatter_degrees_of_freedom": number("degrees of freedom of the noise", "1", least=0),
 }
 
 JUDGED: Fields = {
-    "limits": mapping("MPE of each metric: fixed part (mm) and divisor of the length"),
-    "u_test": number("standard uncertainty that seat and fixture add", "mm", least=0),
+    "limits": mapping("MPE of each metric: constant term (mm) and divisor of the length"),
+    "u_test": number("standard uncertainty due to seat and fixture", "mm", least=0),
     "standards": text("standards whose tests are run", among=("", *STANDARDS)),
-    "influences": mapping("uncertainty (mm, and relative to a length), and thermal expansion of artefact and arm"),
+    "influences": mapping("uncertainty (mm; relative to a length), and thermal expansion of artefact and arm"),
     "rule": text("decision rule"),
 }
 
 EVALUATION: Fields = {
-    "used": text("sockets from which the arm was identified"),
+    "used": text("sockets whose poses were used in the calibration"),
     "warnings": text("warnings about the results"),
     "calibration_warnings": text("warnings about the calibration"),
-    "maxima": mapping("largest values allowed, mm"),
+    "maxima": mapping("largest permitted value of each metric, mm"),
     **JUDGED,
 }
 
@@ -304,107 +298,3 @@ TABLES: dict[str, Fields] = {
     "evaluation": EVALUATION,
     "points": JUDGED,
 }
-
-
-def read_checked(path: str | os.PathLike, kinds: Sequence[str]) -> Stored:
-    """The tables of a capture, calibration or evaluation, with values that they can have. Raises `InputError`."""
-    stored = read_tables(path, kinds)
-    with undamaged(path):
-        check_fields(RECORDING, Entries(path, "entry", {}), stored.attributes)
-        for name, fields in TABLES.items():
-            if name in stored.tables:
-                check_fields(fields, stored.tables[name], stored.tables[name].attributes)
-        measured = stored.attributes.get("measured")
-        check_sense(path, {"the day of measurement is not a date": measured and not is_moment(measured[:10])})
-        if "capture" in stored.tables:
-            joints = stored.tables["capture"]["angle"].shape[1]
-            arms = [table["alpha"].shape for name, table in stored.tables.items() if name.endswith("_arm")]
-            others = any(shape != (joints,) for shape in arms)
-            check_sense(path, {"the numbers of joints of its arm and of its readings differ": others})
-        if stored.attributes["kind"] == "calibration":
-            _check_calibration(path, stored.tables["parameters"], stored.tables["reference"])
-        if "uncertainty" in stored.tables:
-            covariance = stored.tables["uncertainty"]["covariance"]
-            check_sense(
-                path,
-                {
-                    "the covariance matrix has negative eigenvalues or is not symmetric": not _is_semidefinite(
-                        covariance
-                    )
-                },
-            )
-        if "points" in stored.tables:
-            _check_points(path, stored.tables["points"])
-    return stored
-
-
-def check_shown(path: str | os.PathLike, kind: str, summary: Mapping[str, Any]) -> None:
-    """Raise `InputError` where values of a file, or the summary in it, make no sense."""
-    stored = read_checked(path, (kind,))
-    with undamaged(path):
-        if kind == "calibration":
-            attributes = stored.tables["parameters"].attributes
-            names = {"scale_k": "k", "scale_u": "u_k", "converged": "converged"}
-            shown = [np.nan if summary[name] is None else summary[name] for name in names]
-            held = [attributes[name] for name in names.values()]
-            same = np.allclose(np.array(shown, float), np.array(held, float), rtol=0, atol=0, equal_nan=True)
-            check_sense(path, {"its summary does not agree with its values": not same})
-
-
-def _check_calibration(path: str | os.PathLike, table: StoredTable, reference: StoredTable) -> None:
-    """Raise `InputError` where values of a calibration contradict each other.
-
-    k is a weighted mean of measured over certified lengths, so it lies between the least and the largest of them; its
-    lengths are between positions by weighted poses, and those stored between centroids, which differ by less than u.
-    """
-    attributes, covariance, names = table.attributes, table["covariance"], table["parameter"].tolist()
-    k, u_k, converged = (attributes[name] for name in ("k", "u_k", "converged"))
-    lengths = [
-        reference[f"measured_{stage}"] / reference["value"]
-        for stage in ("stage1", "calibrated")
-        if len(reference["value"]) and f"measured_{stage}" in reference
-    ]
-    scaled = attributes["method"] == "two-stage"  # only the division by k needs reference lengths
-    finite = all(np.all(np.isfinite(x)) for x in ((k, u_k, covariance) if scaled else (covariance,)))
-    slack = _ROUNDING + (3 * u_k if u_k < _LARGEST_U else 0.0)
-    of_lengths = any(ratio.min() - slack <= k <= ratio.max() + slack for ratio in lengths)
-    needed = converged and lengths and (scaled or not np.isnan(k))
-    check_sense(
-        path,
-        {
-            "a parameter is named twice": len(set(names)) != len(names),
-            "a parameter is both free and fixed": set(names) & set(attributes["held"] or ()),
-            "a lower bound is above the upper": not np.all(table["lower"] <= table["upper"]),
-            "the scale k is not positive": not k > 0 and not np.isnan(k),
-            "a converged calibration has a scale or covariance that is not finite": converged and not finite,
-            "the scale k does not agree with its lengths": needed and not of_lengths,
-            "the covariance matrix has negative eigenvalues or is not symmetric": finite
-            and not _is_semidefinite(covariance),
-        },
-    )
-
-
-def _check_points(path: str | os.PathLike, table: StoredTable) -> None:
-    """Raise `InputError` where the points of an evaluation, or what is stated about the arm's reach, cannot be."""
-    position, attributes = table["position"], table.attributes
-    shoulder = attributes.get("shoulder_mm", [0.0] * 3)
-    finite = position.shape == (len(table["socket"]), 3) and np.all(np.isfinite(position))
-    check_sense(
-        path,
-        {
-            "a position is not three finite numbers": not finite,
-            "the reach is not positive and finite": not 0 < attributes.get("radius_mm", 1.0) < np.inf,
-            "the shoulder is not three finite numbers": len(shoulder) != 3 or not np.all(np.isfinite(shoulder)),
-        },
-    )
-
-
-def _is_semidefinite(covariance: np.ndarray) -> bool:
-    """Whether a matrix is symmetric, and its correlations have no eigenvalue below zero, to rounding."""
-    variance = np.diag(covariance)
-    if np.any(variance < 0):
-        return False
-    root = np.sqrt(np.where(variance > 0, variance, 1.0))
-    correlation = covariance / root / root[:, None]
-    symmetric = np.allclose(correlation, correlation.T, rtol=0, atol=1e-9)
-    return symmetric and bool(np.all(np.linalg.eigvalsh(correlation) > -1e-6))

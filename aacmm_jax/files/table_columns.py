@@ -65,8 +65,8 @@ def _check_not_taken(table: TextTable, columns: Sequence[int], taken: Sequence[i
     if both is not None:
         name = f" {quoted(table.header[both])}" if table.header else ""
         raise InputError(
-            f"{table.path} column {both + 1}{name} is one of the joint readings, but is also picked for something "
-            "else (group, session, or a measured value); pick another column."
+            f"{table.path} column {both + 1}{name} is one of the joint readings, but is also picked as group, session "
+            "or measured value; pick another column."
         )
 
 
@@ -103,7 +103,7 @@ def reading_columns(
     whole = [family.columns for family in named if family.whole]
     if len(whole) > 1:
         choices = [f"{stated_by(columns)} ({quoted(table.header[columns[0]])}, ...)" for columns in whole]
-        raise InputError(f"{table.path} has several columns for each joint; add {' or '.join(choices[:4])}.")
+        raise InputError(f"{table.path} has several columns per joint; add {' or '.join(choices[:4])}.")
     # Where none is whole, one of as many columns is there twice.
     for columns in whole or [family.columns for family in named if len(family.columns) == joints]:
         table.check_ascending(columns, line)
@@ -124,11 +124,11 @@ def reading_columns(
     if joints == len(_OF_UR) and all(len(columns) == 1 for columns in of_ur):
         guess = [[columns[0] for columns in of_ur]]
     proposed = guess[0] if guess else proposed_columns(table, joints, taken)
-    add = f"add {stated_by(proposed)} if these columns are the joints in order"
+    add = f"add {stated_by(proposed)} if these columns are the readings of the joints in order"
     if not proposed:
         add = (
-            "correct the header, or the delimiter if it is confused with decimal commas, or pick one column per "
-            f"joint with {line.format('...')}, or name the columns q_1 to q_{joints}"
+            f"pick one column per joint with {line.format('...')}, or correct the header (for example, name the "
+            f"columns q_1 to q_{joints}), or correct the delimiter if it was confused with a decimal comma"
         )
     raise InputError(
         f"{table.path} has {table.shown()}, but it is not clear which columns hold the readings of the arm's {joints} "
@@ -183,9 +183,9 @@ def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str |
         unit = text.unit(columns, stated_unit)
         if unit not in (None, "counts", *possible):
             raise InputError(
-                f"{text.path} states {quoted(unit)} for readings of {joints} joints "
-                f"({quoted(text.header[columns[0]])}), but such readings are in {', '.join(possible)} or counts; pick "
-                "their columns with columns = [...], or correct the header."
+                f"{text.path} has readings of {joints} joints in {quoted(unit)} (column "
+                f"{quoted(text.header[columns[0]])}), but these must be in {', '.join(possible)} or counts; pick the "
+                "columns of the readings with columns = [...], or correct the header."
             )
         units.append(unit)
     return units[0], units[1]
@@ -247,14 +247,15 @@ def read_poses(
         picked = reading_columns(table, joints, taken, columns, line="--columns {}", required=required)
     header, linear = header_units(table, picked, arm, unit) if picked else (None, None)
     if linear not in (None, "mm"):
-        raise InputError(f"{path} states {linear} for readings of prismatic joints; convert them to mm.")
+        raise InputError(f"{path} has readings of prismatic joints in {linear}; convert these readings to mm.")
     if header is not None and (header not in _ANGLES or unit not in (None, header)):
         raise InputError(
-            f"{path} states {header} for joint readings; give the readings in deg or rad, and omit --unit."
+            f"the header of {path} states {header} for the joint readings; give the readings in deg or rad, and omit "
+            "--unit."
         )
     if bool(picked) == (near is not None):
         raise InputError(
-            f"{path} needs exactly one set of joint readings: give either columns q_1 to q_{joints} or --near."
+            f"{path} needs exactly one source of joint readings; give either columns q_1 to q_{joints} or --near."
         )
     if near is not None and len(near) != joints:
         raise InputError(
@@ -315,7 +316,7 @@ def _poses(
     from scipy.spatial.transform import Rotation
 
     if position is None:
-        raise InputError(f"{table.path} has orientations, but no positions in columns x, y and z; add these columns.")
+        raise InputError(f"{table.path} has orientations, but no columns x, y and z with positions; add these columns.")
     unit, (columns, rotation_unit) = position[1] or length or "mm", orientation
     if unit not in LENGTH_UNITS or length not in (None, unit) or rotation_unit not in (None, *_ANGLES):
         raise InputError(
@@ -330,7 +331,7 @@ def _poses(
         if len(wrong):
             raise InputError(
                 f"{table.path} row {wrong[0] + 1}: the length of the quaternion is not 1; correct the quaternion, or "
-                "the choice of its columns."
+                "pick the right columns."
             )
         poses[:, :3, :3] = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
     elif columns:

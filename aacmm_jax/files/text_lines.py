@@ -216,9 +216,9 @@ def names_of_columns(
         names = fitting if len(fitting) == 1 else [line for line in names if are_numbered(line[1])]
         if len(names) != 1:
             raise InputError(
-                f"{path} has words in all columns in both line {first} ({quoted(shorten(upper, 3))}) and line {last} "
-                f"({quoted(shorten(lower, 3))}); add skip = {last - 1} if line {last} names the columns; otherwise "
-                f"remove line {last}."
+                f"{path} has two lines with words in all columns: line {first} ({quoted(shorten(upper, 3))}) and line "
+                f"{last} ({quoted(shorten(lower, 3))}); add skip = {last - 1} if line {last} names the columns, "
+                f"otherwise remove line {last}."
             )
     chosen = names[0][1] if names else [""] * width if units else []
     if not units:

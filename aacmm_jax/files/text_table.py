@@ -81,7 +81,7 @@ class TextTable:
             if len(cells) != width:
                 raise InputError(
                     f"{path} line {line_number} has {len(cells)} columns, but the lines before it have {width}; give "
-                    "all lines the same number of columns, copy the file again if it is incomplete, or add skip = "
+                    "all lines the same number of columns, or copy the file again if it is incomplete, or add skip = "
                     f"{line_number - 1} if the table begins there."
                 )
         self._lines, self._rows = [number for number, _ in rows], [cells for _, cells in rows]
@@ -104,7 +104,7 @@ class TextTable:
     def shown(self) -> str:
         """Its columns as a message shows them: names with their numbers."""
         if not self.header:
-            others = f", but its header {len(self.title)} names" if self.misnamed else " without names"
+            others = f", but {len(self.title)} names in the header" if self.misnamed else " without names"
             return f"{self.width} columns{others}"
         most = max(_LONG, 150 // self.width)
         names = [f"{i} {quoted(name[:most])}" for i, name in enumerate(self.header, start=1)]
@@ -116,7 +116,7 @@ class TextTable:
         if missing and len(missing) < len(wanted):
             others = shorten([str(column) for column in wanted if column not in missing])
             raise InputError(
-                f"{self.path} has no column {quoted(str(missing[0]))}, but the columns {others}; correct the header, "
+                f"{self.path} has the columns {others}, but no column {quoted(str(missing[0]))}; correct the header, "
                 "or pick the columns by number."
             )
         return not missing
@@ -136,7 +136,9 @@ class TextTable:
         names.pop(None, None)
         if len(names) > 1:
             shown = shorten([f"{quoted(name)} is in {str(unit)[:_LONG]}" for unit, name in names.items()], 2)
-            raise InputError(f"{self.path} mixes units: {shown}; convert one of the columns, and change its header.")
+            raise InputError(
+                f"{self.path} mixes units: {shown}; convert the columns to the same unit, and correct the header."
+            )
         if AMBIGUOUS in names and stated_unit not in ("deg", "gon"):
             raise InputError(
                 f"{self.path}: the header says {quoted(names[AMBIGUOUS])}, but grad means deg in German and gon "
@@ -151,8 +153,8 @@ class TextTable:
             indices = self._matching(column)
             if not indices:
                 raise InputError(
-                    f"{self.path} has no column {quoted(str(column))}; it has {self.shown()}: pick other columns, by "
-                    "name or by number, or correct the header."
+                    f"{self.path} has no column {quoted(str(column))}; the table has {self.shown()}; pick another "
+                    "column by name or by number, or correct the header."
                 )
             if len(indices) > 1 and isinstance(column, str) and plain_name(column) in map(plain_name, self.header):
                 raise InputError(
@@ -162,7 +164,10 @@ class TextTable:
             self.check_ascending(indices)
             picked += indices
         if len(set(picked)) < len(picked):
-            raise InputError(f"{self.path}: one column is picked twice by {shorten([str(x)[:99] for x in wanted])}.")
+            raise InputError(
+                f"{self.path}: {shorten([str(x)[:99] for x in wanted])} pick the same column twice; pick each column "
+                "once."
+            )
         return picked
 
     def check_ascending(self, picked: Sequence[int], line: str = "columns = [{}]") -> None:
@@ -178,13 +183,13 @@ class TextTable:
             return
         ordered = ", ".join(str(picked[i] + 1) for i in order)
         advice = (
-            f"add {line.format(ordered)} to use the order of their numbers, each column once, or list the columns in "
-            "the order of the joints."
+            f"add {line.format(ordered)} to sort the columns by their numbers, or list each column once in the order "
+            "of the joints."
         )
         if axes is not None:
             advice = f"pick the columns as a list in the order of the axes: [{ordered}]."
         shown = shorten([quoted(name[:_LONG]) for name in names], _LONG)
-        raise InputError(f"{self.path} has its columns in the order {shown}; {advice}")
+        raise InputError(f"{self.path} has the columns in the order {shown}; {advice}")
 
     def numbers(self, picked: Sequence[int], *, measured: bool = False, stated: bool = False) -> np.ndarray:
         """The numbers of columns, counted from 0, ``(rows, columns)``; ``measured``: they are not numbers of columns,
@@ -193,15 +198,15 @@ class TextTable:
         if hashed is not None and not self._hashes:
             raise InputError(
                 f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; remove "
-                "the line if it is a comment, otherwise write its first cell without #."
+                "the line if it is a comment, otherwise remove the # from its first cell."
             )
         # A file without a last line's end may be cut: then its last number has fewer decimals than the others.
         decimals = [len(row[-1].partition(self._decimal)[2]) for row in self._rows]
         if self.width - 1 in picked and not self._ended and len(decimals) >= _FEW and decimals[-1] < min(decimals[:-1]):
             raise InputError(
                 f"{self.path} line {self._lines[-1]}: the last number, {quoted(self._rows[-1][-1])}, has fewer digits "
-                "than all numbers above it, and the line has no end-of-line character, so the file may be "
-                "incomplete; copy the file again, or end that line if it is complete."
+                "than all numbers above it, and the line has no line break, so the file may be incomplete; copy the "
+                "file again, or add a line break if the file is complete."
             )
         table = np.stack([self._column(i) for i in picked], axis=1)
         if not measured:
@@ -211,14 +216,15 @@ class TextTable:
             order = ", ".join(str(picked[i] + 1) for i in np.argsort(table[0]))
             raise InputError(
                 f"{self.path} line {self._lines[0]} contains the column numbers {cells[0]} to {cells[-1]}; add skip = "
-                f"{self._lines[0]} and columns = [{order}], or write the numbers with decimal points if they were "
-                "measured."
+                f"{self._lines[0]} and columns = [{order}], or, if these numbers are measured values, write them with "
+                "decimal points."
             )
         for (i, column), (j, other) in itertools.combinations(zip(picked, table.T, strict=True), 2):
             if not stated and self.length >= _FEW and np.ptp(column) > 0 and np.array_equal(column, other):
                 raise InputError(
                     f"{self.path} has the same numbers in columns {i + 1} and {j + 1}; give each column once, or add "
-                    f"columns = [{', '.join(str(index + 1) for index in picked)}] if these columns are right."
+                    f"columns = [{', '.join(str(index + 1) for index in picked)}] if both columns really have the same "
+                    "readings."
                 )
         return table
 
@@ -236,9 +242,9 @@ class TextTable:
         place = f"{self.path} line {self._lines[row]} column {index + 1}: {quoted(cell)}"
         plain = cell.replace(self._decimal, ".")
         if not is_number(plain) or (self._decimal == "," and "." in cell):
-            mark = 'add decimal = "," to its table' if self._decimal == "." else 'leave out decimal = ","'
+            mark = 'add decimal = "," to its table' if self._decimal == "." else 'remove decimal = ","'
             raise InputError(
-                f"{place} is not a number with the decimal mark '{self._decimal}'; write it without quotes and "
+                f"{place} is not a number with the decimal mark '{self._decimal}'; write the number without quotes and "
                 f"thousands separators, or {mark}, or add skip = {self._lines[row]} if the table begins after this "
                 "line."
             )

@@ -38,7 +38,7 @@ class Strict(BaseModel):
         """Refuse true and false where a number is wanted, in one sentence for all kinds of numbers."""
         wanted = cls.model_fields[str(info.field_name)].annotation
         if wanted is not bool and any(isinstance(x, bool) for x in (value if isinstance(value, list) else [value])):
-            raise ValueError("expected a number, but it is true or false; give a number.")
+            raise ValueError("a number is needed, but the value is true or false; give a number.")
         return value
 
 
@@ -49,22 +49,22 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
         # What would take a parser gigabytes or minutes.
         if len(text) > _MOST_CHARACTERS:
             raise InputError(
-                f"{path} has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; name a shorter file."
+                f"{path} has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; give a shorter file."
             )
         if long_key := _LONG_KEY.search(text):
             line = text.count("\n", 0, long_key.start()) + 1
-            raise InputError(f"{path} line {line} has a key of more than {_DEEPEST} parts; correct it.")
+            raise InputError(f"{path} line {line} has a key of more than {_DEEPEST} parts; correct the key.")
         content = tomllib.loads(text)
     except InputError:
         raise
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not UTF-8 text; name a TOML file.") from error
+        raise InputError(f"{path} is not UTF-8 text; give a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}; correct the file there.") from error
     except RecursionError as error:
-        raise InputError(f"{path} nests tables or lists too deeply; at most {_DEEPEST} levels are allowed.") from error
+        raise InputError(f"{path} nests tables or lists too deeply; use at most {_DEEPEST} levels.") from error
     except ValueError as error:  # digits beyond those that Python converts
-        raise InputError(f"{path} contains a number with thousands of digits; correct it.") from error
+        raise InputError(f"{path} contains a number with thousands of digits; correct the number.") from error
     _check_content(path, content)
     return validated(model, content, str(path))
 
@@ -72,7 +72,7 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
 def _check_content(path: str | os.PathLike, value: Any, place: str = "", depth: int = 0) -> None:
     """Refuse depth, numbers and characters that no file of this package has, with the key at which they are."""
     if depth > _DEEPEST:
-        raise InputError(f"{path} nests tables or lists too deeply; at most {_DEEPEST} levels are allowed.")
+        raise InputError(f"{path} nests tables or lists too deeply; use at most {_DEEPEST} levels.")
     for text in (place, value if isinstance(value, str) else ""):
         control = next(filter(is_control, text), None)
         if control is not None:
@@ -86,7 +86,7 @@ def _check_content(path: str | os.PathLike, value: Any, place: str = "", depth: 
         for number, item in enumerate(value, start=1):
             _check_content(path, item, f"{place} {number}", depth + 1)
     elif isinstance(value, int | float) and _LARGEST < abs(value) < math.inf:
-        raise InputError(f"{path}: '{place}' is implausibly large; correct it.")
+        raise InputError(f"{path}: '{place}' is implausibly large; correct the value.")
 
 
 def validated(model: type[Model], content: Mapping[str, Any], where: str) -> Model:

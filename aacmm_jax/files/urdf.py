@@ -106,7 +106,7 @@ def read_urdf(
         try:
             text = file.content.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise InputError("it is not UTF-8 text; save the file as UTF-8.") from error
+            raise InputError("the file is not UTF-8 text; save it as UTF-8.") from error
         robot = parse_urdf(text)
         source = UrdfSource(text, *_ends(robot, base, tip))
         arm = urdf_chain(source).arm
@@ -138,7 +138,9 @@ def urdf_chain(source: UrdfSource) -> UrdfChain:
             before.append(fixed_before)
             frames.append(frame)
     if not joints:
-        raise InputError(f"no joint moves between {quoted(source.base)} and {quoted(source.tip)}; name other links.")
+        raise InputError(
+            f"there is no moving joint between {quoted(source.base)} and {quoted(source.tip)}; choose other links."
+        )
     length = sum(float(np.linalg.norm(joint.origin[:3, 3])) for joint in path)
     if length > _LONGEST:
         raise InputError(
@@ -241,7 +243,7 @@ def urdf_of(arm: Arm, nominal: ArmSpecification) -> ExportedUrdf:
             f"    <origin {origin}/>\n"
             "  </joint>\n"
         )
-        notes = (f"the calibrated tip is the origin of the link {quoted(name)}, which was added.",)
+        notes = (f"the calibrated tip is the origin of the link {quoted(name)}, which was added to the URDF.",)
     return ExportedUrdf(edited(nominal.urdf.text, origins, chain.robot, added), name, tuple(origins), notes)
 
 
@@ -285,14 +287,16 @@ def _check_moving(joint: UrdfJoint) -> None:
     if joint.kind not in ("revolute", "continuous", "prismatic"):
         of_format = joint.kind in ("floating", "planar")
         kind = f"is {joint.kind}" if of_format else f"has the unknown type {quoted(joint.kind)}"
-        raise InputError(f"{what} {kind}, which an arm cannot have; name links without this joint between them.")
+        raise InputError(
+            f"{what} {kind}, which cannot be part of an arm; choose links without this joint between them."
+        )
     if joint.mimics is not None:
         raise InputError(
-            f"{what} mimics {quoted(joint.mimics)}, so it has no reading of its own; name links without this joint "
+            f"{what} mimics {quoted(joint.mimics)}, so it has no reading of its own; choose links without this joint "
             "between them."
         )
     if joint.axis is None:
-        raise InputError(f"{what} has an axis of length 0; correct its <axis xyz=...>.")
+        raise InputError(f"{what} has an axis of length 0; correct <axis xyz=...> of the joint.")
     if joint.kind == "continuous":
         return
     unit, factor, other = ("m", 1e-3, "") if slides else ("rad", 1.0, ', or type="continuous"')
@@ -300,7 +304,7 @@ def _check_moving(joint: UrdfJoint) -> None:
     if joint.limits is None or not joint.limits[0] < joint.limits[1]:
         state = f"has the limits {' and '.join(limits)} {unit}" if limits else "has no limits"
         raise InputError(
-            f"{what} is {joint.kind} and {state}; give it <limit lower=... upper=...> in {unit}, with lower below "
+            f"{what} is {joint.kind} and {state}; add <limit lower=... upper=...> in {unit}, with lower below "
             f"upper{other}."
         )
     if not slides and _LARGEST < max(map(abs, joint.limits)) <= _IN_DEGREES:
@@ -330,16 +334,20 @@ def _joints_between(robot: Robot, base: str, tip: str) -> list[UrdfJoint]:
     if base in parents:
         return back[: parents.index(base) + 1][::-1]
     if base == tip:
-        raise InputError(f"base and tip are the same link, {quoted(base)}; name two different links.")
+        raise InputError(f"base and tip are the same link, {quoted(base)}; choose two different links.")
     other = [joint.parent for joint in _joints_before(robot, base)]
     if tip in other:
-        raise InputError(f"{quoted(base)} comes after {quoted(tip)}, not before it; exchange base and tip.")
+        raise InputError(
+            f"the base {quoted(base)} is after the tip {quoted(tip)} in the chain of joints; exchange base and tip."
+        )
     common = next((link for link in other if link in parents), None)
     if common is None:
-        raise InputError(f"there is no chain of joints from {quoted(base)} to {quoted(tip)}; name links of one arm.")
+        raise InputError(
+            f"there is no chain of joints from {quoted(base)} to {quoted(tip)}; choose two links of the same arm."
+        )
     raise InputError(
-        f"{quoted(base)} and {quoted(tip)} are on two branches that separate at {quoted(common)}; name that link as "
-        "the base, or a tip on the branch of the base."
+        f"{quoted(base)} and {quoted(tip)} are on two branches that separate at {quoted(common)}; choose "
+        f"{quoted(common)} as the base, or a tip on the same branch as the base."
     )
 
 
@@ -347,20 +355,24 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
     """The base and the tip link that are named, else the root, and the only end of a chain that moves."""
     for what, link in (("base", base), ("tip", tip)):
         if link is not None and link not in robot.links:
-            raise InputError(f"there is no link {quoted(link)} for the {what}; its links are {_listed(robot.links)}.")
+            raise InputError(
+                f"the URDF has no link {quoted(link)} for the {what}; its links are {_listed(robot.links)}."
+            )
     if base is None and tip is not None and (back := _joints_before(robot, tip)):
         base = back[-1].parent
     if base is None:
         roots = [link for link in robot.links if link not in robot.joint_before]
         if not robot.links:
-            raise InputError("it has no <link>; name the URDF of a robot.")
+            raise InputError("the URDF has no <link>; give the URDF of a robot.")
         if not roots:
             raise InputError(
                 "every link has a joint before it, so the joints form a loop; a URDF must be a tree, so correct the "
                 "joints."
             )
         if len(roots) > 1:
-            raise InputError(f"it has {len(roots)} roots, {_listed(roots)}; name the base (base= or --base).")
+            raise InputError(
+                f"the URDF has {len(roots)} root links, {_listed(roots)}; choose the base (base= or --base)."
+            )
         base = roots[0]
     if tip is not None:
         return base, tip
@@ -371,9 +383,9 @@ def _ends(robot: Robot, base: str | None, tip: str | None) -> tuple[str, str]:
         if base in parents and any(joint.kind != "fixed" for joint in back[: parents.index(base) + 1]):
             tips.append(link)
     if not tips:
-        raise InputError(f"no joint after {quoted(base)} moves; name another base (base= or --base).")
+        raise InputError(f"there is no moving joint after {quoted(base)}; choose another base (base= or --base).")
     if len(tips) > 1:
-        raise InputError(f"its chains end at {_listed(tips)}; name the tip (tip= or --tip).")
+        raise InputError(f"the URDF has several chains, which end at {_listed(tips)}; choose the tip (tip= or --tip).")
     return base, tips[0]
 
 

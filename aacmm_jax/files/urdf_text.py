@@ -33,7 +33,7 @@ _LARGEST = 1e6  # m and rad, of positions, angles and directions
 _LARGEST_ANGLE = 6.3  # rad, of roll, pitch and yaw: one revolution
 _METRE = 1000.0  # mm
 _ZERO = (0.0, 0.0, 0.0)
-_EXPAND = "so it is a xacro file; expand it with 'xacro FILE.xacro > FILE.urdf' and name that."
+_EXPAND = "so the file is a xacro file; expand it with 'xacro FILE.xacro > FILE.urdf' and give FILE.urdf."
 
 
 class _Names(NamedTuple):
@@ -91,7 +91,7 @@ class Element(NamedTuple):
         if not value:
             raise InputError(f"{self.where} has no {name}; add it.")
         if any(map(is_control, value)):
-            raise InputError(f"{self.where} has a control character in its {name}; remove the character.")
+            raise InputError(f"{self.where} has a control character in {name}; remove the character.")
         return value
 
     def numbers(self, name: str, default: tuple[float, ...]) -> Float[np.ndarray, " k"]:
@@ -104,9 +104,9 @@ class Element(NamedTuple):
             raise InputError(f"{stated}, {_EXPAND}")
         values = np.array([number(part) for part in text.split()] if all(map(is_number, text.split())) else [])
         if count == 3 and np.any(np.abs(values) >= _LARGEST):  # limits may be as large as one likes
-            raise InputError(f"{stated}; it must be below {_LARGEST:g}.")
+            raise InputError(f"{stated}; the numbers must be below {_LARGEST:g}.")
         if len(values) != count or not np.all(np.isfinite(values)):
-            raise InputError(f"{stated}; it must be {'a number' if count == 1 else f'{count} numbers'}.")
+            raise InputError(f"{stated}; give {'one number' if count == 1 else f'{count} numbers'}.")
         return values
 
     def origin(self) -> Transform:
@@ -128,7 +128,7 @@ class Element(NamedTuple):
         names = _NAMES[self.name].attributes.split()
         for key in self.attributes:
             if key == "quat_xyzw":
-                raise InputError(f"{self.where} has a quaternion, quat_xyzw; write its angles as rpy.")
+                raise InputError(f"{self.where} has a quaternion (quat_xyzw); write the rotation as rpy instead.")
             if key not in names and ":" not in key and key != "xmlns":
                 self.check_name("attribute", key, names)
 
@@ -136,7 +136,7 @@ class Element(NamedTuple):
         """Refuse the name of an attribute or element in it that is misspelt, or none of ``names``."""
         if not _NAMES[self.name].others or difflib.get_close_matches(name.casefold(), names, n=1, cutoff=_ALIKE):
             shape = "<{}>" if what == "element" else "{}"
-            meant = nearest(shape.format(name.casefold()), map(shape.format, names)) if names else "; take it out."
+            meant = nearest(shape.format(name.casefold()), map(shape.format, names)) if names else "; remove it."
             shown = f"<{quoted(name)[1:-1]}>" if what == "element" else quoted(name)
             raise InputError(f"{self.where} has an unknown {what} {shown}{meant}")
 
@@ -248,7 +248,7 @@ def _link(element: Element) -> UrdfLink:
     mass.text("value")
     value = float(mass.numbers("value", (0.0,))[0])
     if value < 0:
-        raise InputError(f"{mass.where} is {value:g} kg; it cannot be negative.")
+        raise InputError(f"{mass.where} is {value:g} kg; a mass cannot be negative.")
     return UrdfLink(value, inertial.origin()[:3, 3])
 
 
@@ -313,7 +313,7 @@ def edited(text: str, origins: Mapping[str, Mapping[str, str]], robot: Robot, ad
 def _parsed(text: str) -> tuple[Element, int]:
     """The root element, and where its end tag begins."""
     if len(text) > _MOST_CHARACTERS:
-        raise InputError(f"it has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; name a URDF file.")
+        raise InputError(f"the file has {len(text):,} characters, more than {_MOST_CHARACTERS:,}; give a URDF file.")
     content = text.encode()
     parser = expat.ParserCreate("utf-8")
     stack: list[Element | None] = []  # None: not read
@@ -329,7 +329,8 @@ def _parsed(text: str) -> tuple[Element, int]:
         parent = stack[-1] if stack else None
         if not stack and name != "robot":
             raise InputError(
-                f"its root element is <{quoted(name)[1:-1]}>, but that of a URDF is <robot>; name a URDF file."
+                f"the root element is <{quoted(name)[1:-1]}>, but a URDF has the root element <robot>; give a URDF "
+                "file."
             )
         if stack and (parent is None or not _is_read(name, parent, line)):
             stack.append(None)
@@ -361,7 +362,7 @@ def _parsed(text: str) -> tuple[Element, int]:
 
     def refuse_entities(name: str, *_: object) -> None:
         raise InputError(
-            f"it has a document type, {quoted(name)}, which a URDF does not need; remove the document type."
+            f"the file declares a document type, {quoted(name)}, which aacmm does not accept; remove <!DOCTYPE ...>."
         )
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
@@ -369,7 +370,7 @@ def _parsed(text: str) -> tuple[Element, int]:
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        raise InputError(f"it is not valid XML: {error}; correct the file there.") from error
+        raise InputError(f"the file is not valid XML: {error}; correct the file there.") from error
     return root[0], ends[-1]
 
 
@@ -381,13 +382,13 @@ def _is_read(name: str, parent: Element, line: int) -> bool:
         earlier = parent.child(name)
         if name in once and earlier is not None:
             raise InputError(
-                f"{parent.where} has a second <{name}>, after that of line {earlier.line}; remove one of the two."
+                f"{parent.where} has a second <{name}>, after the first in line {earlier.line}; remove one of the two."
             )
         if parent.name == "geometry" and parent.children:
-            raise InputError(f"{parent.where} has two shapes; give each a <collision> of its own.")
+            raise InputError(f"{parent.where} has two shapes; put each shape into its own <collision>.")
         return name in _NAMES
     if name in _NAMES:
-        raise InputError(f"{parent.where} contains <{name}>, which does not belong there; move it.")
+        raise InputError(f"{parent.where} contains <{name}>, which is not allowed there; move it to the right element.")
     if ":" not in name:
         parent.check_name("element", name, [*once, *often])
     return False

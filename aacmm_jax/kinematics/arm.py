@@ -103,7 +103,9 @@ class Arm(eqx.Module):
             self.coefficients = checked(given, _BY_TERM, "coefficients", sizes)
             self.gravity = checked(DOWN if gravity is None else gravity, _VECTOR, "gravity")
         elif coefficients is not None or gravity is not None:
-            raise InputError("coefficients and gravity need an arm made by with_corrections().")
+            raise InputError(
+                "coefficients and gravity need an arm with corrections; create the arm with with_corrections()."
+            )
         arrays = (self.alpha, self.a, self.d, self.theta, self.beta, self.probe, self.coefficients, self.gravity)
         batches = [array.shape[:-1] for array in arrays if array is not None]
         try:
@@ -236,8 +238,8 @@ def joint_limits(arm: Arm, limits: Limits | None) -> JointLimits:
     if rows is None:
         if arm.prismatic:
             raise InputError(
-                f"joint {arm.prismatic[0]} is prismatic, but the arm has no limits that state how far this joint "
-                "slides; give the arm limits (limits=, or limits_mm in its file)."
+                f"joint {arm.prismatic[0]} is prismatic, but the arm has no joint limits, so the travel of this joint "
+                "is not known; give the limits (limits=, or limits in the file of the arm)."
             )
         rows = [(-math.pi, math.pi)] * arm.joints
     return np.asarray(checked_limits(rows, arm.joints, arm.prismatic))

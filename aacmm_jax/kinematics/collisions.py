@@ -153,7 +153,9 @@ def body_along_links(arm: Arm, radius: float | Sequence[float], tool_radius: flo
     if size > 2 * tool + _SHORTEST:
         rows.append(("probe", n, base, n, probe * (1 - 2 * tool / size), tool, size))
     if not rows:
-        raise InputError("every link of the arm has the length 0, so the arm has no body; give its URDF.")
+        raise InputError(
+            "every link of the arm has the length 0, so there is no body to check; give the URDF of the arm."
+        )
     names, *columns, lengths = zip(*rows, strict=True)
     start_frame, start, end_frame, end, widths = map(np.array, columns)
     first, second = np.triu_indices(len(rows), 1)

@@ -82,7 +82,7 @@ class AbstractCorrection(abc.ABC):
 
     def wrong(self, term: "Term", joints: int) -> str:
         """What is wrong with a term of this kind for an arm of so many joints, in a few words; empty if nothing is."""
-        return "has a number, but takes none" if term.number else ""
+        return "must have no number before the underscore" if term.number else ""
 
     def usual(self, terms: Sequence["Term"]) -> dict[str, float]:
         """The groups of the default prior with their standard deviations, for an arm with these terms of this kind."""
@@ -170,7 +170,7 @@ class Harmonics(AbstractCorrection):
         return "" if orders == [1, 2] else "+".join(runs)
 
     def wrong(self, term: Term, joints: int) -> str:
-        return "" if 1 <= term.number <= _HIGHEST else f"has no order from 1 to {_HIGHEST}"
+        return "" if 1 <= term.number <= _HIGHEST else f"must have an order from 1 to {_HIGHEST}, as in cos1_2"
 
     def usual(self, terms: Sequence[Term]) -> dict[str, float]:
         octaves = [(2**k, min(2 ** (k + 1) - 1, _HIGHEST)) for k in range(_HIGHEST.bit_length())]
@@ -225,8 +225,8 @@ class Coupling(AbstractCorrection):
         pairs = [re.fullmatch(r"([1-9]\d*)-([1-9]\d*)", pair) for pair in option.split("+")]
         if not all(pairs):
             raise InputError(
-                f"coupled={option} does not name pairs of joints; write coupled=2-3, for example, if the reading of "
-                "joint 2 moves joint 3."
+                f"coupled={option} does not name pairs of joints; if the reading of joint 2 moves joint 3, for "
+                "example, write coupled=2-3."
             )
         return tuple(Term(self, "coupled", int(pair[1]), int(pair[2])) for pair in pairs if pair)
 
@@ -236,7 +236,7 @@ class Coupling(AbstractCorrection):
     def wrong(self, term: Term, joints: int) -> str:
         if not 1 <= term.number <= joints:
             return f"must name the reading of another joint from 1 to {joints}, as in coupled2_3"
-        return "names the joint's own reading, which is what gear does" if term.number == term.joint else ""
+        return "must name another joint (use gear for a joint's own reading)" if term.number == term.joint else ""
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         return q[np.array([term.number - 1 for term in terms])]
@@ -254,7 +254,7 @@ class Gravity(AbstractCorrection):
 
     model = "gravity"
     words = ("compliance",)
-    description = "compliances under the moment of gravity"
+    description = "joint compliances under the moments of gravity"
     unit = "rad/m"
     unit_alone = "rad/(kN m)"
     usual_size = 1e-3  # 1 mrad for links with levers of 1 m
@@ -313,7 +313,7 @@ class Expansion(AbstractCorrection):
         return (Term(self, "expansion", 0, 0),)
 
     def wrong(self, term: Term, joints: int) -> str:
-        return "applies to the whole arm and takes no number" if term.number or term.joint else ""
+        return "applies to the whole arm, so its name must have no number" if term.number or term.joint else ""
 
     def values(self, terms: Sequence[Term], q: Readings, forward: ForwardPass) -> Rows:
         measured = q.shape[0] > len(forward.x)
@@ -387,7 +387,7 @@ def terms_of(model: str, joints: int, loads: Loads | None = None) -> tuple[Term,
         part = _SHORT_FORMS.get(given.strip(), given.strip())
         name, _, option = part.partition("=")
         if name in seen:
-            raise InputError(f"the model names '{name}' twice; name every part once, as in dh,gravity,harmonics=1+2.")
+            raise InputError(f"the model names '{name}' twice; give each part once, as in dh,gravity,harmonics=1+2.")
         seen.add(name)
         if name == "dh":
             continue

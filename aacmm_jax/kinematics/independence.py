@@ -241,7 +241,7 @@ class TradeOff(NamedTuple):
         """The trade-off in words."""
         (first, *others), movement = self.names, f"{1e3 * self.movement:.2g} um"
         step = _step(first)
-        text = f"one {step} of {first} changes the tips by {movement}"
+        text = f"a change of 1 {step} in {first} moves the tips by only {movement}"
         if others:
             pairs = list(zip(self.amounts[1:], others, strict=True))[:_PARTNERS_NAMED]
             imitation = listed(f"{amount:.2g} {_step(name)} of {name}" for amount, name in pairs)

@@ -90,7 +90,7 @@ class Parameters(eqx.Module):
         for name in free:
             if name in held:
                 raise InputError(
-                    f"parameter '{name}' is named both as held and as free; name it in only one of the two."
+                    f"parameter '{name}' is named both as held and as free; give the parameter in only one of the two."
                 )
         if arm.beta is None and any(name.startswith("beta_") for name in (*held, *free)):
             arm = arm.replace(beta=jnp.zeros_like(arm.alpha))
@@ -201,7 +201,7 @@ def _unique_names(arm: Arm, names: Iterable[str], what: str) -> tuple[str, ...]:
     _located(arm.joints, correction_names(arm), names)
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise InputError(f"parameter '{name}' is named twice in {what}; name each parameter once.")
+            raise InputError(f"parameter '{name}' is given twice in {what}; give each parameter once.")
     return names
 
 
@@ -235,8 +235,8 @@ class Bounds(eqx.Module):
             for index in np.argwhere(~(low <= high))[:1]:  # also where one is NaN
                 at = tuple(index)
                 raise InputError(
-                    f"bounds of {space.names[at[-1]]} are {low[at]:g} to {high[at]:g}; the lower bound must be a "
-                    "number not above the upper bound."
+                    f"bounds of {space.names[at[-1]]} are {low[at]:g} to {high[at]:g}; both bounds must be numbers, "
+                    "with the lower bound not above the upper bound."
                 )
 
     @classmethod

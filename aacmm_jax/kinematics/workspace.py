@@ -286,8 +286,8 @@ def search_region(
     allowed, margins = joint_limits(arm, limits), margin * reading_units(arm.geometry)
     if not (math.isfinite(margin) and margin >= 0 and np.all(margins < (allowed[:, 1] - allowed[:, 0]) / 2)):
         raise InputError(
-            f"a margin of {math.degrees(margin):g} deg leaves a joint no range within its limits; give a smaller "
-            "margin."
+            f"a margin of {math.degrees(margin):g} deg leaves no range of motion between the limits of a joint; give a "
+            "smaller margin."
         )
     inner = allowed + margins[:, None] * np.array([1.0, -1.0])
     cell = None if cell is None else checked_cell(arm, cell, inner)

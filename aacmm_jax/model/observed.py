@@ -17,7 +17,7 @@ from jaxtyping import Float
 from ..core.numpy_or_jax import AnyArray, namespace, pytree, set_at, static, to_numpy
 from ..data.capture import Capture, check_one_capture, check_readings
 from ..data.observations.held import platform_frames, position_of
-from ..data.observations.observation import AbstractObservation, Tips, offset_of
+from ..data.observations.observation import AbstractObservation, Rows, Tips, offset_of
 from ..kinematics.arm import Arm
 from ..kinematics.chain import Geometry, JointMotion, forward_pass, joint_motion
 from ..kinematics.parameters import Parameters
@@ -168,6 +168,11 @@ class Observed:
             parts = new | parts  # what another observation says stays
         parts |= platform_frames(self.observations, tips)
         return namespace(arm, forward).concatenate([parts[name] for name in self.blocks])
+
+    def squared_distances(self, rows: Sequence[Rows]) -> list[Float[AnyArray, " _"]]:
+        """Squared distances of the poses of each group from their geometry, mm^2, by the rows of the groups."""
+        in_mm = [stack.in_mm(part.values, part.by_tip) for stack, part in zip(self.stacks, rows, strict=True)]
+        return [namespace(vectors).sum(vectors**2, axis=0) for vectors in in_mm]
 
     def mean_by_observation(self, by_group: Sequence[Float[AnyArray, " _"]]) -> Float[AnyArray, " k"]:
         """Means over the poses of each observation of values with the poses of each group."""

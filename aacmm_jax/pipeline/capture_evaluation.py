@@ -180,9 +180,9 @@ def _refuse_options_of_tests(chosen: EvaluationOptions) -> None:
     }
     if any(given.values()):
         raise InputError(
-            f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only, but this "
-            "capture supports none, or none was requested; request a test with --acceptance (standards), or leave "
-            "this option out."
+            f"{shorten([name for name, there in given.items() if there])} applies to acceptance tests only, but the "
+            "capture allows no acceptance test, or no test was requested; request a test with --acceptance "
+            "(standards), or leave this option out."
         )
 
 
@@ -199,7 +199,7 @@ def _warnings(
     if partly:
         yield (
             f"The calibration used some of the poses of {', '.join(partly)}; the other poses of these sockets and "
-            "observations are treated as used, too."
+            "observations are treated as used by the calibration, too."
         )
     if not same_arm(recording.nominal.arm, record.recording.nominal.arm):
         yield (

@@ -121,8 +121,8 @@ def plan(
         placement = None
         if lengths:
             raise InputError(
-                "lengths must be between sockets with given positions; if only the number of sockets is given, use "
-                "length and u."
+                "lengths can be given only between sockets with given positions; use length and u if only the number "
+                "of sockets is given."
             )
     problem = problem.within(cones=_cones(cone, names, problem.options.tool_axis))
     if placement is None:
@@ -162,7 +162,7 @@ def plan(
     unseen = observability(problem.arm, planned.capture(), problem.space)
     if unseen.rank < len(problem.space.names):
         raise InputError(
-            f"no choice of {poses} poses in these sockets determines the parameters. {' '.join(unseen.sentences())}"
+            f"{poses} poses in these sockets cannot determine all parameters. {' '.join(unseen.sentences())}"
         )
     if problem.options.unconstrained:
         free = problem.within(cones=None, cell=None)

@@ -63,7 +63,7 @@ def determined_by(arm: Arm) -> dict[str, Observability]:
         "sockets": Capture(sockets),
         "sockets and a reference length": Capture(sockets, length),
         "a tracker that measures the probe": Capture({}, observations=points),
-        "a tracker that measures a target at an unknown place": Capture({}, observations=target),
+        "a tracker that measures a target at an unknown position": Capture({}, observations=target),
     }
     return {data: observability(arm, capture, every) for data, capture in kinds.items()}
 

@@ -101,13 +101,13 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
     least = least_poses(pool)
     if poses < least.sum():
         raise InputError(
-            f"{poses} poses are too few for this kit; give at least {least.sum()} poses, or remove something from the "
+            f"{poses} poses are too few for this kit; give at least {least.sum()} poses, or remove an item from the "
             "kit."
         )
     chosen, motions = _in_order(problem, things, _chosen(problem, things, pool, poses, least))
     unseen = observability(problem.arm, Capture({}, (), chosen), problem.space)
     if unseen.rank < len(problem.space.names):
-        raise InputError(f"this kit does not determine the parameters. {' '.join(unseen.sentences())}")
+        raise InputError(f"this kit cannot determine all parameters. {' '.join(unseen.sentences())}")
     planned = KitPlan(
         arm=problem.arm,
         names=problem.space.names,
@@ -134,7 +134,7 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
 def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
     items = [item if isinstance(item, KitItem) else KitItem(item, places=0) for item in kit]
     if not items:
-        raise InputError("the kit is empty; name an artefact or an instrument.")
+        raise InputError("the kit is empty; give at least one artefact or instrument.")
     for item in items:
         if not isinstance(item.simulated, AbstractSimulated):
             raise InputError(
@@ -144,8 +144,8 @@ def _checked(kit: Sequence[KitItem | AbstractSimulated]) -> list[KitItem]:
         cones_of([Cone(item.half_angle, item.normal)])  # refuses what is no cone
         if item.places < 0:
             raise InputError(
-                f"'{item.simulated.name}' has {item.places} places; give a positive number, or 0 to leave it where it "
-                "is."
+                f"'{item.simulated.name}' has places = {item.places}; give a positive number, or 0 if the plan must "
+                "not move the item."
             )
     names = [item.simulated.name for item in items]
     twice = [name for name in names if names.count(name) > 1]

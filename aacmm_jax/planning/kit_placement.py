@@ -163,7 +163,9 @@ def place(problem: DesignProblem, items: Sequence[KitItem], poses: int) -> list[
     for item in items:
         name = item.simulated.name
         if item.places and item.simulated.placed(name, np.zeros(6)) is None:
-            raise InputError(f"'{name}' is an instrument, so the plan does not place it; remove its number of places.")
+            raise InputError(
+                f"'{name}' is an instrument, which the plan does not place; set its number of placements (places) to 0."
+            )
         names = [f"{name}/{i + 1}" for i in range(item.places)] if item.places > 1 else [name]
         things += [Thing(item, item.simulated.changed(name=name)) for name in names]
     if not any(item.places for item in items):
@@ -184,8 +186,8 @@ def place(problem: DesignProblem, items: Sequence[KitItem], poses: int) -> list[
             scored.append((value(pools, 0), number, layout))
     if not scored:
         raise InputError(
-            "no placement of the kit was found in which the arm reaches all of it well; give a region nearer to the "
-            "arm, fewer places, or wider cones."
+            "no placement of the kit was found in which the arm reaches every item in enough poses; give a region "
+            "nearer to the arm, fewer placements, or wider cones."
         )
     return best_layout(
         [layout for _, _, layout in sorted(scored)[:_DESIGNED]],

@@ -122,8 +122,8 @@ def hardly_reached(name: str, point: Float[np.ndarray, " 3"]) -> str:
     """Why nothing can be planned with a place."""
     where = ", ".join(f"{round(float(x)):.6g}" for x in point)
     return (
-        f"{name} at ({where}) mm cannot be reached in enough poses within joint limits, cone and obstacles; move it, "
-        "widen its cone, shorten retract, or give more candidates."
+        f"{name} at ({where}) mm cannot be reached in enough poses within the joint limits, inside the cone and clear "
+        "of obstacles; change the position, widen the cone, shorten retract, or give more candidates."
     )
 
 

@@ -83,10 +83,10 @@ def given_placement(
                 )
     if len({frozenset(pair[:2]) for pair in lengths}) < len(lengths):
         raise InputError(
-            "a reference length is named twice; its certified value can be used only once, so name it once."
+            "a reference length is given twice, but its certified value can be used only once; give each length once."
         )
     if any(len(set(pair[:2])) < 2 for pair in lengths):
-        raise InputError("a reference length joins a socket to itself; name two different sockets.")
+        raise InputError("a reference length joins a socket to itself; give two different sockets.")
     for i, name in enumerate(names):
         for other in names[:i]:
             if np.linalg.norm(points[name] - points[other]) < 1:
@@ -174,8 +174,8 @@ def best_placement(
         limited = problem.region.cell is not None or (problem.region.cones is not None and problem.region.cones.any)
         wider = ", wider cones, or fewer obstacles" if limited else ""
         raise InputError(
-            "no placement was found that the arm reaches well; give a region nearer to the arm, or a shorter "
-            f"length{wider}."
+            "no placement was found in which the arm reaches all sockets in enough poses; give a region nearer to the "
+            f"arm, or a shorter length{wider}."
         )
     starts = _STARTS // sockets
 
@@ -214,7 +214,8 @@ def _random_placements(
             if len(placements) == _PLACEMENTS:
                 return placements
     raise InputError(
-        "no placement of the sockets and the reference length was found in the region; widen it, or shorten the length."
+        "no placement of the sockets and the reference length was found in the region; widen the region, or shorten "
+        "the length."
     )
 
 

@@ -139,7 +139,7 @@ class DesignProblem(NamedTuple):
             InputError: The arm is a batch or reaches no volume, or an option is out of range.
         """
         if not is_single(arm):
-            raise InputError("a plan is for one arm, not for a batch; give one arm of the batch.")
+            raise InputError("a plan needs a single arm, but this is a batch; select one arm of the batch.")
         options = checked_fields(options)
         space = Parameters.free_of(arm) if options.space is None else options.space
         # Plans are at 20 C, so they say nothing of thermal expansion.
@@ -149,8 +149,8 @@ class DesignProblem(NamedTuple):
         length = default_length(arm) if options.check_length is None else options.check_length
         if arm.joints < 3 or total_link_length(arm) == 0:
             raise InputError(
-                "this arm does not reach a volume, so there is nothing to plan; give an arm with at least three "
-                "joints and one link."
+                "the tip of this arm does not reach a volume, so there is nothing to plan; give an arm with at least "
+                "three joints and one link."
             )
         noise = small_arm_noise() if options.noise is None else options.noise
         noise.check(arm.joints)

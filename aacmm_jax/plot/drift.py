@@ -8,7 +8,7 @@ import numpy as np
 from ..core.text import pluralise
 from ..drift.results import Drift, Trend, in_words
 from ..summaries.result_tables import listed_apart
-from ..uncertainty.coverage_level import in_percent
+from ..uncertainty.coverage import in_percent
 from .charts import SERIES, Axis, Marks, Plot, histogram, linear, names
 from .figures import check_format, draw, new_figure, save_figure
 

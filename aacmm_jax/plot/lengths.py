@@ -12,7 +12,7 @@ from ..core.units import DEG
 from ..diagnostics.joint_travel import TriedPoses
 from ..summaries.calibration import metrics_by_socket_and_length
 from ..summaries.tables import decimals_for, format_number
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import U_AT_LEVEL
 from ..uncertainty.volume import VolumetricUncertainty
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, names, runs, shades, thinned
 from .figures import draw
@@ -193,7 +193,7 @@ def volumetric_uncertainty_map(volume: VolumetricUncertainty, axes: Any = None) 
         >>> axes = aj.plot.volumetric_uncertainty_map(volume)
     """
     if not np.any(np.isfinite(volume.expanded_length)):
-        raise InputError("the data determine no length over the volume, so there is no uncertainty to draw.")
+        raise InputError("the data do not determine lengths over the volume, so there is no uncertainty to draw.")
     return draw(volume_chart(volume).plots[0], axes)
 
 

@@ -17,7 +17,7 @@ from ..summaries.compared_models import compared_models_summary
 from ..summaries.result_tables import listed_apart
 from ..summaries.tables import decimals_for, format_number, rows_of
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import U_AT_LEVEL
 from ..uncertainty.identifiability import Observability
 from .charts import SHADES, Axis, Chart, Marks, Plot, borders, level, linear, logarithmic, names
 from .figures import TONES, draw
@@ -54,7 +54,7 @@ def change_chart(unit: str, parameters: Sequence[Mapping[str, Any]]) -> Chart:
     description = "Calibrated minus nominal value. Bars show U; where no bar is visible, U is smaller than the mark."
     if outside := int(np.sum((change < axis.low) | (change > axis.high))):
         description += (
-            f" {pluralise(outside, 'value')} without U drawn at the edge of the chart, because outside its range; "
+            f" Drawn at the edge of the chart, because outside its range: {pluralise(outside, 'value')} without U; "
             "see the table."
         )
     kind = "length" if unit == "mm" else "angle"

@@ -37,7 +37,8 @@ _OF_ARMS: tuple[dict[str, Any], ...] = ({"symbol": "square", "tone": "soft"}, SE
 _UNITS: dict[str, tuple[str, str, Callable[[ObservationResiduals], Any]]] = {
     "mm": ("residuals", "Residuals in mm", lambda part: part.distance),
     "standard deviations": ("normalised", "Residuals in standard deviations", lambda part: part.normalised),
-    "deg": ("angles", "Residuals of orientations", lambda part: np.asarray(part.angle) / DEG),
+    "deg": ("angles", "Residuals of angles", lambda part: part.other["rad"] / DEG),
+    "px": ("pixels", "Residuals in pixels", lambda part: part.other["px"]),
 }
 _DRAWN = 400  # most poses in one plot of a pattern in a page
 _FEWEST = 12  # poses: fewer show no pattern
@@ -129,7 +130,7 @@ def pose_chart(
     ticks, edges = groups.parts()
     x = linear("pose" if len(groups.sizes) == 1 else f"pose, {groups.word} after {groups.word}",
                [0.0, len(last) + 1.0], margin=0.0)  # fmt: skip
-    y = {"standard deviations": "residual", "deg": "angle between orientations"}.get(
+    y = {"standard deviations": "residual", "deg": "residual angle", "px": "distance in the image"}.get(
         unit, f"distance from the {groups.centre}"
     )
     plot = Plot(
@@ -139,7 +140,7 @@ def pose_chart(
     )
     median, largest = (format_number(float(value)) for value in (np.median(last[finite]), last[finite].max()))
     description = f"Median {median} {unit}, largest {largest} {unit} ({last_arm} arm)."
-    description += " The only pose of a socket has no distance and is not drawn." if len(finite) < len(last) else ""
+    description += " Poses that are the only pose of their socket are not drawn." if len(finite) < len(last) else ""
     description += f" {len(drawn)} of {len(finite)} poses are drawn." if len(drawn) < len(finite) else ""
     return Chart(id, title, description, (plot,), None if len(arms) > 1 else _pose_table(groups, last, unit, far))
 
@@ -200,12 +201,12 @@ def pose_distances(record: CalibrationRecord, axes: Any = None) -> Any:
 def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = None) -> Any:
     """Plot the residual of every pose of a calibration by kind of observation (logarithmic).
 
-    Poses that a robust loss took half of their weight from or more have a ring. `InputError` for orientations that the
-    calibration does not have.
+    Poses that a robust loss took half of their weight from or more have a ring. `InputError` for a unit in which
+    nothing was measured.
 
     Args:
         record: The calibration.
-        unit: ``"mm"``, ``"standard deviations"``, or ``"deg"`` for orientations.
+        unit: ``"mm"``, ``"standard deviations"``, or ``"deg"`` or ``"px"`` for what was measured in these units.
         axes: Axes to plot into, which are returned; new ones if None.
 
     Example:
@@ -213,10 +214,12 @@ def residuals_by_kind(record: CalibrationRecord, unit: str = "mm", axes: Any = N
         >>> axes = aj.plot.residuals_by_kind(aj.calibration.record_of(robust, recording, robust="huber"))
     """
     if unit not in _UNITS:
-        raise InputError(f"unit is '{unit}'; it must be mm, standard deviations or deg.")
+        raise InputError(f"unit is '{unit}'; it must be mm, standard deviations, deg or px.")
     chart = kinds_chart(record, unit)
     if chart is None:
-        raise InputError("the calibration has no orientations; draw its residuals in mm or in standard deviations.")
+        raise InputError(
+            f"the calibration has no residuals in {unit}; draw its residuals in mm or in standard deviations."
+        )
     return draw(chart.plots[0], axes)
 
 
@@ -224,15 +227,17 @@ def kinds_chart(
     record: CalibrationRecord, unit: str, far: Marked | None = None, most: int | None = None
 ) -> Chart | None:
     """Residuals of a calibration in a unit, by kind of observation; ``far`` marks poses, by default those that lost
-    weight. None where there are no orientations."""
-    parts = [part for part in enumerate(observation_residuals(record)) if unit != "deg" or part[1].angle is not None]
+    weight. None where nothing was measured in this unit."""
+    measured = {"deg": "rad"}.get(unit, unit)
+    every = unit in ("mm", "standard deviations")
+    parts = [part for part in enumerate(observation_residuals(record)) if every or measured in part[1].other]
     if not parts:
         return None
     names, sizes, kinds, word = Groups.of(record.recording.capture)
     index = [i for i, _ in parts]
     names, sizes, kinds = (tuple(values[i] for i in index) for values in (names, sizes, kinds))
     values = np.concatenate([np.asarray(_UNITS[unit][2](part)) for _, part in parts])
-    if far is None or unit == "deg":
+    if far is None or not every:
         weights = np.concatenate([part.weight for _, part in parts])
         far = "half of the full weight or less", np.flatnonzero(weights <= 0.5)
     groups = Groups(names, sizes, kinds, word)  # type: ignore
@@ -253,7 +258,7 @@ def save_calibration_figure(record: CalibrationRecord, path: Path) -> None:
     """
     charts = [arms_chart(record.recording.capture, distances_by_arm(record))]
     charts += [] if record.sockets_alone else [kinds_chart(record, "standard deviations")]
-    charts.append(kinds_chart(record, "deg"))
+    charts += [kinds_chart(record, "deg"), kinds_chart(record, "px")]
     plots = [chart.plots[0] for chart in charts if chart is not None]
     plots += [] if record.recording.true is None else [error_plot(record)]
     save_figure(draw_all(plots, len(plots) if len(plots) <= 3 else 2, (5.5, 3.9), legends=True), path)

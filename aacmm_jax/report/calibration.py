@@ -25,18 +25,18 @@ from ..summaries.tables import (
     shared_sentence,
     two_digits,
 )
-from ..uncertainty.coverage_level import LEVEL_IN_PERCENT
+from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
 from .elements import DRAWN, Block, Report, Section, length_table, observation_tables, removed_tables
 
 _METHODS = {
     "two-stage": "Identification from repeatability, then a scale fix",
-    "joint": "Joint least squares of poses and lengths",
+    "joint": "One least-squares fit of poses and lengths",
     REPEATABILITY: "Identification with the scale of the nominal arm",
 }
 _MOST_KINDS = 3  # among the facts at the beginning
-_OBSERVED = "Joint least squares of all observations"
+_OBSERVED = "One least-squares fit of all observations"
 
 
 def calibration_report(record: CalibrationRecord) -> Report:

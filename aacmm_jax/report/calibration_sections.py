@@ -37,7 +37,7 @@ from ..summaries.tables import (
     two_digits,
 )
 from ..uncertainty.arm_uncertainty import Uncertainty
-from ..uncertainty.coverage_level import LEVEL_IN_PERCENT
+from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.identifiability import Observability
 from ..uncertainty.volume import VolumetricUncertainty
 from .elements import DRAWN, Block, Section, residual_chart, socket_table, view_of_arm
@@ -80,7 +80,7 @@ def parameters(record: CalibrationRecord, summary: dict[str, Any]) -> Section:
 
 
 def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Evaluation) -> list[Section]:
-    """Residuals of the calibrated arm, pose by pose; of observations in mm, in standard deviations and of orientations,
+    """Residuals of the calibrated arm, pose by pose; of observations in mm, in standard deviations, in deg and px,
     with the poses that a robust loss took weight from, and the geometry."""
     capture = record.recording.capture
     if record.sockets_alone:
@@ -101,7 +101,7 @@ def residuals(record: CalibrationRecord, summary: dict[str, Any], evaluation: Ev
     if not summary["robust"]:
         introduction += "Poses with more than eight times the median distance, in standard deviations, are marked."
         far = "far from its geometry", pose_outliers(normalised, groups.sizes)[0]
-    charts = (kinds_chart(record, unit, far, DRAWN) for unit in ("mm", "standard deviations", "deg"))
+    charts = (kinds_chart(record, unit, far, DRAWN) for unit in ("mm", "standard deviations", "deg", "px"))
     blocks = [introduction, *([weights_table(summary)] if summary["robust"] else []), *filter(None, charts)]
     introduction = (
         "The unknown geometry of the observations was determined together with the parameters. Positions and frames "

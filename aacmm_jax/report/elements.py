@@ -1,6 +1,7 @@
 """The elements of a report, independent of how they are shown; tables, charts and views of captures and evaluations."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Float
 from ..calibration.evaluation import Evaluation
 from ..calibration.record import CalibrationRecord
 from ..core.numpy_or_jax import AnyArray
+from ..core.units import people_read
 from ..data.capture import Capture
 from ..data.observations.observation import POINT, offset_of
 from ..diagnostics.pose_residuals import distances_of, observation_residuals
@@ -20,11 +22,13 @@ from ..plot.residuals import Groups, distances_in, pose_chart
 from ..summaries.observations import capture_observations
 from ..summaries.result_tables import BY_CONSTRUCTION, with_u_digits
 from ..summaries.tables import (
+    OTHER_RMS,
     Cell,
     Table,
     by_columns,
     decimals_for,
     format_number,
+    in_read_unit,
     listed,
     number,
     numbers,
@@ -175,7 +179,11 @@ def observation_tables(record: CalibrationRecord) -> list[Table]:
     if not capture.observations:
         return []
     u = {part.observation.name: part.u for part in observation_residuals(record)}
-    rows = capture_observations(capture)
+    rows: list[dict[str, Any]] = [
+        row | {f"u_{unit}": value or None for unit, value in u[row["observation"]].items()}
+        for row in capture_observations(capture)
+    ]
+    units = [unit for unit in ("mm", *OTHER_RMS) if any(row.get(f"u_{unit}") for row in rows)]
     certified = [{"observation": row["observation"]} | quantity for row in rows for quantity in row["certified"]]
     columns = {
         "observation": "observation",
@@ -183,13 +191,13 @@ def observation_tables(record: CalibrationRecord) -> list[Table]:
         "tip": lambda row: row["target"] or "own probe",
         "poses": "poses",
         "unknown geometry": lambda row: ", ".join(row["unknowns"]),
-        "u of measured values [mm]": lambda row: number(u[row["observation"]] or None),
+        **{
+            f"u of measured values [{people_read(unit)[1]}]": partial(in_read_unit, unit, f"u_{unit}") for unit in units
+        },
         "stated": lambda row: "; ".join(f"{quantity['quantity']} {_words(quantity)}" for quantity in row["stated"]),
     }
     if not any(row["stated"] for row in rows):
         del columns["stated"]
-    if not any(u[row["observation"]] for row in rows):
-        del columns["u of measured values [mm]"]
     of_certified = {
         "observation": "observation",
         "quantity": "quantity",

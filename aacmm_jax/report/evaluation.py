@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from ..acceptance.judgement import COVERAGE_FACTOR
 from ..acceptance.record import EvaluationRecord, PointsRecord
 from ..acceptance.results import AcceptanceTest
 from ..calibration.evaluation import Evaluation, evaluate
@@ -21,6 +20,7 @@ from ..summaries.evaluation import evaluation_summary, points_summary
 from ..summaries.observations import capture_words
 from ..summaries.tables import Cell, Table, decimals_for, format_number, listed, number
 from ..summaries.verdicts import overall_decision
+from ..uncertainty.coverage import COVERAGE_FACTOR
 from .elements import DRAWN, Block, Report, Section, length_table, residual_chart, socket_table, view_of_arm
 
 _STAGES = ("nominal", "calibrated")

@@ -186,7 +186,7 @@ def _flat(y: PyTree[Array], given: PyTree, absent: float, what: str) -> Flat:
         return ravel_pytree(jax.tree.map(leaf_of, y, given))[0]
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"{what} does not match the start; give a number, or a PyTree like the start ({error})."
+            f"{what} does not match the start; give a number, or a PyTree with the structure of the start ({error})."
         ) from error
 
 
@@ -207,7 +207,7 @@ def _minimum(
         value = ravel_pytree(fn(unravel(point), args))[0]
         if not value.size or jnp.iscomplexobj(value):
             raise InputError(
-                "the residual must consist of real numbers and contain at least one; check what the function returns."
+                "the residual must contain only real numbers, and at least one number; check what the function returns."
             )
         return value
 

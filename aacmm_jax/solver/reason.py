@@ -25,7 +25,7 @@ class Reason(eqx.Enumeration):
     max_steps = "Not converged: the step limit was reached; allow more steps or start closer."
     stalled = (
         "Not converged: no step lowers the cost, and this is not a minimum; is the residual smooth, and is its "
-        "derivative right?"
+        "derivative correct?"
     )
     nonfinite = (
         "Not converged: the residual or its derivative is not finite at the start; check the data and the start."

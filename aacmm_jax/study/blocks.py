@@ -57,8 +57,8 @@ class Variable(NamedTuple):
 
 METRICS = {
     "k": Variable("1", "k, measured / nominal"),
-    "scale": Variable("1", "scale after stage 1, found / true"),
-    "scale_error": Variable("1", "scale error after the scale fix, found / true - 1"),
+    "scale": Variable("1", "scale after stage 1, identified / true"),
+    "scale_error": Variable("1", "scale error after the scale fix, identified / true - 1"),
     "de_stage1": Variable("mm", "DE before the scale fix"),
     "deltam_stage1": Variable("mm", "Deltam before the scale fix"),
     "length_error_stage1": Variable("mm", "largest length error before the scale fix"),
@@ -74,7 +74,7 @@ VARIABLES = {
     "steps": Variable("1", "evaluations of all solves", "i4", -1),
     **METRICS,
     "truth_inside": Variable("1", "1 if the true arm lies inside the bounds", "i1", -1),
-    "active": Variable("1", "-1 on the lower bound, +1 on the upper, 0 inside, -128 if not yet run", "i1", -128, True),
+    "active": Variable("1", "bound reached: -1 the lower, +1 the upper, 0 none, -128 if not yet run", "i1", -128, True),
     "estimate": Variable("mm or rad", "identified parameters at the end of the solve", by_parameter=True),
     "true": Variable("mm or rad", "parameters of the true arm", by_parameter=True),
 }
@@ -150,6 +150,6 @@ def check_same(begun: str, where: str, advice: str) -> None:
         before, now = (f"{name}{sign}{side[name]}" if name in side else f"no {name}" for side in (then, here))
         if before != now:
             raise InputError(
-                f"{where} was begun with {before}, but this process has {now}, which can change the numbers; use the "
+                f"{where} was begun with {before}, but this process has {now}, which can change the results; use the "
                 f"same environment, or {advice}."
             )

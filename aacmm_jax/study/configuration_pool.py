@@ -149,8 +149,8 @@ def _out_of_reach(fixture: Fixture) -> InputError:
         points = " and ".join("(" + ", ".join(f"{x:g}" for x in point) + ")" for point in fixture.points)
         what += f" at {points} mm"
     return InputError(
-        f"{what} cannot be reached in enough poses within the joint limits; move it, or widen the joint limits "
-        "(capture.joint_limits_deg)."
+        f"{what} cannot be reached in enough poses within the joint limits; change its position, or widen the joint "
+        "limits (capture.joint_limits_deg)."
     )
 
 
@@ -218,7 +218,7 @@ def _placements(arm: Arm, fixture: Fixture, limits: Array, key: Array, count: in
             return np.array(placements[:count])
     kind = "socket" if fixture.length is None else f"reference length of {fixture.length:g} mm"
     raise InputError(
-        f"a {kind} has no placement in its region within the reach and the joint limits of the arm; widen or move the "
+        f"no position of a {kind} in its region is within the reach and the joint limits of the arm; widen or move the "
         "region."
     )
 

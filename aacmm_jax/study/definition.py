@@ -258,8 +258,8 @@ class Study:
             return possible
         if asked == "two-stage" and prior is not None:
             raise InputError(
-                "identification.method is 'two-stage', which ignores a prior; use 'joint', or prior = 'none' in "
-                "[identification]."
+                "identification.method is 'two-stage', which ignores a prior; use method = 'joint', or prior = 'none' "
+                "in [identification]."
             )
         if asked is not None:
             return asked
@@ -322,7 +322,10 @@ class Study:
         if capture is not None and self.specification.reference is not None:
             raise InputError("the capture file already contains its reference lengths; remove [reference].")
         if capture is not None and capture.columns not in (self.nominal.arm.joints, self.nominal.arm.columns):
-            raise InputError("the capture and the arm differ in their number of joints; name the arm that recorded it.")
+            raise InputError(
+                "the capture and the arm have different numbers of joints; give the arm with which the capture was "
+                "recorded."
+            )
         deviations = self.specification.deviation
         given = [key for key in type(deviations).model_fields if getattr(deviations, key) is not None]
         check_deviations(given, self.joints, self.space.names)
@@ -339,13 +342,14 @@ class Study:
                 pool, (placements, poses) = self.specification.capture.pool, self.pool_capacity(fixture)
                 if fixture.points is None and placements < 2:
                     raise InputError(
-                        f"a capture.pool of {pool} poses contains fewer than two placements of {fixture.poses} poses "
-                        f"in each of its {POOL_PARTS} parts; give at least {2 * POOL_PARTS * fixture.ends * poses}."
+                        f"a capture.pool of {pool} poses is too small, because each of its {POOL_PARTS} parts must "
+                        f"contain at least two placements with {fixture.poses} poses; give at least "
+                        f"{2 * POOL_PARTS * fixture.ends * poses}."
                     )
                 if fixture.poses > poses:
                     raise InputError(
-                        f"{fixture.poses} poses are more than the pool has per socket ({poses}); give a capture.pool "
-                        f"larger than {pool}."
+                        f"{fixture.poses} poses per socket are needed, but the pool has only {poses} per socket; give "
+                        f"a capture.pool larger than {pool}."
                     )
         _ = self.cell_values  # its checks
 

@@ -29,7 +29,7 @@ _COEFFICIENTS = (
 def coefficients_of(nominal: ArmSpecification, model: str | None) -> tuple[str, ...]:
     """Coefficients of a model of the joints; without one, those of the nominal arm's own corrections."""
     if model is not None and not model.strip():
-        raise InputError("a model is empty; for an arm without joint corrections, give the model dh.")
+        raise InputError("a model is empty; give the model dh for an arm without joint corrections.")
     arm = nominal.arm if model is None else _modelled(nominal, model)
     return tuple(name for name in correction_names(arm) if not name.startswith("gravity_"))
 
@@ -88,8 +88,8 @@ def check_deviations(given: Iterable[str], arm: Arm, names: Iterable[str]) -> No
     for kind, _, key, _ in _COEFFICIENTS:
         if key in given and key not in present:
             raise InputError(
-                f"deviation.{key} applies to coefficients that no arm of this study has; add them in deviation.model, "
-                f"for example model = '{kind}'."
+                f"deviation.{key} applies to coefficients that no arm of this study has; add these coefficients in "
+                f"deviation.model, for example model = '{kind}'."
             )
 
 

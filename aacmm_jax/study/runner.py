@@ -171,13 +171,14 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
         connected: Any = distributed.Client(**target, timeout=5)
     except Exception as error:  # of a dozen types: no such file or host, no answer, not a scheduler's file
         raise InputError(
-            f"no Dask scheduler answers at {address}; start one, or omit --dask to use this machine's cores."
+            f"no Dask scheduler answers at {address}; start a scheduler, or omit --dask to use the cores of this "
+            "computer."
         ) from error
     with connected as client:
         count = len(client.scheduler_info(n_workers=-1)["workers"])
         if not count:
             raise InputError(
-                f"the Dask cluster at {address} has no workers; start some, for example: dask worker {address}"
+                f"the Dask cluster at {address} has no workers; start workers, for example: dask worker {address}"
             )
         client.register_worker_callbacks(use_compilation_cache)  # of workers that join later, too
         yield client.get_executor(retries=_RETRIES, pure=False), count
@@ -244,12 +245,12 @@ def _difference(begun: Study, asked: Study) -> str:
                     return f"{table}.{key} differs"
         elif value != before[table]:
             return f"{table} differs"
-    return "its arm or its capture differs"
+    return "the arm or the capture differs"
 
 
 def _run(study: Study, begun: str, block: Block, file: Path | None, device: Any = None) -> dict[str, np.ndarray] | None:
     """The task of a worker: one block, computed with what the study was begun with; written to a shared folder."""
-    check_same(begun, f"on the worker {platform.node()}: the study", "leave that worker out")
+    check_same(begun, f"on the worker {platform.node()}: the study", "leave this worker out")
     results = run_block(equal_study(study), block, device=device)
     if file is None:
         return results

@@ -139,7 +139,7 @@ class CaptureTable(_Table):
         if sum(given is not None for given in (self.file, self.kit, self.positions_mm, self.sockets)) != 1:
             raise ValueError("give exactly one of positions_mm, sockets (with a region), file and kit.")
         if self.sockets is not None and self.region is None:
-            raise ValueError("sockets at random places need a region.")
+            raise ValueError("sockets at random positions need a region; add region.")
         generated = {"poses", "region", "joint_limits_deg", "pool"} & self.model_fields_set
         if self.recorded and generated:
             source = "kit" if self.file is None else "file"
@@ -198,7 +198,7 @@ class ReferenceTable(_Table):
     @model_validator(mode="after")
     def _one(self) -> "ReferenceTable":
         if (self.length_mm is None) == (self.ends_mm is None):
-            raise ValueError("give either length_mm (for random places in the region) or ends_mm.")
+            raise ValueError("give either length_mm (for random positions in the region) or ends_mm.")
         if self.ends_mm is not None and "positions" in self.model_fields_set:
             raise ValueError("ends_mm determines the number of positions; remove positions.")
         for start, end in itertools.chain(*(self.ends_mm or [])):
@@ -251,12 +251,13 @@ class Specification(_Table):
         reference, scaled = self.reference, set(self.identification.method or ()) & {"two-stage", "joint"}
         if reference is None and not self.capture.recorded and scaled:
             raise ValueError(
-                "method two-stage or joint needs a reference length; add a [reference], or use method = 'stage1'."
+                "the methods two-stage and joint need a reference length; add [reference], or use method = 'stage1'."
             )
         at_random = reference is not None and reference.length_mm is not None and reference.region is None
         if at_random and self.capture.region is None:
             raise ValueError(
-                "a reference length at a random place needs a region; give the region in [reference], or give ends_mm."
+                "a reference length at a random position needs a region; give the region in [reference], or give "
+                "ends_mm."
             )
         return self
 

@@ -37,7 +37,7 @@ from .blocks import DIMENSIONS, VARIABLES, Block, blocks_of
 from .definition import POOL_PARTS, Study
 from .specification import Specification, unit
 
-_ADVICE = "free some space there, then run the same command again: finished blocks are kept"
+_ADVICE = "free some disk space, then run the same command again (finished blocks are kept)"
 _TRIALS_IN_MEMORY = 50_000
 _LARGEST = 1e20  # mm, rad, or a factor
 _BY_TRIAL = tuple(name for name, kind in VARIABLES.items() if not kind.by_parameter)
@@ -95,7 +95,7 @@ class Results:
                 shapes = any(array.shape != results.empty(name).shape for name, array in arrays.items())
                 check_sense(results.path, {"the shapes of its results do not match its study": shapes})
                 ran = (arrays["converged"][()] != VARIABLES["converged"].fill).all()
-                check_sense(results.path, {"it has trials that did not run": not ran})
+                check_sense(results.path, {"it contains trials that were not run": not ran})
         return results
 
     @cached_property
@@ -304,11 +304,12 @@ def read(path: Path) -> Results:
         return results
     if parts != parts_of(path).name:
         raise InputError(
-            f"{path} was renamed, but its results are in {parts}; rename it back to {parts.removesuffix('.parts')}."
+            f"{path} was renamed, but its results are in {parts}; rename the file back to "
+            f"{parts.removesuffix('.parts')}."
         )
     if not parts_of(path).is_dir():
         raise InputError(
-            f"{path} has its results in the folder {parts}, which is missing; put that folder next to the file."
+            f"the results of {path} are in the folder {parts}, which is missing; put this folder next to the file."
         )
     check_owners(path, reading=True)
     return results
@@ -324,7 +325,7 @@ def check_owners(path: Path, *, reading: bool = False) -> None:
             continue
         user = user_name(status.st_uid)
         if not reading:
-            _refuse(item, f"{item} belongs to {user}, so its results are not continued; choose another output path.")
+            _refuse(item, f"{item} belongs to {user}, so its study is not continued; choose another output path.")
         elif status.st_uid != (owner := os.stat(path).st_uid):
             raise InputError(
                 f"{folder} belongs to {user}, but {path.name} belongs to {user_name(owner)}, so the blocks are not "
@@ -352,9 +353,11 @@ def _check_block(file: Path) -> None:
         return
     what = "is a link" if stat.S_ISLNK(status.st_mode) else ""
     if not what and status.st_uid != os.stat(file.parent).st_uid:
-        what = f"belongs to {user_name(status.st_uid)}, who does not own its folder"
+        what = f"belongs to {user_name(status.st_uid)}, who is not the owner of its folder"
     if what:
-        raise InputError(f"{file} {what}, so it is not read; remove it, and run the study again with --resume.")
+        raise InputError(
+            f"{file} {what}, so the block is not read; remove the file, and run the study again with --resume."
+        )
 
 
 def _refuse(path: Path, sentence: str) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..core.units import ARCSEC, error_unit
-from ..summaries.tables import Cell, Table, format_number, listed, number
+from ..summaries.tables import Cell, Styled, Table, View, format_number, listed, number
 from .blocks import METRICS
 from .specification import unit
 
@@ -140,3 +140,24 @@ def parameter_table(summary: Mapping[str, Any]) -> Table:
         "bias": scaled("bias"),
         "standard deviation": scaled("spread"),
     })  # fmt: skip
+
+
+def study_view(summary: dict[str, Any]) -> View:
+    """What people see of a study, or of one cell with every parameter."""
+    yield [
+        Styled(summary["name"] or "Study"),
+        f" of {summary['arm']}: {summary['cells']} cells of {summary['trials']:,} trials, seed {summary['seed']}",
+    ]
+    if not summary["finished"]:
+        yield [Styled("Not finished:", "yellow"), f" {summary['trials_run']:,} trials so far."]
+    if any(cell["trials_run"] for cell in summary["results"]):
+        yield cell_table(summary)
+        yield from metric_tables(summary)
+        yield "Length error and angle error: the largest error of any length parameter and of any angle parameter."
+        if len(summary["results"]) == 1:
+            yield parameter_table(summary)
+        else:
+            yield "--cell N shows one cell with the bias of every parameter; --figures FOLDER writes the figures."
+    else:
+        yield "No trial has ended yet."
+    yield from (f"Written: {path}" for path in summary.get("figures_written", ()))

@@ -26,7 +26,7 @@ _NO_MOMENT = (
     "Gravity has no moment about joint {joint}, because the axis of this joint is vertical or passes through the "
     "load; left out: {names}."
 )
-_OTHERS = "Left out, because each is constant or a combination of other functions of the same joint: {names}."
+_OTHERS = "Functions left out, because each is constant or a combination of other functions of the same joint: {names}."
 
 
 def arm_survey(
@@ -163,5 +163,5 @@ def _advice(expected: list[Expected], moving: list[str], joints: int) -> str:
     return (
         f"Record {2 * poses} poses, as different as possible, in {best.data}. With {pluralise(poses, 'pose')} or "
         "more, the calibration contributes less to the uncertainty of a measured length than the noise of the "
-        f"readings; the other poses serve to check the calibration.{tracked} {to_move}"
+        f"readings does; the remaining poses serve to check the calibration.{tracked} {to_move}"
     )

@@ -283,4 +283,4 @@ def cross_validation_summary(validation: CrossValidation) -> dict[str, Any]:
 def agreement_row(agreement: Agreement) -> dict[str, Any]:
     """Errors found and predicted of some poses, mm and in standard deviations."""
     names = {"rms_mm": "rms", "rms_predicted_mm": "predicted", "rms_angle_rad": "rms_angle"}
-    return attributes(agreement, "reduced_chi", "probability", poses="count", **names)
+    return attributes(agreement, "reduced_chi", "probability", "rms_px", poses="count", **names)

@@ -65,7 +65,7 @@ def correction_summary(
         warnings.append(
             f"In {pluralise(len(summary['singular']), 'row')} (row {rows}) the nominal arm is at a singularity, or "
             "close to one: axes align, or the arm is fully stretched. At a singularity, the inverse kinematics of "
-            "its controller has no unique solution and may choose other joint readings than the corrected ones. In "
+            "the controller has no unique solution and may choose other joint readings than the corrected ones. In "
             "these rows, command joint readings instead of poses, or avoid the poses."
         )
     summary["largest_distance_mm"] = float(distance[reached].max())
@@ -87,7 +87,7 @@ def correction_summary(
         warnings.append(
             f"In {pluralise(len(large), 'row')} (row {shorten([str(x) for x in large])}) the correction changes a "
             f"reading by more than {_LARGE_CHANGE:g} deg: axes of the arm nearly align in these poses, so small "
-            "corrections need large motions. Check these rows before you send an arm to the poses."
+            "corrections need large motions. Check these rows before you send an arm to these poses."
         )
     return summary
 

@@ -8,7 +8,7 @@ from ..core.text import csv_text
 from ..core.units import people_read, people_read_change
 from ..drift.results import Drift, Trend
 from ..drift.statistics import LengthChange
-from ..uncertainty.coverage_level import in_percent
+from ..uncertainty.coverage import in_percent
 from . import tables
 from .result_tables import listed_apart
 from .tables import Cell, Styled, View, attributes, decimals_for, listed, number, plain, rows_of

@@ -15,6 +15,7 @@ from ..data.capture import Capture, names_in, part_of
 from ..data.observations.held import Socket
 from ..diagnostics.findings import sentences
 from ..diagnostics.held_out import no_better, surprise
+from ..diagnostics.pose_residuals import rms
 from ..pipeline.cross_validation import groups_of
 from ..uncertainty.arm_uncertainty import Uncertainty
 from .calibration import agreement_row, length_metrics, metrics, metrics_by_socket_and_length
@@ -86,11 +87,10 @@ def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> 
     """Repeatability of a group's own sockets, and errors of the lengths that count for it."""
     row = {} if part is None else metrics(part)
     if part is not None and part.observed is not None:
-        pairs = zip(part.observed.kinds, part.observed.residuals, strict=True)
+        pairs = zip(part.observed.kinds, part.observed.distances, strict=True)
         # The only pose of a socket shows no scatter.
-        scattered = [np.asarray(values)[:3] for kind, values in pairs if kind != "socket" or values.shape[1] > 1]
-        squares = [np.zeros(0), *(np.sum(values**2, axis=0) for values in scattered)]
-        row["observed_rms_mm"] = float(np.sqrt(np.concatenate(squares).mean()))
+        scattered = [np.asarray(distances) for kind, distances in pairs if kind != "socket" or len(distances) > 1]
+        row["observed_rms_mm"] = rms(np.concatenate([np.zeros(0), *scattered]))
     return row | length_metrics(np.asarray(whole.error)[lengths])
 
 
@@ -106,6 +106,7 @@ def _observation_rows(parts: dict[str, Evaluation]) -> list[dict[str, Any]]:
         nominal_rms_mm=before.rms,
         rms_mm=after.rms,
         rms_angle_rad=after.rms_angle,
+        rms_px=after.rms_px,
         reduced_chi=after.reduced_chi,
     )[len(parts["calibrated"].repeatability.socket_rms) :]
 

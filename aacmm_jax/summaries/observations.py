@@ -23,7 +23,7 @@ from ..data.observations.observation import (
 from ..diagnostics.contradictions import session_metrics
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..model.observed import Observed
-from .tables import attributes, observed_words, plain, rows_of
+from .tables import OTHER_RMS, attributes, observed_words, plain, rows_of
 
 _LITTLE_WEIGHT = 0.5
 
@@ -108,6 +108,7 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
     others = record.others
     if others is not None:
         columns = {"poses": others.poses, "rms_mm": others.rms, "rms_angle_rad": others.rms_angle}
+        columns |= {} if others.rms_px is None else {"rms_px": others.rms_px}
         rows = rows_of(observation=others.names, **columns)
         poses = int(others.poses.sum())
         summary["other_poses"] = {"poses": poses, "rms_mm": others.rms_of_all, "observations": rows}
@@ -117,14 +118,14 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
 def _agreement(pairs: Sequence[tuple[ObservationResiduals, np.ndarray]]) -> dict[str, Any]:
     """Root mean squares of some observations together, by the nominal and by the calibrated arm."""
     residuals = [part for part, _ in pairs]
-    angles = [part.angle for part in residuals if part.angle is not None]
+    others = {unit: [part.other[unit] for part in residuals if unit in part.other] for unit in OTHER_RMS}
     rows = np.concatenate([np.full(len(part.distance), part.observation.rows) for part in residuals])
     squares = np.concatenate([part.normalised for part in residuals]) ** 2
     return {
         "poses": len(rows),
         "rms_before_mm": rms(np.concatenate([distances for _, distances in pairs])),
         "rms_after_mm": rms(np.concatenate([part.distance for part in residuals])),
-        "rms_angle_rad": rms(np.concatenate(angles)) if angles else None,
+        **{key: rms(np.concatenate(others[unit])) if others[unit] else None for unit, key in OTHER_RMS.items()},
         "reduced_chi": float(np.sqrt(np.average(squares, weights=rows))),
     }
 
@@ -188,7 +189,8 @@ def less_weight(residuals: tuple[ObservationResiduals, ...]) -> list[dict[str, A
             pose=i + 1,
             weight=part.weight[i],
             residual_mm=part.distance[i],
-            residual_angle_rad=[None] * len(i) if part.angle is None else part.angle[i],
+            residual_angle_rad=part.other["rad"][i] if "rad" in part.other else [None] * len(i),
+            residual_px=part.other["px"][i] if "px" in part.other else [None] * len(i),
             normalised=part.normalised[i],
         )
     return sorted(rows, key=lambda row: (row["weight"], -row["normalised"]))

@@ -15,6 +15,7 @@ from ..planning.design import Plan
 from ..planning.kit import KitPlan
 from ..planning.motion import Motion
 from ..planning.problem import MORE, Prediction
+from ..uncertainty.coverage import COVERAGE_FACTOR, K_IN_WORDS
 from .calibration import reference_length_rows
 from .tables import Styled, View, attributes, listed, number, warnings_of, written_of
 
@@ -173,13 +174,14 @@ def kit_plan(summary: dict[str, Any]) -> View:
 def _predictions(summary: dict[str, Any], where: str, without: dict[str, Any] | None = None) -> View:
     """U of a length by this plan, and by what it is compared with; the noise it assumes; how the arm moves."""
     length = f"{summary['check_length_mm']:g} mm"
-    yield ["\n", Styled(f"Contribution of the calibration to U of lengths of {length} over the volume [mm, k = 2]")]
+    title = f"Contribution of the calibration to U of lengths of {length} over the volume [mm, {K_IN_WORDS}]"
+    yield ["\n", Styled(title)]
     titles = {key: text.format(**summary, where=where) for key, text in _PREDICTED.items()}
     predictions = {title: summary[key] for key, title in titles.items() if summary[key] is not None} | (without or {})
     yield listed("", predictions.items(), {
         "": lambda row: row[0],
-        "median": lambda row: "not determined" if row[1] is None else 2 * row[1]["median_mm"],
-        "largest": lambda row: "" if row[1] is None else 2 * row[1]["largest_mm"],
+        "median": lambda row: "not determined" if row[1] is None else COVERAGE_FACTOR * row[1]["median_mm"],
+        "largest": lambda row: "" if row[1] is None else COVERAGE_FACTOR * row[1]["largest_mm"],
     })  # fmt: skip
     encoders, seat, slide = summary["encoder_arcsec"], summary["seating_mm"], summary["linear_encoder_mm"]
     by_joint = isinstance(encoders, list)

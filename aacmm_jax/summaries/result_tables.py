@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..core.units import DEG, people_read
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import K_IN_WORDS, U_AT_LEVEL
 from . import tables
 from .tables import METRICS, Cell, Columns, Table, decimals_for, listed, number
 
@@ -35,11 +35,6 @@ def with_u_digits(u: float | None, mark: str = "") -> Cell:
 def _said(words: str, mark: str) -> Cell:
     """What is to be noticed in a row, if anything."""
     return Cell(words, None, mark if words else "")
-
-
-def _in_degrees(row: Row) -> Cell:
-    angle = row["rms_angle_rad"]
-    return number(None if angle is None else angle / DEG)
 
 
 def _two_decimals(key: str) -> Any:
@@ -216,9 +211,7 @@ def agreement_tables(summary: Row) -> list[Table]:
         "poses": "poses",
         "nominal [mm]": "rms_before_mm",
         "calibrated [mm]": "rms_after_mm",
-        "calibrated [deg]": (
-            _in_degrees if any(row["rms_angle_rad"] is not None for row in summary["observations"]) else None
-        ),
+        **tables.other_rms_columns(summary["observations"], "calibrated"),
         "calibrated, in standard deviations": _two_decimals("reduced_chi"),
     }
     by_kind, by_observation = (
@@ -232,8 +225,9 @@ def agreement_tables(summary: Row) -> list[Table]:
 def other_poses_table(others: Row) -> Table:
     """How the calibrated arm agrees with poses that it was not calibrated with."""
     caption = f"Held-out poses, drawn at random: {others['poses']}; RMS distance {others['rms_mm']:.4f} mm"
-    columns: Columns = {"observation": "observation", "poses": "poses", "RMS [mm]": "rms_mm", "RMS [deg]": _in_degrees}
-    return listed(caption, others["observations"], columns)
+    rows = others["observations"]
+    columns: Columns = {"observation": "observation", "poses": "poses", "RMS [mm]": "rms_mm"}
+    return listed(caption, rows, columns | tables.other_rms_columns(rows, "RMS"))
 
 
 def weights_table(summary: Row, most: int | None = None) -> Table:
@@ -279,6 +273,7 @@ def observations_table(caption: str, rows: Rows) -> Table:
         "nominal": "nominal_rms_mm",
         "calibrated": "rms_mm",
         "predicted": "rms_predicted_mm" if any("rms_predicted_mm" in row for row in rows) else None,
+        **tables.other_rms_columns(rows, "calibrated"),
         "calibrated, in standard deviations": _two_decimals("reduced_chi"),
     })  # fmt: skip
 
@@ -315,7 +310,7 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         f"decision, {value}" if nominal and not brief else "decision": decided if limited else None,
         "decision, nominal": before if limited and nominal and not brief else None,
         value: read("value_mm"),
-        "U (k = 2)": lambda row: stated_expanded(row["expanded_mm"]),
+        f"U ({K_IN_WORDS})": lambda row: stated_expanded(row["expanded_mm"]),
         "MPE": "limit_mm" if limited else None,
         "nominal": read("as_found_mm") if nominal else None,
         "worst at": "where",

@@ -10,6 +10,7 @@ Example:
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple
 
@@ -252,6 +253,23 @@ def noise_sentence(summary: Mapping[str, Any]) -> str:
     }[part["form"]]
 
 
+# Unit of residuals that are not lengths -> the key of their root mean square.
+OTHER_RMS = {"rad": "rms_angle_rad", "px": "rms_px"}
+
+
+def other_rms_columns(rows: Sequence[Mapping[str, Any]], title: str) -> dict[str, Any]:
+    """Columns with the root mean squares of residuals that are not lengths, in the units that people read; only of
+    units in which something was measured."""
+    present = {unit: key for unit, key in OTHER_RMS.items() if any(row.get(key) is not None for row in rows)}
+    return {f"{title} [{people_read(unit)[1]}]": partial(in_read_unit, unit, key) for unit, key in present.items()}
+
+
+def in_read_unit(unit: str, key: str, row: Mapping[str, Any]) -> "Cell":
+    """A value of a row in the unit in which people read it; nothing where the row has none."""
+    value = row.get(key)
+    return number(None if value is None else people_read(unit)[0] * value)
+
+
 def rms_difference(row: Mapping[str, Any], best_rms: float) -> tuple[float, float]:
     """The RMS error outside less that of the best model, and its standard error by the scatter of the differences
     between regions, mm: a difference of squares is that of the roots times their sum."""
@@ -292,7 +310,8 @@ def shared_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
 def tried_sentence(row: Mapping[str, Any]) -> str:
     """How much of the volume a calibration has tried, in words."""
     return (
-        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses, which means "
-        f"that the nearest calibration pose is within the spacing of these poses ({row['spacing_rad'] / DEG:.2g} deg "
-        "RMS over the joints). In the rest of the joint space, U is an extrapolation by the model."
+        f"{100 * row['tried'] / row['poses']:.2g} % of the joint space is covered by calibration poses: in this part, "
+        "the nearest calibration pose is no farther away than the spacing of the calibration poses "
+        f"({row['spacing_rad'] / DEG:.2g} deg RMS over the joints). In the rest of the joint space, U is an "
+        "extrapolation by the model."
     )

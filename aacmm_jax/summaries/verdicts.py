@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from ..calibration.prediction import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
-from ..uncertainty.coverage_level import U_AT_LEVEL
+from ..uncertainty.coverage import U_AT_LEVEL
 from .tables import two_digits
 
 _LACKING = "the residuals show errors that the model does not describe"  # what tests of residuals doubt

@@ -16,7 +16,7 @@ from ..kinematics.chain import joint_motion
 from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import Parameters
 from .covariance import SharedErrors
-from .coverage_level import LEVEL
+from .coverage import LEVEL
 from .degrees_of_freedom import Components, Law, coverage_factor, degrees_of_freedom
 from .shared_kinds import PLACES, SUCCESSIVE, VISITS
 

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from ..core.distributions import student_density, student_quantile, student_tail
 from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, namespace, set_at
-from .coverage_level import LEVEL
+from .coverage import LEVEL
 
 _DRAWS = 128  # combinations of the variances of several parts that have distributions
 _ROUNDS = 24  # most steps of Newton's method to a coverage factor

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..core.linear_algebra import inverse_cholesky
+from ..core.linear_algebra import inverse_cholesky, matrix_products, products, squares
 from ..core.numpy_or_jax import AnyArray, added_to, namespace
 from ..data.noise import Noise
 from ..data.observations.observation import Rows
@@ -71,23 +71,6 @@ def covariance_of_noise(errors: ArmErrors, noise: Noise) -> Float[AnyArray, "m r
 def covariance_of_sigma(errors: ArmErrors, sigma: Float[AnyArray, ""]) -> Float[AnyArray, "m r r"]:
     """Of a group's rows, where every coordinate of a tip scatters by ``sigma``, mm."""
     return namespace(errors, sigma).maximum(sigma, LEAST_SIGMA) ** 2 * squares(errors.by_seat)
-
-
-def squares(rows: Float[AnyArray, "r c m"]) -> Float[AnyArray, "m r r"]:
-    """A matrix a pose times its own transpose."""
-    return namespace(rows).moveaxis(products(rows, rows), -1, 0)
-
-
-def products(left: Float[AnyArray, "r c m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r s m"]:
-    """A matrix a pose times the transpose of another, as sums: XLA computes many products of small matrices several
-    times as slowly."""
-    first, *others = (left[:, None, c] * right[None, :, c] for c in range(left.shape[1]))
-    return sum(others, first)
-
-
-def matrix_products(left: Float[AnyArray, "r s m"], right: Float[AnyArray, "s c m"]) -> Float[AnyArray, "r c m"]:
-    """The product of two matrices a pose."""
-    return products(left, namespace(right).swapaxes(right, 0, 1))
 
 
 class UnknownsCovariance(NamedTuple):

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..core.linear_algebra import inverse_positive_definite
+from ..core.linear_algebra import inverse_positive_definite, matrix_products, products
 from ..core.numpy_or_jax import AnyArray, namespace, scan, stop_gradient, while_loop
 from ..core.units import ARCSEC
 from ..data.noise import Noise, noise_of, one_arcsec
@@ -28,8 +28,6 @@ from .linear_propagation import (
     ArmErrors,
     Influence,
     covariance_of_sigma,
-    matrix_products,
-    products,
     row_errors,
 )
 

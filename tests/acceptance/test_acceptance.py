@@ -238,7 +238,7 @@ def test_limits_that_cannot_be_are_refused(texts, said):
         (lambda: acceptance.decide("a", 1, 0), "error is 'a'; give a number"),
         (lambda: acceptance.decide(np.array([1.0, 2.0]), 1, 0), "give a number"),
         (lambda: acceptance.decide(math.nan, 1, 0), "error is nan; give a number"),
-        (lambda: acceptance.decide(0.0, 1.0, 0.0, "din"), "known are iso-2017, iso-2013, simple"),
+        (lambda: acceptance.decide(0.0, 1.0, 0.0, "din"), "choose one of iso-2017, iso-2013, simple"),
         (lambda: run(Measured({"A": np.eye(3)}, measuring_range=-1.0)), "measuring_range"),
         (lambda: run(Measured({"A": [[1, 2]]})), "'A'"),
         (lambda: run(Measured({"A": np.full((2, 3), 1e200)})), "beyond"),
@@ -538,12 +538,12 @@ def test_points_are_evaluated_without_an_arm(aacmm, tmp_path):
         (("diameter = 30.98", "diameter = 0"), "diameter"),
         (('file = "sphere/touch.txt"', ""), "either file or files"),
         (('unit = "um"', 'unit = "um"\ncolumns = [1, 2, 4]'), "column '4'"),
-        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "one column is picked twice"),
+        (('unit = "um"', 'unit = "um"\ncolumns = [1, 1, 2]'), "pick the same column twice"),
         (("reach = 1000", "reech = 1000"), "did you mean 'reach'"),
-        (("shoulder = [0, 0, 0]", ""), "reach and shoulder together"),
+        (("shoulder = [0, 0, 0]", ""), "reach and shoulder are needed together"),
         (
             ('name = "{end}"', 'name = "{end}"\ntarget = "ball"'),
-            "target, session and temperature_C apply to",
+            "target, session and temperature_C apply only to",
         ),
     ],
 )
@@ -673,7 +673,7 @@ def test_an_arm_that_cannot_take_a_zone_goes_without_it():
     assert "0 to 20 %" in procedure.left_out[0]
     assert {item.name for item in procedure.sockets if item.name.startswith("spat")} == {"spat/middle", "spat/far"}
     assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "asme", margin=3.0), "margin")
-    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "known are asme, iso")
+    assert_refused(lambda: plan_procedure(aj.load_arm("iiwa14"), "vdi"), "choose one of asme, iso")
 
 
 def test_planned_poses_can_be_taken(cheng, procedure):

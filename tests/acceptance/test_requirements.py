@@ -358,7 +358,7 @@ def test_expansions_that_cannot_be_read_are_refused(text):
 
     assert_refused(lambda: read_expansions([text]), "--expansion", "artefact=11.5,1,20.8,0.2")
     assert_refused(lambda: read_expansions(["arm=1e6,0,20,0"]), "arm", "per K")
-    assert_refused(lambda: read_expansions(["arm=11.5e-6,0,20,0"]), "in 1/K; give it in 1e-6/K")
+    assert_refused(lambda: read_expansions(["arm=11.5e-6,0,20,0"]), "in 1/K; give the coefficient in 1e-6/K")
     assert_refused(lambda: read_expansions(["arm=1,0,20,0", "arm=1,0,20,0"]), "two expansions")
 
 

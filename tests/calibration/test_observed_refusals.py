@@ -76,12 +76,13 @@ REFUSED = {
     ),
     "one orientation": (
         lambda arm: one_orientation(arm, "SMR"),
-        "target 'SMR' was seen in only one orientation of the last frame, so the position of the target cannot be "
-        "distinguished from that of the instrument; record poses with the wrist turned.",
+        "target 'SMR' was measured in only one orientation of the last frame, so the position of the target cannot be "
+        "distinguished from that of the instrument; record poses in other orientations.",
     ),
     "a plane touched in one line": (
         lambda arm: kinds.Plane("wall", reaching(arm, np.array([400, -100, 200]) + 2 * LINE)),
-        "the touches hardly determine the geometry of plane 'wall'; record touches that are not on one line.",
+        "the touches do not determine the geometry of plane 'wall' well enough; record touches that are not on one "
+        "line.",
     ),
     "a plane touched twice": (
         lambda arm: kinds.Plane("wall", Q[:2]),
@@ -94,17 +95,18 @@ REFUSED = {
             reaching(arm, np.array([450, -100, 200]) + LINE[:15]),
             50.0,
         ),
-        "the touches hardly determine the geometry of planes 'block'; record touches that are not on one line.",
+        "the touches do not determine the geometry of planes 'block' well enough; record touches that are not on one "
+        "line.",
     ),
     "a small cap": (
         lambda arm: kinds.Sphere("s", reaching(arm, on_cap(10))),
-        "the touches hardly determine the geometry of sphere 's'; distribute the touches over the sphere, or give its "
-        "diameter.",
+        "the touches do not determine the geometry of sphere 's' well enough; distribute the touches over the sphere, "
+        "or give its diameter.",
     ),
     "a bore touched in one ring": (
         lambda arm: kinds.Cylinder("bore", reaching(arm, ring(25.0)), diameter=50.0),
-        "the touches hardly determine the geometry of cylinder 'bore'; distribute the touches around the cylinder at "
-        "two heights, or give its diameter.",
+        "the touches do not determine the geometry of cylinder 'bore' well enough; distribute the touches around the "
+        "cylinder at two heights, or give its diameter.",
     ),
     "a covariance that is not positive": (
         lambda arm: kinds.MeasuredPoints("T", Q, POINTS, covariance=np.diag([1.0, 1.0, -0.1])),
@@ -118,8 +120,8 @@ REFUSED = {
     ),
     "mixed units": (
         lambda arm: kinds.MeasuredPoints("T", np.rad2deg(Q), POINTS),
-        "observation 'T' pose 2 joint 6 is 56.982 rad, more than four revolutions: these look like degrees; convert "
-        "with numpy.deg2rad.",
+        "observation 'T' pose 2 joint 6 is 56.982 rad, more than four revolutions, so the readings are probably in "
+        "degrees; convert with numpy.deg2rad.",
     ),
     "a name given twice": (
         lambda arm: [kinds.MeasuredPoints("T", Q, POINTS), kinds.MeasuredPoints("T", Q[:9], POINTS[:9])],
@@ -146,7 +148,7 @@ def test_refused_in_one_sentence(paper_arm, what):
     [
         ('units = { points = "m" }', ["says mm, but the manifest says m", "correct one of the two"]),
         ('[[points]]\nname = "a"\nfile = "b.csv"', ["two observations have the name 'a'", "give them different names"]),
-        ('target = "a\\nb"', ["target of observation 'a' has the name", "a name of one line"]),
+        ('target = "a\\nb"', ["target of observation 'a' has the name", "a text of one line"]),
     ],
 )
 def test_refused_in_a_manifest(tmp_path, text, parts):

@@ -122,7 +122,7 @@ def test_the_prior_determines_what_too_few_poses_do_not(paper_arm, bounds, true)
     for options in ({}, {"prior": MAKER}):  # a prior does not say how much tips scatter
         with pytest.raises(aj.InputError, match="equations"):
             aj.calibrate(paper_arm, capture, bounds, **options)
-    with pytest.warns(aj.IdentifiabilityWarning, match="Determined by the prior, and little"):
+    with pytest.warns(aj.IdentifiabilityWarning, match="Determined by the prior, and hardly"):
         found = aj.calibrate(paper_arm, capture, bounds, prior=MAKER, noise=NOISE)
     assert found.converged
     assert np.all(found.determined)
@@ -172,7 +172,7 @@ def test_learned_scales_settle_where_a_bound_is_reached(name):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"prior": MAKER, "method": "two-stage"}, "without a robust loss, without a prior"),
+        ({"prior": MAKER, "method": "two-stage"}, "cannot be combined with a robust loss, a prior or"),
         ({"prior": aj.Prior({"length": 0.3})}, "did you mean 'lengths'"),
         ({"prior": aj.Prior({"d_3": 0.3}, mean={"d_3": 0.4})}, "outside its bounds"),
     ],

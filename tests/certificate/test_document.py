@@ -443,7 +443,7 @@ def test_observations_are_stated_with_what_is_certified_of_them(observed_record,
         chi = values[*row, "RMS residual in standard deviations"].value
         assert chi == pytest.approx(found.reduced_chi[i], abs=5.1e-4)
         assert values["Nominal parameters", *row[1:], "RMS residual"].value > 0.3
-    assert ("Calibrated parameters", "Observations", "3: tracker", "RMS residual of the orientation") in values
+    assert ("Calibrated parameters", "Observations", "3: tracker", "RMS residual in rad") in values
     assert ("Calibrated parameters", "Scale", "k") not in values
     said = " ".join(contents(text, "*/dcc:statements"))
     assert "comes from tracker (transforms), ball (sphere), block (parallel planes), bar (artefact)." in said

@@ -72,7 +72,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
         "points",
         "sphere",
         "frame of tracker",
-        "Held-out poses, drawn at random",
+        "Held-out poses, drawn",
     ):
         assert part in shown
     assert aacmm("show", "c.h5").stdout in shown
@@ -256,7 +256,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
 @pytest.mark.parametrize(
     ("command", "parts"),
     [
-        ("calibrate tracker.h5 -o x.h5 --method two-stage", ["method='two-stage' is for sockets"]),
+        ("calibrate tracker.h5 -o x.h5 --method two-stage", ["method='two-stage' applies only to sockets"]),
         ("calibrate tracker.h5 -o x.h5 --scale nominal", ["--scale nominal is for captures that do not fix the scale"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --method joint", ["stage 1 only; omit --method"]),
         ("calibrate free.h5 -o x.h5 --scale nominal --cross-validate", ["needs a calibrated scale"]),
@@ -269,7 +269,7 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate monday.h5 -o x.h5 --cross-validate --leave-out [AC]", ["without '[AC]', no data fix the scale"]),
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe applies to several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the file name 'monday'"]),
-        ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be drawn", "1 to 79"]),
+        ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be selected", "1 to 79"]),
         ("calibrate tracker.h5 -o x.h5 --without 'no*'", ["no socket matches"]),
         ("evaluate c.h5 few.h5", ["sphere 'ball' has 2 touches"]),
         ("evaluate c.h5 monday.h5 --acceptance din", ["'din'", "jjf, asme, iso"]),

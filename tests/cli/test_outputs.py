@@ -97,7 +97,7 @@ def test_one_path_is_not_two_outputs(aacmm, inputs):
         (inputs / "link.png").unlink(missing_ok=True)
         (inputs / "link.png").symlink_to("x.png")
         done = aacmm("calibrate", "c.h5", "-o", first, "--figure", second, expect=2)
-        assert "is named for two outputs" in done.stderr
+        assert "is given for two outputs" in done.stderr
     assert content(inputs) == before
 
 

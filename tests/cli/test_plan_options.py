@@ -54,7 +54,7 @@ def test_a_robot_by_default(aacmm):
         "via approach points 50 mm above the sockets",
         "the arm's body with itself and with obstacles (table)",
         "Not checked for collisions, because these parts touch in every pose of the arm: offset d_1 and table.",
-        "Note: each link is assumed to have a radius of 60 mm",
+        "Note: every link is assumed to be a capsule with a radius of 60 mm",
     ):
         assert text in printed
     assert "60" in printed.split("largest tilt [deg]")[1].split("Reference")[0]

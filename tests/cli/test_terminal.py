@@ -246,7 +246,7 @@ REFUSED = [
     (("export", "there.h5", "--format", "csv", "--arm", "true"), "--arm applies to --format toml"),
     (
         ("evaluate", "there.h5", "there.h5", "--mpe", "zzz=1"),
-        "names the unknown metric 'zzz'; known are " + ", ".join(aj.acceptance.METRICS),
+        "names the unknown metric 'zzz'; choose one of " + ", ".join(aj.acceptance.METRICS),
     ),
 ]
 

@@ -55,7 +55,7 @@ def test_show_and_links(aacmm, robot):
     assert "From a URDF, links world to tool0; positions are in the frame of world." in said
     said = " ".join(aacmm("show", "robot.urdf", "--base", "shoulder", "--tip", "tool0").stdout.split())
     assert "in a frame at (50, 0, 100) mm in shoulder, with its z axis along (0, -1, 0)" in said
-    assert "name the tip (tip= or --tip)" in aacmm("show", "robot.urdf", expect=2).stderr
+    assert "choose the tip (tip= or --tip)" in aacmm("show", "robot.urdf", expect=2).stderr
     assert "is not a URDF" in aacmm("show", "panda", "--tip", "tool0", expect=2).stderr
     robot.rename(robot.with_suffix(".h5"))
     assert "--base and --tip name links of a URDF" in aacmm("show", "robot.h5", "--tip", "x", expect=2).stderr

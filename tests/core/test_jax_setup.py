@@ -54,7 +54,7 @@ def test_only_failures_of_reading_blame_the_file(without_gpu):
         assert sentence(lambda error=error: failing(error)) == SENTENCE
     backend.prepare_command()
     assert_refused(lambda: failing(KeyError("angle")), "capture.h5 is damaged")
-    assert_refused(lambda: failing(MemoryError()), "capture.h5 cannot be read", "no memory")
+    assert_refused(lambda: failing(MemoryError()), "capture.h5 cannot be read", "out of memory")
     jax_error = type("JaxRuntimeError", (RuntimeError,), {"__module__": "jax.errors"})
     for kind in (AssertionError, ImportError, FloatingPointError, jax_error, KeyboardInterrupt):
         with pytest.raises(kind):

@@ -10,7 +10,7 @@ from ..refusals import assert_refused
 
 def test_degrees_are_recognized():
     """Of revolute joints; prismatic ones slide by hundreds of mm."""
-    said = ["socket 'A' pose 2 joint 1 is 90 rad", "more than four revolutions", "look like degrees", "numpy.deg2rad"]
+    said = ["socket 'A' pose 2 joint 1 is 90 rad", "more than four revolutions", "probably in degrees", "numpy.deg2rad"]
     capture, arm = aj.Capture({"A": np.array([[0.0, 1.0], [90.0, 2.0]])}), aj.Arm(alpha=[1, 0], a=[1, 1], d=[0, 0])
     assert_refused(lambda: aj.evaluate(arm, capture), *said)
     aj.evaluate(arm.replace(prismatic=(1,)), capture)
@@ -22,7 +22,7 @@ def test_sockets_of_a_batch():
     batch = aj.stack_captures([aj.Capture({"A": rows[:2], "B": rows[2:]}) for rows in q])
     np.testing.assert_array_equal(batch.sockets["A"], q[:, :2])
     np.testing.assert_array_equal(batch.sockets["B"], q[:, 2:])
-    assert_refused(lambda: aj.stack_captures([]), "no capture to stack")
+    assert_refused(lambda: aj.stack_captures([]), "the list of captures is empty")
 
 
 def test_one_reference_length_needs_no_list():

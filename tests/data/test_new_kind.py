@@ -21,7 +21,7 @@ NOISE = aj.Noise(encoder_arcsec=2.0, seating=0.005)
 class Wire(AbstractObservation):
     """Poses with the tip on a taut wire: across it, in two directions, its distance is 0."""
 
-    kind, table, noun, rows = "wire", "wire", "wire", 2
+    kind, table, noun, row_units = "wire", "wire", "wire", ("mm", "mm")
     sag: Float[AnyArray, ""] = declared("standard deviation of the wire about its line", "mm", default=0.0)
     # As the axis of a cylinder: the turn of z to its direction, and where it meets the plane across it.
     line = Part("line of {name}", "rad", "rad", "mm", "mm")

@@ -269,7 +269,7 @@ def test_a_plane_is_read_by_its_normal():
         (lambda: kinds.MeasuredPoints("p", Q, POINTS, u=-1), "negative"),
         (lambda: kinds.MeasuredPoints("p", Q, POINTS, u=1, covariance=np.eye(3)), "both given"),
         (lambda: kinds.MeasuredPoints("p", Q, POINTS, covariance=-np.eye(3)), "not symmetric and positive"),
-        (lambda: kinds.MeasuredPoints("", Q, POINTS), "name of one line"),
+        (lambda: kinds.MeasuredPoints("", Q, POINTS), "text of one line"),
         (lambda: kinds.MeasuredTransforms("p", Q, POINTS, 2 * MEASURED, u_angle=1e-3), "not a rotation"),
         (lambda: kinds.MeasuredTransforms("p", Q, POINTS, MEASURED, u_angle=0.0), "must be positive"),
         (lambda: kinds.Sphere("s", Q, diameter=0), "must be positive"),
@@ -326,9 +326,9 @@ def test_a_cylinder_is_fitted_under_jit_too():
     [
         (kinds.Cylinder("c", Q), touches(0, 330, [0, 20], 4), "4 touches, but there are 5 unknowns"),
         (kinds.Cylinder("c", Q, diameter=40), touches(0, 330, [0, 20], 3), "3 touches, but there are 4 unknowns"),
-        (kinds.Cylinder("c", Q), touches(0, 330, [0]), "hardly determine the geometry"),
-        (kinds.Cylinder("c", Q), touches(0, 20, [0, 10, 20, 30, 40], 25), "hardly determine the geometry"),
-        (kinds.Cylinder("c", Q, diameter=40), touches(0, 0.1, [0, 20]), "hardly determine the geometry"),
+        (kinds.Cylinder("c", Q), touches(0, 330, [0]), "do not determine the geometry"),
+        (kinds.Cylinder("c", Q), touches(0, 20, [0, 10, 20, 30, 40], 25), "do not determine the geometry"),
+        (kinds.Cylinder("c", Q, diameter=40), touches(0, 0.1, [0, 20]), "do not determine the geometry"),
     ],
 )
 def test_touches_that_leave_a_geometry_open(observation, tips, message):

@@ -52,7 +52,7 @@ def test_what_was_left_out_is_reported_and_kept(paper_arm, noisy_capture, copied
     counts = ", ".join(f"{name} ({count})" for name, count in zip(noisy_capture.names, poses, strict=True))
     for found in (recording, aj.files.load_capture(tmp_path / "c.h5")):
         said = sentences(of_recording(found))
-        assert f"of another pose of the same socket or observation: {counts}." in said[0]
+        assert f"as another pose of the same socket or observation: {counts}." in said[0]
         assert said[1].startswith("Duplicates ignored: reference lengths given more than once")
         assert f"{length[::-1]}, {length}; delete" in said[1]
     only = copied.select(only="A")

@@ -53,7 +53,7 @@ def test_every_encoder_has_its_own_noise(paper_arm):
     [
         (
             {"noise": aj.Noise(seating=0.1), "seating": 0.1},
-            ["simulate is given both noise and seating", "give everything in"],
+            ["simulate is given both noise and seating", "state all standard deviations in"],
         ),
         ({"noise": aj.Noise(), "encoder_arcsec": 0.0, "seating": 0.0}, ["noise and encoder_arcsec and seating"]),
         ({"noise": aj.Noise(encoder_arcsec=[1.0, 2.0])}, ["encoder_arcsec has 2 values", "6 joints"]),

@@ -73,7 +73,10 @@ def test_a_remounted_probe_is_named():
 def test_unseen_data_that_scatter_more_than_predicted():
     parts = {"A": agreement(0.11), "B": agreement(0.35), "C": agreement(0.25)}
     (text,) = sentences(surprise(agreement(0.25, 90, 180.0), NOTHING, parts, unknown))
-    assert "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm, 3.5" in text
+    assert (
+        "0.25 mm RMS from their geometry, 2.5 times the predicted 0.1 mm, most of all in B (0.35 mm RMS, 3.5 times"
+        in text
+    )
     assert "A (" not in text
     assert "reference lengths" not in text
     assert surprise(agreement(0.11), agreement(0.11), parts, unknown) == []

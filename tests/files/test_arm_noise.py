@@ -116,7 +116,7 @@ def test_a_urdf_is_a_robots():
 @pytest.mark.parametrize(
     ("stated", "text"),
     [
-        ("[noise]\nrepeatability_mm = 0.1\nencoder_arcsec = 3.0", "give either repeatability_mm or encoder_arcsec"),
+        ("[noise]\nrepeatability_mm = 0.1\nencoder_arcsec = 3.0", "repeatability_mm and encoder_arcsec both state"),
         ("[noise]\nencoder_arcsec = [1.0, 2.0]", "encoder_arcsec has 2 values, but the arm has 3 joints"),
         ("[noise]\nencoder_arcsec = 0.0\nseating_mm = 0.0", "every standard deviation of the noise is zero"),
         ("[noise]\nrepeatability_mm = -0.1", "greater than 0"),

@@ -182,7 +182,7 @@ def test_saved_arm_reads_back_the_same_numbers(tmp_path):
         ("45.0", "nan", ["'joint 2.alpha' must be a finite number, not nan"]),
         ("45.0", "", ["not valid TOML", "line 10"]),
         ("130.0]", "]", ["'probe' has 2 entries", "give at least 3"]),
-        ('"standard"', '"craig"', ["joint 1 has a twist or a length", "alpha_0", "place the base frame"]),
+        ('"standard"', '"craig"', ["joint 1 has a twist or a length", "alpha_0", "choose a base frame"]),
         ("probe_z = 60.0", "probe_q = 60.0", ["unknown parameter 'probe_q' of a 2-joint arm", "did you mean 'probe_"]),
         ("probe_z = 60.0", "d_1 = 60.0", ["'d_1' is held, not free"]),
         ("probe_z = 60.0", "probe_z = -60.0", ["'identification.override.probe_z' must be greater than 0, not -60.0"]),
@@ -226,11 +226,13 @@ def test_what_is_not_an_arm_file(tmp_path):
     craig = (
         'convention = "craig"\nlength_unit = "mm"\nangle_unit = "deg"\njoint = [{ alpha = 0, a = 0, d = 1, beta = 1 }]'
     )
-    assert_refused(lambda: aj.load_arm(written(tmp_path, craig)), "beta", "standard convention", "remove beta")
+    assert_refused(
+        lambda: aj.load_arm(written(tmp_path, craig)), "beta", "only with convention = 'standard'", "remove beta"
+    )
     assert_refused(lambda: aj.load_arm("pandaa"), "'pandaa' is neither a file nor an arm", "did you mean 'panda'?")
-    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "known are cheng2018-ra7125", "ur5e.")
+    assert_refused(lambda: aj.load_arm("zzz"), "'zzz'", "choose one of cheng2018-ra7125", "ur5e.")
     assert_refused(lambda: aj.load_arm("missing.toml"), "missing.toml does not exist", "check the path")
-    assert_refused(lambda: aj.load_arm(tmp_path / "folder.toml"), tmp_path, "is a folder", "name a file")
+    assert_refused(lambda: aj.load_arm(tmp_path / "folder.toml"), tmp_path, "is a folder", "give a file")
     assert_refused(lambda: aj.load_arm(tmp_path / "binary.toml"), tmp_path, "not UTF-8 text")
 
 

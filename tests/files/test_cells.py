@@ -149,12 +149,13 @@ def test_meshes_that_are_not_at_hand(tmp_path):
     path = written(tmp_path, "two.dae")
     found = load_cell(path)
     assert found.notes == (
-        "the meshes of two are not available as STL or OBJ; only the other shapes of their joints are used.",
+        "the meshes of two are not available as STL or OBJ files; only the other collision shapes that move with the "
+        "same joints are checked.",
     )
     assert found.cell.body.names == ("base", "one", "two/2")
     path.write_text(path.read_text().replace('<sphere radius="0.03"/>', "<ellipsoid/>"))
     found = load_cell(path)
-    assert "capsules along their D-H rows" in found.notes[0]
+    assert "each of these links is modelled as capsules" in found.notes[0]
     assert found.cell.body.names[-1] != "two"
     (path.parent / "plain.urdf").write_text(LINKS.replace("collision", "visual"))
     assert "5 % of the total length of the links" in load_cell(path.parent / "plain.urdf").notes[0]

@@ -70,7 +70,7 @@ CHANGES = {
 def test_changed_content_is_refused(path, change):
     changed(path, change)
     for read in (read_tables, read_summary):
-        assert_refused(lambda read=read: read(path, KIND), path, "changed by another program", "make it again")
+        assert_refused(lambda read=read: read(path, KIND), path, "changed by another program", "create it again")
 
 
 def test_files_of_other_versions_are_refused_by_name(path):
@@ -113,16 +113,16 @@ HOSTILE = {
     "soft link": (link_to("soft"), "a link to something else"),
     "external storage": (external_storage, "stored in another file"),
     "virtual": (virtual, "stored in another file"),
-    "nothing stored": (replaced((2**33,), "f8"), "far more than the file contains"),
-    "nothing stored, chunks": (replaced((2**17, 2**16), "f8", chunks=(2, 2**16)), "far more than the file contains"),
+    "nothing stored": (replaced((2**33,), "f8"), "far more than the file can contain"),
+    "nothing stored, chunks": (replaced((2**17, 2**16), "f8", chunks=(2, 2**16)), "far more than the file can contain"),
     "compressed": (
         replaced(data=np.zeros(2**21), compression="gzip", chunks=(2**21,)),
-        "far more than the file contains",
+        "far more than the file can contain",
     ),
     "compound": (replaced((3,), [("a", "f8"), ("b", "i4")]), "of a type that does not occur in files of aacmm"),
     "reference": (replaced((3,), h5py.ref_dtype), "of a type that does not occur in files of aacmm"),
     "lists": (replaced((3,), h5py.vlen_dtype("f8")), "of a type that does not occur in files of aacmm"),
-    "texts": (replaced(data=[["a", "b"]], dtype=h5py.string_dtype()), "a table of texts in several dimensions"),
+    "texts": (replaced(data=[["a", "b"]], dtype=h5py.string_dtype()), "an array of texts with more than one dimension"),
     "group": (lambda file: (file.pop("t/x"), file.create_group("t/x")), "is not an array"),
     "itself": (lambda file: file.__setitem__("t/t", file["t"]), "is not an array"),
 }
@@ -136,7 +136,7 @@ def test_nothing_leads_out_of_a_file(path, change, part, monkeypatch):
         monkeypatch.setattr(sys, "executable", "")
     changed(path, change)
     resealed(path)
-    assert_refused(lambda: read_tables(path, KIND), path, part, "name a file written by aacmm")
+    assert_refused(lambda: read_tables(path, KIND), path, part, "give a file written by aacmm")
 
 
 def test_many_texts_that_are_one(path, monkeypatch):
@@ -156,7 +156,7 @@ def test_large_files_are_read_in_parts(path, monkeypatch):
     content = bytearray(path.read_bytes())
     content[content.index(b"mm")] ^= 1
     path.write_bytes(content)
-    assert_refused(lambda: read_tables(path, KIND), path, "make it again")
+    assert_refused(lambda: read_tables(path, KIND), path, "create it again")
 
 
 def test_only_ordinary_files_of_limited_size(path, tmp_path, monkeypatch):
@@ -164,7 +164,7 @@ def test_only_ordinary_files_of_limited_size(path, tmp_path, monkeypatch):
     (tmp_path / "link").symlink_to("/dev/zero")
     for name in (tmp_path / "fifo", tmp_path / "link", "/dev/zero"):
         for read in (InputFile, fingerprint, aj.files.load_capture, aj.files.read_manifest):
-            assert_refused(lambda name=name, read=read: read(name), name, "a pipe or a device", "name an ordinary file")
+            assert_refused(lambda name=name, read=read: read(name), name, "a pipe or a device", "give an ordinary file")
     with open(tmp_path / "long", "wb") as file:
         file.truncate(3 * 2**20)
     monkeypatch.setenv(LARGEST_FILE, "2")
@@ -191,4 +191,4 @@ def test_a_damaged_file_is_not_given_to_hdf5(path, monkeypatch):
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     monkeypatch.setattr(h5py, "File", None)
-    assert_refused(lambda: read_tables(path, KIND), path, "does not match its SHA-256; make it again.")
+    assert_refused(lambda: read_tables(path, KIND), path, "does not match its SHA-256; create it again.")

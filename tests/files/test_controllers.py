@@ -114,6 +114,8 @@ def test_tables_list_the_coefficients_of_corrections_with_their_units(paper_arm)
 
 
 def test_refusals(arm, paper_arm):
-    assert_refused(lambda: aj.files.dh_table(arm, convention="dh"), "convention is 'dh'", "known are standard, craig")
-    assert_refused(lambda: aj.files.dh_table(arm, units="inch"), "units is 'inch'", "known are mm-deg, m-rad")
+    assert_refused(
+        lambda: aj.files.dh_table(arm, convention="dh"), "convention is 'dh'", "choose one of standard, craig"
+    )
+    assert_refused(lambda: aj.files.dh_table(arm, units="inch"), "units is 'inch'", "choose one of mm-deg, m-rad")
     assert_refused(lambda: aj.files.zero_offsets(arm, paper_arm, Q), "7 and 6 joints")

@@ -72,10 +72,10 @@ def test_a_model_in_an_arm_file(tmp_path):
     assert correction_names(specification.arm) == tuple(f"{word}2_{i}" for i in (1, 2, 3) for word in ("cos", "sin"))
     assert "sin2_2" in specification.space().names  # free where data determine it
     for text, sentence in {
-        'model = "gear"\ncoefficients = {gear_1 = 1e-3}': "give either model",
+        'model = "gear"\ncoefficients = {gear_1 = 1e-3}': "exactly one of model and coefficients",
         'model = "gears"': "unknown model 'gears'; did you mean 'gear'",
         "coefficients = {gear_4 = 1e-3}": "'gear_4' must name a joint from 1 to 3",
-        'model = "gravity"\nmass = [1, 2, 3]': "give both mass and centre",
+        'model = "gravity"\nmass = [1, 2, 3]': "give both or neither",
         "coefficients = {gear_1 = 1e-3}\nnominal = {alfa = [1, 2, 3]}": "nominal has the unknown key 'alfa'",
     }.items():
         file.write_text(f"{plain}\n[corrections]\n{text}\n")

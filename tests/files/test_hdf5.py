@@ -96,27 +96,27 @@ def make_foreign(path, source):
 
 BAD = {
     "missing": (lambda path, source: None, ["does not exist", "check the path"]),
-    "folder": (lambda path, source: path.mkdir(), ["is a folder", "name a file"]),
+    "folder": (lambda path, source: path.mkdir(), ["is a folder", "give a file"]),
     "text": (
         lambda path, source: path.write_text("q1,q2\n1,2\n"),
-        ["is not an HDF5 file", "name a file written by aacmm"],
+        ["is not an HDF5 file", "give a file written by aacmm"],
     ),
     "empty": (lambda path, source: path.touch(), ["is not an HDF5 file"]),
-    "foreign": (make_foreign, ["was not written by aacmm", "name a "]),
+    "foreign": (make_foreign, ["was not written by aacmm", "give a "]),
     "newer": (set_attribute("format_version", 7), ["format version 7, newer", "(6)", "update aacmm_jax"]),
-    "older": (set_attribute("format_version", 5), ["format version 5, older", "(6)", "make it again"]),
-    "no version": (edit(lambda file: file.attrs.pop("format_version")), ["damaged", "make it again"]),
-    "other kind": (set_attribute("kind", "study"), ["contains a study", "name a "]),
-    "no table": (remove("capture"), ["has no table 'capture'", "make it again"]),
-    "no arm": (remove("nominal_arm"), ["has no table 'nominal_arm'", "make it again"]),
-    "no entry": (remove("capture/angle"), ["has no entry 'angle'", "make it again"]),
-    "short entry": (replace("capture/angle", np.zeros((2, 3))), ["damaged", "make it again"]),
-    "text for numbers": (replace("reference/value", "long"), ["damaged", "make it again"]),
+    "older": (set_attribute("format_version", 5), ["format version 5, older", "(6)", "create it again"]),
+    "no version": (edit(lambda file: file.attrs.pop("format_version")), ["damaged", "create it again"]),
+    "other kind": (set_attribute("kind", "study"), ["contains a study", "give a "]),
+    "no table": (remove("capture"), ["has no table 'capture'", "create it again"]),
+    "no arm": (remove("nominal_arm"), ["has no table 'nominal_arm'", "create it again"]),
+    "no entry": (remove("capture/angle"), ["has no entry 'angle'", "create it again"]),
+    "short entry": (replace("capture/angle", np.zeros((2, 3))), ["damaged", "create it again"]),
+    "text for numbers": (replace("reference/value", "long"), ["damaged", "create it again"]),
     "group for numbers": (
         edit(lambda file: (file.pop("capture/angle"), file.create_group("capture/angle"))),
         ["'angle' is not an array"],
     ),
-    "no partner": (remove("nominal_arm/highest"), ["damaged", "make it again"]),
+    "no partner": (remove("nominal_arm/highest"), ["damaged", "create it again"]),
     "not finite": (replace("nominal_arm/alpha", [0.0, np.nan, 0.0]), ["alpha[1] is nan; give finite numbers"]),
 }
 
@@ -131,16 +131,16 @@ def test_bad_file(tmp_path, good, kind, make, parts):
 
 def test_a_capture_is_no_calibration(tmp_path, good):
     path = good.files["capture"]
-    assert_refused(lambda: aj.files.load_calibration(path), path, "contains a capture", "name a calibration file")
+    assert_refused(lambda: aj.files.load_calibration(path), path, "contains a capture", "give a calibration file")
     # The other way round is meant: a calibration holds its capture.
     assert aj.files.load_capture(good.files["calibration"]).capture.names == ("A", "B")
     for name in ("stage1_arm", "parameters", "observed"):
         remove(name)(tmp_path / "bad.h5", good.files["calibration"])
         assert_refused(
-            lambda: aj.files.load_calibration(tmp_path / "bad.h5"), f"has no table '{name}'", "make it again"
+            lambda: aj.files.load_calibration(tmp_path / "bad.h5"), f"has no table '{name}'", "create it again"
         )
     path = good.files["capture"] / "below.h5"
-    assert_refused(lambda: aj.files.load_capture(path), path, "cannot be read: not a directory", "name another")
+    assert_refused(lambda: aj.files.load_capture(path), path, "cannot be read: not a directory", "give another")
 
 
 @pytest.mark.parametrize("kind", LOAD)
@@ -152,7 +152,7 @@ def test_cut_short(tmp_path, good, kind):
     inside = np.linspace(2000, len(content) - 200, 12).astype(int)
     for size in (1, 7, 8, 40, 96, 1000, *inside, *(len(content) - cut for cut in (seal, seal - 1, 66, 1))):
         path.write_bytes(content[:size])
-        assert_refused(lambda: LOAD[kind](path), path, "damaged", "name a file" if size < 8 else "make it again")
+        assert_refused(lambda: LOAD[kind](path), path, "damaged", "give a file" if size < 8 else "create it again")
 
 
 def folder_of(path: Path) -> list[str]:
@@ -482,9 +482,13 @@ def test_names_that_no_file_can_hold(tmp_path, good, name):
     arm = good.recording._replace(nominal=good.recording.nominal._replace(name=name))
     for recording in (socket, arm):
         assert_refused(
-            lambda recording=recording: aj.files.save_capture(tmp_path / "c.h5", recording), repr(name), "rename it"
+            lambda recording=recording: aj.files.save_capture(tmp_path / "c.h5", recording),
+            repr(name),
+            "choose another name",
         )
-    assert_refused(lambda: aj.files.save_arm(arm.nominal.arm, tmp_path / "a.toml", name=name), repr(name), "rename it")
+    assert_refused(
+        lambda: aj.files.save_arm(arm.nominal.arm, tmp_path / "a.toml", name=name), repr(name), "choose another name"
+    )
     assert folder_of(tmp_path) == []
 
 

@@ -81,7 +81,7 @@ def test_visits_of_sessions_and_targets(tmp_path, motion):
     assert read(tmp_path, HEAD + ANGLES + socket.format("A")).visits == (0, 0, 0, 0, 1, 1, 1, 1)
     text = HEAD + ANGLES + socket.format("day/A") + 'session = "day"\n' + other + 'session = "day"\n'
     assert read(tmp_path, text).visits == (0, 0, 0, 0, 1, 1, 1, 1, -1, -1, -1, -1)
-    with pytest.raises(aj.InputError, match="remove visits from a socket with a target"):
+    with pytest.raises(aj.InputError, match="visits apply only to sockets measured with the arm's own probe"):
         read(tmp_path, HEAD + ANGLES + socket.format("A") + 'target = "ball"\n' + other)
 
 
@@ -206,9 +206,9 @@ def test_what_a_field_matches(tmp_path, motion, name, file, exclude, expected):
 @pytest.mark.parametrize(
     ("file", "exclude", "parts"),
     [
-        ("hole_{hole}.csv", [], ["Nearest: 'hole_0_pose.csv', 'hole_1_pose.csv'.", "letters, digits and '-' only"]),
-        ("{hole}_pose.csv", ["*_pose.csv"], ["except 'hole_0_pose.csv'", "rules out; change exclude"]),
-        ("hole_{hole}_poze.csv", [], ["there is 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
+        ("hole_{hole}.csv", [], ["names are 'hole_0_pose.csv', 'hole_1_pose.csv'.", "only letters, digits and '-'"]),
+        ("{hole}_pose.csv", ["*_pose.csv"], ["except 'hole_0_pose.csv'", "leaves these files out; change exclude"]),
+        ("hole_{hole}_poze.csv", [], ["similar names: 'hole_1_pose.csv', 'hole_0_pose.csv'", "check the path"]),
         ("plate/{hole}.csv", [], ["no file matches 'plate/{hole}.csv'", "check the path"]),
     ],
     ids=["longer name", "excluded", "misspelt", "no such folder"],
@@ -242,13 +242,13 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
     ("text", "parts"),
     [
         (SMALL.replace("a.csv", "z.csv"), ["z.csv does not exist", "check the path"]),
-        (SMALL.replace("a.csv", "folder"), ["folder is a folder", "name a file"]),
+        (SMALL.replace("a.csv", "folder"), ["folder is a folder", "give a file"]),
         (
             SMALL.replace("rad", "grad"),
             ["'angles.unit' must be 'rad', 'deg', 'arcsec', 'gon', 'mrad' or 'counts', not 'grad'"],
         ),
         (HEAD + SOCKET, ["'angles' is missing", "unit of the readings", "add [angles]"]),
-        (HEAD + ANGLES, ["neither a [[socket]] nor another observation", "add one"]),
+        (HEAD + ANGLES, ["no [[socket]] and no other observation", "add at least one"]),
         (SMALL.replace("file", "flie"), ["unknown key 'socket 1.flie'", "did you mean 'file'?"]),
         (SMALL.replace("unit", "unti"), ["unknown key 'angles.unti'", "did you mean 'unit'?"]),
         (SMALL + LENGTH.replace("from", "form"), ["unknown key 'length 1.form'", "did you mean 'from'?"]),
@@ -256,26 +256,29 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + 'name = "{place}"', ["name '{place}'", "file 'a.csv' has no field", "use the same fields"]),
         (
             SMALL + 'exclude = ["b*"]',
-            ["exclude applies to file names with a field in braces", "'a.csv' has none; remove exclude"],
+            ["exclude applies only to file names with a field in braces", "'a.csv' has no such field; remove exclude"],
         ),
         (SMALL + 'files = ["a.csv"]', ["socket 1", "either file or files"]),
         (HEAD + ANGLES + '[[socket]]\nfiles = ["a.csv"]', ["socket 1", "needs a name"]),
         (HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = []', ["'socket 1.files' has no entries", "give at least 1"]),
         (SMALL + SOCKET, ["socket 'a' is defined twice", "in one [[socket]]"]),
-        (SMALL + LENGTH, ["'a' to 'b'", "unknown socket 'b'", "known are a."]),
+        (SMALL + LENGTH, ["'a' to 'b'", "unknown socket 'b'", "choose one of a."]),
         (SMALL + LENGTH.replace("200.0", "-200.0"), ["'a' to 'b' is -200 mm", "positive"]),
         (SMALL + LENGTH.replace("200.0", '"long"'), ["'length 1.value' must be a valid number, not 'long'"]),
         (SMALL + LENGTH + "u = -1", ["'length 1.u' must be greater than or equal to 0, not -1"]),
         (SMALL + LENGTH.replace('"b"', '"{x}"'), ["from 'a' to '{x}'", "field that no [[socket]] has"]),
-        (SMALL + LENGTH.replace("200.0", "true"), ["length 1.value: expected a number, but it is true or false"]),
+        (
+            SMALL + LENGTH.replace("200.0", "true"),
+            ["length 1.value: a number is needed, but the value is true or false"],
+        ),
         (SMALL + SOCKET.replace("file", 'name = "b"\nfile') + 2 * LENGTH, ["from 'a' to 'b' of 200 mm is given twice"]),
         (
             HEAD + ANGLES + '[[socket]]\nname = "a"\nfiles = ["a.csv", "a.csv"]',
             ["socket 1.files: 'a.csv' is given twice"],
         ),
         (SMALL.replace('"a.csv"', '"a.csv"\nname = ""'), ["a socket has the name ''"]),
-        (SMALL.replace("rad", "counts"), ["angles", "counts_per_turn and unit = 'counts' must be given together"]),
-        (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "must be given together"]),
+        (SMALL.replace("rad", "counts"), ["angles", "counts_per_turn and unit = 'counts' need each other"]),
+        (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "need each other"]),
         (
             SMALL.replace('"rad"', '"counts"\ncounts_per_turn = [9, 9]'),
             ["angles.counts_per_turn has 2 values", "6 joints"],
@@ -292,7 +295,7 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL.replace('"rad"', '"counts"\ncounts_per_turn = []'), ["'angles.counts_per_turn' has no entries"]),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = [1, 1, 2, 3, 4, 5]'),
-            ["a.csv: one column is picked twice by 1, 1, 2, 3, 4"],
+            ["a.csv: 1, 1, 2, 3, 4 and 1 more pick the same column twice"],
         ),
         (SMALL.replace('"rad"', '"rad"\nsign = 2'), ["'angles.sign' must be 1 or -1, not 2"]),
         (SMALL.replace('"rad"', '"rad"\nsign = [1, 1, 0, 1, 1, 1]'), ["'angles.sign 3' must be 1 or -1, not 0"]),
@@ -306,11 +309,11 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         ),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = [1, 2, 3, 4, 5, 9]'),
-            ["a.csv has no column '9'; it has 6 columns without names: pick other columns"],
+            ["a.csv has no column '9'; the table has 6 columns without names; pick another column"],
         ),
         (SMALL.replace('"rad"', '"rad"\ncolumns = [0, 2, 3, 4, 5, 6]'), ["'angles.columns 1' must be greater than 0"]),
         (HEAD + ANGLES + PATTERN.replace(".csv", ".txt"), ["no file matches '{place}.txt'", "check the path"]),
-        (HEAD + ANGLES + PATTERN.replace('name = "{place}"\n', ""), ['has {place}, so add name = "{place}" in']),
+        (HEAD + ANGLES + PATTERN.replace('name = "{place}"\n', ""), ['add name = "{place}" to']),
         (
             HEAD + ANGLES + PATTERN.replace('file = "{place}.csv"', 'files = ["{place}.csv", "{palce}_2.csv"]'),
             ["file '{palce}_2.csv' has {palce}", "'{place}.csv' has {place}", "use the same fields"],
@@ -324,9 +327,12 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL + LENGTH.replace("200.0", "'200.0'"), ["'length 1.value' must be a valid number, not '200.0'"]),
         (
             SMALL.replace('"rad"', '"rad"\ncolumns = ["1", 2, 3, 4, 5, 6]'),
-            ["a.csv has no column '1'; it has 6 columns without names"],
+            ["a.csv has no column '1'; the table has 6 columns without names"],
         ),
-        (SMALL.replace('"rad"', '"rad"\noffset = true'), ["angles.offset: expected a number, but it is true or false"]),
+        (
+            SMALL.replace('"rad"', '"rad"\noffset = true'),
+            ["angles.offset: a number is needed, but the value is true or false"],
+        ),
         (SMALL + LENGTH.replace("200.0", "1e300"), ["'length 1.value' is implausibly large"]),
         (SMALL + LENGTH + "u = inf", ["'length 1.u' must be a finite number"]),
         (SMALL + LENGTH.replace("200.0", "9" * 5001), ["contains a number with thousands of digits"]),
@@ -337,13 +343,13 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
         (SMALL.replace('"a.csv"', '"a.csv"\nname = "a\\u001b[2J"'), ["control character U+001B; remove the character"]),
         (SMALL + '"\\u001b" = 1', ["control character U+001B"]),
         (SMALL + "x = " + "[" * 900 + "]" * 900, ["nests tables or lists too deeply"]),
-        (SMALL + "x = " + "[" * 90 + "]" * 90, ["nests tables or lists too deeply; at most 16 levels are allowed"]),
+        (SMALL + "x = " + "[" * 90 + "]" * 90, ["nests tables or lists too deeply; use at most 16 levels"]),
         (SMALL + ".".join(["a"] * 20_000) + " = 1", ["line 6 has a key of more than 16 parts"]),
         (SMALL + "[" + ' . "a" . '.join(["x"] * 20_000) + "]", ["line 6 has a key of more than 16 parts"]),
         (SMALL + "#" * 5_000_000, ["has 5,000,", "characters, more than 4,000,000"]),
         (
             HEAD + ANGLES + PATTERN.replace("place", "1"),
-            ["the field {1} in '{1}' has no valid name; begin the name with a letter"],
+            ["the field {1} in '{1}' has a name that does not begin with a letter; rename the field"],
         ),
         (HEAD + ANGLES + PATTERN.replace("{place}", "{a}{b}"), ["two fields with nothing between them"]),
         (HEAD + ANGLES + PATTERN.replace("{place}", "/".join(f"{{f{i}}}" for i in range(9))), ["more than 8 fields"]),
@@ -425,7 +431,7 @@ def test_bad_manifest(tmp_path, motion, text, parts):
     [
         (b"1,2,3,4,5.5\n", ["has 5 columns", "the arm's 6 joints", "one column per joint", "columns = [...]"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5\n", ["line 2 has 5 columns", "before it have 6", "give all lines the same"]),
-        (b"q\n1,2,3,4,5.5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "write it"]),
+        (b"q\n1,2,3,4,5.5,6\n\n1,2,x,4,5,6\n", ["line 4 column 3", "'x' is not a number", "write the number"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,1_0\n", ["line 2 column 6", "'1_0' is not a number"]),
         (b"1,2,3,4,5.5,\n", ["has 5 columns without names", "the arm's 6 joints"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,\n", ["line 2 column 6", "'' is not a number"]),
@@ -437,7 +443,7 @@ def test_bad_manifest(tmp_path, motion, text, parts):
             b"1,2,3,4,5,6\n",
             [
                 "line 1 contains the column numbers 1 to 6;",
-                "add skip = 1 and columns = [1, 2, 3, 4, 5, 6], or write the numbers with",
+                "add skip = 1 and columns = [1, 2, 3, 4, 5, 6], or, if these numbers are measured values, write",
             ],
         ),
         (b"0 1 2 3 4 5\n", ["line 1 contains the column numbers 0 to 5;"]),
@@ -510,7 +516,7 @@ def test_degrees_taken_for_radians(tmp_path, motion):
 
 def test_what_is_not_a_manifest(tmp_path):
     assert_refused(lambda: aj.files.read_manifest(tmp_path / "none.toml"), "none.toml does not exist", "check the path")
-    assert_refused(lambda: aj.files.read_manifest(tmp_path), tmp_path, "is a folder", "name a file")
+    assert_refused(lambda: aj.files.read_manifest(tmp_path), tmp_path, "is a folder", "give a file")
 
 
 def test_the_time_of_day_of_a_date_is_left_out(tmp_path, motion):

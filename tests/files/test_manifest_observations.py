@@ -240,9 +240,9 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        (ALL.replace('"x"', '"xx"'), ["a.csv has no column 'xx'; it has the columns 1 'q1', 2 'q2'"]),
-        (ALL.replace('"x"', "20"), ["a.csv has no column '20'; it has"]),
-        (ALL.replace('"x"', '"y"'), ["one column is picked twice"]),
+        (ALL.replace('"x"', '"xx"'), ["a.csv has no column 'xx'; the table has the columns 1 'q1', 2 'q2'"]),
+        (ALL.replace('"x"', "20"), ["a.csv has no column '20'; the table has"]),
+        (ALL.replace('"x"', '"y"'), ["pick the same column twice"]),
         (ALL.replace('"q?"', '"q[1-3]"'), ["3 columns are picked for the readings", "6 joints"]),
         (ALL.replace("points =", "point ="), ["no 'point'", "did you mean 'points'?"]),
         (ALL.replace(', "z"]', "]"), ["points needs 3 columns, but 2 are picked"]),
@@ -251,7 +251,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         # Mixed units: in one header, or in header and manifest.
         (
             ALL.replace('"x", "y"', '"x [m]", "y [mm]"'),
-            ["mixes units: 'x [m]' is in m, 'y [mm]' is in mm", "convert one of the columns"],
+            ["mixes units: 'x [m]' is in m, 'y [mm]' is in mm", "convert the columns to the same unit"],
         ),
         (
             ALL.replace('"x", "y"', '"y", "y_mm"') + 'units = { points = "inch" }',
@@ -269,7 +269,7 @@ def test_touched_surfaces_and_files_by_name(tmp_path):
         (ALL + "dimaeter = 3", ["unknown key 'points 1.dimaeter'"]),
         (ALL + 'delimiter = ";"', ["has no column"]),
         (ALL + "coverage_factor = 0", ["greater than 0"]),
-        (ALL + 'target = "{x}"', ["target uses the unknown field x"]),
+        (ALL + 'target = "{x}"', ["target uses the field x"]),
         (ALL + "[[points]]", ["needs either file or files"]),
     ],
 )
@@ -301,9 +301,12 @@ def test_bad_rotations(tmp_path, text, parts):
 @pytest.mark.parametrize(
     ("header", "parts"),
     [
-        (NAMES[:11], ["no column 'q?'; it has 12 columns, but its header 11 names: pick"]),
-        (None, ["no column 'q?'; it has 12 columns without names: pick other columns"]),
-        ([*NAMES[:9], "u_x", "U95 Y", "U(95) Z"], ["no column 'U*95* X', but the columns U*95* Y, U*95* Z; correct"]),
+        (NAMES[:11], ["no column 'q?'; the table has 12 columns, but 11 names in the header; pick"]),
+        (None, ["no column 'q?'; the table has 12 columns without names; pick another column"]),
+        (
+            [*NAMES[:9], "u_x", "U95 Y", "U(95) Z"],
+            ["has the columns U*95* Y, U*95* Z, but no column 'U*95* X'; correct"],
+        ),
     ],
 )
 def test_bad_headers(tmp_path, header, parts):
@@ -379,8 +382,11 @@ value = 50.0
     ("text", "parts"),
     [
         ('[[points]]\nfile = "a.csv"\n[[points]]\nname = "b"\nfile = "a.csv"\nsession = "x"\n', ["a has no session"]),
-        ('[sessions]\nprobe = "same"\n[[points]]\nfile = "a.csv"\n', ["[sessions] applies to tables with a session"]),
-        ('[[points]]\nfile = "a.csv"\nsession = "{day}"\n', ["session uses the unknown field day"]),
+        (
+            '[sessions]\nprobe = "same"\n[[points]]\nfile = "a.csv"\n',
+            ["[sessions] applies only to tables with a session"],
+        ),
+        ('[[points]]\nfile = "a.csv"\nsession = "{day}"\n', ["session uses the field day"]),
         (
             '[[points]]\nfile = "a.csv"\nsession = "x"\ncolumns = { session = "x" }\n',
             ["session is given both as a key and in columns"],

@@ -59,7 +59,7 @@ joint = [
         (tmp_path / "wrong.toml").write_text(text.replace(old, new))
         assert_refused(lambda: aj.load_arm(tmp_path / "wrong.toml"), said)
     (tmp_path / "wrong.toml").write_text(text.replace(", limits = [0, 1.5]", "").replace(", limits = [-90, 90]", ""))
-    assert_refused(lambda: aj.load_arm(tmp_path / "wrong.toml"), "joint 1 is prismatic, but its travel is not stated")
+    assert_refused(lambda: aj.load_arm(tmp_path / "wrong.toml"), "joint 1 is prismatic, but has no limits")
 
 
 def test_a_capture_file_gives_back_arms_and_readings(tmp_path):
@@ -108,7 +108,7 @@ def test_a_manifest_states_the_unit_of_slides(tmp_path):
     found = read_manifest(tmp_path / "counts.toml").capture.q
     np.testing.assert_allclose(found, Q * [1, 1, -1, 1], rtol=1e-12)
     (tmp_path / "rad.toml").write_text(text.replace('unit = "deg"', 'unit = "rad"'))
-    assert_refused(lambda: read_manifest(tmp_path / "rad.toml"), "look like degrees")
+    assert_refused(lambda: read_manifest(tmp_path / "rad.toml"), "probably in degrees")
 
 
 def test_plans_are_tables_with_the_unit_of_each_joint():
@@ -132,7 +132,7 @@ def test_commanded_readings_and_their_correction(tmp_path):
     (tmp_path / "again.csv").write_text(text)
     np.testing.assert_allclose(TextTable(tmp_path / "again.csv").numbers(range(rows.shape[1])), rows, rtol=1e-12)
     path.write_text("q_1_deg,q_2_deg,q_3_um,q_4_deg\n10,20,1e5,30\n")
-    assert_refused(lambda: read_poses(path, SCARA), "states um for readings of prismatic joints")
+    assert_refused(lambda: read_poses(path, SCARA), "has readings of prismatic joints in um")
 
 
 def test_for_controllers():

@@ -53,7 +53,7 @@ def assert_readable(path):
 def test_an_endless_file_is_damaged(path, endless, monkeypatch, limit):
     monkeypatch.setattr(reader_process, "_CPU_SECONDS", 0.2 if limit == "CPU time" else 10)
     monkeypatch.setattr(reader_process, "_CLOCK_PER_CPU", 300 if limit == "CPU time" else 0.02)
-    assert_refused(lambda: read_tables(endless, KIND), endless, "is damaged", "make it again")
+    assert_refused(lambda: read_tables(endless, KIND), endless, "is damaged", "create it again")
     monkeypatch.undo()
     assert_readable(path)
 
@@ -83,7 +83,7 @@ def test_memory_is_limited(path, monkeypatch):
     reader_process._reader.stop()  # which has memory left from reading it
     reader_process._vouched_for.clear()
     monkeypatch.setattr(reader_process, "_MEMORY", -(2**25))  # less than a new one has
-    assert_refused(lambda: read_tables(path, KIND), path, "is damaged", "make it again")
+    assert_refused(lambda: read_tables(path, KIND), path, "is damaged", "create it again")
 
 
 def test_a_child_that_has_ended_is_replaced(path):

@@ -77,8 +77,8 @@ def test_the_better_ones_are_named_with_both_figures(both):
     assert commanded["rms_mm"] > 0.3
     said = reading_sets_sentence((commanded, measured), 80)
     assert (
-        f"a calibration with the measured readings leaves 0.045 mm RMS, one with the "
-        f"commanded readings {commanded['rms_mm']:.3g}" in said
+        f"a calibration with the measured readings leaves residuals of 0.045 mm RMS, and a calibration with "
+        f"the commanded readings leaves {commanded['rms_mm']:.3g}" in said
     )
     (line,) = measured["lines"]
     assert line == (
@@ -88,7 +88,7 @@ def test_the_better_ones_are_named_with_both_figures(both):
     path.write_text(re.sub("^columns = .*$", line.split(" in [[")[0], path.read_text(), flags=re.MULTILINE))
     again = compare_reading_sets(path, aj.files.read_manifest(path))
     assert [row["taken"] for row in again] == [False, True]
-    assert "the manifest uses those that fit better" in reading_sets_sentence(again, 80)
+    assert "the manifest uses the readings that fit better" in reading_sets_sentence(again, 80)
     assert not compare_reading_sets(EXAMPLES / "simulated_robot" / "tracker.toml", recording)  # whose table has one set
 
 
@@ -97,7 +97,7 @@ def test_alike_is_said():
         {"role": "commanded", "lines": ["a"], "rms_mm": 0.31, "taken": True},
         {"role": "measured", "lines": ["b"], "rms_mm": 0.30, "taken": False},
     ]
-    assert "which fit equally well" in reading_sets_sentence(sets, 80)
+    assert "both fit equally well" in reading_sets_sentence(sets, 80)
     assert reading_sets_sentence(sets[:1], 80) == ""
 
 
@@ -151,7 +151,9 @@ def test_the_table_pasted_into_the_manifest(tmp_path, header, size, angles, sock
 
     write(f"[angles]\n{angles}" if angles else "", socket)
     printed = angles_toml(explanation(order, ZEROS), None, manifest)
-    assert ("In [[socket]] (a.csv), replace its columns by:" in printed) == ("columns" in socket and order != PLAIN)
+    assert ("In [[socket]] (a.csv), replace the picked columns with:" in printed) == (
+        "columns" in socket and order != PLAIN
+    )
     line = printed.split("\n# columns")[1].strip() if "\n# columns" in printed else socket.removeprefix("columns")
     line = f"columns {line}" if "columns" in socket else socket
     np.testing.assert_allclose(write(printed, line), Q, atol=1e-8)

@@ -24,9 +24,9 @@ def files(tmp_path_factory, paper_arm, noisy_capture):
 @pytest.mark.parametrize(
     ("kind", "name", "value", "said"),
     [
-        ("calibration", "k", 2.0, "the scale k does not agree with its lengths"),
+        ("calibration", "k", 2.0, "the scale k does not agree with the reference lengths"),
         ("calibration", "u_k", -1.0, "u_k (standard uncertainty of k) is below 0"),
-        ("calibration", "u_k", 1e-9, "its summary does not agree with its values"),
+        ("calibration", "u_k", 1e-9, "the summary does not agree with the stored values"),
         ("calibration", "method", "guess", "method (method) is not one of two-stage, joint, repeatability"),
         ("calibration", "steps", -1, "steps (number of evaluations) is below 0"),
         ("calibration", "steps", 1.5, "steps (number of evaluations) has the wrong type"),
@@ -46,4 +46,4 @@ def test_show_refuses_what_makes_no_sense(aacmm, files, tmp_path, kind, name, va
         seal(stream)
     assert said in aacmm("show", path, expect=2).stderr
     if "summary" not in said:
-        assert_refused(lambda: getattr(aj.files, f"load_{kind}")(path), path, said, "make it again")
+        assert_refused(lambda: getattr(aj.files, f"load_{kind}")(path), path, said, "create it again")

@@ -10,7 +10,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.core.units import ANGLE_UNITS
-from aacmm_jax.files.manifest_rows import Readings, Wanted
+from aacmm_jax.files.manifest_readings import Readings, Wanted
 from aacmm_jax.files.manifest_tables import Angles
 from aacmm_jax.files.text_table import TextTable
 from tests.refusals import assert_refused, refusal
@@ -276,7 +276,7 @@ def test_units_that_contradict_the_manifest(tmp_path, header):
         (["X [deg]", "Y [deg]", "Z [deg]"], None, ["points are in 'deg'", "mm, m, um, inch"]),
         (["X", "Y", "Z"], None, ["does not state the unit of its points", 'add unit = "mm" to [points]']),
         (["P3", "P2", "P1"], "mm", ["in the order 'P3', 'P2', 'P1'; add columns = [3, 2, 1]"]),
-        (["n", "X", "Y", "W"], "mm", ["has no column 'z', but the columns x, y"]),
+        (["n", "X", "Y", "W"], "mm", ["has the columns x, y, but no column 'z'"]),
         (["t", "a", "b", "c"], "mm", ["the columns 1 't', 2 'a'", "add columns = [2, 3, 4] with these three"]),
         (["Z [mm]", "Y [mm]", "X [mm]", "Hole"], None, None),
     ],
@@ -308,27 +308,29 @@ SIX = ",".join(f"{x}" for x in Q[0, :6]) + "\n"
           for word in ("float", "raw")),
         *((JOINTS + ",".join([word] * 6) + "\n" + SIX, "", ["line 2 column 1", "is not a number"])
           for word in ("NA", "null", "None", "N/A", "-", "\u22120.5", "(0.5)", "=0.5", "$0.5")),
-        (JOINTS + ",".join(["radiants"] * 6) + "\n" + SIX, "", ["states 'radiants' for readings"]),
+        (JOINTS + ",".join(["radiants"] * 6) + "\n" + SIX, "", ["has readings of revolute joints in 'radiants'"]),
         (JOINTS + "deg,deg,deg,dge,deg,deg\n" + SIX, "", ["mixes units: 'J6 [deg]' is in deg, 'J4 [dge]' is in dge"]),
         (",".join(["meter"] + ["deg"] * 5) + "\n" + JOINTS + SIX, "", ["mixes units: 'J1 [meter]' is in m"]),
         (",".join(["rads"] * 6) + "\n" + JOINTS + SIX, "", ["says rad, but the manifest says deg"]),
         ("Base,Arm,Elbow,R,P,Y\n" + ",".join(["int"] * 6) + "\n" + SIX, "",
-         ["in both line 1 ('Base, Arm, Elbow and 3 more') and line 2", "add skip = 1 if line 2 names the columns"]),
+         ["line 1 ('Base, Arm, Elbow and 3 more') and line 2", "add skip = 1 if line 2 names the columns"]),
         ("# J6,J5,J4,J3,J2,J1\n# by hand\n" + SIX, "", ["in the order 'J6'"]),
-        ("F,E,D,C,B,A\n" + SIX, "", ["add columns = [1, 2, 3, 4, 5, 6] if these columns are the joints in order"]),
+        ("F,E,D,C,B,A\n" + SIX, "", [
+            "add columns = [1, 2, 3, 4, 5, 6] if these columns are the readings of the joints"
+        ]),
         *((",".join(numbered(name)) + "\n" + SIX, "", ["says rad, but the manifest says deg"])
           for name in ("J{}_radians", "q_rad_{}", "J{} (rad) raw", "J{}.rad")),
-        (",".join(numbered("J{}_mdeg")) + "\n" + SIX, "", ["states 'mdeg' for readings of revolute joints"]),
+        (",".join(numbered("J{}_mdeg")) + "\n" + SIX, "", ["has readings of revolute joints in 'mdeg'"]),
         (",".join(numbered("J{} [Grad]")) + "\n" + SIX, 'units = { q = "rad" }\n', ["grad means deg in German"]),
-        (JOINTS + SIX + "#" + SIX, "", ["line 3 begins with #", "write its first cell without #"]),
+        (JOINTS + SIX + "#" + SIX, "", ["line 3 begins with #", "remove the # from its first cell"]),
         (JOINTS + "#N/A" + SIX[SIX.index(","):] + SIX, "", ["line 2 begins with #"]),
         ("J1,J2,J3,J4,J5,J6,Load\n" + SIX.replace("\n", ",1\n"), 'group = "J1"\n',
-         ["column 1 'J1' is one of the joint readings, but is also picked for something else"]),
+         ["column 1 'J1' is one of the joint readings, but is also picked as group"]),
         (JOINTS + SIX, 'group = "J1"\ncolumns = "J*"\n', ["column 1 'J1' is one of the joint readings"]),
-        ("Socket,1,2,3,4,5,6\nA," + SIX, 'group = "Socket"\n', ["no column 'Socket'; it has 7 columns without names"]),
-        (",".join(numbered("q{}_rad/s")) + "\n" + SIX, "", ["states 'rad/s' for readings of revolute joints ('q1_"]),
+        ("Socket,1,2,3,4,5,6\nA," + SIX, 'group = "Socket"\n', ["no column 'Socket'; the table has 7 columns"]),
+        (",".join(numbered("q{}_rad/s")) + "\n" + SIX, "", ["readings of revolute joints in 'rad/s' (column 'q1_"]),
         ("J6,J5,J4,J3,J2,J1\nbegin,data\n" + SIX, "", ["in the order 'J6'"]),
-        ("Time,J6,J5,J4,J3,J2,J1\n" + SIX, "", ["6 columns, but its header 7 names", "correct the header"]),
+        ("Time,J6,J5,J4,J3,J2,J1\n" + SIX, "", ["6 columns, but 7 names in the header", "correct the header"]),
         ("a,b\n1,2\n", "", ["[[socket]] 'a': "]),
     ],
 )  # fmt: skip
@@ -362,7 +364,10 @@ NUMBERS = "0.12345,1.12345,2.12345,3.12345,4.12345,-2.12345\n"
 @pytest.mark.parametrize(
     ("content", "parts"),
     [
-        (3 * NUMBERS + NUMBERS[:-3], ["line 4: the last number, '-2.123', has fewer digits", "end that line if it is"]),
+        (
+            3 * NUMBERS + NUMBERS[:-3],
+            ["line 4: the last number, '-2.123', has fewer digits", "add a line break if the file is"],
+        ),
         (
             3 * NUMBERS.replace("\n", "e-05\n") + NUMBERS[:-1] + "e-0",
             ["line 4: the last number", "copy the file again"],
@@ -371,7 +376,7 @@ NUMBERS = "0.12345,1.12345,2.12345,3.12345,4.12345,-2.12345\n"
         (3 * NUMBERS + NUMBERS[:30], ["line 4 has 4 columns", "copy the file again if it is incomplete"]),
         (
             "J1,J2,J3,J4,J5,J6\n" + 6 * "0,5,1,5" + "\n",
-            ["but its header 6 names", "if it is confused with decimal commas"],
+            ["but 6 names in the header", "if it was confused with a decimal comma"],
         ),
         (
             "J1,J2,J3,J4,J5,J6,J7\n0.5," + NUMBERS,
@@ -406,7 +411,7 @@ def test_what_is_no_table(tmp_path, content, parts):
 
 
 def test_decimal_commas_stated_where_there_are_points(tmp_path):
-    parts = ("is not a number with the decimal mark ','", "or leave out decimal")
+    parts = ("is not a number with the decimal mark ','", "or remove decimal")
     assert_refused(lambda: read(tmp_path, NUMBERS.replace(",", ";"), RADIANS + SOCKET + COMMA), *parts)
 
 

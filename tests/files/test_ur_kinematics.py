@@ -115,7 +115,7 @@ def test_refusals(tmp_path, text, parts):
 def test_other_refusals(tmp_path):
     text = aj.files.ur_kinematics_yaml(direct())
     tilted = text.replace("roll: 0.0", "roll: 0.1", 1)
-    assert_refused(lambda: aj.load_arm(file(tmp_path, tilted)), "first axis is not the z axis")
+    assert_refused(lambda: aj.load_arm(file(tmp_path, tilted)), "axis of the first joint is not the z axis")
     huge = text.replace("x: 0.0", "x: 1e300", 1)
     assert_refused(lambda: aj.load_arm(file(tmp_path, huge)), "'1e300'", "below 100000")
     wrong = text.replace("roll: 0.0", "roll: none", 1)

@@ -176,7 +176,7 @@ def test_manifest_and_arm_file_name_a_urdf(tmp_path, nominal):
     assert_refused(lambda: aj.load_arm(arm, tip="tool0"), "is not a URDF", "omit base and tip")
     assert_refused(lambda: aj.load_arm("panda", probe=(0, 0, 1)), "already states the probe")
     both = written(tmp_path, head + "joint = [{alpha = 0, a = 1, d = 0}]\n", "both.toml")
-    assert_refused(lambda: aj.load_arm(both), "either joint", "or urdf")
+    assert_refused(lambda: aj.load_arm(both), "exactly one of joint and urdf", "or urdf")
 
 
 def joint(name: str, **changes: str) -> tuple[str, str]:
@@ -192,12 +192,12 @@ def joint(name: str, **changes: str) -> tuple[str, str]:
 ISLAND = ('<link name="wrist_2"/>', '<link name="wrist_2"/><link name="island"/>')
 BACK = '<child link="base_link"/></joint><joint name="back" type="fixed"><parent link="tool0"/><child link="world"/>'
 REFUSED = {
-    "several tips": (None, {"tip": None}, ["'upper_cover', 'tool0', 'left_finger'", "name the tip"]),
+    "several tips": (None, {"tip": None}, ["'upper_cover', 'tool0', 'left_finger'", "choose the tip"]),
     "unknown tip": (None, {"tip": "tool9"}, ["no link 'tool9'", "its links are 'world'"]),
     "branches": (None, {"base": "upper_cover"}, ["two branches", "separate at 'upper'"]),
-    "exchanged": (None, {"base": "tool0", "tip": "world"}, ["comes after", "exchange base and tip"]),
+    "exchanged": (None, {"base": "tool0", "tip": "world"}, ["is after the tip 'world'", "exchange base and tip"]),
     "same": (None, {"base": "tool0"}, ["same link"]),
-    "nothing moves": (None, {"tip": "base_link"}, ["no joint moves between 'world' and 'base_link'"]),
+    "nothing moves": (None, {"tip": "base_link"}, ["no moving joint between 'world' and 'base_link'"]),
     "endless slide": (joint("finger_1", limit=""), {"tip": "left_finger"}, ["'finger_1' is prismatic and has no"]),
     "reversed slide": (
         joint("finger_1", limit='<limit lower="0.04" upper="0"/>'), {"tip": "left_finger"}, ["limits 0.04 and 0 m;"]
@@ -219,7 +219,7 @@ REFUSED = {
     "no such link": (('<link name="wrist_2"/>', ""), {}, ["names the link 'wrist_2', which does not exist"]),
     "twice": (('<link name="wrist_2"/>', '<link name="wrist_2"/><link name="wrist_2"/>'), {}, ["occurs twice"]),
     "no chain": (ISLAND, {"base": "island"}, ["no chain of joints from 'island' to 'tool0'"]),
-    "roots": (ISLAND, {"tip": None}, ["2 roots, 'world', 'island'"]),
+    "roots": (ISLAND, {"tip": None}, ["2 root links, 'world', 'island'"]),
     "numbers": (('xyz="0.35 0 0.03"', 'xyz="0.35 0"'), {}, ["line ", "joint 'joint_4'", "'0.35 0'", "3 numbers"]),
     "no number": (('xyz="0.35 0 0.03"', 'xyz="a 0 0"'), {}, ["'a 0 0'"]),
     "huge": (('rpy="0 -1.5708 0"', 'rpy="1e300 0 0"'), {}, ["'1e300 0 0'", "below 1e+06"]),
@@ -240,7 +240,9 @@ REFUSED = {
     "axes": (joint("joint_5", axis='<axes xyz="0 1 0"/>'), {}, ["joint 'joint_5'", "<axes>; did you mean '<axis>'?"]),
     "Lower": (('lower="-2"', 'Lower="-2"'), {}, ["<limit> of joint 'joint_5'", "'Lower'; did you mean 'lower'?"]),
     "two origins": (
-        ('<origin xyz="0.35', '<origin xyz="0 0 0"/><origin xyz="0.35'), {}, ["second <origin>, after that of line 50"]
+        ('<origin xyz="0.35', '<origin xyz="0 0 0"/><origin xyz="0.35'), {}, [
+            "second <origin>, after the first in line"
+        ]
     ),
     "two axes": (joint("joint_5", axis='<axis xyz="0 1 0"/><axis xyz="1 0 0"/>'), {}, ["has a second <axis>"]),
     "axis without xyz": (joint("joint_5", axis="<axis/>"), {}, ["<axis> of joint 'joint_5' has no xyz"]),
@@ -248,11 +250,11 @@ REFUSED = {
     "misspelt mass": (('<mass value="3"/>', '<mas value="3"/>'), {}, ["<inertial> of link 'upper'", "<mas>"]),
     "mass outside": (
         ('<inertial><origin xyz="0 0 0.2"/><mass value="3"/>', '<mass value="3"/><inertial>'), {},
-        ["link 'upper' contains <mass>, which does not belong there"],
+        ["link 'upper' contains <mass>, which is not allowed there"],
     ),
     "inside an origin": (
         ('<origin xyz="0.08 0 0"/>', '<origin xyz="0.08 0 0"><axis xyz="0 0 1"/></origin>'), {},
-        ["contains <axis>, which does not belong there; move it"],
+        ["contains <axis>, which is not allowed there; move it"],
     ),
     "text": (('<origin xyz="0.35 0 0.03"', 'origin xyz="0.35" <origin'), {}, ["'origin xyz=\"0.35\"'"]),
     "quaternion": (('rpy="0 1.5708 0"', 'quat_xyzw="0 1 0 0"'), {}, ["quat_xyzw", "as rpy"]),
@@ -301,7 +303,7 @@ BOMB = '<!DOCTYPE robot [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&
         (b"", "not valid XML"),
         (b"\xff\xfe\x00", "not UTF-8 text"),
         (b"<robot name='\x00'/>", "not valid XML"),
-        (b"<robot><link name='a'/></robot>", "no joint after 'a' moves"),
+        (b"<robot><link name='a'/></robot>", "no moving joint after 'a'"),
         (b"<robot/>", "no <link>"),
     ],
 )

@@ -175,7 +175,7 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         ("functions,harmonics=1", "the model names 'harmonics' twice"),
         ("gear=2", "gear takes no option"),
         ("expansion=2", "expansion takes no option"),
-        (["expansion_1"], "applies to the whole arm and takes no number"),
+        (["expansion_1"], "applies to the whole arm, so its name must have no number"),
         (["cos1"], "must name a joint from 1 to 7"),
         ("coupled=2", "does not name pairs of joints"),
         ("coupled=2-9", "must name a joint from 1 to 7"),

@@ -53,7 +53,7 @@ def test_numbers_of_joints_are_checked():
     assert SCARA.replace(prismatic=(4, 1, 4)).prismatic == (1, 4)
     with pytest.raises(aj.InputError, match=r"limits of joint 3 are 5 to 1 mm"):
         SCARA.replace(limits=[(-1, 1), (-1, 1), (5, 1), (-1, 1)])
-    with pytest.raises(aj.InputError, match="joint 3 is prismatic, but the arm has no limits that state how far"):
+    with pytest.raises(aj.InputError, match="joint 3 is prismatic, but the arm has no joint limits"):
         aj.simulate(SCARA.replace(limits=None), {"A": (400, 100, 200)})
 
 

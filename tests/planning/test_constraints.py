@@ -197,7 +197,7 @@ LOW = {"A": (450, 100, 5), "B": (450, -300, 200)}
 REFUSED = {
     "narrow": (
         {"cone": {"A": Cone(math.radians(20), (0, 0, -1.0))}, "sockets": LOW},
-        "'A' .* widen its cone",
+        "'A' .* widen the cone",
     ),
     "obstacle": (
         {"cell": True, "sockets": {"A": (300, 600, 300), "B": (450, -300, 200)}},

@@ -226,8 +226,8 @@ def test_readings_taken_by_the_plan_come_back_through_its_manifest(paper_arm, gi
 REFUSED = {
     "too few": ({"poses": 5}, "too few for 4 sockets"),
     "equations": ({"poses": 9, "sockets": 4}, "plan at least 11"),
-    "criterion": ({"criterion": "B"}, "criterion is 'B'; known are length, A, D, E"),
-    "margin": ({"margin": 4.0}, "no range within its limits"),
+    "criterion": ({"criterion": "B"}, "criterion is 'B'; choose one of length, A, D, E"),
+    "margin": ({"margin": 4.0}, "no range of motion between the limits"),
     "u": ({"u": 0.0}, "u of a reference length is 0 mm"),
     "length": ({"length": 9000.0}, "does not fit this arm"),
     "range": ({"length": (500.0, 300.0)}, "does not fit this arm"),
@@ -241,7 +241,7 @@ REFUSED = {
     ),
     "twice": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "B"), ("B", "A")]},
-        "named twice",
+        "given twice",
     ),
     "itself": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "A")]},
@@ -253,8 +253,11 @@ REFUSED = {
     ),
     "beyond the reach": ({"farthest": 1.2}, "farthest is 1.2; it must be"),
     "no range": ({"region": {"z": (10.0, 0.0)}}, "which is not a range"),
-    "under the table": ({"above": 2000.0}, "reaches well"),
-    "no length": ({"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}}, "determines the parameters.*the scale"),
+    "under the table": ({"above": 2000.0}, "reaches all sockets"),
+    "no length": (
+        {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}},
+        "cannot determine all parameters.*the scale",
+    ),
     "unknown end": (
         {"sockets": {"A": (400, 200, 300), "B": (400, 300, 300)}, "lengths": [("A", "C")]},
         "unknown socket 'C'",

@@ -179,7 +179,7 @@ def test_least_poses():
     [
         ([], {}, "the kit is empty"),
         ([EVERYTHING[3], EVERYTHING[3]], {}, "two items of the kit have the name 'ball'"),
-        ([KitItem(EVERYTHING[1], places=2)], {}, "'tracker' is an instrument, so the plan does not place it"),
+        ([KitItem(EVERYTHING[1], places=2)], {}, "'tracker' is an instrument, which the plan does not place"),
         ([kinds.SimulatedSphere("far", (5000, 0, 0), 50.0, 5)], {}, "'far' at .* cannot be reached"),
         ([EVERYTHING[1]], {"poses": 2}, "2 poses are too few for this kit; give at least 3"),
         ([EVERYTHING[3]], {"region": {"w": (0, 1)}}, "unknown key 'w'"),
@@ -201,14 +201,14 @@ def bar(**options):
         (
             bar(places=0, half_angle=1e-5, normal=(1, 0, 0)),
             {},
-            "widen its cone",
+            "widen the cone",
         ),
         (
             bar(places=0, half_angle=0.3, normal=(0, 0, -1)),
             {"retract": 500.0},  # under the table
             "shorten retract",
         ),
-        (bar(half_angle=0.001), {"region": {"z": (200, 400)}}, "fewer places, or wider cones"),
+        (bar(half_angle=0.001), {"region": {"z": (200, 400)}}, "fewer placements, or wider cones"),
     ],
     ids=["cone", "approach", "placed"],
 )
@@ -221,7 +221,7 @@ def test_what_cannot_be_reached_says_why(paper_arm, space, monkeypatch, item, op
 
 def test_a_kit_that_leaves_parameters_open(paper_arm):
     """Touches of one sphere say nothing of where the arm stands or of its first offset."""
-    with pytest.raises(aj.InputError, match="this kit does not determine the parameters"):
+    with pytest.raises(aj.InputError, match="this kit cannot determine all parameters"):
         plan_kit(
             paper_arm,
             [EVERYTHING[3]],

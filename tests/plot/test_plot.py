@@ -84,7 +84,7 @@ def test_figures_of_a_calibration_from_observations(observed_record, tmp_path):
     """The file has the distances, the residuals in standard deviations and the orientations."""
     aj.plot.save_calibration_figure(observed_record, tmp_path / "figure.svg")
     text = (tmp_path / "figure.svg").read_text()
-    for words in ("distance from the geometry [mm]", "residual [standard deviations]", "angle between orientations"):
+    for words in ("distance from the geometry [mm]", "residual [standard deviations]", "residual angle [deg]"):
         assert f"<!-- {words}" in text
     lines = aj.plot.pose_distances(observed_record).lines
     assert np.sqrt(np.mean(lines[1].get_ydata()[:15] ** 2)) == pytest.approx(observed_record.observed.rms_after[0])
@@ -154,8 +154,8 @@ def test_an_arm_is_drawn_in_space(record):
     ("call", "said"),
     [
         (lambda record: aj.plot.parameter_changes(record, "lengths"), "length or angle"),
-        (lambda record: aj.plot.residuals_by_kind(record, "um"), "mm, standard deviations or deg"),
-        (lambda record: aj.plot.residuals_by_kind(record, "deg"), "no orientations"),
+        (lambda record: aj.plot.residuals_by_kind(record, "um"), "mm, standard deviations, deg or px"),
+        (lambda record: aj.plot.residuals_by_kind(record, "deg"), "no residuals in deg"),
         (
             lambda record: aj.plot.acceptance_metrics(aj.acceptance.run(aj.acceptance.Measured({"A": np.eye(3)}))),
             "no metric has a limit",

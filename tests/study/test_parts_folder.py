@@ -38,23 +38,23 @@ def colleague(path):
 
 
 FOLDER = r"s\.h5\.parts belongs to nobody, "
-BLOCK = r"cell.*\.npz belongs to nobody, who does not own its folder, so it is not read; remove it"
+BLOCK = r"cell.*\.npz belongs to nobody, who is not the owner of its folder, so the block is not read; remove the file"
 OURS = ("a link to a folder", "a link to a block", "an open folder")  # which need no second user
 # What is done to a study of the user with blocks, and how running it and reading it is refused; None: it is not.
 PLANTED = {
     "a link to a folder": (link_folder, *[r"s\.h5\.parts is a link, so the blocks in it are not read"] * 2),
-    "a link to a block": (link_block, *[r"cell.*\.npz is a link, so it is not read; remove it"] * 2),
+    "a link to a block": (link_block, *[r"cell.*\.npz is a link, so the block is not read; remove the file"] * 2),
     "an open folder": (
         lambda path: parts_of(path).chmod(0o777),
         *[r"other users may write to .*s\.h5\.parts \(mode 0777\), .* yours, run chmod go-w '.*\.parts'"] * 2,
     ),
     "a folder": (
         lambda path: give(parts_of(path)),
-        FOLDER + r"so its results are not continued; choose another output path",
+        FOLDER + r"so its study is not continued; choose another output path",
         FOLDER + r"but s\.h5 belongs to root, so the blocks are not read; make one user the owner of both",
     ),
     "a block": (lambda path: give(min(parts_of(path).iterdir())), BLOCK, BLOCK),
-    "a colleague's": (colleague, r"s\.h5 belongs to nobody, so its results are not continued", None),
+    "a colleague's": (colleague, r"s\.h5 belongs to nobody, so its study is not continued", None),
 }
 
 

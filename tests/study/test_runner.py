@@ -129,4 +129,4 @@ def test_nobody_answers(aacmm, home, monkeypatch):
     monkeypatch.setattr(distributed, "Client", lambda **given: client(**given | {"timeout": given["timeout"] / 10}))
     done = aacmm("study", home / "spec.toml", "-o", "s.h5", "--dask", "tcp://127.0.0.1:1", expect=2)
     assert done.stderr.count("\n") == 1
-    assert "no Dask scheduler answers at tcp://127.0.0.1:1; start one, or omit --dask" in done.stderr
+    assert "no Dask scheduler answers at tcp://127.0.0.1:1; start a scheduler, or omit --dask" in done.stderr

@@ -97,7 +97,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"trials": 10**8, "bounds": {"length_mm": list(range(101))}}, "101 cells of 100,000,000 trials are more than"),
         ({"seed": -1}, "'seed' must be greater than or equal to 0"),
         ({"capture": {}}, "give exactly one of positions_mm, sockets .* file and kit"),
-        ({"capture": {"sockets": 2}}, "sockets at random places need a region"),
+        ({"capture": {"sockets": 2}}, "sockets at random positions need a region"),
         ({"capture": {"sockets": 2, "region": {"x_mm": [0, 1]}}}, "a region needs distance_mm, or x_mm, y_mm and z_mm"),
         ({"capture": {"sockets": 2, "region": {"distance_mm": [2, 1]}}}, "2 to 1 is not a range"),
         (
@@ -105,10 +105,10 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
             "7 poses in 1 socket give 18 equations, but 20 unknowns need at least 8 poses",
         ),
         ({"capture": CAPTURE | {"poses": [70, 7]}}, "need at least 8 poses"),
-        ({"capture": CAPTURE | {"poses": 3000}}, "3000 poses are more than the pool has"),
+        ({"capture": CAPTURE | {"poses": 3000}}, "3000 poses per socket are needed, but the pool has"),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "contains fewer than two placements of 100 poses .* give at least 8192",
+            "must contain at least two placements with 100 poses; give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "'capture.pool' must be less than or equal to 16777216"),
@@ -120,9 +120,9 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ),
         ({"capture": {"file": "a.h5", "poses": 5}}, "a.h5 does not exist"),
         ({"reference": {"u_mm": 0.1}}, "give either length_mm .* or ends_mm"),
-        ({"reference": {"length_mm": 300}}, "a reference length at a random place needs a region"),
+        ({"reference": {"length_mm": 300}}, "a reference length at a random position needs a region"),
         ({"reference": {"ends_mm": [[[0, 0, 0], [0, 0, 0]]]}}, "two ends at the same position"),
-        ({"identification": {"method": "joint"}}, "needs a reference length"),
+        ({"identification": {"method": "joint"}}, "need a reference length"),
         (
             {"identification": {"method": "both"}},
             "'identification.method' must be 'stage1', 'two-stage' or 'joint', not 'both'",
@@ -166,7 +166,7 @@ def test_a_narrow_region_is_found(tmp_path):
         ),
         (
             {"capture": {"sockets": 1, "region": {"distance_mm": [300, 900]}, "poses": 100, "pool": 4096}},
-            "contains fewer than two placements of 100 poses .* give at least 8192",
+            "must contain at least two placements with 100 poses; give at least 8192",
         ),
         ({"trials": 10**9}, "'trials' must be less than or equal to 100000000"),
         ({"capture": CAPTURE | {"pool": 10**9}}, "'capture.pool' must be less than or equal to 16777216"),
@@ -188,7 +188,7 @@ def test_a_narrow_region_is_found(tmp_path):
         ),
         (
             {"reference": {"length_mm": 2900, "region": {"distance_mm": [100, 1000]}}},
-            "a reference length of 2900 mm has no placement in its region",
+            "no position of a reference length of 2900 mm in its region",
         ),
     ],
     ids=str,

@@ -104,7 +104,7 @@ def test_a_second_run_at_the_same_time_is_refused(study, tmp_path):
         ({"chunk": 0}, "chunk is 0; give a whole number of at least 1"),
         (
             {"version": "9.9"},
-            "was begun with aacmm_jax .*, but this process has aacmm_jax 9.9, which can change the numbers",
+            "was begun with aacmm_jax .*, but this process has aacmm_jax 9.9, which can change the results",
         ),
     ],
     ids=str,
@@ -127,7 +127,7 @@ def test_other_files_are_not_overwritten(study, tmp_path, noisy_capture):
     aj.files.save_capture(
         tmp_path / "c.h5", aj.Recording(noisy_capture, aj.files.load_specification("cheng2018-simulation"))
     )
-    with pytest.raises(aj.InputError, match=r"c\.h5 contains a capture; name a study file"):
+    with pytest.raises(aj.InputError, match=r"c\.h5 contains a capture; give a study file"):
         aj.study.run_study(study, tmp_path / "c.h5")
     aj.files.load_capture(tmp_path / "c.h5")
 
@@ -138,7 +138,8 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
     for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
         path = path.rename(tmp_path / "t.h5")
         with pytest.raises(
-            aj.InputError, match=r"t\.h5 was renamed, but its results are in s\.h5\.parts; rename it back to s\.h5"
+            aj.InputError,
+            match=r"t\.h5 was renamed, but its results are in s\.h5\.parts; rename the file back to s\.h5",
         ):
             use(path)
         path = path.rename(tmp_path / "s.h5")
@@ -146,7 +147,7 @@ def test_results_without_their_parts_are_missed(home, study, tmp_path):
     for use in (aj.study.open_study, lambda path: aj.study.run_study(study, path)):
         with pytest.raises(
             aj.InputError,
-            match=r"results in the folder s\.h5\.parts, which is missing; put that folder next to the file",
+            match=r"s\.h5 are in the folder s\.h5\.parts, which is missing; put this folder next to the file",
         ):
             use(path)
     with pytest.raises(aj.InputError, match="does not exist"):
@@ -242,9 +243,7 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(home, tmp_path):
         assert done.returncode == 2, done.stderr
         assert done.stderr.count("\n") == 1
         assert what in done.stderr
-        assert (
-            "cannot be written: file too large; free some space there, then run the same command again" in done.stderr
-        )
+        assert "cannot be written: file too large; free some disk space, then run the same command again" in done.stderr
         aj.study.open_study(path).close()
     process = command(home, "-o", path)
     process.communicate(timeout=600)

@@ -306,7 +306,7 @@ REFUSED = {
     ),
     "estimated with": (
         lambda arm, capture, bounds: aj.identify(arm, capture, bounds, noise=NOISE, noise_model="estimated"),
-        "the noise is given",
+        "cannot be combined with a given noise",
     ),
 }
 

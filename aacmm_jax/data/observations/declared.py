@@ -52,11 +52,21 @@ class Entry(NamedTuple):
     @property
     def described(self) -> str:
         """Its line in the docstring of the class."""
-        alternatives = (self.annotation, *get_args(self.annotation))
-        names = next((kind.dim_str for kind in alternatives if getattr(kind, "dim_str", "")), "").split()
+        names = self._sizes
         shape = f" ``({', '.join(names)}{',' * (len(names) == 1)})``" if names else ""
         unit = f", {self.unit}" if self.unit not in ("", "1") else ""
         return f"{self.name}: {self.says[:1].upper()}{self.says[1:]}{shape}{unit}{self.more and '; '}{self.more}."
+
+    @property
+    def _sizes(self) -> list[str]:
+        """Of its dimensions, as the annotation has them: letters, or numbers where they are fixed."""
+        alternatives = (self.annotation, *get_args(self.annotation))
+        return next((kind.dim_str for kind in alternatives if getattr(kind, "dim_str", "")), "").split()
+
+    @property
+    def row_shape(self) -> tuple[int, ...]:
+        """Of an array with a row for each pose, the shape of a row: along each dimension 3, unless annotated."""
+        return tuple(map(int, self._sizes[1:])) if self._sizes else (3,) * (len(self.dimensions) - 1)
 
     @property
     def required(self) -> bool:
@@ -198,7 +208,7 @@ def _checked(entry: Entry, value: Any, where: str, sizes: Sizes) -> Any:
     if entry.name == "q":
         value = checked_readings(where, value)
     if entry.spread is not None:
-        value = _spread(as_floats(value, what), (sizes["m"], 3, 3)[: len(entry.dimensions)], entry.spread, what)
+        value = _spread(as_floats(value, what), (sizes["m"], *entry.row_shape), entry.spread, what)
     value = checked(value, entry.annotation, what, sizes)
     if entry.of_poses and len(value) != sizes["m"]:
         raise InputError(f"{what} has {len(value)} values; give one for each of the {sizes['m']} poses.")
@@ -218,14 +228,14 @@ def _spread(array: AnyArray, shape: tuple[int, ...], fewest: int, what: str) -> 
         given = " or ".join(str(alternative) if alternative else "one number" for alternative in shapes)
         raise InputError(f"{what} has shape {array.shape}; give {given}.")
     if not fewest and is_concrete(array) and np.any(np.asarray(array) < 0):
-        raise InputError(f"{what} is negative, but a standard uncertainty must be zero or positive.")
+        raise InputError(f"{what} is negative, but a standard uncertainty must be 0 or positive.")
     return numpy_if_known(lambda values: namespace(values).broadcast_to(values, shape))(array)
 
 
 def checked_name(name: object, what: str) -> str:
     """A name of one line, or `InputError`."""
     if not isinstance(name, str) or not name.strip() or name.splitlines() != [name]:
-        raise InputError(f"{what} has the name {shown(name)}; give it a name of one line.")
+        raise InputError(f"{what} has the name {shown(name)}; give a text of one line as the name.")
     return name
 
 

@@ -42,7 +42,7 @@ class Socket(AbstractObservation):
         (40, 6) ['position of hole']
     """
 
-    kind, table, noun, rows, linear = "socket", "socket", "socket", 3, True
+    kind, table, noun, row_units, linear = "socket", "socket", "socket", POINT, True
     position = Part("position of {name}", *POINT)
 
     def start(self, tips: Tips, offset: Float[AnyArray, " 3"]) -> Parts:
@@ -88,8 +88,8 @@ class Artefact(AbstractObservation):
         (12, 6) ['placement plate', 'coordinates of plate']
     """
 
-    kind, table, noun, rows = "artefact", "artefact", "artefact", 3
-    point: tuple[str, ...] = declared("point of the artefact that held the tip", "", "pose")
+    kind, table, noun, row_units = "artefact", "artefact", "artefact", POINT
+    point: tuple[str, ...] = declared("point of the artefact in which the tip was seated", "", "pose")
     names: tuple[str, ...] = declared("point of the artefact", "", "names")
     coordinates: Float[AnyArray, "c 3"] = declared("certified coordinates", "mm", "names", "axis", uncertainty="u")
     u: Float[AnyArray, ""] = declared(
@@ -99,13 +99,15 @@ class Artefact(AbstractObservation):
         more="the error of a coordinate is the same in every placement",
     )
     artefact: str = declared(
-        "name of the artefact", default=NAME, more="all observations of one artefact share its errors"
+        "name of the artefact",
+        default=NAME,
+        more="all observations of the same artefact have the same errors of the coordinates",
     )
     placement: str = declared(
         "name of the placement of the artefact",
         default=NAME,
         of_session=True,
-        more="all observations of one placement share its frame",
+        more="all observations of the same placement have the same frame",
     )
     index: str | None = declared(
         "index of the platform that carries the artefact", default=None, of_session=True,
@@ -143,7 +145,7 @@ class Artefact(AbstractObservation):
         for point in dict.fromkeys(self.point):
             if point not in self.names:
                 raise InputError(
-                    f"{where} has poses in '{point}', which has no coordinates{nearest(point, self.names)}"
+                    f"{where} has poses in the point '{point}', which has no coordinates{nearest(point, self.names)}"
                 )
         return {"free": not is_exact(self.u)}
 
@@ -294,12 +296,12 @@ class SimulatedArtefact(AbstractSimulated):
         moves="frame",
     )
     errors: Float[np.ndarray, "c 3"] | None = declared(
-        "errors of the certified coordinates", "mm", default=None, more="all placements have the same errors"
+        "errors of the certified coordinates", "mm", default=None, more="every placement has the same errors"
     )
     u: float = declared("standard uncertainty of the certified coordinates", "mm", default=0.0)
     artefact: str = declared("name of the artefact", default=NAME)
     placement: str | None = declared("name of the placement", default=None)
-    index: str | None = declared("name of the index of a platform", default=None)
+    index: str | None = declared("index of the platform that carries the artefact", default=None)
 
     def tips(self, random: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         coordinates = np.repeat(np.array(list(self.points.values())), self.poses, axis=0)

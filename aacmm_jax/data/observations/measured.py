@@ -60,7 +60,7 @@ class MeasuredPoints(AbstractObservation):
         (50, 3) ['frame of tracker']
     """
 
-    kind, table, rows = "points", "points", 3
+    kind, table, row_units = "points", "points", POINT
     points: Float[AnyArray, "m 3"] = declared("measured point", "mm", "pose", "axis")
     u: AnyArray | None = declared(
         "standard uncertainty of a coordinate", "mm", "pose", "axis", default=None, spread=0,
@@ -74,7 +74,7 @@ class MeasuredPoints(AbstractObservation):
         "station of the instrument",
         default=NAME,
         of_session=True,
-        more="all observations of one station share its frame",
+        more="all observations of the same station have the same frame",
     )
     frame = Part("frame of {station}", *FRAME)
     fixes_scale = True
@@ -136,9 +136,10 @@ class MeasuredTransforms(MeasuredPoints):
         ['frame of 6-D probe', 'orientation of 6-D probe']
     """
 
-    kind, table, rows, rotates = "transforms", "transforms", 6, True
+    kind, table, rotates = "transforms", "transforms", True
+    row_units = (*POINT, "rad", "rad", "rad")
     rotations: Float[AnyArray, "m 3 3"] = declared(
-        "measured axes of the target, as columns", "1", "pose", "axis", "axis_2"
+        "measured orientation of the target, with its axes as columns", "1", "pose", "axis", "axis_2"
     )
     u_angle: Float[AnyArray, ""] = declared(
         "standard uncertainty of an orientation about each axis", "rad", positive=True
@@ -203,7 +204,7 @@ class Distances(AbstractObservation):
         ['pivot of telescoping bar']
     """
 
-    kind, table, rows = "distances", "distances", 1
+    kind, table, row_units = "distances", "distances", ("mm",)
     values: Float[AnyArray, " m"] = declared("measured distance from the pivot", "mm", "pose")
     u: Float[AnyArray, " m"] = declared(
         "standard uncertainty of a distance",
@@ -215,7 +216,7 @@ class Distances(AbstractObservation):
     )
     constant: bool = declared(
         "whether an unknown constant is added to all distances", default=False,
-        more="for example for a bar whose zero is unknown",
+        more="for example, for a telescoping bar whose zero is unknown",
     )  # fmt: skip
     pivot = Part("pivot of {name}", *POINT)
     zero = Part("constant of {name}", "mm", when="constant")

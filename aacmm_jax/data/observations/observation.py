@@ -19,10 +19,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...core.errors import InputError
+from ...core.linear_algebra import inverse_positive_definite, products_by_column
 from ...core.numpy_or_jax import AnyArray, namespace, numpy_if_known, register
 from ...core.rotations import rotation_matrix, rotation_vector
 from .declared import Declared, declared
 
+OTHER_UNITS = ("rad", "px")  # of residuals that are not in mm
 POINT = ("mm",) * 3
 FRAME = ("rad",) * 3 + POINT
 # Two components of the rotation vector that turns z to the normal, and the distance from the origin.
@@ -30,6 +32,9 @@ PLANE = ("rad", "rad", "mm")
 # Two components of the rotation vector that turns z to the axis' direction, and where the axis meets the plane through
 # the origin across it, along the x and y axes that are turned likewise.
 AXIS = ("rad", "rad", "mm", "mm")
+
+# Added to the normal matrix of the tip's displacement, of its trace: large against rounding, small against 1.
+_UNSEEN = 1e-9
 
 # The numbers of each unknown as columns: one for all poses (p = 1), or one for each pose (p = m).
 Unknowns = Mapping[str, Float[AnyArray, "k p"]]
@@ -47,7 +52,8 @@ class Tips(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Residuals of an observation, r for each of its m poses, mm (orientations: rad), and their derivatives."""
+    """Residuals of an observation, r for each of its m poses, in the units that its kind declares, and their
+    derivatives by mm and rad."""
 
     values: Float[AnyArray, "r m"]
     by_tip: Float[AnyArray, "r 3 m"]
@@ -76,7 +82,9 @@ class AbstractObservation(Declared):
 
     kind: ClassVar[str]
     table: ClassVar[str]  # name of its tables in a manifest
-    rows: ClassVar[int]  # residuals of a pose
+    # The unit of each residual of a pose: those in mm first, then others that all are in rad, or all in px. A property
+    # where it depends on the data.
+    row_units: tuple[str, ...]
     derived: ClassVar[tuple[str, ...]] = ()  # fields of `completed` that are no entries
     rotates: ClassVar[bool] = False  # whether the residual depends on the rotation of the last frame
     stacks: ClassVar[bool] = True  # whether it can be evaluated together with others of the kind: see `alike`
@@ -84,7 +92,7 @@ class AbstractObservation(Declared):
     linear: ClassVar[bool] = False
     fixes_scale: bool = False  # whether it determines the scale of the arm
     q: Float[AnyArray, "m n"] = declared("joint reading", "rad", "pose", "joint")
-    target: str = declared("tip that was held or measured; empty: the probe of the arm", default="")
+    target: str = declared("target that was seated or measured; empty for the arm's own probe", default="")
 
     # Of a repeated calibration: what is added to the residuals (r, m), and certified values in place of its own.
     shift: Float[AnyArray, "r m"] | None
@@ -92,6 +100,8 @@ class AbstractObservation(Declared):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        if isinstance(units := getattr(cls, "row_units", ()), tuple):
+            _check_row_units(cls.__name__, units)
         leaves = [entry.name for entry in cls.entries if entry.content == "number"] + ["shift", "drawn"]
         others = [entry.name for entry in cls.entries if entry.content != "number"]
         register(cls, (*leaves,), ("name", *others, *cls.derived))
@@ -133,6 +143,34 @@ class AbstractObservation(Declared):
         return {getattr(self, name): part.units_of(self) for name, part in present.items()}
 
     @property
+    def rows(self) -> int:
+        """Number of residuals of a pose."""
+        return len(self.row_units)
+
+    @property
+    def lengths(self) -> int:
+        """How many of them are in mm: the first ones."""
+        return self.row_units.count("mm")
+
+    @property
+    def other_unit(self) -> str:
+        """The unit of the residuals that are not in mm; empty where all of them are."""
+        return self.row_units[-1] if self.rows > self.lengths else ""
+
+    def in_mm(self, rows: Float[AnyArray, "r *k m"], by_tip: Float[AnyArray, "r 3 m"]) -> Float[AnyArray, "c *k m"]:
+        """Residuals, or their derivatives by k numbers, as a vector whose length is the distance of the tip from the
+        geometry, mm: the residuals in mm themselves; of a kind without any, the shortest displacement of the tip that
+        changes the residuals so, by their derivatives with respect to the tip."""
+        if self.lengths:
+            return rows[: self.lengths]
+        xp = namespace(rows, by_tip)
+        normal = xp.einsum("ram,rbm->mab", by_tip, by_tip)
+        # Directions of the tip that no residual depends on, such as the line of sight, get no displacement.
+        least = _UNSEEN * xp.einsum("maa->m", normal) + 1e-300
+        inverse = inverse_positive_definite(normal + least[:, None, None] * xp.asarray(np.eye(3)))
+        return products_by_column(xp.einsum("mab,rbm->arm", inverse, by_tip), rows)
+
+    @property
     def alike(self) -> Hashable | None:
         """What observations of this class, with as many unknowns of the same units, must have in common to be `stacked`
         and evaluated together; None for one that is evaluated alone."""
@@ -140,7 +178,7 @@ class AbstractObservation(Declared):
             return None
         choices = [*self.derived, *(entry.name for entry in self.entries if entry.content == "truth")]
         absent = tuple(name for name in self.stated if getattr(self, name) is None)
-        return (*(getattr(self, name) for name in choices), absent)
+        return (*(getattr(self, name) for name in choices), absent, self.row_units)
 
     @property
     def by_pose(self) -> tuple[str, ...]:
@@ -195,7 +233,7 @@ class AbstractObservation(Declared):
         self, q: Float[AnyArray, "*batch m n"], shift: Float[AnyArray, "*batch r m"], values: Mapping[str, AnyArray]
     ) -> "AbstractObservation":
         """The same observation with other errors than it was recorded with: other readings, rad, a constant added to
-        each residual, mm and rad, and other certified values, by the names of the certified parts."""
+        each residual, in its unit, and other certified values, by the names of the certified parts."""
         return self.changed(q=q, shift=shift, drawn=dict(values))
 
     def certified_values(self) -> Certified:
@@ -227,6 +265,14 @@ class AbstractObservation(Declared):
         rows = list(zip(*(getattr(self, label) for label in labels), strict=True)) or [()] * self.q.shape[-2]
         numbers = {row: place for place, row in enumerate(dict.fromkeys(rows))}
         return np.array([numbers[row] for row in rows])
+
+
+def _check_row_units(name: str, units: tuple[str, ...]) -> None:
+    others = units[units.count("mm") :]
+    if "mm" in others or len(set(others)) > 1 or not set(others) <= set(OTHER_UNITS):
+        raise TypeError(
+            f"row_units of {name} are {units}; declare those in mm first, then others that are all in rad or all in px."
+        )
 
 
 def quantities_by_unit(units: Sequence[str], values: Float[np.ndarray, " k"]) -> tuple[Quantity, ...]:
@@ -324,7 +370,10 @@ class AbstractOfTarget(AbstractSimulated):
 
     def completed(self, where: str) -> Mapping[str, Any]:
         if bool(self.target) != (self.place is not None):
-            raise InputError(f"{where} needs either both a target and its position in the last frame, or neither.")
+            raise InputError(
+                f"{where} needs both a target and its position in the last frame (place), or neither; add one or "
+                "remove the other."
+            )
         return {"offset": self.place}
 
 

@@ -54,7 +54,7 @@ class AbstractTouched(AbstractObservation):
     ball added or taken off, times ``share``: 1/2 of a diameter.
     """
 
-    rows: ClassVar[int] = 1
+    row_units = ("mm",)
     certificate: ClassVar[str] = ""
     share: ClassVar[float] = 1.0
     advice: ClassVar[str]  # to whoever has touched too little of it
@@ -145,7 +145,7 @@ class AbstractTouched(AbstractObservation):
                 f"{where} has {tips.shape[1]} touches, but there are {len(rows)} unknowns; record more touches."
             )
         if np.linalg.svd(rows, compute_uv=False)[-1] < _LEAST_SINGULAR * np.sqrt(tips.shape[1]):
-            raise InputError(f"the touches hardly determine the geometry of {where}; {self.advice}.")
+            raise InputError(f"the touches do not determine the geometry of {where} well enough; {self.advice}.")
 
 
 class AbstractRound(AbstractTouched):
@@ -159,8 +159,8 @@ class AbstractRound(AbstractTouched):
     stylus: Float[AnyArray, ""] = declared(
         "diameter of the tip's ball", "mm", default=0.0,
         more=(
-            "0 if the tip itself touches the surface, or if the diameter is unknown (the fitted diameter then "
-            "includes the stylus)"
+            "0 if the tip itself touches the surface, or if the diameter is unknown (then the fitted diameter includes "
+            "the ball)"
         ),
     )  # fmt: skip
     derived = ("free",)
@@ -261,7 +261,9 @@ class ParallelPlanes(Plane):
     )
     u: Float[AnyArray, ""] = declared("standard uncertainty of the distance", "mm", default=0.0)
     stylus: Float[AnyArray, ""] = declared("diameter of the tip's ball", "mm", default=0.0)
-    inside: bool = declared("whether the ball was between the planes (a gap), not outside (a block)", default=False)
+    inside: bool = declared(
+        "whether the ball was between the planes (true, a gap) or outside (false, a block)", default=False
+    )
     derived, certificate = ("free",), "distance"
     size = Part("distance of {name}", "mm", when="free")  # from the plane of the first side
     stacks = False  # which way the other plane is follows from all of its poses
@@ -385,7 +387,7 @@ class SimulatedPlanes(AbstractSimulated):
     poses: int = declared("number of poses")
     distance: float | None = declared(
         "true distance to the second plane", "mm", default=None,
-        more="along the cross product of the sides; None for a single plane",
+        more="in the direction of the cross product of the sides; None for a single plane",
     )  # fmt: skip
     u: float = declared("standard uncertainty of the certified distance", "mm", default=0.0)
 

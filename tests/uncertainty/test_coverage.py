@@ -1,4 +1,4 @@
-"""The coverage probability of every U is stated in one place, and numbers and words follow it."""
+"""The coverage of every U is stated in one place, and numbers and words follow it."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from aacmm_jax.uncertainty.coverage_level import in_percent
+from aacmm_jax.uncertainty.coverage import in_percent
 
 PACKAGE = Path(__file__).resolve().parents[2] / "aacmm_jax"
 
@@ -37,7 +37,7 @@ OTHERS = {
 EDITED = r"""
 import importlib.util, json, re, sys
 
-name = "aacmm_jax.uncertainty.coverage_level"
+name = "aacmm_jax.uncertainty.coverage"
 specification = importlib.util.find_spec(name)
 with open(specification.origin) as file:
     source = file.read()
@@ -63,11 +63,12 @@ def test_a_level_in_words(level, words):
     assert in_percent(level) == words
 
 
-def test_no_other_place_states_the_level():
+def test_no_other_place_states_the_coverage():
     pattern, stated = re.compile(r"(?<![\d.])(?:95(?: |\\u00a0|\\xa0|&nbsp;|\u00a0)?%|0\.95(?!\d))"), Counter()
     for path in PACKAGE.rglob("*"):
-        if path.suffix in (".py", ".html", ".js") and path.name != "coverage_level.py":
+        if path.suffix in (".py", ".html", ".js") and path != PACKAGE / "uncertainty/coverage.py":
             stated[path.relative_to(PACKAGE).as_posix()] += len(pattern.findall(path.read_text()))
+            assert not re.search(r"k = 2\b|coverage factor 2\b", path.read_text()), path
     assert {name: count for name, count in stated.items() if count} == OTHERS
 
 
@@ -93,7 +94,7 @@ def test_where_another_level_is_stated_numbers_and_words_follow(tmp_path, cache)
         "U (99 %) of a measured length",
         "Expanded uncertainty U over the working volume (99 %, coverage factor 2.58)",
         "Reference lengths [mm]; U: 99 %",
-        "changed by more than their uncertainty (99 %; ",
+        "changed by more than their expanded uncertainty (99 %; ",
         "[default: 0.99]",
     ):
         assert text in printed, text
