@@ -83,10 +83,10 @@ def check_backend() -> None:
         jax.devices()
     except Exception as error:  # a RuntimeError, or an AssertionError where nothing that is named is there
         told = _told()
+        device = f"device for {told}" if told else "device"
+        advice = "remove this setting" if told else "see the message of JAX"
         raise RuntimeError(
-            f"JAX cannot start, because {told or 'JAX'} {'names' if told else 'finds'} no device that this machine "
-            f"and this installation have; {'remove this setting' if told else 'see the message of JAX'}, or set "
-            "JAX_PLATFORMS=cpu."
+            f"JAX cannot start, because this installation of JAX finds no {device}; {advice}, or set JAX_PLATFORMS=cpu."
         ) from error
 
 

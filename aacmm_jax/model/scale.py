@@ -124,12 +124,12 @@ def fix_scale(
         )
     check_finite(arm=arm, capture=capture)
     if not is_single(arm):
-        raise InputError("the arm is a batch, but fix_scale takes a single arm; use jax.vmap.")
+        raise InputError("fix_scale needs a single arm, but this is a batch; use jax.vmap.")
     check_one_capture(capture)
     if capture.observations:
         names = shorten([observation.name for observation in capture.observations])
         raise InputError(
-            f"fix_scale takes sockets and reference lengths only, but the capture has other observations ({names}); "
+            f"fix_scale supports only sockets and reference lengths, but the capture has other observations ({names}); "
             "give a capture without these observations."
         )
     check_readings(capture, arm)

@@ -115,7 +115,7 @@ def comparison(summary: dict[str, Any]) -> View:
     yield listed(
         f"Lengths of {lengths['length_mm']:g} mm, new minus old, at {lengths['places']} positions in the volume [mm]",
         [["not determined" if lengths[key] is None else lengths[key] for key in keys]],
-        ("RMS", "RMS from the uncertainties alone", "95th percentile", "largest", "mean"),
+        ("RMS", "RMS expected from the uncertainties", "95th percentile", "largest", "mean"),
     )
     if len(summary["trend"]) > 2:
         first, *others = summary["trend"]
@@ -133,7 +133,7 @@ def comparison(summary: dict[str, Any]) -> View:
             "beyond U",
             "p of all changes",
             "RMS [mm]",
-            "by chance [mm]",
+            "RMS expected [mm]",
             "largest [mm]",
         )
         title = "Each calibration minus the first (the error of the first calibration is contained in every row)"

@@ -17,10 +17,10 @@ BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
 MODELS_MEANING = (
     "Determined: number of parameters that the data determine. Inside: RMS distance of all poses from their geometry. "
-    "Outside: RMS distance of held-out poses, with each region held out in turn. Above the best: outside error minus "
-    "the outside error of the best model, from the differences in each region. u: standard errors from the scatter of "
-    "the regions. Ratio: mean of (error / predicted standard deviation)² of held-out poses. Evidence: logarithm of "
-    "the evidence, minus the value of the most probable model."
+    "Outside: RMS distance of held-out poses, with each region held out in turn. Excess: outside error minus the "
+    "outside error of the best model, from the differences in each region. u: standard errors from the scatter of the "
+    "regions. Ratio: mean of (error / predicted standard deviation)² of held-out poses. Evidence: logarithm of the "
+    "evidence, minus the value of the most probable model."
 )
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
@@ -339,8 +339,8 @@ def model_tables(summary: Row) -> tuple[Table, Table]:
         "inside [mm]": "rms_inside",
         "outside [mm]": "rms_outside",
         "u of outside": "u_outside",
-        "above the best": lambda row: to_best(row)[0],
-        "u of this": lambda row: to_best(row)[1],
+        "excess [mm]": lambda row: to_best(row)[0],
+        "u of excess": lambda row: to_best(row)[1],
         "ratio": _two_decimals("ratio"),
         "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
         "CPU [s]": lambda row: number(row["cpu_seconds"], 1),

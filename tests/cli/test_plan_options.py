@@ -49,7 +49,7 @@ def test_a_robot_by_default(aacmm):
     """Cones of 60 deg, approach points 50 mm above, the noise of its data sheet; no obstacles unless asked for."""
     printed = " ".join(aacmm(*PLAN, "--collisions").stdout.split())
     for text in (
-        "encoders of 9.04 arcsec",
+        "noise of 9.04 arcsec (encoders)",
         "Franka Emika data sheet",
         "via approach points 50 mm above the sockets",
         "the arm's body with itself and with obstacles (table)",

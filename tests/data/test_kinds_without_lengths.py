@@ -7,6 +7,8 @@ import json
 import math
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -55,12 +57,13 @@ class AbstractSight(AbstractObservation):
         between = tips.position - frame[3:]
         values, by_local = self.seen_at(products_by_column(rotation.swapaxes(0, 1), between))
         by_tip = xp.einsum("rim,jim->rjm", by_local, xp.broadcast_to(rotation, (3, 3, m)))
-        by_turn = [-xp.sum(by_tip * cross(xp.broadcast_to(axes[:, k], (3, m)), between), axis=1) for k in range(3)]
+        turned = [cross(xp.broadcast_to(axes[:, k], (3, m)), between) for k in range(3)]
+        by_turn = [-xp.sum(by_tip * moved[None], axis=1) for moved in turned]
         return Rows(
             values=values - self.seen(),
             by_tip=by_tip,
             by_unknowns={self.frame: xp.concatenate([xp.stack(by_turn), -xp.moveaxis(by_tip, 1, 0)])},
-            measured=variances(self.u, m) * xp.asarray(np.eye(2)),
+            measured=variances(self.u, m) * xp.asarray(np.eye(2))[None],
         )
 
 
@@ -87,8 +90,8 @@ class Bearing(AbstractSight):
     def seen_at(self, local):
         xp, (x, y, z) = namespace(local), local
         flat, square = xp.sqrt(x**2 + y**2), x**2 + y**2 + z**2
-        by_azimuth = xp.stack([-y, x, xp.zeros_like(x)]) / flat**2
-        by_elevation = xp.stack([-x * z / flat, -y * z / flat, flat]) / square
+        by_azimuth = xp.stack([-y, x, xp.zeros_like(x)]) / flat[None] ** 2
+        by_elevation = xp.stack([-x * z / flat, -y * z / flat, flat]) / square[None]
         return xp.stack([xp.arctan2(y, x), xp.arctan2(z, flat)]), xp.stack([by_azimuth, by_elevation])
 
 
@@ -114,7 +117,7 @@ class Picture(AbstractSight):
         xp, (x, y, z) = namespace(local), local
         none = xp.zeros_like(x)
         by_local = [xp.stack([-y / x, none + 1, none]), xp.stack([-z / x, none, none + 1])]
-        return FOCAL * xp.stack([y, z]) / x, xp.stack(by_local) * FOCAL / x
+        return FOCAL * xp.stack([y, z]) / x[None], xp.stack(by_local) * FOCAL / x[None, None]
 
 
 class AbstractSimulatedSight(AbstractInBox):
@@ -328,3 +331,13 @@ def test_plans_choose_poses_of_it(paper_arm, kind):
         space=aj.Parameters(paper_arm, ("a_2", "d_4", "theta_3")), poses=20, candidates=120, seed=1,
     )  # fmt: skip
     assert {one.kind for one in planned.observations} == {kind, "sphere"}
+
+
+def test_a_batch_of_arms_is_evaluated_alike(recording):
+    """The same numbers from JAX as from NumPy, to rounding."""
+    arms = [recording.nominal.arm, recording.true.arm]
+    alone = [aj.evaluate(arm, recording.capture).observed for arm in arms]
+    together = aj.evaluate(jax.tree.map(lambda *leaves: jnp.stack(leaves), *arms), recording.capture).observed
+    for i, one in enumerate(alone):
+        for name in ("rms", "rms_angle", "rms_px", "reduced_chi"):
+            np.testing.assert_allclose(getattr(together, name)[i], getattr(one, name), rtol=1e-6)

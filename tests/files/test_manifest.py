@@ -435,7 +435,7 @@ def test_bad_manifest(tmp_path, motion, text, parts):
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,1_0\n", ["line 2 column 6", "'1_0' is not a number"]),
         (b"1,2,3,4,5.5,\n", ["has 5 columns without names", "the arm's 6 joints"]),
         (b"1,2,3,4,5.5,6\n1,2,3,4,5.5,\n", ["line 2 column 6", "'' is not a number"]),
-        (b"1,2,3,4,5.5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "correct it"]),
+        (b"1,2,3,4,5.5,6\n1,2,3,4,nan,6\n", ["line 2 column 5", "'nan' is not finite", "correct the number"]),
         (b"q1,q2,q3,q4,q5,q6\n", ["contains no numbers", "one line per pose"]),
         (b"", ["contains no numbers", "one line per pose"]),
         (b"0,5;1,5;2,5;0,5;1,5;2,5\n", ["line 1 column 1: '0,5' is not a number", 'or add decimal = ","']),
