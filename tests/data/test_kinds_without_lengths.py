@@ -220,7 +220,7 @@ def test_a_residual_in_mm_is_the_distance_from_the_line_of_sight():
 
 @pytest.mark.parametrize("units", [("rad", "mm"), ("mm", "rad", "px"), ("deg",)])
 def test_units_that_no_kind_may_have(units):
-    with pytest.raises(TypeError, match="declare those in mm first"):
+    with pytest.raises(TypeError, match="declare the rows in mm first"):
         type("Wrong", (Bearing,), {"row_units": units})
 
 
