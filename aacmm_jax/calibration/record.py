@@ -123,6 +123,7 @@ class CalibrationRecord(NamedTuple):
     shared: SharedErrors | None = None  # shared errors, likewise
     components: Components | None = None  # parts of the covariance that do not rest on the scatter of single poses
     surplus_k: float = 0.0  # of u_k^2, by lengths that disagree
+    decisions: tuple[str, ...] = ()  # what was decided by default, a sentence each
 
     @property
     def given_noise(self) -> Noise | None:

@@ -63,6 +63,7 @@ ARM: Fields = {
     "override": mapping("half-widths of single parameters, mm or rad"),
     "held": text("fixed parameters"),
     "free": text("parameters that are free in addition to the default parameters"),
+    "stated": text("what a person chose: parameters, bounds", among=("parameters", "bounds")),
     **_GEOMETRY,
     "coefficient": text("name of the coefficient", "coefficient"),
     "coefficients": number("coefficient of a joint correction, in its own unit", "1", "coefficient"),
@@ -118,6 +119,7 @@ CALIBRATION: Fields = {
     "reason": text("why the solve ended"),
     "divided": truth("whether the lengths of the arm are those of stage 1 divided by k"),
     "against_division": text("why the lengths were not divided by k"),
+    "decisions": text("what was decided by default"),
     "sampled_says": text("result of the Monte Carlo simulation"),
     "robust": text("robust loss"),
 }

@@ -322,6 +322,7 @@ class ArmSpecification(NamedTuple):
     free: tuple[str, ...] = ()  # names that are free in addition, such as Hayati's ``beta_2``
     urdf: UrdfSource | None = None  # that the arm was read from; None for others
     prior: Prior | None = None  # of the parameters; None where the file states none
+    stated: tuple[str, ...] = ()  # "parameters", "bounds": those that a person chose, which no default changes
 
     def space(self) -> Parameters:
         """The free parameters that the file proposes."""

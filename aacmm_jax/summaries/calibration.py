@@ -165,6 +165,7 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
         "poses": len(recording.capture.readings),
         "sockets_used": list(recording.capture.names),
         "scale_expanded": uncertainty.expanded_k() if math.isfinite(record.u_k) else None,
+        "decisions": list(record.decisions),
         "active_stage1": on_bounds(record),
         "active": on_bounds(record, final=True),
         **{stage: metrics(evaluation) for stage, evaluation in evaluations.items()},
