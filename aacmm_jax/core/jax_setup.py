@@ -62,9 +62,9 @@ def check_x64() -> None:
     check_setting()
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
-            "64-bit floats were turned off after aacmm_jax was imported, and a calibration in float32 is wrong by "
-            "tens of micrometres; leave the block of jax.enable_x64(False), or call "
-            "jax.config.update('jax_enable_x64', True)."
+            "64-bit floats were turned off after aacmm_jax was imported, and a calibration in float32 is wrong by tens "
+            "of micrometres; call aacmm_jax outside jax.enable_x64(False), or call jax.config.update('jax_enable_x64', "
+            "True)."
         )
 
 

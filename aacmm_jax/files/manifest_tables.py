@@ -115,9 +115,11 @@ class Angles(Strict):
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
         if (self.unit == "counts") != (self.counts_per_turn is not None):
-            raise ValueError("counts_per_turn and unit = 'counts' need each other; give both or neither.")
+            raise ValueError("counts_per_turn and unit = 'counts' are only possible together; give both or neither.")
         if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
-            raise ValueError("counts_per_mm and linear_unit = 'counts' need each other; give both or neither.")
+            raise ValueError(
+                "counts_per_mm and linear_unit = 'counts' are only possible together; give both or neither."
+            )
         return self
 
     def converted(self, readings: Float[np.ndarray, "N n"], arm: Arm) -> Float[np.ndarray, "N n"]:

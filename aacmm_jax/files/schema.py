@@ -63,7 +63,7 @@ ARM: Fields = {
     "override": mapping("half-widths of single parameters, mm or rad"),
     "held": text("fixed parameters"),
     "free": text("parameters that are free in addition to the default parameters"),
-    "stated": text("what a person chose: parameters, bounds", among=("parameters", "bounds")),
+    "stated": text("what the user stated: parameters or bounds", among=("parameters", "bounds")),
     **_GEOMETRY,
     "coefficient": text("name of the coefficient", "coefficient"),
     "coefficients": number("coefficient of a joint correction, in its own unit", "1", "coefficient"),

@@ -119,7 +119,7 @@ def fix_scale(
     """
     if not capture.lengths:
         raise InputError(
-            "the capture contains no reference length, so the scale cannot be fixed; add a reference length "
+            "the capture contains no reference length, so the scale cannot be determined; add a reference length "
             "between two of its sockets."
         )
     check_finite(arm=arm, capture=capture)

@@ -32,7 +32,7 @@ def _levels_of(natural: int) -> BeforeValidator:
 def _different(levels: list) -> list:
     for i, level in enumerate(levels):
         if level in levels[:i]:
-            raise ValueError(f"the level {_label(level)} is given twice; give each level once.")
+            raise ValueError(f"the value {_label(level)} is given twice; give each value once.")
     return levels
 
 

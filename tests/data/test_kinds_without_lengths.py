@@ -220,7 +220,7 @@ def test_a_residual_in_mm_is_the_distance_from_the_line_of_sight():
 
 @pytest.mark.parametrize("units", [("rad", "mm"), ("mm", "rad", "px"), ("deg",)])
 def test_units_that_no_kind_may_have(units):
-    with pytest.raises(TypeError, match="declare those in mm first"):
+    with pytest.raises(TypeError, match="declare the rows in mm first"):
         type("Wrong", (Bearing,), {"row_units": units})
 
 
@@ -341,3 +341,49 @@ def test_a_batch_of_arms_is_evaluated_alike(recording):
     for i, one in enumerate(alone):
         for name in ("rms", "rms_angle", "rms_px", "reduced_chi"):
             np.testing.assert_allclose(getattr(together, name)[i], getattr(one, name), rtol=1e-6)
+
+
+class Exposures(Picture):
+    """Pictures that were exposed several times in each pose: two residuals for each."""
+
+    kind, table = "exposures", "exposures"
+    pixels: Float[AnyArray, "m r"] = declared("column and row of each exposure", "px", "pose", "exposure")
+
+    @property
+    def row_units(self):
+        return ("px",) * self.pixels.shape[1]
+
+    def residual(self, tips, unknowns):
+        rows, count = super().residual(tips, unknowns), self.rows // 2
+        xp = namespace(rows)
+        measured = variances(self.u, self.q.shape[0]) * xp.asarray(np.eye(self.rows))[None]
+        by_unknowns = {name: xp.concatenate([by] * count, axis=1) for name, by in rows.by_unknowns.items()}
+        by_tip, values = (xp.concatenate([array] * count) for array in (rows.by_tip, rows.values + self.seen()))
+        return Rows(values - self.pixels.T, by_tip, by_unknowns, measured)
+
+    def seen(self):
+        return self.pixels[:, :2].T
+
+
+@pytest.mark.parametrize("kind", ["picture"], indirect=True, scope="module")
+def test_a_pose_may_have_more_residuals_than_its_tip_has_coordinates(recording):
+    """Ten exposures of each pose count as one whose variance is a tenth."""
+    random, once, several = np.random.default_rng(0), [], []
+    for sight in recording.capture.observations:
+        pixels = np.asarray(sight.pixels)[:, None] + 0.3 * random.normal(size=(len(sight.q), 10, 2))
+        several.append(Exposures(sight.name, sight.q, pixels.reshape(len(pixels), -1), u=0.3))
+        once.append(Picture(sight.name, sight.q, pixels.mean(axis=1), u=0.3 / np.sqrt(10)))
+    bounds, found, unseen = recording.nominal.bounds(), [], []
+    for observations in (once, several):
+        capture = aj.Capture(recording.capture.sockets, recording.capture.lengths, observations)
+        found.append(aj.calibrate(recording.nominal.arm, capture, bounds, noise=NOISE))
+        assert bool(found[-1].converged)
+        # Compared with the same poses, as if they were others.
+        unseen.append(aj.calibration.unseen_errors(aj.uncertainty_of(found[-1]), capture).of(["left", "right"]))
+    np.testing.assert_allclose(found[0].parameters, found[1].parameters, atol=1e-6)
+    covariances = [result.parameter_covariance.matrix for result in found]
+    np.testing.assert_allclose(*covariances, rtol=1e-3, atol=1e-9 * np.abs(covariances[0]).max())
+    np.testing.assert_allclose(found[1].observed.reduced_chi[-2:], 1.0, atol=0.15)
+    np.testing.assert_allclose(found[0].observed.rms_after, found[1].observed.rms_after, rtol=1e-3)
+    for name in ("count", "rms", "predicted"):
+        assert getattr(unseen[0], name) == pytest.approx(getattr(unseen[1], name), rel=1e-3)

@@ -277,8 +277,8 @@ PATTERN = '[[socket]]\nname = "{place}"\nfile = "{place}.csv"\n'
             ["socket 1.files: 'a.csv' is given twice"],
         ),
         (SMALL.replace('"a.csv"', '"a.csv"\nname = ""'), ["a socket has the name ''"]),
-        (SMALL.replace("rad", "counts"), ["angles", "counts_per_turn and unit = 'counts' need each other"]),
-        (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "need each other"]),
+        (SMALL.replace("rad", "counts"), ["angles", "counts_per_turn and unit = 'counts' are only possible together"]),
+        (SMALL.replace(SOCKET, "counts_per_turn = 9\n" + SOCKET), ["angles", "only possible together"]),
         (
             SMALL.replace('"rad"', '"counts"\ncounts_per_turn = [9, 9]'),
             ["angles.counts_per_turn has 2 values", "6 joints"],

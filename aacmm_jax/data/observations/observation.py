@@ -271,7 +271,8 @@ def _check_row_units(name: str, units: tuple[str, ...]) -> None:
     others = units[units.count("mm") :]
     if "mm" in others or len(set(others)) > 1 or not set(others) <= set(OTHER_UNITS):
         raise TypeError(
-            f"row_units of {name} are {units}; declare those in mm first, then others that are all in rad or all in px."
+            f"row_units of {name} are {units}; declare the rows in mm first, followed by rows that are all in rad or "
+            "all in px."
         )
 
 
