@@ -5,7 +5,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration import sampling
-from aacmm_jax.calibration.prediction import CrossValidation, LeftOut
+from aacmm_jax.calibration.agreement import CrossValidation, LeftOut
 from aacmm_jax.calibration.sampling import numerical_tolerance
 from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.pipeline.cross_validation import groups_of
