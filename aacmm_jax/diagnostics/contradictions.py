@@ -12,6 +12,7 @@ from ..core.errors import InputError
 from ..core.units import DEG
 from ..data.capture import Capture, names_in, part_of
 from ..data.observations.held import Socket
+from .culprits import culprits_of
 from .equations import EXACT, PROBE, Block, Equations, GroupTest, Rows, contradicting_groups, different_groups, fit_of
 from .findings import Case, Finding, case_of, chance_text
 
@@ -168,7 +169,7 @@ def contradictions_of(record: CalibrationRecord) -> list[Contradiction]:
 
 
 def _contradictions(case: Case) -> list[Contradiction]:
-    equations, kinds = case.equations, groupings(case.record.recording.capture)
+    equations, kinds = without_bad_poses(case), groupings(case.record.recording.capture)
     best: list[list[GroupTest]] = []
     kind, labels = "", {}
     for candidate, groups in kinds.items():
@@ -184,6 +185,15 @@ def _contradictions(case: Case) -> list[Contradiction]:
     contradictions = [Contradiction(kind, tuple(_suspect(equations, labels, test) for test in group)) for group in best]
     negligible = contradictions and contradictions[0].suspects[0].rms_others[0] < EXACT
     return [] if negligible else contradictions
+
+
+def without_bad_poses(case: Case) -> Equations:
+    """The equations without single poses that explain the residuals: no group is wrong because one of its poses is."""
+    bad = [culprit.number for culprit in culprits_of(case) if culprit.kind == "pose"]
+    if not bad:
+        return case.equations
+    rows = [part.at(~np.isin(part.poses, bad)) for part in case.equations.rows]
+    return case.equations._replace(rows=[part for part in rows if len(part.poses)])
 
 
 def _different(
@@ -227,7 +237,8 @@ def _cause(equations: Equations, members: Sequence[str]) -> Cause | None:
     apart = sum(fit_of([block for block in blocks if block.group in (group, None)]).cost for group in ("", "members"))
     contradicted = max(whole.cost - apart, 1e-300)
     best = None
-    for names in (*((name,) for name in equations.extra if name not in PROBE), PROBE):
+    joints = equations.extra.index(PROBE[0])
+    for names in (*((name,) for name in equations.extra[:joints]), PROBE):
         fitted = fit_of(equations.blocks(members, names))
         added = whole.degrees_of_freedom - fitted.degrees_of_freedom
         gain, variance = whole.cost - fitted.cost, max(fitted.cost / max(fitted.degrees_of_freedom, 1), 1e-300)

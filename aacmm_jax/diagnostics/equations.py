@@ -21,7 +21,7 @@ from ..calibration.task import without_lengths
 from ..core.distributions import f_tail
 from ..core.numpy_or_jax import to_numpy
 from ..data.noise import Noise
-from ..kinematics.arm import by_joint, is_length, value_of
+from ..kinematics.arm import by_joint, is_length, parameter_names, value_of, without_corrections
 from ..kinematics.parameters import Parameters
 from ..model.observed import Observed
 from ..uncertainty.linearisation import Linearisation
@@ -209,6 +209,14 @@ class Rows(NamedTuple):
         """Some of the poses."""
         return Rows(self.name, *(part[poses] for part in self[1:]))
 
+    def whitened(self, covariance: Float[np.ndarray, "m r r"]) -> "Rows":
+        """The same poses in standard deviations of another noise, whose covariance is given in those of the present."""
+        factor = np.linalg.cholesky(0.5 * (covariance + covariance.swapaxes(1, 2)))
+        root = np.linalg.inv(factor)
+        columns = {name: root @ getattr(self, name) for name in ("shared", "private", "extra", "by_tip")}
+        residual = np.einsum("mab,mb->ma", root, self.residual)
+        return self._replace(residual=residual, in_mm=self.in_mm @ factor, **columns)
+
     def squares(self, step: Float[np.ndarray, " s"]) -> Float[np.ndarray, " m"]:
         """Squared distance of each pose from the geometry, mm^2, after a step; its own geometry follows."""
         moved = self.residual + self.shared @ step
@@ -222,7 +230,7 @@ class Equations(NamedTuple):
 
     rows: list[Rows]  # of the observations, sockets first; sockets with one pose are not among them
     relations: list[Block]  # of reference lengths and certified values, which belong to no group
-    extra: tuple[str, ...]  # zeros of the joints, and the probe
+    extra: tuple[str, ...]  # zeros of the joints, the probe, and the other parameters that are fixed
     steps: Float[np.ndarray, " e"]  # their natural steps, rad and mm
 
     def blocks(self, members: Sequence[str] = (), names: Sequence[str] = ()) -> list[Block]:
@@ -240,6 +248,8 @@ def equations_of(record: CalibrationRecord) -> Equations:
     """The equations of a calibration, linear at its solution; as weighted by its robust loss."""
     kinds = by_joint(record.calibrated.arm, "theta", "d")  # where a reading is added
     extra = (*(f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)), *PROBE)
+    every_name = parameter_names(without_corrections(record.calibrated.arm))
+    extra += tuple(name for name in every_name if name not in (*record.names, *extra))
     in_solve = lengths_in_solve(record)
     # The length that the equations keep: none where anything but repeatability says what the scale is.
     scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)

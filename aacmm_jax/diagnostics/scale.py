@@ -19,6 +19,7 @@ from ..core.text import shorten
 from ..core.units import INCH, M
 from ..model.observed import Observed
 from ..uncertainty.shared_kinds import PLACES
+from .culprits import culprits_of
 from .equations import EXACT, LEAST_U, PRIOR, Block, Rows, lengths_in_solve, linearisation_of, scale_anchor_of
 from .findings import Case, Finding, chance_text
 from .residual_tests import LEVEL, consistency
@@ -120,7 +121,8 @@ def _of_k(record: CalibrationRecord) -> Finding | None:
 
 def _of_lengths(case: Case) -> Finding | None:
     lengths = case.once(lengths_of)
-    if lengths is None or lengths.probability >= LEVEL:
+    named = any(culprit.kind == "certified" for culprit in culprits_of(case))
+    if lengths is None or lengths.probability >= LEVEL or named:
         return None
     kinds = set() if case.record.shared is None else set(case.record.shared.kinds)
     odd = ""
