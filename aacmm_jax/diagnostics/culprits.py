@@ -133,7 +133,9 @@ class _Search:
     def __init__(self, case: Case):
         self.case, (self.rows, self.relations) = case, case.chunks
         self.names = pose_names(case.record.recording.capture)[0]
-        self.causes = [*_of_functions(case), *_of_certified(case)]
+        self.causes, parameters = [*_of_functions(case), *_of_certified(case)], _of_parameters(case)
+        self.anchor = [cause for cause in parameters if cause.name == case.equations.anchor]
+        self.parameters = [cause for cause in parameters if cause not in self.anchor] + self.anchor
         self.noises = _of_noise(case, self.rows)
         self.added: list[Callable[[], Float[np.ndarray, "R c"]]] = []  # columns of the causes that were chosen
         self.chosen: list[tuple[_Result, list[_Result]]] = []
@@ -144,6 +146,7 @@ class _Search:
         """By the rows as they are weighted now."""
         self.left = Residuals.of([*(part.block("") for part in self.rows), *self.relations])
         self.candidates = Candidates.of(self.left, [self._columns(cause) for cause in self.causes])
+        self.fixed = Candidates.of(self.left, [self._columns(cause) for cause in self.parameters])
         for columns in self.added:
             self._extend(columns())
 
@@ -151,6 +154,7 @@ class _Search:
         before = self.left.basis.shape[1]
         self.left = self.left.extended(columns)
         self.candidates = self.candidates.less(self.left.basis[:, before:])
+        self.fixed = self.fixed.less(self.left.basis[:, before:])
 
     def _columns(self, cause: _Cause) -> Float[np.ndarray, "R _"]:
         of_relations = sum(len(block.residual) for block in self.relations)
@@ -160,6 +164,16 @@ class _Search:
         column = np.zeros((len(self.case.left.values), 1))
         column[len(column) - of_relations + cause.row] = 1.0
         return column
+
+    def _at_this_scale(self) -> Candidates:
+        """Fixed parameters, less what the scale anchor does: with both free, the arm could shrink, and with it its
+        residuals."""
+        if not self.anchor:
+            return self.fixed
+        whole = self.fixed.projected
+        anchor = whole[:, -1:]
+        others = whole - anchor @ (anchor.T @ whole) / max(float(np.sum(anchor**2)), 1e-300)
+        return self.fixed._replace(parts=self.fixed.parts[:-1], projected=others)
 
     def _of_pose(self, number: int) -> Float[np.ndarray, "R r"]:
         """Columns with which a pose agrees whatever its residuals are."""
@@ -219,10 +233,7 @@ class _Search:
         """Add the best cause to the model."""
         cause = best.cause
         if cause.of_noise is None:
-            number = cause.row
-            self.added.append(
-                (lambda: self._of_pose(number)) if cause.kind == "pose" else (lambda: self._columns(cause))
-            )
+            self.added.append(self._adding(cause))
             self._extend(self.added[-1]())
             return
         along, whitened = cause.of_noise, []
@@ -233,16 +244,32 @@ class _Search:
         self.rows = whitened
         self._begin()
 
+    def _adding(self, cause: _Cause) -> Callable[[], Float[np.ndarray, "R c"]]:
+        """The columns that a cause adds to the model, also where rows are weighted anew."""
+        if cause.kind == "pose":
+            return lambda: self._of_pose(cause.row)
+        if cause.kind != "fixed" or not self.anchor:
+            return lambda: self._columns(cause)
+        number, lengths = self.parameters.index(cause), self.fixed.lengths
+        of_cause, of_anchor = self.fixed.projected[:, number], self.fixed.projected[:, -1]
+        part = float(of_cause @ of_anchor) / max(float(of_anchor @ of_anchor), 1e-300)
+        part *= lengths[number] / lengths[-1]
+        return lambda: self._columns(cause) - part * self._columns(self.anchor[0])
+
     def _results(self) -> list[_Result]:
         """All significant causes."""
-        tests = self.candidates.tests(self.left, self.least)
+        causes = [*self.causes, *self.parameters[: len(self.parameters) - len(self.anchor)]]
+        tests = [
+            *self.candidates.tests(self.left, self.least),
+            *self._at_this_scale().tests(self.left, self.least),
+        ]
         number: dict[str, int] = {}
-        for cause, test in zip(self.causes, tests, strict=True):
+        for cause, test in zip(causes, tests, strict=True):
             number[cause.family] = number.get(cause.family, 0) + (test.degrees_of_freedom[0] > 0)
         results = []
-        for cause, test in zip(self.causes, tests, strict=True):
+        for cause, test in zip(causes, tests, strict=True):
             probability = test.probability * number[cause.family]
-            if probability < (LEVEL if cause.family == "function" else _LEVEL):
+            if test.degrees_of_freedom[0] and probability < (LEVEL if cause.family == "function" else _LEVEL):
                 results.append(self._of_columns(cause, test, number[cause.family]))
         poses = [
             studentised(part, self.left, rows, private)
@@ -315,10 +342,12 @@ class _Search:
         if terms:
             # All together, by the equations as they were weighted last, with the other causes.
             rest = Residuals.of([*(part.block("") for part in self.rows), *self.relations])
-            for (result, _), columns in zip(self._of_mean(), self.added, strict=True):
+            mean, each = [result for result, _ in self.chosen if result.cause.of_noise is None], []
+            for result, adding in zip(mean, self.added, strict=True):
                 if result.cause.term is None:
-                    rest = rest.extended(columns())
-            each = [self._columns(result.cause) for result in terms]
+                    rest = rest.extended(adding())
+                else:
+                    each.append(adding())
             (together,) = Candidates.of(rest, [np.concatenate(each, axis=1)]).tests(rest, self.least)
             parts = np.split(together.coefficients, np.cumsum([columns.shape[1] for columns in each])[:-1])
             coefficients = {id(result): part for result, part in zip(terms, parts, strict=True)}
@@ -332,9 +361,6 @@ class _Search:
             culprit = Culprit(cause.kind, cause.name, result.probability, part)
             culprits.append(self._in_words(culprit, result, alike, coefficients.get(id(result), np.zeros(0))))
         return tuple(culprits)
-
-    def _of_mean(self) -> list[tuple[_Result, list[_Result]]]:
-        return [pair for pair in self.chosen if pair[0].cause.of_noise is None]
 
     def _in_words(
         self, culprit: Culprit, result: _Result, alike: Sequence[_Result], coefficient: np.ndarray
@@ -409,20 +435,26 @@ def studentised(part: Rows, left: Residuals, rows: slice, private: Float[np.ndar
 
 
 def _of_functions(case: Case) -> list[_Cause]:
-    """Causes that are functions of readings and of the order of the poses, and fixed parameters."""
+    """Causes that are functions of the readings, and of the order of the poses."""
     arm, capture = case.record.calibrated.arm, case.record.recording.capture
     q = np.asarray(capture.readings)
     functions = missing_terms(arm, q)
     gravity = [term for term in functions if term.kind == "gravity"]
-    fixed = fixed_parameters(case.equations.extra, case.record.names, arm.joints, len(q))
     families = {
         "function": functions,
         "step": steps(arm, capture, gravity),
         "seat": shifted_seats(capture),
         "coupling": couplings(arm, q),
     }
-    of_terms = [_Cause("term", family, term.concerns, term) for family, terms in families.items() for term in terms]
-    return [*of_terms, *(_Cause("fixed", "fixed", term.concerns, term) for term in fixed)]
+    return [_Cause("term", family, term.concerns, term) for family, terms in families.items() for term in terms]
+
+
+def _of_parameters(case: Case) -> list[_Cause]:
+    """Parameters that are no unknowns: those that are fixed, and the scale anchor."""
+    free = [name for name in case.record.names if name != case.equations.anchor]
+    joints, poses = case.record.calibrated.arm.joints, len(np.asarray(case.record.recording.capture.readings))
+    terms = fixed_parameters(case.equations.extra, free, joints, poses)
+    return [_Cause("fixed", "fixed", term.concerns, term) for term in terms]
 
 
 def _of_certified(case: Case) -> list[_Cause]:

@@ -230,8 +230,9 @@ class Equations(NamedTuple):
 
     rows: list[Rows]  # of the observations, sockets first; sockets with one pose are not among them
     relations: list[Block]  # of reference lengths and certified values, which belong to no group
-    extra: tuple[str, ...]  # zeros of the joints, the probe, and the other parameters that are fixed
+    extra: tuple[str, ...]  # zeros of the joints, the probe, and other parameters that are no unknowns
     steps: Float[np.ndarray, " e"]  # their natural steps, rad and mm
+    anchor: str | None  # the length among these that is kept, because with it the arm and its residuals could shrink
 
     def blocks(self, members: Sequence[str] = (), names: Sequence[str] = ()) -> list[Block]:
         """All in one group; with some of ``extra`` as unknowns that only certain observations have."""
@@ -248,13 +249,13 @@ def equations_of(record: CalibrationRecord) -> Equations:
     """The equations of a calibration, linear at its solution; as weighted by its robust loss."""
     kinds = by_joint(record.calibrated.arm, "theta", "d")  # where a reading is added
     extra = (*(f"{kind}_{i}" for i, kind in enumerate(kinds, start=1)), *PROBE)
-    every_name = parameter_names(without_corrections(record.calibrated.arm))
-    extra += tuple(name for name in every_name if name not in (*record.names, *extra))
     in_solve = lengths_in_solve(record)
     # The length that the equations keep: none where anything but repeatability says what the scale is.
     scaled = record.prior is not None or any(o.fixes_scale for o in record.recording.capture.observations)
     anchor = None if in_solve else record.hold if scaled else scale_anchor_of(record)
     names = tuple(name for name in record.names if name != anchor)
+    of_arm = parameter_names(without_corrections(record.calibrated.arm))
+    extra += tuple(name for name in of_arm if name not in (*names, *extra))
     every = (*names, *(name for name in extra if name not in names))
     linear = linearisation_of(record, every, noise=record.noise, lengths=in_solve)
     observed, p, free = linear.observed, len(every), len(names)
@@ -302,7 +303,7 @@ def equations_of(record: CalibrationRecord) -> Equations:
         by = np.eye(len(chosen))[stated] * (weight * steps[:free])[stated][:, None]
         relations.append(Block(PRIOR, None, residual, by, np.zeros((len(stated), 0))))
     natural = np.array([1.0 if is_length(name) else 1e-3 for name in extra])
-    return Equations(rows, relations if len(u) else relations[1:], extra, natural)
+    return Equations(rows, relations if len(u) else relations[1:], extra, natural, anchor)
 
 
 def in_chunks(equations: Equations) -> tuple[list[Rows], list[Block]]:
