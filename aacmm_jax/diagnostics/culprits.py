@@ -139,6 +139,7 @@ class _Search:
         self.noises = _of_noise(case, self.rows)
         self.added: list[Callable[[], Float[np.ndarray, "R c"]]] = []  # columns of the causes that were chosen
         self.chosen: list[tuple[_Result, list[_Result]]] = []
+        self.sizes: dict[str, int] = {}  # causes of each family
         self.least = _SECOND_ORDER * float(np.sqrt(case.left.cost))
         self._begin()
 
@@ -199,6 +200,7 @@ class _Search:
             best, *others = sorted(results, key=lambda result: -result.criterion)
             if best.cause.kind != "pose" and sum(r.cause.kind != "pose" for r, _ in self.chosen) >= MOST_CAUSES:
                 break
+            best = self._at_its_pose(best)
             alike = [other for other in others if other.criterion > best.criterion - _AS_WELL]
             self.chosen.append((best, alike))
             added = 1 if best.test is None else best.test.degrees_of_freedom[0]
@@ -263,9 +265,9 @@ class _Search:
             *self.candidates.tests(self.left, self.least),
             *self._at_this_scale().tests(self.left, self.least),
         ]
-        number: dict[str, int] = {}
+        number = self.sizes = dict.fromkeys((cause.family for cause in causes), 0)
         for cause, test in zip(causes, tests, strict=True):
-            number[cause.family] = number.get(cause.family, 0) + (test.degrees_of_freedom[0] > 0)
+            number[cause.family] += test.degrees_of_freedom[0] > 0
         results = []
         for cause, test in zip(causes, tests, strict=True):
             probability = test.probability * number[cause.family]
@@ -276,6 +278,22 @@ class _Search:
             for part, rows, private in zip(self.rows, self.left.slices, self.left.private, strict=False)
         ]
         return [*results, *self._bad_poses(poses), *self._noisy(poses)]
+
+    def _at_its_pose(self, best: _Result) -> _Result:
+        """A step at the pose of all near it where it explains most."""
+        term, case = best.cause.term, self.case
+        if term is None or term.first < 0:
+            return best
+        arm, capture = case.record.calibrated.arm, case.record.recording.capture
+        if best.cause.family == "seat":
+            terms = shifted_seats(capture, term)
+        else:
+            gravity = [t for t in missing_terms(arm, np.asarray(capture.readings)) if t.kind == "gravity"]
+            terms = steps(arm, capture, gravity, term)
+        causes = [best.cause._replace(term=near) for near in terms]
+        tests = Candidates.of(self.left, [self._columns(cause) for cause in causes]).tests(self.left, self.least)
+        cause, test = max(zip(causes, tests, strict=True), key=lambda pair: pair[1].gain)
+        return self._of_columns(cause, test, self.sizes[cause.family])
 
     def _of_columns(self, cause: _Cause, test: ScoreTest, number: int) -> _Result:
         share, freedom = test.gain / self.left.cost, self.left.degrees_of_freedom

@@ -36,36 +36,44 @@ def pose_names(capture: Capture) -> tuple[list[str], list[str], list[str]]:
     return names, owners, places
 
 
-def steps(arm: Arm, capture: Capture, gravity: Sequence[MissingTerm]) -> list[MissingTerm]:
+def steps(
+    arm: Arm, capture: Capture, gravity: Sequence[MissingTerm], near: MissingTerm | None = None
+) -> list[MissingTerm]:
     """What may change from one pose to the next: zeros, the base or an instrument, the probe, and the load; ``gravity``
-    are the functions of the load."""
+    are the functions of the load. Steps at poses that are evenly chosen, or at all poses ``near`` that of another."""
     arm, q = to_numpy(arm), np.asarray(capture.readings)
     forward, (names, _, _) = forward_pass(arm.geometry, joint_motion(arm.geometry, q)), pose_names(capture)
     turned = np.stack([np.moveaxis(np.asarray(axis), 0, -1).reshape(-1, 3) for axis in forward.frame], axis=2)
     terms = []
-    for first in np.unique(np.linspace(_FEWEST, len(q) - _FEWEST, _STEPS).astype(int)):
-        if not 0 < first < len(q):
-            continue
+    places = np.unique(np.linspace(_FEWEST, len(q) - _FEWEST, _STEPS).astype(int))
+    if near is not None:
+        between = len(q) // _STEPS + 1
+        places = np.arange(near.first - between, near.first + between + 1)
+    for first in (int(place) for place in places if 0 < place < len(q)):
         later, after = (np.arange(len(q)) >= first).astype(float)[:, None], f"from {names[first]} on"
         for joint in range(1, arm.joints + 1):
             follows, concerns = f"a step of the zero of joint {joint} {after}", f"joint {joint}"
-            cause = "a zero offset that slips"
-            terms.append(MissingTerm("slipped zero", joint, later, follows=follows, cause=cause, concerns=concerns))
+            term = MissingTerm("slipped zero", joint, later, follows=follows, concerns=concerns, first=first)
+            terms.append(term._replace(cause="a zero offset that slips"))
         for kind, columns, follows, cause in (
             ("moved base", np.eye(3)[None], "a step of the tip", "a base, artefact or instrument that was moved"),
             ("moved probe", turned, "a step of the probe in the last frame", "a probe or target that was displaced"),
         ):
             columns = later[:, :, None] * columns
-            terms.append(MissingTerm(kind, None, columns, follows=f"{follows} {after}", cause=cause))
+            terms.append(MissingTerm(kind, None, columns, follows=f"{follows} {after}", cause=cause, first=first))
         for load in gravity:
             follows = f"a change of the load on joint {load.joint} {after}"
             cause = "a payload that was put on or taken off"
-            terms.append(load._replace(kind="payload", values=later * load.values, follows=follows, cause=cause))
-    return terms
+            loaded = load._replace(kind="payload", values=later * load.values, first=first)
+            terms.append(loaded._replace(follows=follows, cause=cause))
+    if near is None:
+        return terms
+    return [term for term in terms if (term.kind, term.concerns) == (near.kind, near.concerns)]
 
 
-def shifted_seats(capture: Capture) -> list[MissingTerm]:
-    """A step of the tip within one socket, or within one hole or other place of an artefact."""
+def shifted_seats(capture: Capture, near: MissingTerm | None = None) -> list[MissingTerm]:
+    """A step of the tip within one socket, or within one hole or other place of an artefact: at some of its poses, or
+    at every pose of the place of another one that is ``near``."""
     names, owners, places = pose_names(capture)
     terms, labels = [], np.array(places)
     distinct = list(dict.fromkeys(places))
@@ -73,13 +81,14 @@ def shifted_seats(capture: Capture) -> list[MissingTerm]:
         return []
     for place in distinct:
         poses = np.flatnonzero(labels == place)
-        last = len(poses) - _FEWEST_OF_GROUP
-        for first in np.unique(np.linspace(_FEWEST_OF_GROUP, last, _STEPS_OF_GROUP).astype(int)):
-            if not 0 < first < len(poses) or last < _FEWEST_OF_GROUP:
-                continue
+        last, number = len(poses) - _FEWEST_OF_GROUP, _STEPS_OF_GROUP if near is None else len(poses)
+        if last < _FEWEST_OF_GROUP or (near is not None and near.first not in poses):
+            continue
+        for first in np.unique(np.linspace(_FEWEST_OF_GROUP, last, number).astype(int)):
             later = np.isin(np.arange(len(labels)), poses[first:]).astype(float)
             follows = f"a step of {place} from {names[poses[first]]} on, as if it had moved"
             term = MissingTerm("shifted seat", None, later[:, None, None] * np.eye(3), follows=follows)
+            term = term._replace(first=int(poses[first]))
             cause = "a seat or artefact that shifts"
             terms.append(term._replace(cause=cause, concerns=owners[poses[0]]))
     return terms

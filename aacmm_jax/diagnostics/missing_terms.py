@@ -45,6 +45,7 @@ class MissingTerm(NamedTuple):
     cause: str = ""  # what causes that
     concerns: str = "tip"  # the joint, socket or observation
     column: int | None = None  # of `Rows.extra`, where that is not the joint's
+    first: int = -1  # pose from which on it applies, of a step
     correction: tuple[str, str] | None = None  # model and option of the joint correction that describes it
 
     @property
