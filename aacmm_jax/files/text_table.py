@@ -41,9 +41,9 @@ class TextTable:
     A name that the header does not have exactly is compared without regard to case, blanks and a unit in brackets.
     A header is a line of words before the first row: none of them begins like a number.
 
-    ``delimiter`` and ``decimal`` are found where they are None; ``skip`` lines before the header are left out; of several lines of words,
-    the header is the one that has the columns that are ``wanted``. Raises `InputError` where the file is no text, its
-    rows differ in their number of columns, or several lines may be its header.
+    ``delimiter`` and ``decimal`` are found where they are None; ``skip`` lines before the header are left out; of
+    several lines of words, the header is the one that has the columns that are ``wanted``. Raises `InputError` where
+    the file is no text, its rows differ in their number of columns, or several lines may be its header.
     """
 
     def __init__(

@@ -353,7 +353,8 @@ def test_the_robots_own_files(tmp_path, mark):
     (tmp_path / "c.csv").write_text("\n".join(lines) + "\n")
     (tmp_path / "capture.toml").write_text('arm = "ur10"\n[[points]]\nfile = "c.csv"\npreset = "ipa"\n')
     (seen,) = aj.files.read_manifest(tmp_path / "capture.toml").capture.observations
-    assert np.array_equal(seen.q, Q) and np.array_equal(seen.points, P)
+    assert np.array_equal(seen.q, Q)
+    assert np.array_equal(seen.points, P)
     assert np.allclose(np.sqrt(np.einsum("mii->mi", seen.covariance)), U)
 
 
