@@ -21,8 +21,8 @@ from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.degrees_of_freedom import Components
+from .agreement import CrossValidation
 from .evaluation import Evaluation, evaluate
-from .prediction import CrossValidation
 from .results import (
     Calibration,
     Identification,
@@ -123,6 +123,7 @@ class CalibrationRecord(NamedTuple):
     shared: SharedErrors | None = None  # shared errors, likewise
     components: Components | None = None  # parts of the covariance that do not rest on the scatter of single poses
     surplus_k: float = 0.0  # of u_k^2, by lengths that disagree
+    decisions: tuple[str, ...] = ()  # what was decided by default, a sentence each
 
     @property
     def given_noise(self) -> Noise | None:

@@ -170,7 +170,8 @@ class AbstractSingleResult(AbstractResult):
         fitted, prior = self.stage1.fitted_degrees_of_freedom, self.prior
         if prior is None:
             return max(fitted, 1.0)
-        spared = sum(prior.parameters) - namespace(prior.effective).sum(prior.effective)
+        effective = np.asarray(prior.effective) if is_concrete(prior.effective) else prior.effective
+        spared = sum(prior.parameters) - namespace(effective).sum(effective)  # NumPy compiles nothing
         if is_concrete(spared) and np.ndim(spared) == 0:
             return max(fitted + float(spared), 1.0)
         return namespace(spared).maximum(fitted + spared, 1.0)

@@ -108,7 +108,7 @@ def _check_evaluation(
             )
         return
     if not same_arm(record.calibrated.arm, evaluation.calibrated.arm):
-        raise InputError("the evaluation is of another calibration; evaluate this calibration.")
+        raise InputError("the evaluation belongs to another calibration; run aacmm evaluate with this calibration.")
     simulated |= evaluation.recording.true is not None
     tests = evaluation.acceptance()["calibrated"]
     decision = worst([test.decision for test in tests if test.decision is not None])

@@ -262,8 +262,8 @@ def _determined(summary: dict[str, Any]) -> View:
     """What data can and cannot determine of the arm."""
     yield [
         "\n",
-        Styled("Redundant"),
-        f" parameters, which no data determine (of {summary['parameters']} parameters in total):",
+        Styled("Redundant parameters"),
+        f" (no data can determine them one by one; the arm has {summary['parameters']} parameters in total):",
     ]
     yield from (f"  {text}" for text in summary["redundant"])
     if summary["weak"]:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import typer
 
-from .. import data, files, kinematics, pipeline, plot, summaries
+from .. import data, files, pipeline, plot, summaries
 from ..core.errors import IdentifiabilityWarning, InputError
 from ..core.units import DEG
 from ..files.hdf5 import read_tables
@@ -42,7 +42,8 @@ def calibrate(
     ),
     model: str | None = option(
         "Model these non-geometric errors of the joints, for example dh,gravity,harmonics=1+2,gear,coupled=2-3; dh "
-        "alone includes none of them. Default: the model of the arm file.",
+        "alone includes none of them. Default: the model of the arm file; if it has none, the model that predicts "
+        "held-out regions best.",
         "KINDS",
     ),
     prior: str | None = option(
@@ -113,7 +114,12 @@ def calibrate(
     ),
     remove_contradicting: bool = flag(
         "--remove-contradicting",
-        "Leave out a socket, placement or station that contradicts all others, and report the effect on the result.",
+        "Leave out a socket, placement or station that contradicts all others, even with --no-automatic.",
+    ),
+    automatic: bool = option(
+        "Widen default bounds that the fit reaches, leave out groups that contradict all others, and choose the model "
+        "of the joints that predicts held-out regions best. What is stated by options or the arm file stays as stated.",
+        default=True,
     ),
     figure: Path | None = option("Plot the residual of every pose to this file (.png, .svg or .pdf).", "FILE"),
     max_steps: int = option(
@@ -128,11 +134,13 @@ def calibrate(
     sessions of one arm.
     """
     from ..diagnostics.usability import does_not_fit
-    from ..files.arm_tables import with_model
+    from ..files.arm_tables import prior_of_text, with_model
     from ..pipeline.capture_calibration import calibrate_capture
 
     # Options that have the name and the values of an argument of `calibrate_capture` are passed as they are.
-    alike = {name: value for name, value in locals().items() if name in pipeline.CaptureOptions._fields}
+    alike = {
+        name: value for name, value in locals().items() if name in pipeline.CaptureOptions._fields and name != "prior"
+    }
     chosen = pipeline.CaptureOptions(**alike)._replace(
         hold=None if hold == "none" else hold,
         noise=_known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
@@ -147,11 +155,10 @@ def calibrate(
         recording = _recording(capture, same_probe)
         recording = recording._replace(capture=recording.capture.select(only or None, without or ()))
         nominal = recording.nominal if model is None else with_model(recording.nominal, model)
-        fixed = nominal.held if held is None else names_option(held)
-        freed = [*(name for name in nominal.free if name not in (fixed or ())), *names_option(free or "")]
-        nominal = nominal._replace(held=fixed, free=tuple(dict.fromkeys(freed)))
+        nominal = _with_parameters(nominal, held, free)
         nominal = _bounded(nominal, length_bound_mm, angle_bound_deg, bound or [])
-        chosen = chosen._replace(prior=_prior(nominal, prior, model))
+        if prior is not None:
+            chosen = chosen._replace(prior=prior_of_text(prior, nominal.arm))
         record = calibrate_capture(recording._replace(nominal=nominal), **chosen._asdict())
         summary = summaries.calibration.calibration_summary(record)
         files.save_calibration(output, record, summary)
@@ -178,6 +185,18 @@ def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
     return pipeline.join_recordings(sessions, same_probe=same_probe)
 
 
+def _with_parameters(nominal: Any, held: str | None, free: str | None) -> Any:
+    """The arm with the parameters that the command line fixes and frees; what is freed there, its file may fix."""
+    if held is None and free is None:
+        return nominal
+    freed = names_option(free or "")
+    fixed = nominal.held if held is None else names_option(held)
+    if fixed is not None and held is None:
+        fixed = tuple(name for name in fixed if name not in freed)
+    freed = [*(name for name in nominal.free if name not in (fixed or ())), *freed]
+    return nominal._replace(held=fixed, free=tuple(dict.fromkeys(freed)), stated=tuple({*nominal.stated, "parameters"}))
+
+
 def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bounds: Sequence[str]) -> Any:
     """The arm with the bounds of its parameters, as its file or the command line says."""
     from ..kinematics.arm import is_length
@@ -185,21 +204,13 @@ def _bounded(nominal: Any, length_mm: float | None, angle_deg: float | None, bou
     widths = options.numbers_by_name("--bound", bounds, "NAME=WIDTH, in mm or deg", 1)
     of_bounds = {name: width if is_length(name) else width * DEG for name, (width,) in widths.items()}
     identified = nominal.space().names
+    by_hand = bool(bounds) or length_mm is not None or angle_deg is not None
     return nominal._replace(
+        stated=tuple({*nominal.stated, "bounds"}) if by_hand else nominal.stated,
         length=nominal.length if length_mm is None else length_mm,
         angle=nominal.angle if angle_deg is None else angle_deg * DEG,
         override={name: width for name, width in nominal.override.items() if name in identified} | of_bounds,
     )
-
-
-def _prior(nominal: Any, text: str | None, model: str | None) -> Any:
-    """The prior that the command line states; else that of the arm's file, or the default one of a model of joints."""
-    if text is not None:
-        from ..files.arm_tables import prior_of_text
-
-        return prior_of_text(text, nominal.arm)
-    of_model = nominal.prior is None and model is not None and nominal.arm.corrections is not None
-    return kinematics.default_prior(nominal.arm) if of_model else nominal.prior
 
 
 def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_encoder_mm: float | None) -> Any:

@@ -25,7 +25,7 @@ def demo(
     seed: int = seed("the noise"),
     as_json: bool = options.JSON,
 ) -> None:
-    """Calibrate a simulated arm and compare the result with the true arm.
+    """Calibrate a simulated arm whose true errors are known.
 
     The simulated arm is that of Cheng et al. 2018, with realistic noise.
     """

@@ -116,6 +116,7 @@ def calibration(summary: dict[str, Any]) -> View:
     yield from words.verdict_of(summary)
     if summary.get("lengths_tested"):
         yield words.lengths_sentence(summary["lengths_tested"])
+    yield from (f"Decided by default: {decision}" for decision in summary["decisions"])
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
     if summary["scale_k"] is not None:
         u = summary["scale_u"] or 0.0

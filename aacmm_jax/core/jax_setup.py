@@ -62,9 +62,9 @@ def check_x64() -> None:
     check_setting()
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
-            "64-bit floats were turned off after aacmm_jax was imported, and a calibration in float32 is wrong by "
-            "tens of micrometres; leave the block of jax.enable_x64(False), or call "
-            "jax.config.update('jax_enable_x64', True)."
+            "64-bit floats were turned off after aacmm_jax was imported, and a calibration in float32 is wrong by tens "
+            "of micrometres; call aacmm_jax outside jax.enable_x64(False), or call jax.config.update('jax_enable_x64', "
+            "True)."
         )
 
 
@@ -83,10 +83,10 @@ def check_backend() -> None:
         jax.devices()
     except Exception as error:  # a RuntimeError, or an AssertionError where nothing that is named is there
         told = _told()
+        device = f"device for {told}" if told else "device"
+        advice = "remove this setting" if told else "see the message of JAX"
         raise RuntimeError(
-            f"JAX cannot start, because {told or 'JAX'} {'names' if told else 'finds'} no device that this machine "
-            f"and this installation have; {'remove this setting' if told else 'see the message of JAX'}, or set "
-            "JAX_PLATFORMS=cpu."
+            f"JAX cannot start, because this installation of JAX finds no {device}; {advice}, or set JAX_PLATFORMS=cpu."
         ) from error
 
 

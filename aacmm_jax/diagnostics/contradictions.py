@@ -271,7 +271,7 @@ def session_metrics(record: CalibrationRecord) -> dict[str, tuple[int, float, fl
 
 
 def remove_contradicting(
-    record: CalibrationRecord, solve: Callable[[Capture], Calibration | Identification]
+    record: CalibrationRecord, solve: Callable[[Capture], Calibration | Identification | CalibrationRecord]
 ) -> CalibrationRecord:
     """A calibration without the groups that contradict the others, one after the other; as it is where none does.
 
@@ -299,9 +299,11 @@ def remove_contradicting(
         kept = tuple(name for name in names_in(capture) if name not in suspect.members)
         try:
             rest = part_of(capture, kept)
-            again = record_of(solve(rest), record.recording._replace(capture=rest), robust=record.robust)
+            again = solve(rest)
         except InputError:  # what is left does not determine the arm, so nothing can be said without this group
             break
+        if not isinstance(again, CalibrationRecord):
+            again = record_of(again, record.recording._replace(capture=rest), robust=record.robust)
         changed = np.abs(again.vectors()["calibrated"] - record.vectors()["calibrated"])
         u = np.sqrt(np.diag(record.covariance))
         changes = np.where(u > 0, changed / np.where(u > 0, u, 1.0), 0.0)
@@ -318,5 +320,5 @@ def remove_contradicting(
             changed_most=again.names[worst],
             change=float(changes[worst]),
         )
-        record = again._replace(others=record.others, removed=(*record.removed, removed))
+        record = again._replace(others=again.others or record.others, removed=(*record.removed, removed))
     return record

@@ -106,7 +106,7 @@ class CorrectionsTable(Strict):
                 "the coefficients by name."
             )
         if self.nominal and not self.coefficients:
-            raise ValueError("nominal applies only to coefficients, but a model is given; remove nominal.")
+            raise ValueError("the key nominal applies only to coefficients, but a model is given; remove nominal.")
         unknown = set(self.nominal) - {*GEOMETRY}
         if unknown:
             raise ValueError(
@@ -189,7 +189,7 @@ class ArmFile(Strict):
             raise ValueError("base and tip apply only to a URDF, whose links they name; remove both, or give urdf.")
         if self.urdf is not None and self.prismatic:
             raise ValueError(
-                "prismatic applies only to an arm without urdf, because a URDF itself states which of its joints are "
+                "the key prismatic applies only to an arm without urdf, because a URDF states which of its joints are "
                 "prismatic; remove prismatic."
             )
         return self
@@ -220,7 +220,10 @@ class ArmFile(Strict):
         if len({joint.limits is None for joint in self.joint}) > 1:
             raise ValueError("limits are given for some joints only; give limits for all joints or for none.")
         if max(self.prismatic, default=0) > len(self.joint):
-            raise ValueError(f"prismatic names joint {max(self.prismatic)}, but the arm has {len(self.joint)} joints.")
+            raise ValueError(
+                f"prismatic names joint {max(self.prismatic)}, but the arm has {len(self.joint)} joints; correct "
+                "prismatic."
+            )
         if self.prismatic and first.limits is None:
             raise ValueError(
                 f"joint {min(self.prismatic)} is prismatic, but has no limits; give limits for every joint (in "

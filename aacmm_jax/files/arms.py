@@ -18,7 +18,7 @@ from ..kinematics.corrected_arm import loads_of
 from ..kinematics.independence import nearly_parallel
 from ..kinematics.parameters import ArmSpecification, single, with_tool
 from ..uncertainty.target_parameters import determined_parameters
-from .arm_tables import GEOMETRY, ArmFile, NoiseTable
+from .arm_tables import GEOMETRY, ArmFile, Identification, NoiseTable
 from .controllers import read_ur_kinematics
 from .outputs import as_path, storable, write_text
 from .toml import read_toml
@@ -209,9 +209,16 @@ def _specification(path: Path, model: ArmFile, probe: Numbers | None) -> ArmSpec
         length=proposed.length * units["mm"],
         angle=specification.angle if proposed.angle is None else proposed.angle * units["rad"],
         override=widths,
+        stated=() if path.parent == _SHIPPED else _stated(proposed),
     )
     specification.bounds()  # refuses names that the arm does not have
     return specification
+
+
+def _stated(proposed: Identification) -> tuple[str, ...]:
+    """What a person chose in the table ``[identification]``."""
+    keys = proposed.model_fields_set
+    return ("parameters",) * bool(keys & {"held", "free"}) + ("bounds",) * bool(keys & {"length", "angle", "override"})
 
 
 def _arm_of_rows(model: ArmFile) -> Arm:

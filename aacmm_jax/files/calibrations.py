@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.agreement import CrossValidation, LeftOut
 from ..calibration.evaluation import Evaluation
-from ..calibration.prediction import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord, OtherPoses, Removed
 from ..calibration.results import NoisyEncoder, ObservedMetrics, PriorMetrics
 from ..data.capture import Capture
@@ -123,7 +123,7 @@ def _socket_table(capture: Capture, evaluations: Mapping[str, Evaluation]) -> Ta
         for name, values, says in (
             ("de", metrics.socket_de, "mean distance from the centroid"),
             ("deltam", metrics.socket_deltam, "largest half range"),
-            ("rms", metrics.socket_rms, "root mean square distance from the centroid"),
+            ("rms", metrics.socket_rms, "RMS distance from the centroid"),
         ):
             variables |= columns("socket", **{f"{name}_{stage}": (np.asarray(values), "mm", f"{says}, {stage} arm")})
     centroids = np.asarray(evaluations["calibrated"].repeatability.centroids)
@@ -159,9 +159,8 @@ def _observed_of(path: str | os.PathLike, stored: Stored, capture: Capture) -> O
     check_sense(
         path,
         {
-            "the names of its results are not those of its observations": tuple(row["name"] for row in rows)
-            != expected,
-            "its estimated geometry does not belong to its observations": {
+            "the results and the observations have different names": tuple(row["name"] for row in rows) != expected,
+            "the estimated geometry does not belong to the observations": {
                 name: len(part) for name, part in parts.items()
             }
             != sizes,

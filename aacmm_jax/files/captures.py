@@ -72,13 +72,10 @@ def recording_tables(recording: Recording) -> dict[str, Table]:
     capture, arm, urdf = recording.capture, recording.nominal.arm, recording.nominal.urdf
     check_one_capture(capture)
     poses = _reading_variables("angle", np.asarray(capture.q), arm)
-    poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket that held the tip"))
+    poses |= columns("pose", socket=([capture.names[i] for i in capture.owner], "", "socket of the pose"))
     if capture.visits is not None:
         visits = np.array(capture.visits)
-        poses |= columns(
-            "pose",
-            visit=(visits, "1", "number of the visit to the socket during which the pose was recorded; -1 if unknown"),
-        )
+        poses |= columns("pose", visit=(visits, "1", "number of the visit to the socket; -1 if unknown"))
     # Copies that were left out: poses by socket, and lengths by their ends.
     (sockets, counts), (starts, ends) = (tuple(zip(*rows, strict=True)) or ((), ()) for rows in capture.repeated)
     attributes = {
@@ -139,7 +136,7 @@ def recording_of(path: str | os.PathLike, stored: Stored) -> Recording:
             visits=visits,
         )
         spheres = tuple(checked_sphere(sphere, capture.columns) for sphere in spheres_of(stored))
-        check_readings(capture, nominal.arm, advice='import them with unit = "deg" in [angles] of the manifest')
+        check_readings(capture, nominal.arm, advice='import the readings with unit = "deg" in [angles] of the manifest')
     table = stored.tables.get("urdf")
     if table is not None:
         text = "".join(map(str, table["text"]))
@@ -208,12 +205,7 @@ def sphere_table(spheres: Sequence[ProbedSphere], arm: Arm | None = None) -> Tab
     ]
     values = np.array([touched for *_, touched in rows])
     variables = rows_table("touch", (sphere for sphere, *_ in rows), SPHERES).variables | columns(
-        "touch",
-        group=(
-            [number for _, number, _ in rows],
-            "1",
-            "number of the group of touches: a repetition, or an orientation of the wrist",
-        ),
+        "touch", group=([number for _, number, _ in rows], "1", "number of the repetition or wrist orientation")
     )
     if arm is None:
         return Table(variables | {"position": Variable(("touch", "axis"), values, "mm", "centre of the probe")})
@@ -286,7 +278,9 @@ def specification_of(path: str | os.PathLike, stored: Stored, name: str) -> ArmS
     fields = {key: field for key, field in ARM.items() if key in ArmSpecification._fields}
     proposed = values_in(ArmSpecification, fields, table, attributes)
     widths = (proposed["length"], proposed["angle"], *proposed["override"].values())
-    check_sense(path, {"a half-width is not positive and finite": not all(0 < width < np.inf for width in widths)})
+    check_sense(
+        path, {"a half-width of the bounds is not positive and finite": not all(0 < width < np.inf for width in widths)}
+    )
     prior = None
     if "prior_groups" in attributes:
         sd = dict(zip(attributes["prior_groups"], attributes["prior_sd"], strict=True))

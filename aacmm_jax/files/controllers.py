@@ -176,9 +176,9 @@ def zero_offsets_csv(zeros: ZeroOffsets) -> str:
     """
     lines = [
         "# Add these offsets to the joint readings of the nominal arm.",
-        "# Distance between the tips of the nominal arm with these offsets and of the calibrated arm: RMS "
-        f"{zeros.rms:.4f} mm, largest {zeros.largest:.4f} mm",
-        f"# (RMS {zeros.rms_nominal:.4f} mm without the offsets). Position of the tip in the last frame: "
+        f"# With these offsets, the tips of the nominal and the calibrated arm differ by {zeros.rms:.4f} mm RMS, at "
+        f"most {zeros.largest:.4f} mm",
+        f"# ({zeros.rms_nominal:.4f} mm RMS without the offsets). Position of the tip in the last frame: "
         f"{_row(zeros.probe, ' ')} mm.",
     ]
     units = ["deg", "rad", *(["mm"] if "mm" in zeros.units else [])]
@@ -329,7 +329,7 @@ def _entries(text: str) -> dict[str, str]:
             continue
         match = _LINE.fullmatch(line)
         if match is None:
-            raise InputError(f"line {count} is not of the form 'key: value'; correct it.")
+            raise InputError(f"line {count} is not of the form 'key: value'; correct the line.")
         indent, key, value = len(match[1]), match[2], match[3] or ""
         while above and above[-1][0] >= indent:
             above.pop()

@@ -67,15 +67,15 @@ def save_evaluation(
         arm=(arms, "", "arm that measured"),
         standard=(standards, "", "standard of the test"),
         name=(names, "", "metric"),
-        value=(values, "mm", "value of the worst part"),
+        value=(values, "mm", "worst value of the metric"),
         expanded=(
             [part.expanded for part in worst],
             "mm",
             f"expanded uncertainty, coverage factor {COVERAGE_FACTOR:g}",
         ),
         limit=(limits, "mm", "MPE"),
-        decision=(decisions, "", "decision by the rule of the test"),
-        where=([part.where for part in worst], "", "what gave the worst part"),
+        decision=(decisions, "", "statement of conformity by the decision rule of the test"),
+        where=([part.where for part in worst], "", "measurement that gave the worst value"),
     )
     tables["figures"] = Table(figures)
     if record.uncertainty is not None:
@@ -88,7 +88,7 @@ def _points_tables(record: PointsRecord) -> dict[str, Table]:
     measured, reach = record.measured, record.measured.reach
     owner = [name for name, points in measured.sockets.items() for _ in points]
     position = np.concatenate([np.zeros((0, 3)), *measured.sockets.values()])
-    points = columns("point", socket=(owner, "", "socket that held it"))
+    points = columns("point", socket=(owner, "", "socket in which the tip was seated"))
     points["position"] = Variable(("point", "axis"), position, "mm", "centre of the probe")
     attributes = dict(table_of(record, schema.JUDGED).attributes)
     if reach is not None:
@@ -129,7 +129,7 @@ def load_evaluation(path: str | os.PathLike) -> Any:
             parameters = values_in(Uncertainty, schema.UNCERTAINTY, table, table.attributes)
             names = set(parameters["names"])
             strange = not names <= set(parameter_names(calibrated.arm)) or len(names) < len(parameters["names"])
-            check_sense(path, {"a parameter is unknown or is named twice": strange})
+            check_sense(path, {"a parameter is unknown or is given twice": strange})
             within = records_within(stored.tables, _RECORDS)
             uncertainty = Uncertainty(arm=calibrated.arm, u_k=None, **within, **parameters)
         return EvaluationRecord(captures.recording_of(path, stored), calibrated, uncertainty=uncertainty, **values)
@@ -251,7 +251,7 @@ def _check(path: str | os.PathLike, summary: Mapping[str, Any]) -> None:
             "a model lacks a region": uneven,
             "a model lacks a number": any(row[key] is None for row in models for key in _NEEDED),
             "a number is impossibly large": any(abs(value) > _LARGEST for value in numbers if value is not None),
-            "a number is negative where only 0 or more is possible": any(
+            "a number that must be 0 or positive is negative": any(
                 value is not None and value < 0 for value in positive
             ),
         },

@@ -275,8 +275,8 @@ def _lengths(
         choices = {tuple((name, values[name]) for name in sorted(names)) for values in fields if names <= values.keys()}
         if not choices and names:
             raise InputError(
-                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; use the fields of "
-                "the sockets' names."
+                f"length from '{entry.start}' to '{entry.end}' uses a field that no [[socket]] has; use only fields "
+                "that occur in the names of sockets."
             )
         choices = choices if names else {()}
         pairs = [(fill(entry.start, dict(choice)), fill(entry.end, dict(choice))) for choice in sorted(choices)]

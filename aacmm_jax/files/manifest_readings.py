@@ -68,7 +68,7 @@ class Readings:
         if set(thermometer) & set(picked):
             raise InputError(
                 f"{text.path} column {thermometer[0] + 1} is {TEMPERATURE}, not a joint reading; remove this column "
-                "from columns."
+                "from the key columns."
             )
         numbers = text.numbers(picked, measured=True, stated=stated is not None)
         angles = self._angles_of(text, picked, wanted)

@@ -181,7 +181,7 @@ class _Reader:
             if len(values) != len(rows):
                 raise InputError(
                     f"{self._where}: {file} has {len(values)} rows of '{key}', but there are {len(rows)} readings; "
-                    "give one row of each per pose."
+                    "give one row of values and one row of readings per pose."
                 )
         return rows_of
 

@@ -115,9 +115,11 @@ class Angles(Strict):
     @model_validator(mode="after")
     def _counts(self) -> "Angles":
         if (self.unit == "counts") != (self.counts_per_turn is not None):
-            raise ValueError("counts_per_turn and unit = 'counts' need each other; give both or neither.")
+            raise ValueError("counts_per_turn and unit = 'counts' are only possible together; give both or neither.")
         if (self.linear_unit == "counts") != (self.counts_per_mm is not None):
-            raise ValueError("counts_per_mm and linear_unit = 'counts' need each other; give both or neither.")
+            raise ValueError(
+                "counts_per_mm and linear_unit = 'counts' are only possible together; give both or neither."
+            )
         return self
 
     def converted(self, readings: Float[np.ndarray, "N n"], arm: Arm) -> Float[np.ndarray, "N n"]:
@@ -181,7 +183,7 @@ class SocketTable(_Named):
     @model_validator(mode="after")
     def _has_name(self) -> "SocketTable":
         if self.files is not None and self.name is None and self.group is None:
-            raise ValueError("a socket with several files needs a name; add name.")
+            raise ValueError("a socket with several files needs a name; add the key name.")
         if self.visits is not None and self.target:
             raise ValueError(
                 "visits apply only to sockets measured with the arm's own probe, but this socket has a target; remove "

@@ -188,8 +188,8 @@ class OutputFile:
                     _current.reset(token)
         if not ours:
             raise InputError(
-                f"{self.named} exists and is not an earlier output of this kind; choose another name, or replace it "
-                "with --overwrite."
+                f"{self.named} exists and is not an earlier output of the same kind; choose another name, or replace "
+                "it with --overwrite."
             )
 
     def replace(self, keep: bool) -> None:

@@ -128,8 +128,8 @@ _WHAT = {
     "file per socket " + _ROWS.format("", "capture"),
     KitPlan: "Manifest of a planned calibration. Fill in certified values and uncertainties (k = 1), record the files "
     + _ROWS.format(": the joint readings first, then the measured values", "capture"),
-    Procedure: "{}: manifest of the plan. Fill in the calibrated values and uncertainties (k = 1) of your artefacts, "
-    "record one file per socket and per group of touches " + _ROWS.format("", "acceptance"),
+    Procedure: "Manifest of a planned acceptance test ({}). Fill in the calibrated values and uncertainties (k = 1) of "
+    "your artefacts, record one file per socket and per group of touches " + _ROWS.format("", "acceptance"),
 }
 
 

@@ -181,5 +181,5 @@ def reading_sets_sentence(rows: Sequence[dict[str, Any]], poses: int) -> str:
     elif best["taken"]:
         verdict = f", and the manifest uses the readings that fit better: {figures}"
     else:
-        verdict = f": {figures}. Use the {best['role']} readings, with {shorten(best['lines'], 3)}"
+        verdict = f": {figures}. To use the {best['role']} readings, write {shorten(best['lines'], 3)}"
     return f"The tables contain both commanded and measured readings{verdict}."

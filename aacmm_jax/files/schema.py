@@ -25,7 +25,7 @@ NOISE: Fields = {
 
 USUAL_NOISE: Fields = {
     "arm_class": text("class of the arm"),
-    "source": text("where the noise is stated"),
+    "source": text("source of the stated noise"),
     "noise": part(NOISE),
 }
 
@@ -57,12 +57,13 @@ _GEOMETRY: Fields = {
     "probe": number("tip in the last frame", "mm", "axis"),
 }
 ARM: Fields = {
-    "name": text("what the arm is called"),
+    "name": text("name of the arm"),
     "length": number("half-width of the bounds of lengths", "mm", name="half_width_length_mm"),
     "angle": number("half-width of the bounds of angles", "rad", name="half_width_angle_rad"),
     "override": mapping("half-widths of single parameters, mm or rad"),
     "held": text("fixed parameters"),
-    "free": text("parameters that are free in addition to those that are free by default"),
+    "free": text("parameters that are free in addition to the default parameters"),
+    "stated": text("what the user stated: parameters or bounds", among=("parameters", "bounds")),
     **_GEOMETRY,
     "coefficient": text("name of the coefficient", "coefficient"),
     "coefficients": number("coefficient of a joint correction, in its own unit", "1", "coefficient"),
@@ -118,6 +119,7 @@ CALIBRATION: Fields = {
     "reason": text("why the solve ended"),
     "divided": truth("whether the lengths of the arm are those of stage 1 divided by k"),
     "against_division": text("why the lengths were not divided by k"),
+    "decisions": text("what was decided by default"),
     "sampled_says": text("result of the Monte Carlo simulation"),
     "robust": text("robust loss"),
 }
@@ -258,7 +260,7 @@ JUDGED: Fields = {
     "limits": mapping("MPE of each metric: constant term (mm) and divisor of the length"),
     "u_test": number("standard uncertainty due to seat and fixture", "mm", least=0),
     "standards": text("standards whose tests are run", among=("", *STANDARDS)),
-    "influences": mapping("uncertainty (mm; relative to a length), and thermal expansion of artefact and arm"),
+    "influences": mapping("uncertainty in mm, relative uncertainty, thermal expansion of artefact and arm"),
     "rule": text("decision rule"),
 }
 

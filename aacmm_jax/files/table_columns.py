@@ -184,8 +184,8 @@ def header_units(text: TextTable, picked: Sequence[int], arm: Arm, stated: str |
         if unit not in (None, "counts", *possible):
             raise InputError(
                 f"{text.path} has readings of {joints} joints in {quoted(unit)} (column "
-                f"{quoted(text.header[columns[0]])}), but these must be in {', '.join(possible)} or counts; pick the "
-                "columns of the readings with columns = [...], or correct the header."
+                f"{quoted(text.header[columns[0]])}), but readings must be in {', '.join(possible)} or counts; pick "
+                "the columns of the readings with columns = [...], or correct the header."
             )
         units.append(unit)
     return units[0], units[1]

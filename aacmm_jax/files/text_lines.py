@@ -217,8 +217,8 @@ def names_of_columns(
         if len(names) != 1:
             raise InputError(
                 f"{path} has two lines with words in all columns: line {first} ({quoted(shorten(upper, 3))}) and line "
-                f"{last} ({quoted(shorten(lower, 3))}); add skip = {last - 1} if line {last} names the columns, "
-                f"otherwise remove line {last}."
+                f"{last} ({quoted(shorten(lower, 3))}); add skip = {last - 1} if line {last} contains the names of the "
+                f"columns, otherwise remove line {last}."
             )
     chosen = names[0][1] if names else [""] * width if units else []
     if not units:

@@ -82,7 +82,7 @@ class TextTable:
                 raise InputError(
                     f"{path} line {line_number} has {len(cells)} columns, but the lines before it have {width}; give "
                     "all lines the same number of columns, or copy the file again if it is incomplete, or add skip = "
-                    f"{line_number - 1} if the table begins there."
+                    f"{line_number - 1} if the table begins in that line."
                 )
         self._lines, self._rows = [number for number, _ in rows], [cells for _, cells in rows]
         # Columns at the end that are empty in all rows and without a name: lines that end with delimiters.
@@ -250,7 +250,7 @@ class TextTable:
             )
         value = number(plain)
         if not abs(value) <= _LARGEST:
-            raise InputError(f"{place} is not finite, or is implausibly large; correct it.")
+            raise InputError(f"{place} is not finite, or is implausibly large; correct the number.")
         return value
 
     def cells(self, index: int) -> list[str]:

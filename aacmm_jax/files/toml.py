@@ -60,7 +60,7 @@ def read_toml(path: str | os.PathLike, model: type[Model]) -> Model:
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not UTF-8 text; give a TOML file.") from error
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}; correct the file there.") from error
+        raise InputError(f"{path} is not valid TOML: {error}; correct the file at this point.") from error
     except RecursionError as error:
         raise InputError(f"{path} nests tables or lists too deeply; use at most {_DEEPEST} levels.") from error
     except ValueError as error:  # digits beyond those that Python converts

@@ -357,7 +357,7 @@ def _parsed(text: str) -> tuple[Element, int]:
         if data.strip() and stack[-1] is not None:
             raise InputError(
                 f"line {parser.CurrentLineNumber}: {stack[-1].words} contains the text {quoted(data.strip())}, which "
-                "is not allowed there; remove it."
+                "is not allowed there; remove the text."
             )
 
     def refuse_entities(name: str, *_: object) -> None:
@@ -370,7 +370,7 @@ def _parsed(text: str) -> tuple[Element, int]:
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        raise InputError(f"the file is not valid XML: {error}; correct the file there.") from error
+        raise InputError(f"the file is not valid XML: {error}; correct the file at this point.") from error
     return root[0], ends[-1]
 
 

@@ -55,7 +55,7 @@ def with_corrections(
         raise InputError("gravity has the length 0; give its direction in the base frame.")
     down, loads, sizes = down / np.linalg.norm(down), None, {"links": plain.joints}
     if (mass is None) != (centre is None):
-        raise InputError("mass and centre (the centres of mass) need each other; give both or neither.")
+        raise InputError("mass and centre (the centres of mass) are only possible together; give both or neither.")
     if mass is not None:
         masses = checked(mass, Float[np.ndarray, " links"], "mass", sizes)
         centres = checked(centre, Float[np.ndarray, "links 3"], "centre", sizes)

@@ -308,8 +308,9 @@ class ArmSpecification(NamedTuple):
     """An arm as a file states it, with the identification that the file proposes.
 
     Example:
-        >>> mine = aj.kinematics.ArmSpecification(arm, "my arm", length=5.0, override={"probe_z": 60.0})
-        >>> print(mine.name, len(mine.space().names), mine.bounds().upper[-1] - arm.probe[2])
+        >>> specification = aj.kinematics.ArmSpecification(arm, "my arm", length=5.0, override={"probe_z": 60.0})
+        >>> space, bounds = specification.space(), specification.bounds()
+        >>> print(specification.name, len(space.names), bounds.upper[-1] - arm.probe[2])
         my arm 21 60.0
     """
 
@@ -322,6 +323,7 @@ class ArmSpecification(NamedTuple):
     free: tuple[str, ...] = ()  # names that are free in addition, such as Hayati's ``beta_2``
     urdf: UrdfSource | None = None  # that the arm was read from; None for others
     prior: Prior | None = None  # of the parameters; None where the file states none
+    stated: tuple[str, ...] = ()  # "parameters", "bounds": those that a person chose, which no default changes
 
     def space(self) -> Parameters:
         """The free parameters that the file proposes."""

@@ -119,17 +119,17 @@ def fix_scale(
     """
     if not capture.lengths:
         raise InputError(
-            "the capture contains no reference length, so the scale cannot be fixed; add a reference length "
+            "the capture contains no reference length, so the scale cannot be determined; add a reference length "
             "between two of its sockets."
         )
     check_finite(arm=arm, capture=capture)
     if not is_single(arm):
-        raise InputError("the arm is a batch, but fix_scale takes a single arm; use jax.vmap.")
+        raise InputError("fix_scale needs a single arm, but this is a batch; use jax.vmap.")
     check_one_capture(capture)
     if capture.observations:
         names = shorten([observation.name for observation in capture.observations])
         raise InputError(
-            f"fix_scale takes sockets and reference lengths only, but the capture has other observations ({names}); "
+            f"fix_scale supports only sockets and reference lengths, but the capture has other observations ({names}); "
             "give a capture without these observations."
         )
     check_readings(capture, arm)

@@ -13,13 +13,14 @@ from ..calibration.results import Calibration, Identification
 from ..calibration.sampling import monte_carlo
 from ..core.arguments import checked_arguments, with_options
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..data.capture import Capture, draw_poses, join_sessions
+from ..data.capture import draw_poses, join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
-from ..diagnostics.contradictions import remove_contradicting
 from ..diagnostics.findings import case_of
-from ..kinematics.priors import Prior
+from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
+from .automatic import with_best_model, with_wider_bounds, without_contradicting
 from .cross_validation import can_cross_validate, cross_validate
 from .single import CalibrationOptions, calibrate, identify
 
@@ -35,6 +36,7 @@ class CaptureOptions(NamedTuple):
         two-stage
     """
 
+    model: str | None = _SOLVE.model
     method: Literal["two-stage", "joint"] | None = _SOLVE.method
     robust: LossName | None = _SOLVE.robust
     prior: Prior | Literal["stated"] | None = "stated"
@@ -50,6 +52,7 @@ class CaptureOptions(NamedTuple):
     monte_carlo: bool = False
     strict: bool = False
     remove_contradicting: bool = False
+    automatic: bool = True
     max_steps: int = _SOLVE.max_steps
     stage: Callable[[str, Callable[[], Any]], Any] = lambda what, work: work()
 
@@ -60,11 +63,13 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     """Calibrate a recording: what ``aacmm calibrate`` does, with the same defaults.
 
     The nominal arm of the recording says which parameters are free, between which bounds, and their prior
-    (``recording.nominal._replace(length=5.0, free=("beta_2",))`` for others); its model of the joints is calibrated
-    too. What the data leave undetermined is no warning, but part of the record (`warnings_of`).
+    (``recording.nominal._replace(length=5.0, free=("beta_2",))`` for others). What the data leave undetermined is no
+    warning, but part of the record (`warnings_of`).
 
     Args:
         recording: the capture and its nominal arm.
+        model: what the joints do besides their readings, as for `calibrate`; "dh", nothing. By default the model of
+            the nominal arm; where it has none, the model that predicts held-out regions best, if ``automatic``.
         method: "two-stage" or "joint", as for `calibrate`.
         robust: a robust loss, as for `identify`.
         prior: what is known of the parameters; "stated", that of the nominal arm; None, nothing.
@@ -81,6 +86,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         monte_carlo: check the uncertainties by Monte Carlo.
         strict: raise `InputError` where such data could not determine free parameters even without noise.
         remove_contradicting: leave out groups that contradict all others.
+        automatic: widen default bounds that the fit reaches, leave out what contradicts the rest, and compare models of
+            the joints unless a model, a prior, a method or a robust loss is stated. ``decisions`` of the record says
+            what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -105,40 +113,36 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     if chosen.only_poses is not None:
         part, others = draw_poses(recording.capture, chosen.only_poses, chosen.seed)
         recording = recording._replace(capture=part)
-    bounds = recording.nominal.bounds()
-    recording = recording._replace(nominal=recording.nominal._replace(arm=bounds.space.base))
-    prior = recording.nominal.prior if isinstance(chosen.prior, str) else chosen.prior
-    undetermined = "raise" if chosen.strict else "ignore"  # the record says it
-    same = {name: value for name, value in chosen._asdict().items() if name in CalibrationOptions._fields}
-    solving = CalibrationOptions(**same | {"prior": prior, "undetermined": undetermined})
+    nominal = recording.nominal
+    if chosen.model is not None and nominal.arm.corrections is None:
+        nominal = nominal._replace(arm=with_corrections(nominal.arm, chosen.model))
+    if not isinstance(chosen.prior, str):
+        nominal = nominal._replace(prior=chosen.prior)
+    elif chosen.model is not None and nominal.prior is None and nominal.arm.corrections is not None:
+        nominal = nominal._replace(prior=default_prior(nominal.arm))
+    recording = recording._replace(nominal=nominal._replace(arm=nominal.bounds().space.base))
+    automatic = chosen.automatic and chosen.scale == "measured"
+    stated = (chosen.model, chosen.robust, chosen.method, nominal.prior, nominal.arm.corrections)
 
-    def solved(capture: Capture) -> Calibration | Identification:
-        if chosen.scale == "measured":
-            return calibrate(bounds.space.base, capture, bounds, **solving._asdict())
-        if chosen.method is not None or chosen.strict:
-            raise InputError("--scale nominal calibrates with stage 1 only; omit --method and --strict.")
-        if any(observation.fixes_scale for observation in capture.observations):
-            raise InputError(
-                "--scale nominal is for captures that do not fix the scale, but these observations fix the scale; "
-                "omit --scale nominal."
-            )
-        return identify(bounds.space.base, capture, bounds, **solving.solving._asdict())
+    def recorded(result: Calibration | Identification, part: Recording) -> CalibrationRecord:
+        record = record_of(result, part, robust=chosen.robust, others=others)
+        case_of(record)  # takes over what the calibration has computed to test its noise, before others are tested
+        return record
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
-        result = chosen.stage("Calibrating", lambda: solved(recording.capture))
-        record = record_of(result, recording, robust=chosen.robust, others=others)
-        case_of(record)  # takes over what the calibration has computed to test its noise, before others are tested
-        if chosen.remove_contradicting:
-            record = chosen.stage("Comparing groups", lambda: remove_contradicting(record, solved))
-        if _to_cross_validate(record.recording, solving, chosen):
-            if chosen.scale != "measured":
-                raise InputError("--cross-validate needs a calibrated scale; omit --scale nominal (scale).")
-            groups, capture = chosen.leave_out or None, record.recording.capture
-            run = partial(cross_validate, bounds.space.base, capture, bounds, groups=groups, **solving._asdict())
-            record = record._replace(validation=chosen.stage("Cross-validating", run))
+        solved = partial(_solved, chosen)
+        record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
+        if automatic:
+            record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
+        if automatic or chosen.remove_contradicting:
+            record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
+        if automatic and all(value is None for value in stated):
+            record = with_best_model(record, recorded, chosen)
+        if _to_cross_validate(record, chosen):
+            record = chosen.stage("Cross-validating", lambda: _cross_validated(record, chosen))
         if chosen.monte_carlo:
-            result = solved(record.recording.capture) if record.removed else result
+            result = solved(record.recording)
             if not isinstance(result, Calibration) or chosen.robust is not None:
                 raise InputError(
                     "--monte-carlo cannot be combined with --robust or --scale nominal; omit --monte-carlo."
@@ -148,16 +152,52 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     return record
 
 
-def _to_cross_validate(recording: Recording, solving: CalibrationOptions, chosen: CaptureOptions) -> bool:
+def _solving(chosen: CaptureOptions, prior: Prior | None) -> CalibrationOptions:
+    """How `calibrate` is called; what the data do not determine is said by the record."""
+    same = {name: value for name, value in chosen._asdict().items() if name in CalibrationOptions._fields}
+    undetermined = "raise" if chosen.strict else "ignore"
+    return CalibrationOptions(**same | {"model": None, "prior": prior, "undetermined": undetermined})
+
+
+def _solved(chosen: CaptureOptions, recording: Recording) -> Calibration | Identification:
+    """A recording calibrated with the parameters, bounds and prior of its nominal arm."""
+    capture, bounds, solving = recording.capture, recording.nominal.bounds(), _solving(chosen, recording.nominal.prior)
+    if chosen.scale == "measured":
+        return calibrate(bounds.space.base, capture, bounds, **solving._asdict())
+    if chosen.method is not None or chosen.strict:
+        raise InputError("--scale nominal calibrates with stage 1 only; omit --method and --strict.")
+    if any(observation.fixes_scale for observation in capture.observations):
+        raise InputError(
+            "--scale nominal is for captures that do not fix the scale, but these observations fix the scale; "
+            "omit --scale nominal."
+        )
+    return identify(bounds.space.base, capture, bounds, **solving.solving._asdict())
+
+
+def _cross_validated(record: CalibrationRecord, chosen: CaptureOptions) -> CalibrationRecord:
+    """With the errors of each group of a calibration without it. Learned scales of the prior stay as all data have
+    taught them: a few numbers, which one group hardly changes."""
+    if chosen.scale != "measured":
+        raise InputError("--cross-validate needs a calibrated scale; omit --scale nominal (scale).")
+    bounds, prior = record.recording.nominal.bounds(), record.recording.nominal.prior
+    if record.decisions and prior is not None and record.prior is not None:
+        prior = Prior(dict(zip(record.prior.groups, record.prior.sd, strict=True)))
+    solving = _solving(chosen, prior)._asdict()
+    groups = chosen.leave_out or None
+    validation = cross_validate(bounds.space.base, record.recording.capture, bounds, groups=groups, **solving)
+    return record._replace(validation=validation)
+
+
+def _to_cross_validate(record: CalibrationRecord, chosen: CaptureOptions) -> bool:
     """Whether groups are left out: where that was asked for; by default where a real arm measured the reference length
     in several placements, and leaving each of them out takes no longer than the calibration itself."""
-    capture = recording.capture
+    capture, nominal = record.recording.capture, record.recording.nominal
     if chosen.cross_validate is not None:
         return chosen.cross_validate
-    plain = chosen.scale == "measured" and solving.robust is None and solving.prior is None
-    if not plain or capture.observations or recording.true is not None or len(capture.lengths) < 2:
+    plain = chosen.scale == "measured" and chosen.robust is None and (nominal.prior is None or record.decisions)
+    if not plain or capture.observations or record.recording.true is not None or len(capture.lengths) < 2:
         return False
-    return can_cross_validate(capture, len(recording.nominal.space().names))
+    return can_cross_validate(capture, len(nominal.space().names))
 
 
 def join_recordings(recordings: Mapping[str, Recording], *, same_probe: bool = False) -> Recording:

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..calibration.prediction import CrossValidation, LeftOut, unseen_errors
+from ..calibration.agreement import CrossValidation, LeftOut
+from ..calibration.prediction import unseen_errors
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.scale_anchor import fixes_scale
 from ..core.arguments import checked_arguments, items_of, with_options
@@ -251,11 +252,12 @@ def _dense(equations: Equations, parameters: int) -> _Dense:
         white = np.zeros((m, r, size))
         white[..., :shared], white[..., first : first + k] = rows.shared, rows.private
         first += k
+        in_mm = np.pad(rows.in_mm, ((0, 0), (0, 3 - rows.in_mm.shape[1]), (0, 0)))  # of fewer rows a pose
         parts.append((
             *(white.reshape(-1, size), rows.residual.ravel(), np.repeat(rows.poses, r)),
-            (rows.in_mm @ white).reshape(-1, size),
-            np.einsum("mcr,mr->mc", rows.in_mm, rows.residual).ravel(),
-            *(rows.in_mm @ rows.in_mm.swapaxes(1, 2), rows.poses),
+            (in_mm @ white).reshape(-1, size),
+            np.einsum("mcr,mr->mc", in_mm, rows.residual).ravel(),
+            *(in_mm @ in_mm.swapaxes(1, 2), rows.poses),
         ))  # fmt: skip
     relations = [np.pad(block.shared, ((0, 0), (0, size - shared))) for block in equations.relations]
     return _Dense(

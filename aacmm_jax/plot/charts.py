@@ -25,6 +25,7 @@ SERIES: tuple[dict[str, Any], ...] = (
 _SCALES: dict[str, Any] = {"linear": np.asarray, "log": np.log10, "asinh": np.arcsinh}
 _WITHIN = 0.98  # of the values have shades that divide their range evenly
 _MOST_NAMES = 45  # along an axis; more would overlap
+_MOST_TICKS = 6  # along an axis of numbers
 
 
 class Marks(NamedTuple):
@@ -131,9 +132,9 @@ def linear(title: str, *values: Any, zero: bool = False, margin: float = 0.06) -
     return Axis(title, low, high, round_ticks(low, high))
 
 
-def round_ticks(low: float, high: float, most: int = 6) -> tuple[tuple[float, str], ...]:
-    """At most ``most`` round numbers between two, with as many decimals as they need."""
-    raw = (high - low) / most
+def round_ticks(low: float, high: float) -> tuple[tuple[float, str], ...]:
+    """A few round numbers between two, with as many decimals as they need."""
+    raw = (high - low) / _MOST_TICKS
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(step for step in (1, 2, 5, 10) if step * power >= raw * (1 - 1e-9)) * power
     numbers = np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)

@@ -11,7 +11,7 @@ from ..plot.study import metric_plots
 from ..study.results import study_summary
 from ..study.store import Results
 from ..study.tables import cell_table, factor_title, label, level_text, metric_table, metric_title, parameter_table
-from ..summaries.result_tables import MODELS_MEANING, model_tables
+from ..summaries.compared_models import MODELS_MEANING, model_tables
 from ..summaries.tables import format_number, number
 from .elements import Report, Section
 

@@ -24,8 +24,8 @@ class Reason(eqx.Enumeration):
     rounding = "Converged: no step can lower the cost by more than rounding error."
     max_steps = "Not converged: the step limit was reached; allow more steps or start closer."
     stalled = (
-        "Not converged: no step lowers the cost, and this is not a minimum; is the residual smooth, and is its "
-        "derivative correct?"
+        "Not converged: no step lowers the cost, and the last point is not a minimum; is the residual smooth, and is "
+        "its derivative correct?"
     )
     nonfinite = (
         "Not converged: the residual or its derivative is not finite at the start; check the data and the start."

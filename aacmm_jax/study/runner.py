@@ -203,7 +203,7 @@ def _check_arguments(executor: Any, **numbers: Any) -> None:
     context = getattr(executor, "_mp_context", None)
     if context is not None and context.get_start_method() == "fork":
         raise InputError(
-            "the executor forks its processes, which does not work with JAX; create it with "
+            "the executor forks its processes, which does not work with JAX; create the executor with "
             "mp_context=multiprocessing.get_context('spawn')."
         )
 

@@ -32,7 +32,7 @@ def _levels_of(natural: int) -> BeforeValidator:
 def _different(levels: list) -> list:
     for i, level in enumerate(levels):
         if level in levels[:i]:
-            raise ValueError(f"the level {_label(level)} is given twice; give each level once.")
+            raise ValueError(f"the value {_label(level)} is given twice; give each value once.")
     return levels
 
 
@@ -114,7 +114,7 @@ class Region(_Table):
     @model_validator(mode="after")
     def _bounded(self) -> "Region":
         if self.distance_mm is None and None in (self.x_mm, self.y_mm, self.z_mm):
-            raise ValueError("a region needs distance_mm, or x_mm, y_mm and z_mm.")
+            raise ValueError("a region needs distance_mm, or x_mm, y_mm and z_mm; add the missing key.")
         return self
 
 

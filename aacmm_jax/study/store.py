@@ -325,7 +325,7 @@ def check_owners(path: Path, *, reading: bool = False) -> None:
             continue
         user = user_name(status.st_uid)
         if not reading:
-            _refuse(item, f"{item} belongs to {user}, so its study is not continued; choose another output path.")
+            _refuse(item, f"{item} belongs to {user}, so the study is not continued; choose another output path.")
         elif status.st_uid != (owner := os.stat(path).st_uid):
             raise InputError(
                 f"{folder} belongs to {user}, but {path.name} belongs to {user_name(owner)}, so the blocks are not "

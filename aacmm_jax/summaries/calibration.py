@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.agreement import Agreement, CrossValidation
 from ..calibration.evaluation import Evaluation
-from ..calibration.prediction import Agreement, CrossValidation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics
 from ..core.text import csv_text, pluralise
@@ -165,6 +165,7 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
         "poses": len(recording.capture.readings),
         "sockets_used": list(recording.capture.names),
         "scale_expanded": uncertainty.expanded_k() if math.isfinite(record.u_k) else None,
+        "decisions": list(record.decisions),
         "active_stage1": on_bounds(record),
         "active": on_bounds(record, final=True),
         **{stage: metrics(evaluation) for stage, evaluation in evaluations.items()},

@@ -1,17 +1,36 @@
 """Compared models of an arm's joints, in numbers and sentences."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from ..pipeline.model_ladder import ComparedModels
-from .result_tables import MODELS_MEANING, model_tables
-from .tables import Styled, View, attributes, rms_difference, warnings_of, written_of
+from .tables import (
+    Cell,
+    Columns,
+    Styled,
+    Table,
+    View,
+    attributes,
+    listed,
+    number,
+    rms_difference,
+    warnings_of,
+    written_of,
+)
 
 _EXCESS = 2.0  # of the mean squared normalised error, from which the uncertainty is said to be too small
 
 _COPIED = (
     *("model", "parameters", "effective_parameters", "rms_inside", "rms_outside", "u_outside", "ratio"),
     *("log_evidence", "cpu_seconds"),
+)
+MODELS_MEANING = (
+    "Determined: number of parameters that the data determine. Inside: RMS distance of all poses from their geometry. "
+    "Outside: RMS distance of held-out poses, with each region held out in turn. Excess: outside error minus the "
+    "outside error of the best model, from the differences in each region. u: standard errors from the scatter of the "
+    "regions. Ratio: mean of (error / predicted standard deviation)² of held-out poses. Evidence: logarithm of the "
+    "evidence, minus the value of the most probable model."
 )
 
 
@@ -61,6 +80,37 @@ def _warnings(compared: ComparedModels) -> list[str]:
             "whole travel of the joints."
         )
     return sentences
+
+
+def model_tables(summary: Mapping[str, Any]) -> tuple[Table, Table]:
+    """Compared models, and their errors region by region."""
+    models, regions = summary["models"], summary["regions"]
+    most_probable = max(row["log_evidence"] for row in models)
+    least = min(row["rms_outside"] for row in models)
+
+    def to_best(row: Mapping[str, Any]) -> tuple[float | None, float | None]:
+        """None for the best model itself, and where too few regions are compared."""
+        compared = row["difference"] is not None and row["u_difference"] is not None
+        return rms_difference(row, least) if compared and row["rms_outside"] > least else (None, None)
+
+    by_name = listed("Models", models, {
+        "model": lambda row: (
+            row["model"] if row["converged"] else Cell(f"{row['model']}: did not converge", None, "unsure")
+        ),
+        "parameters": "parameters",
+        "determined": lambda row: number(row["effective_parameters"], 1),
+        "inside [mm]": "rms_inside",
+        "outside [mm]": "rms_outside",
+        "u of outside": "u_outside",
+        "excess [mm]": lambda row: to_best(row)[0],
+        "u of excess": lambda row: to_best(row)[1],
+        "ratio": lambda row: number(row["ratio"], 2),
+        "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
+        "CPU [s]": lambda row: number(row["cpu_seconds"], 1),
+    })  # fmt: skip
+    of_region: Columns = {"region": lambda i: regions[i], "poses": lambda i: models[0]["regions"][i]["poses"]}
+    of_region |= {row["model"]: lambda i, row=row: row["regions"][i]["rms"] for row in models}
+    return by_name, listed("RMS error of each region [mm]", range(len(regions)), of_region)
 
 
 def compared_models(summary: dict[str, Any]) -> View:

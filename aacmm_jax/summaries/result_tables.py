@@ -15,21 +15,14 @@ Rows = Sequence[Row]
 STAGES = {"nominal": "nominal", "stage1": "stage 1", "calibrated": "calibrated"}
 BY_CONSTRUCTION = "fixed the scale"  # so that its error is zero
 MARKS = {"conforms": "good", "fails": "bad", "undecided": "unsure", None: ""}  # of decisions
-MODELS_MEANING = (
-    "Determined: number of parameters that the data determine. Inside: RMS distance of all poses from their geometry. "
-    "Outside: RMS distance of held-out poses, with each region held out in turn. Excess: outside error minus the "
-    "outside error of the best model, from the differences in each region. u: standard errors from the scatter of the "
-    "regions. Ratio: mean of (error / predicted standard deviation)² of held-out poses. Evidence: logarithm of the "
-    "evidence, minus the value of the most probable model."
-)
 _SIGNS = {"conforms": "✓ conforms", "fails": "✗ fails", "undecided": "? undecided", None: "–"}
 _HARMONIC = re.compile(r"(?:cos|sin)(\d+)_(\d+)")  # order, joint
 _MOST_LISTED = 48  # coefficients of harmonics that a table lists one by one
 
 
-def with_u_digits(u: float | None, mark: str = "") -> Cell:
+def with_u_digits(u: float | None) -> Cell:
     """An uncertainty, to two digits."""
-    return number(u, decimals_for(u), mark=mark)
+    return number(u, decimals_for(u))
 
 
 def _said(words: str, mark: str) -> Cell:
@@ -317,34 +310,3 @@ def acceptance_tables(tests: Rows, *, brief: bool = False) -> list[Table]:
         "meaning": None if brief else "what",
     }
     return [listed(f"{test['called']}: {test['title']} [mm]", test["figures"], columns) for test in tests]
-
-
-def model_tables(summary: Row) -> tuple[Table, Table]:
-    """Compared models, and their errors region by region."""
-    models, regions = summary["models"], summary["regions"]
-    most_probable = max(row["log_evidence"] for row in models)
-    least = min(row["rms_outside"] for row in models)
-
-    def to_best(row: Row) -> tuple[float | None, float | None]:
-        """Nothing of the best model itself, and where the regions say nothing."""
-        compared = row["difference"] is not None and row["u_difference"] is not None
-        return tables.rms_difference(row, least) if compared and row["rms_outside"] > least else (None, None)
-
-    by_name = listed("Models", models, {
-        "model": lambda row: (
-            row["model"] if row["converged"] else Cell(f"{row['model']}: did not converge", None, "unsure")
-        ),
-        "parameters": "parameters",
-        "determined": lambda row: number(row["effective_parameters"], 1),
-        "inside [mm]": "rms_inside",
-        "outside [mm]": "rms_outside",
-        "u of outside": "u_outside",
-        "excess [mm]": lambda row: to_best(row)[0],
-        "u of excess": lambda row: to_best(row)[1],
-        "ratio": _two_decimals("ratio"),
-        "evidence": lambda row: number(row["log_evidence"] - most_probable, 1),
-        "CPU [s]": lambda row: number(row["cpu_seconds"], 1),
-    })  # fmt: skip
-    of_region: Columns = {"region": lambda i: regions[i], "poses": lambda i: models[0]["regions"][i]["poses"]}
-    of_region |= {row["model"]: lambda i, row=row: row["regions"][i]["rms"] for row in models}
-    return by_name, listed("RMS error of each region [mm]", range(len(regions)), of_region)

@@ -145,9 +145,9 @@ def format_number(value: float, decimals: int = 4, *, signed: bool = False) -> s
     return (f"{value:{sign}.1e}" if small else f"{value:{sign}.{decimals}f}").replace("-", "−")
 
 
-def formatted(value: float | None, decimals: int = 4) -> str:
+def formatted(value: float | None) -> str:
     """A number in a line of the terminal."""
-    return "-" if value is None else format_number(value, decimals).replace("−", "-")
+    return "-" if value is None else format_number(value).replace("−", "-")
 
 
 def two_digits(u: float) -> str:

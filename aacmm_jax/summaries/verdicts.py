@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..calibration.prediction import SIGNIFICANCE
+from ..calibration.agreement import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from ..uncertainty.coverage import U_AT_LEVEL
@@ -46,7 +46,7 @@ def calibration_verdict(
         says = f"To be used with care: {'; '.join(doubts)}, so errors may exceed the stated uncertainty. {stated}."
         return Verdict("unsure", says)
     agrees = held_out is not None and held_out["rms_mm"] is not None
-    checked = "held-out data agree with it" if agrees else "no held-out data confirm it"
+    checked = "held-out data agree with this U" if agrees else "no held-out data confirm this U"
     prefix = "Calibrated, in simulation" if simulated else "Calibrated"
     return Verdict("good" if agrees else "neutral", f"{prefix}: {stated}; {checked}.")
 

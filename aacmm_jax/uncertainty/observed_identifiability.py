@@ -153,7 +153,11 @@ def _linear(
     else:
         of_arm = [covariance_of_sigma(error, np.asarray(1.0 if weigh is None else weigh)) for error in errors]
     if weigh is None:
-        rows = [part._replace(measured=np.zeros_like(part.measured)) for part in rows]
+        # Of more residuals than a tip has coordinates, the tip's scatter alone has a covariance without an inverse.
+        rows = [
+            part if len(part.values) > error.by_seat.shape[1] else part._replace(measured=np.zeros_like(part.measured))
+            for part, error in zip(rows, errors, strict=True)
+        ]
     whitening = whitening_of(rows, observed, of_arm, np.asarray(_LEAST_U))
     if weigh is None:
         weights = {name: np.full_like(weight, certified) for name, weight in whitening.certified.items()}

@@ -110,13 +110,13 @@ REFUSED = {
     ),
     "a covariance that is not positive": (
         lambda arm: kinds.MeasuredPoints("T", Q, POINTS, covariance=np.diag([1.0, 1.0, -0.1])),
-        "covariance of observation 'T' is not symmetric and positive; give variances in mm^2.",
+        "covariance of observation 'T' is not symmetric and positive semidefinite; give variances in mm^2.",
     ),
     "a covariance that is not symmetric": (
         lambda arm: kinds.MeasuredTransforms(
             "T", Q, POINTS, np.stack([np.eye(3)] * 30), u_angle=0.1, covariance=np.triu(np.ones((3, 3)))
         ),
-        "covariance of observation 'T' is not symmetric and positive; give variances in mm^2.",
+        "covariance of observation 'T' is not symmetric and positive semidefinite; give variances in mm^2.",
     ),
     "mixed units": (
         lambda arm: kinds.MeasuredPoints("T", np.rad2deg(Q), POINTS),

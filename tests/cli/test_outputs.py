@@ -176,7 +176,7 @@ def test_a_file_of_somebody_else_is_not_replaced(aacmm, calibrated, command, out
     path = calibrated / output
     path.write_bytes(foreign)
     done = aacmm(*command, output, expect=2)
-    assert f"{output} exists and is not an earlier output of this kind" in done.stderr
+    assert f"{output} exists and is not an earlier output of the same kind" in done.stderr
     assert path.read_bytes() == foreign
     aacmm(*command, output, "--overwrite")
     written = path.read_bytes()

@@ -15,8 +15,8 @@ from aacmm_jax.files.hdf5 import undamaged
 from tests.refusals import assert_refused
 
 SENTENCE = (
-    "JAX cannot start, because JAX_PLATFORMS=cuda names no device that this machine and this installation have; remove "
-    "this setting, or set JAX_PLATFORMS=cpu."
+    "JAX cannot start, because this installation of JAX finds no device for JAX_PLATFORMS=cuda; remove this setting, "
+    "or set JAX_PLATFORMS=cpu."
 )
 
 
@@ -82,7 +82,9 @@ def test_commands_without_the_device_that_is_asked_for(aacmm_process, monkeypatc
     simulate = ("simulate", "panda", "-o", "c.h5", "--socket", "A=400,0,300", "--poses", 10)
     for command in (simulate, ("import", "none.toml", "-o", "i.h5"), ("show", "panda")):
         done = aacmm_process(*command, expect=2 if command[0] == "import" else 0)
-        assert done.stderr.startswith(f"Warning: JAX cannot start, because {setting} names no device")
+        assert done.stderr.startswith(
+            f"Warning: JAX cannot start, because this installation of JAX finds no device for {setting};"
+        )
         assert "damaged" not in done.stderr
     assert aacmm_process("show", "c.h5").stderr == ""
 

@@ -7,6 +7,8 @@ import json
 import math
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -55,12 +57,13 @@ class AbstractSight(AbstractObservation):
         between = tips.position - frame[3:]
         values, by_local = self.seen_at(products_by_column(rotation.swapaxes(0, 1), between))
         by_tip = xp.einsum("rim,jim->rjm", by_local, xp.broadcast_to(rotation, (3, 3, m)))
-        by_turn = [-xp.sum(by_tip * cross(xp.broadcast_to(axes[:, k], (3, m)), between), axis=1) for k in range(3)]
+        turned = [cross(xp.broadcast_to(axes[:, k], (3, m)), between) for k in range(3)]
+        by_turn = [-xp.sum(by_tip * moved[None], axis=1) for moved in turned]
         return Rows(
             values=values - self.seen(),
             by_tip=by_tip,
             by_unknowns={self.frame: xp.concatenate([xp.stack(by_turn), -xp.moveaxis(by_tip, 1, 0)])},
-            measured=variances(self.u, m) * xp.asarray(np.eye(2)),
+            measured=variances(self.u, m) * xp.asarray(np.eye(2))[None],
         )
 
 
@@ -87,8 +90,8 @@ class Bearing(AbstractSight):
     def seen_at(self, local):
         xp, (x, y, z) = namespace(local), local
         flat, square = xp.sqrt(x**2 + y**2), x**2 + y**2 + z**2
-        by_azimuth = xp.stack([-y, x, xp.zeros_like(x)]) / flat**2
-        by_elevation = xp.stack([-x * z / flat, -y * z / flat, flat]) / square
+        by_azimuth = xp.stack([-y, x, xp.zeros_like(x)]) / flat[None] ** 2
+        by_elevation = xp.stack([-x * z / flat, -y * z / flat, flat]) / square[None]
         return xp.stack([xp.arctan2(y, x), xp.arctan2(z, flat)]), xp.stack([by_azimuth, by_elevation])
 
 
@@ -114,7 +117,7 @@ class Picture(AbstractSight):
         xp, (x, y, z) = namespace(local), local
         none = xp.zeros_like(x)
         by_local = [xp.stack([-y / x, none + 1, none]), xp.stack([-z / x, none, none + 1])]
-        return FOCAL * xp.stack([y, z]) / x, xp.stack(by_local) * FOCAL / x
+        return FOCAL * xp.stack([y, z]) / x[None], xp.stack(by_local) * FOCAL / x[None, None]
 
 
 class AbstractSimulatedSight(AbstractInBox):
@@ -217,7 +220,7 @@ def test_a_residual_in_mm_is_the_distance_from_the_line_of_sight():
 
 @pytest.mark.parametrize("units", [("rad", "mm"), ("mm", "rad", "px"), ("deg",)])
 def test_units_that_no_kind_may_have(units):
-    with pytest.raises(TypeError, match="declare those in mm first"):
+    with pytest.raises(TypeError, match="declare the rows in mm first"):
         type("Wrong", (Bearing,), {"row_units": units})
 
 
@@ -328,3 +331,59 @@ def test_plans_choose_poses_of_it(paper_arm, kind):
         space=aj.Parameters(paper_arm, ("a_2", "d_4", "theta_3")), poses=20, candidates=120, seed=1,
     )  # fmt: skip
     assert {one.kind for one in planned.observations} == {kind, "sphere"}
+
+
+def test_a_batch_of_arms_is_evaluated_alike(recording):
+    """The same numbers from JAX as from NumPy, to rounding."""
+    arms = [recording.nominal.arm, recording.true.arm]
+    alone = [aj.evaluate(arm, recording.capture).observed for arm in arms]
+    together = aj.evaluate(jax.tree.map(lambda *leaves: jnp.stack(leaves), *arms), recording.capture).observed
+    for i, one in enumerate(alone):
+        for name in ("rms", "rms_angle", "rms_px", "reduced_chi"):
+            np.testing.assert_allclose(getattr(together, name)[i], getattr(one, name), rtol=1e-6)
+
+
+class Exposures(Picture):
+    """Pictures that were exposed several times in each pose: two residuals for each."""
+
+    kind, table = "exposures", "exposures"
+    pixels: Float[AnyArray, "m r"] = declared("column and row of each exposure", "px", "pose", "exposure")
+
+    @property
+    def row_units(self):
+        return ("px",) * self.pixels.shape[1]
+
+    def residual(self, tips, unknowns):
+        rows, count = super().residual(tips, unknowns), self.rows // 2
+        xp = namespace(rows)
+        measured = variances(self.u, self.q.shape[0]) * xp.asarray(np.eye(self.rows))[None]
+        by_unknowns = {name: xp.concatenate([by] * count, axis=1) for name, by in rows.by_unknowns.items()}
+        by_tip, values = (xp.concatenate([array] * count) for array in (rows.by_tip, rows.values + self.seen()))
+        return Rows(values - self.pixels.T, by_tip, by_unknowns, measured)
+
+    def seen(self):
+        return self.pixels[:, :2].T
+
+
+@pytest.mark.parametrize("kind", ["picture"], indirect=True, scope="module")
+def test_a_pose_may_have_more_residuals_than_its_tip_has_coordinates(recording):
+    """Ten exposures of each pose count as one whose variance is a tenth."""
+    random, once, several = np.random.default_rng(0), [], []
+    for sight in recording.capture.observations:
+        pixels = np.asarray(sight.pixels)[:, None] + 0.3 * random.normal(size=(len(sight.q), 10, 2))
+        several.append(Exposures(sight.name, sight.q, pixels.reshape(len(pixels), -1), u=0.3))
+        once.append(Picture(sight.name, sight.q, pixels.mean(axis=1), u=0.3 / np.sqrt(10)))
+    bounds, found, unseen = recording.nominal.bounds(), [], []
+    for observations in (once, several):
+        capture = aj.Capture(recording.capture.sockets, recording.capture.lengths, observations)
+        found.append(aj.calibrate(recording.nominal.arm, capture, bounds, noise=NOISE))
+        assert bool(found[-1].converged)
+        # Compared with the same poses, as if they were others.
+        unseen.append(aj.calibration.unseen_errors(aj.uncertainty_of(found[-1]), capture).of(["left", "right"]))
+    np.testing.assert_allclose(found[0].parameters, found[1].parameters, atol=1e-6)
+    covariances = [result.parameter_covariance.matrix for result in found]
+    np.testing.assert_allclose(*covariances, rtol=1e-3, atol=1e-9 * np.abs(covariances[0]).max())
+    np.testing.assert_allclose(found[1].observed.reduced_chi[-2:], 1.0, atol=0.15)
+    np.testing.assert_allclose(found[0].observed.rms_after, found[1].observed.rms_after, rtol=1e-3)
+    for name in ("count", "rms", "predicted"):
+        assert getattr(unseen[0], name) == pytest.approx(getattr(unseen[1], name), rel=1e-3)

@@ -95,7 +95,7 @@ def test_zero_offsets_leave_the_error_that_they_cannot_take(arm):
         assert min(rms(found.offsets + step), rms(found.offsets - step)) > found.rms
     assert 0.1 < found.rms < found.rms_nominal
     text = aj.files.zero_offsets_csv(found)
-    assert f"RMS {found.rms:.4f} mm, largest {found.largest:.4f} mm" in text
+    assert f"{found.rms:.4f} mm RMS, at most {found.largest:.4f} mm" in text
     rows = [line.split(",") for line in text.splitlines() if line[0].isdigit()]
     np.testing.assert_allclose([float(row[2]) for row in rows], found.offsets)
     np.testing.assert_allclose([float(row[1]) for row in rows], np.degrees(found.offsets))

@@ -313,7 +313,7 @@ SIX = ",".join(f"{x}" for x in Q[0, :6]) + "\n"
         (",".join(["meter"] + ["deg"] * 5) + "\n" + JOINTS + SIX, "", ["mixes units: 'J1 [meter]' is in m"]),
         (",".join(["rads"] * 6) + "\n" + JOINTS + SIX, "", ["says rad, but the manifest says deg"]),
         ("Base,Arm,Elbow,R,P,Y\n" + ",".join(["int"] * 6) + "\n" + SIX, "",
-         ["line 1 ('Base, Arm, Elbow and 3 more') and line 2", "add skip = 1 if line 2 names the columns"]),
+         ["line 1 ('Base, Arm, Elbow and 3 more') and line 2", "add skip = 1 if line 2 contains the names"]),
         ("# J6,J5,J4,J3,J2,J1\n# by hand\n" + SIX, "", ["in the order 'J6'"]),
         ("F,E,D,C,B,A\n" + SIX, "", [
             "add columns = [1, 2, 3, 4, 5, 6] if these columns are the readings of the joints"

@@ -229,7 +229,7 @@ REFUSED = {
     "no name": (('<link name="wrist_2"/>', "<link/>"), {}, ["a link has no name"]),
     "xacro": (('<link name="wrist_2"/>', '<xacro:arm name="x"/>'), {}, ["xacro FILE.xacro > FILE.urdf"]),
     "xacro value": (('xyz="0.35 0 0.03"', 'xyz="${length} 0 0"'), {}, ["xacro FILE.xacro > FILE.urdf"]),
-    "no XML": (("</robot>", ""), {}, ["not valid XML", "correct the file there"]),
+    "no XML": (("</robot>", ""), {}, ["not valid XML", "correct the file at this point"]),
     "another format": (("<robot", "<model"), {}, ["root element is <model>"]),
     "misspelt origin": (
         ('<origin xyz="0.35', '<orign xyz="0.35'), {}, ["line 50: joint 'joint_4'", "<orign>; did you mean '<origin>'?"]

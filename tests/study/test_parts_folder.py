@@ -50,11 +50,11 @@ PLANTED = {
     ),
     "a folder": (
         lambda path: give(parts_of(path)),
-        FOLDER + r"so its study is not continued; choose another output path",
+        FOLDER + r"so the study is not continued; choose another output path",
         FOLDER + r"but s\.h5 belongs to root, so the blocks are not read; make one user the owner of both",
     ),
     "a block": (lambda path: give(min(parts_of(path).iterdir())), BLOCK, BLOCK),
-    "a colleague's": (colleague, r"s\.h5 belongs to nobody, so its study is not continued", None),
+    "a colleague's": (colleague, r"s\.h5 belongs to nobody, so the study is not continued", None),
 }
 
 

@@ -87,7 +87,7 @@ def test_what_a_toml_file_names_is_in_its_folder(tmp_path, noisy_capture, paper_
         ({"noise": {"encoder_arcsec": [1, -2]}}, "'noise.encoder_arcsec 2' must be greater than or equal to 0, not -2"),
         ({"noise": {"seating_mm": float("nan")}}, "'noise.seating_mm' must be a finite number, not nan"),
         ({"bounds": {"length_mm": []}}, "'bounds.length_mm' has no entries; give at least 1"),
-        ({"bounds": {"length_mm": [2, 1, 2]}}, "bounds.length_mm: the level 2 is given twice"),
+        ({"bounds": {"length_mm": [2, 1, 2]}}, "bounds.length_mm: the value 2 is given twice"),
         ({"bounds": {"override": {"d_33": 1}}}, "bounds.override: unknown parameter 'd_33'"),
         (
             {"bounds": {"length_mm": list(range(1, 200)), "angle_deg": list(range(1, 200))}},

@@ -26,9 +26,9 @@ def finding(severity, doubt="", says="Something was found."):
             HELD_OUT_RMS,
             "good",
             "Calibrated: U (95 %) of a measured length of 300 mm is 0.020 mm (at worst 0.10 mm); held-out data agree "
-            "with it.",
+            "with this U.",
         ),
-        ([], None, "neutral", "no held-out data confirm it"),
+        ([], None, "neutral", "no held-out data confirm this U"),
         ([finding("note")], HELD_OUT_RMS, "good", "Calibrated: U (95 %)"),
         ([finding("unusable", says="It stopped.")], HELD_OUT_RMS, "bad", "Not usable. It stopped."),
         (

@@ -90,7 +90,9 @@ class MeasuredPoints(AbstractObservation):
             values = np.asarray(self.covariance)
             symmetric = np.allclose(values, values.swapaxes(-1, -2), rtol=1e-6, atol=1e-15)
             if not symmetric or np.linalg.eigvalsh(values).min() < -1e-12 * max(np.abs(values).max(), 1e-300):
-                raise InputError(f"covariance of {where} is not symmetric and positive; give variances in mm^2.")
+                raise InputError(
+                    f"covariance of {where} is not symmetric and positive semidefinite; give variances in mm^2."
+                )
         return {}
 
     def check_determined(self, tips: Float[np.ndarray, "3 m"]) -> None:

@@ -167,7 +167,7 @@ class AbstractObservation(Declared):
         normal = xp.einsum("ram,rbm->mab", by_tip, by_tip)
         # Directions of the tip that no residual depends on, such as the line of sight, get no displacement.
         least = _UNSEEN * xp.einsum("maa->m", normal) + 1e-300
-        inverse = inverse_positive_definite(normal + least[:, None, None] * xp.asarray(np.eye(3)))
+        inverse = inverse_positive_definite(normal + least[:, None, None] * xp.asarray(np.eye(3))[None])
         return products_by_column(xp.einsum("mab,rbm->arm", inverse, by_tip), rows)
 
     @property
@@ -271,7 +271,8 @@ def _check_row_units(name: str, units: tuple[str, ...]) -> None:
     others = units[units.count("mm") :]
     if "mm" in others or len(set(others)) > 1 or not set(others) <= set(OTHER_UNITS):
         raise TypeError(
-            f"row_units of {name} are {units}; declare those in mm first, then others that are all in rad or all in px."
+            f"row_units of {name} are {units}; declare the rows in mm first, followed by rows that are all in rad or "
+            "all in px."
         )
 
 

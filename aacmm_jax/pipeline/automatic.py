@@ -1,0 +1,146 @@
+"""What `calibrate_capture` decides where nothing is said: bounds, groups left out, the model of joints.
+
+Each remedy is tried only where the calibration shows that it is needed, is kept only where it helps, and says in one
+sentence what was done and why. What somebody stated is never overruled: stated bounds stay, and with a stated model,
+prior, method or robust loss no models are compared.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..calibration.record import CalibrationRecord
+from ..calibration.results import Calibration, Identification
+from ..core.distributions import f_tail
+from ..core.errors import InputError
+from ..core.text import shorten
+from ..core.units import DEG
+from ..data.capture import Capture
+from ..data.recording import Recording
+from ..diagnostics.contradictions import remove_contradicting
+from ..diagnostics.equations import EXACT
+from ..diagnostics.usability import on_bounds
+from ..kinematics.arm import is_length
+from ..kinematics.parameters import ArmSpecification
+from ..kinematics.priors import default_prior
+from .model_ladder import ComparedModels, compare_models, default_models
+
+Solve = Callable[[Recording], Calibration | Identification]
+Record = Callable[[Calibration | Identification, Recording], CalibrationRecord]
+
+_WIDER, _ROUNDS = 5.0, 4  # factor by which bounds that were reached are widened, and how often
+_WIDEST = np.pi / 2  # rad
+_BY_CHANCE = 0.01  # probability of so much smaller residuals by chance, below which wider bounds are kept
+_PLAIN = "dh"
+_SOME, _FUNCTIONS = "harmonics=1-6", "functions"
+_WORTH = 10.0  # log evidence that a richer model must add for a still richer one to be tried
+
+
+def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
+    """The calibration with wider bounds where parameters ended on one that nobody stated, and the residuals are smaller
+    by more than chance explains; else as it is."""
+    first, nominal = on_bounds(record), record.recording.nominal
+    if not first or "bounds" in nominal.stated:
+        return record
+    best, wider = record, record
+    for _ in range(_ROUNDS):
+        reached = {*on_bounds(wider), *on_bounds(wider, final=True)}
+        if not reached:
+            break
+        recording = wider.recording._replace(nominal=_widened(wider, reached))
+        try:
+            result = solve(recording)
+        except InputError:  # with such bounds the data do not determine the arm
+            break
+        wider = recorded(result, recording)
+        if wider.converged and _is_better(wider, best, len(reached)):
+            best = wider
+    if best is record:
+        return record
+    widths = {name: _half_width(best.recording.nominal, name) for name in best.names}
+    texts = [
+        f"{name} (to ±{width:.3g} mm)" if is_length(name) else f"{name} (to ±{width / DEG:.3g} deg)"
+        for name, width in widths.items()
+        if width > _half_width(nominal, name)
+    ]
+    says = (
+        f"Default bounds were widened where the fit reached them: {shorten(texts, 4)}. The residuals fell from "
+        f"{record.observed.rms:.3g} to {best.observed.rms:.3g} mm RMS."
+    )
+    return best._replace(decisions=(*record.decisions, says))
+
+
+def _half_width(nominal: ArmSpecification, name: str) -> float:
+    """Half-width of the bounds of a parameter, mm or rad."""
+    return nominal.override.get(name, nominal.length if is_length(name) else nominal.angle)
+
+
+def _widened(record: CalibrationRecord, reached: set[str]) -> ArmSpecification:
+    nominal = record.recording.nominal
+    widths = {name: _WIDER * _half_width(nominal, name) for name in reached}
+    widths = {name: width if is_length(name) else min(width, _WIDEST) for name, width in widths.items()}
+    return nominal._replace(override={**nominal.override, **widths})
+
+
+def _is_better(wider: CalibrationRecord, record: CalibrationRecord, widened: int) -> bool:
+    """Whether residuals are smaller by more than chance explains, by the F test of so many further parameters."""
+    before, after = record.observed.rms**2, max(wider.observed.rms**2, 1e-300)
+    freedom = max(wider.degrees_of_freedom, 1.0)
+    return f_tail(max(before - after, 0.0) * freedom / widened / after, widened, freedom) < _BY_CHANCE
+
+
+def without_contradicting(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
+    """The calibration without groups that contradict all others, where the data show which groups these are."""
+
+    def solved(capture: Capture) -> CalibrationRecord:
+        part = record.recording._replace(capture=capture)
+        return recorded(solve(part), part)
+
+    kept = remove_contradicting(record, solved)
+    return kept._replace(decisions=record.decisions)
+
+
+def with_best_model(record: CalibrationRecord, recorded: Record, options: Any) -> CalibrationRecord:
+    """The calibration with the model of the joints that predicts held-out regions best; as it is where that is the arm
+    alone, or where there are too few poses to hold some out."""
+    recording = record.recording
+    nominal, capture = recording.nominal, recording.capture
+    if record.observed.rms < EXACT:  # simulated without noise
+        return record
+    bounds = nominal.bounds()
+
+    def compared(models: list[str]) -> ComparedModels:
+        return compare_models(nominal.arm, capture, bounds, models=models, noise=options.noise)
+
+    models = [model for model in default_models(nominal.arm, capture) if _FUNCTIONS not in model]
+    try:
+        ladder = options.stage("Comparing models", lambda: compared(models))
+        # Models with more functions of each joint take longer, and the next is tried only where the last explains more.
+        for functions in (_SOME, _FUNCTIONS):
+            before = max(ladder.models, key=lambda model: model.log_evidence)
+            richer = _with_functions(before.model, functions)
+            added = options.stage(f"Comparing models ({richer})", lambda model=richer: compared([model]))
+            ladder = ComparedModels((*ladder.models, *added.models))
+            if added.models[0].log_evidence < before.log_evidence + _WORTH:
+                break
+    except (InputError, np.linalg.LinAlgError):  # too few poses to hold some out, or to fit that many functions
+        return record
+    chosen, plain = ladder.recommended, ladder.models[0]
+    if chosen.model == _PLAIN or not chosen.result.converged:
+        return record
+    says = (
+        f"Model of the joints: {chosen.model}. It predicts held-out regions to {chosen.rms_outside:.3g} mm RMS, where "
+        f"Denavit-Hartenberg parameters alone predict them to {plain.rms_outside:.3g} mm ({len(ladder.models)} models "
+        f"compared, {len(chosen.regions)} regions)."
+    )
+    corrected = chosen.result.space.base
+    modelled = recording._replace(nominal=nominal._replace(arm=corrected, prior=default_prior(corrected)))
+    again = recorded(chosen.result, modelled)
+    return again._replace(removed=record.removed, decisions=(*record.decisions, says))
+
+
+def _with_functions(model: str, functions: str) -> str:
+    """A model with these functions of each joint in place of its own."""
+    kinds = [kind for kind in model.split(",") if kind != _PLAIN and not kind.startswith("harmonics")]
+    return ",".join([*kinds[:1], functions, *kinds[1:]] if kinds[:1] == ["gravity"] else [functions, *kinds])
