@@ -77,23 +77,23 @@ def _seen(arm: aj.Arm, capture: aj.Capture, geometry: Any = None) -> Any:
 def scale() -> None:
     """k after stage 1 of forty captures, with all lengths free and with a scale anchor."""
     arm, space, bounds = _paper()
-    found: dict[str | None, list[float]] = {None: [], "longest": []}
+    errors: dict[str | None, list[float]] = {None: [], "longest": []}
     for seed in range(40):
         true = aj.perturbed_arm(space, length=1.0, angle=np.radians(0.1), seed=seed)
         capture = _capture(true, seed, {"A": 70, "B": 10})
-        for hold, values in found.items():
+        for hold, values in errors.items():
             scale_found = aj.identify(arm, capture, bounds, hold=hold).scale
             assert scale_found is not None
             values.append(float(scale_found.value))
     axes = _axes(2.6)
     for height, (hold, colour) in enumerate((("longest", BLUE), (None, ORANGE))):
         jitter = np.random.default_rng(0).uniform(-0.22, 0.22, 40)
-        axes.plot(found[hold], height + jitter, "o", color=colour, markersize=5, alpha=0.8)
+        axes.plot(errors[hold], height + jitter, "o", color=colour, markersize=5, alpha=0.8)
     axes.axvline(1.0, color=GREY, linewidth=1)
     axes.set_yticks((0, 1), ("scale anchor d_3", "all lengths free"))
     axes.set(xlabel="k after stage 1 (1 is right)", ylim=(-0.5, 1.5))
     _save(axes, "explanation/scale")
-    print({hold: (np.mean(values), np.min(values), np.max(values)) for hold, values in found.items()})
+    print({hold: (np.mean(values), np.min(values), np.max(values)) for hold, values in errors.items()})
 
 
 def method() -> None:
@@ -103,8 +103,8 @@ def method() -> None:
     capture = _capture(true, 1, {"A": 70, "B": 10})
     result = aj.calibrate(arm, capture, bounds)
     axes = _axes()
-    for label, each, colour, marker in (("nominal arm", arm, ORANGE, "o"), ("calibrated arm", result.arm, BLUE, "s")):
-        tips = np.asarray(each.position(np.asarray(capture.sockets["A"])))
+    for label, shown, colour, marker in (("nominal arm", arm, ORANGE, "o"), ("calibrated arm", result.arm, BLUE, "s")):
+        tips = np.asarray(shown.position(np.asarray(capture.sockets["A"])))
         distance = np.linalg.norm(tips - tips.mean(axis=0), axis=1)
         axes.plot(
             np.arange(1, 71),
@@ -126,8 +126,8 @@ def uncertainty() -> None:
     for poses, style in ((15, ":"), (30, "-."), (60, "--"), (120, "-")):
         capture = _capture(arm, 3, {"A": poses // 2, "B": poses - poses // 2})
         result = aj.calibrate(arm, capture, bounds, method="joint", noise=NOISE, shared_errors=False)
-        found = aj.uncertainty_of(result)
-        U = 1000 * np.sort(aj.volumetric_uncertainty(found, points=400).expanded_length)
+        of_result = aj.uncertainty_of(result)
+        U = 1000 * np.sort(aj.volumetric_uncertainty(of_result, points=400).expanded_length)
         axes.plot(U, np.linspace(0, 100, len(U)), color=BLUE, linestyle=style, linewidth=2, label=f"{poses} poses")
     axes.set(xlabel="U (95 %) of a length of 300 mm [um]", ylabel="lengths below it [%]", xlim=(0, 80))
     axes.legend(loc="lower right")
@@ -178,7 +178,7 @@ def planned_poses() -> None:
     axes.set(xlabel="poses", ylabel="U (k = 2) of a length of 300 mm [mm]", xscale="log", yscale="log")
     axes.set_xticks(rows["poses"], [str(poses) for poses in rows["poses"]])
     ticks = (0.008, 0.012, 0.02, 0.03, 0.04, 0.06, 0.1)
-    axes.set_yticks(ticks, [str(each) for each in ticks])
+    axes.set_yticks(ticks, [str(tick) for tick in ticks])
     axes.minorticks_off()
     axes.legend()
     _save(axes, "planned_poses")

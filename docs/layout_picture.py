@@ -29,8 +29,8 @@ STYLE = """
 def layers() -> list[list[str]]:
     """The folders of each layer, from the top."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    (found,) = (each["layers"] for each in contracts if each["type"] == "layers")
-    return [sorted(layer.split(" | ")) for layer in found]
+    (folders,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
+    return [sorted(layer.split(" | ")) for layer in folders]
 
 
 def modules(folder: str) -> list[Path]:
@@ -41,7 +41,7 @@ def modules(folder: str) -> list[Path]:
 def imported_folders(path: Path) -> set[str]:
     """The folders of the package from which a module imports, inside of functions too."""
     package = path.relative_to(ROOT).parts[:-1]  # of the module; of an __init__.py the package itself
-    found = set()
+    imported = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = package[: len(package) - node.level + 1] + tuple(node.module.split(".") if node.module else ())
@@ -52,8 +52,8 @@ def imported_folders(path: Path) -> set[str]:
             named = [tuple(alias.name.split(".")) for alias in node.names]
         else:
             continue
-        found |= {name[1] for name in named if name[0] == PACKAGE and len(name) > 1}
-    return found
+        imported |= {name[1] for name in named if name[0] == PACKAGE and len(name) > 1}
+    return imported
 
 
 def imports(folders: list[str]) -> dict[tuple[str, str], int]:

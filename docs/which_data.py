@@ -66,7 +66,7 @@ class Case(NamedTuple):
 
 def cases() -> dict[str, Case]:
     """A measuring arm, robots with six and with seven joints, and a hobby arm."""
-    found = {}
+    by_name = {}
     for key, name, title, of_class, u_artefact, u_tracker, part, facing in (
         ("measuring", "cheng2018-simulation", "Measuring arm", "measuring arm", 0.002, 0.015, 1.0, 0.0),
         ("robot", "ur5e", "Robot", "robot", 0.01, 0.03, 1.0, 0.0),
@@ -77,8 +77,8 @@ def cases() -> dict[str, Case]:
         noise = aj.Noise(encoder_arcsec=np.asarray(class_noise(arm, of_class).encoder_arcsec), seating=SEATING)
         prior = aj.Prior({"lengths": 1.0, "angles": np.radians(1.0)}) if key == "hobby" else None
         size = part * float(aj.kinematics.arm_reach(arm).radius)
-        found[key] = Case(title, arm, noise, u_artefact, u_tracker, size, facing, prior)
-    return found
+        by_name[key] = Case(title, arm, noise, u_artefact, u_tracker, size, facing, prior)
+    return by_name
 
 
 def _sockets(case: Case, number: int, poses: int, seed: int, lengths: bool) -> aj.Capture:
@@ -125,8 +125,8 @@ def _spheres(case: Case, poses: int, seed: int) -> aj.Capture:
 
 
 def _planes(case: Case, poses: int, seed: int) -> aj.Capture:
-    corner, one, other = case.at((0.3, -0.2, 0.1), (0.65, -0.2, 0.1), (0.3, 0.15, 0.1))
-    sides = np.stack([one, other]) - corner
+    corner, first, second = case.at((0.3, -0.2, 0.1), (0.65, -0.2, 0.1), (0.3, 0.15, 0.1))
+    sides = np.stack([first, second]) - corner
     planes = kinds.SimulatedPlanes("planes", corner, sides, poses // 2, 0.25 * case.size, case.u_artefact)
     return _observed(case, seed, planes)
 
@@ -134,8 +134,8 @@ def _planes(case: Case, poses: int, seed: int) -> aj.Capture:
 def _distances(case: Case, poses: int, seed: int) -> aj.Capture:
     box, pivots = case.box(), case.at((0.2, -0.6, -0.1), (0.7, 0.5, 0.0))
     u = case.u_artefact
-    each = (kinds.SimulatedDistances(f"pivot {i}", box, poses // 2, pivot, u) for i, pivot in enumerate(pivots))
-    return _observed(case, seed, *each)
+    distances = (kinds.SimulatedDistances(f"pivot {i}", box, poses // 2, pivot, u) for i, pivot in enumerate(pivots))
+    return _observed(case, seed, *distances)
 
 
 def _station(case: Case) -> np.ndarray:
@@ -175,10 +175,10 @@ def predicted(case: Case, data: str, poses: int, seed: int) -> dict[str, float |
     space = determined_parameters(case.arm, capture)
     seen = aj.observability(case.arm, capture, space)
     well = seen.rank - len(seen.trade_offs)
-    found: dict[str, float | int | None] = {"parameters": well, "median": None, "largest": None}
+    prediction: dict[str, float | int | None] = {"parameters": well, "median": None, "largest": None}
     if not (capture.lengths or capture.observations):
-        return found  # whose scale is unknown
-    noise = case.noise if all(one.target == "" for one in capture.observations) else case.unseated
+        return prediction  # whose scale is unknown
+    noise = case.noise if all(observation.target == "" for observation in capture.observations) else case.unseated
     options: dict[str, Any] = {"replace_noise": False, "shared_errors": False, "prior": case.prior}
     bounds = aj.Bounds.around(case.arm, space)
     try:
@@ -186,10 +186,10 @@ def predicted(case: Case, data: str, poses: int, seed: int) -> dict[str, float |
     except aj.InputError as error:
         if "equations, but there are" not in str(error):
             raise
-        return found  # too few poses for so many parameters
+        return prediction  # too few poses for so many parameters
     uncertainty = aj.uncertainty_of(result)
     expanded = aj.volumetric_uncertainty(uncertainty, points=VOLUME, seed=0).expanded_length
-    return found | {"median": float(np.median(expanded)), "largest": float(np.max(expanded))}
+    return prediction | {"median": float(np.median(expanded)), "largest": float(np.max(expanded))}
 
 
 def predictions() -> list[dict]:
@@ -201,10 +201,10 @@ def predictions() -> list[dict]:
                 continue
             row: dict[str, Any] = {"arm": key, "data": name, "parameters": 0, "median": {}, "largest": {}}
             for poses in COUNTS:
-                found = [predicted(case, name, poses, seed) for seed in SEEDS]
-                row["parameters"] = max(row["parameters"], *(one["parameters"] for one in found))
+                by_seed = [predicted(case, name, poses, seed) for seed in SEEDS]
+                row["parameters"] = max(row["parameters"], *(prediction["parameters"] for prediction in by_seed))
                 for what in ("median", "largest"):
-                    values = [value for one in found if (value := one[what]) is not None]
+                    values = [value for prediction in by_seed if (value := prediction[what]) is not None]
                     row[what][str(poses)] = round(float(np.median(values)), 4) if values else None
             rows.append(row)
     return rows
@@ -239,7 +239,9 @@ def _tolerance(case: Case) -> str:
 
 def _noise(case: Case) -> str:
     arcsec = np.unique(np.asarray(case.noise.encoder_arcsec).round(1))
-    return f"encoders {', '.join(f'{each:g}' for each in arcsec)} arcsec, seat {1000 * float(case.noise.seating):g} um"
+    return (
+        f"encoders {', '.join(f'{value:g}' for value in arcsec)} arcsec, seat {1000 * float(case.noise.seating):g} um"
+    )
 
 
 def _cell(median: float | None, largest: float | None) -> str:

@@ -53,10 +53,10 @@ class Evaluation(eqx.Module):
     """Metrics of one arm on one capture, mm; of a batch of arms with its axes first.
 
     Example:
-        >>> found = aj.evaluate(result.arm, two_bars)
-        >>> print(found.error.round(3), "mm")
+        >>> evaluation = aj.evaluate(result.arm, two_bars)
+        >>> print(evaluation.error.round(3), "mm")
         [-0.003 -0.001] mm
-        >>> print(found.distances.shape)
+        >>> print(evaluation.distances.shape)
         (60,)
     """
 
@@ -95,8 +95,8 @@ def evaluate(
 
     Example:
         >>> new = aj.simulate(true, {"C": (300, -400, 400)}, poses=20, noise=noise, seed=9)
-        >>> for name, one in {"nominal": arm, "calibrated": result.arm}.items():
-        ...     print(f"{name}: DE {aj.evaluate(one, new).repeatability.de:.3f} mm")
+        >>> for name, evaluated in {"nominal": arm, "calibrated": result.arm}.items():
+        ...     print(f"{name}: DE {aj.evaluate(evaluated, new).repeatability.de:.3f} mm")
         nominal: DE 1.910 mm
         calibrated: DE 0.012 mm
     """

@@ -45,7 +45,7 @@ class StandingJoint(NamedTuple):
     Example:
         >>> q = np.array(capture.q)
         >>> q[:, 4] = 0.2
-        >>> print([(one.joint, one.range) for one in aj.diagnostics.standing_joints(arm, q)])
+        >>> print([(joint.joint, joint.range) for joint in aj.diagnostics.standing_joints(arm, q)])
         [(5, 0.0)]
     """
 

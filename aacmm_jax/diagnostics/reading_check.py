@@ -47,8 +47,8 @@ class ReadingCheck(NamedTuple):
     """What `check_readings` found.
 
     Example:
-        >>> found = aj.diagnostics.check_readings(arm, capture.q[:20], positions=true.position(capture.q[:20]))
-        >>> print(found.fits, found.explained, found.poses)
+        >>> check = aj.diagnostics.check_readings(arm, capture.q[:20], positions=true.position(capture.q[:20]))
+        >>> print(check.fits, check.explained, check.poses)
         True True 20
     """
 
@@ -104,8 +104,8 @@ def check_readings(
 
     Example:
         >>> in_another_order = capture.q[:20, [1, 0, 2, 3, 4, 5]]
-        >>> found = aj.diagnostics.check_readings(arm, in_another_order, positions=true.position(capture.q[:20]))
-        >>> print(found.fits, found.best.order)
+        >>> check = aj.diagnostics.check_readings(arm, in_another_order, positions=true.position(capture.q[:20]))
+        >>> print(check.fits, check.best.order)
         False (1, 0, 2, 3, 4, 5)
     """
     arm = to_numpy(arm)

@@ -36,8 +36,8 @@ class Explanation(NamedTuple):
 
     Example:
         >>> readings = capture.q[:20] * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
-        >>> found = aj.diagnostics.check_readings(arm, readings, positions=true.position(capture.q[:20]))
-        >>> print(found.best.signs, f"{found.best.rms:.1f} mm instead of {found.given.rms:.0f} mm")
+        >>> check = aj.diagnostics.check_readings(arm, readings, positions=true.position(capture.q[:20]))
+        >>> print(check.best.signs, f"{check.best.rms:.1f} mm instead of {check.given.rms:.0f} mm")
         (1, 1, -1, 1, 1, 1) 2.2 mm instead of 431 mm
     """
 

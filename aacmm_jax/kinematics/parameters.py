@@ -308,8 +308,9 @@ class ArmSpecification(NamedTuple):
     """An arm as a file states it, with the identification that the file proposes.
 
     Example:
-        >>> mine = aj.kinematics.ArmSpecification(arm, "my arm", length=5.0, override={"probe_z": 60.0})
-        >>> print(mine.name, len(mine.space().names), mine.bounds().upper[-1] - arm.probe[2])
+        >>> specification = aj.kinematics.ArmSpecification(arm, "my arm", length=5.0, override={"probe_z": 60.0})
+        >>> space, bounds = specification.space(), specification.bounds()
+        >>> print(specification.name, len(space.names), bounds.upper[-1] - arm.probe[2])
         my arm 21 60.0
     """
 

@@ -32,7 +32,7 @@ class KitPlan(NamedTuple):
         >>> box = [[200, -300, 100], [600, 300, 500]]
         >>> tracker = aj.data.observations.SimulatedPoints("tracker", box, 30, u=0.02)
         >>> planned = aj.planning.plan_kit(arm, [tracker], poses=30, candidates=100)
-        >>> print(planned.poses, [one.name for one in planned.observations])
+        >>> print(planned.poses, [observation.name for observation in planned.observations])
         30 ['tracker']
     """
 
@@ -90,7 +90,7 @@ def plan_kit(arm: Arm, kit: Sequence[KitItem | AbstractSimulated], *, poses: int
         >>> bar = aj.data.observations.SimulatedArtefact("ball bar", ends, 2, (0, 0, 0.7, 300, -200, 300), u=0.001)
         >>> tracker = aj.data.observations.SimulatedPoints("tracker", [[200, -300, 100], [600, 300, 500]], 30, u=0.02)
         >>> planned = aj.planning.plan_kit(arm, [bar, tracker], poses=30, candidates=100)
-        >>> print([one.name for one in planned.observations], sum(len(one.q) for one in planned.observations))
+        >>> print([observation.name for observation in planned.observations], planned.poses)
         ['ball bar', 'tracker'] 30
         >>> print(f"u of {planned.check_length:.0f} mm: at most {planned.predicted.largest:.2f} mm")
         u of 300 mm: at most 0.04 mm

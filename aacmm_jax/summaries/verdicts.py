@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..calibration.prediction import SIGNIFICANCE
+from ..calibration.agreement import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from ..uncertainty.coverage import U_AT_LEVEL

@@ -49,8 +49,8 @@ class Observability(NamedTuple):
     mm. ``null`` ``(p, nullity)`` are directions that change nothing that was recorded.
 
     Example:
-        >>> found = aj.observability(arm, capture, space)
-        >>> print(found.rank, len(found.undetermined), f"{found.condition:.0f}")
+        >>> analysis = aj.observability(arm, capture, space)
+        >>> print(analysis.rank, len(analysis.undetermined), f"{analysis.condition:.0f}")
         21 0 18
     """
 
@@ -161,12 +161,12 @@ def observability(
 
     Example:
         >>> one_socket = aj.simulate(arm, {"A": (400, 200, 300)}, poses=30)
-        >>> found = aj.observability(arm, one_socket, space)
-        >>> print(found.rank, "of", len(found.names))
+        >>> analysis = aj.observability(arm, one_socket, space)
+        >>> print(analysis.rank, "of", len(analysis.names))
         20 of 21
-        >>> print(found.undetermined[0])
+        >>> print(analysis.undetermined[0])
         all lengths together: the scale
-        >>> print(found.remedy)
+        >>> print(analysis.remedy)
         A reference length would determine these parameters.
     """
     if space is None:

@@ -43,15 +43,15 @@ def _summary(item: PublicName) -> str:
 def page(namespace: str, names: list[PublicName]) -> str:
     """The reference of one namespace as reStructuredText."""
     module = importlib.import_module(namespace)
-    own = [item for item in names if item.namespace == namespace]
+    of_namespace = [item for item in names if item.namespace == namespace]
     others = [item for item in names if any(name.rpartition(".")[0] == namespace for name in item.also)]
     title = namespace.replace("aacmm_jax", "aj", 1)
     lines = [*_underlined(title, "="), inspect.getdoc(module) or "", ""]
-    if own:
-        lines += ["| " + f"{_link(item.name)}: {_summary(item)}" for item in own] + [""]
+    if of_namespace:
+        lines += ["| " + f"{_link(item.name)}: {_summary(item)}" for item in of_namespace] + [""]
     if others:
         lines += ["Here too: " + ", ".join(_link(item.name) for item in others) + ".", ""]
-    for item in own:
+    for item in of_namespace:
         lines += [*_underlined(item.short, "-"), *_entry(item)]
     return "\n".join(lines) + "\n"
 

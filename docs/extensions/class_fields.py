@@ -26,21 +26,21 @@ def _fields_of(cls: type) -> dict[str, tuple[str, str]]:
     comments = _comments(source)
     (tree,) = ast.parse(source).body
     assert isinstance(tree, ast.ClassDef)
-    found = {}
+    named = {}
     for node in tree.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.end_lineno is not None:
             comment = comments.get(node.end_lineno, "")
-            found[node.target.id] = (ast.unparse(node.annotation), comment)
-    return found
+            named[node.target.id] = (ast.unparse(node.annotation), comment)
+    return named
 
 
 def fields(cls: type) -> dict[str, tuple[str, str]]:
     """Public fields of a class of this package and of its bases: name to annotation and comment."""
-    found: dict[str, tuple[str, str]] = {}
+    public: dict[str, tuple[str, str]] = {}
     for base in reversed(inspect.getmro(cls)):
         if base.__module__.startswith("aacmm_jax") and not issubclass(base, enum.Enum):
-            found |= {name: field for name, field in _fields_of(base).items() if not name.startswith("_")}
-    return found
+            public |= {name: field for name, field in _fields_of(base).items() if not name.startswith("_")}
+    return public
 
 
 def lines_of(cls: type, stated: str) -> list[str]:

@@ -87,7 +87,11 @@ def page() -> str:
     for name, command in _commands().items():
         parts.append(f"## aacmm {name}\n\n{_help(command.help or '')}\n")
         parts.append(f"{_help(command.epilog or '')}\n")
-        parameters = [one for one in command.params if one.name != "help" and not getattr(one, "hidden", False)]
+        parameters = [
+            parameter
+            for parameter in command.params
+            if parameter.name != "help" and not getattr(parameter, "hidden", False)
+        ]
         parts.append("\n".join(map(_parameter, parameters)))
     return "\n".join(parts)
 

@@ -83,8 +83,8 @@ def _kind(annotation: object) -> str:
 def _argument(model: type[BaseModel], key: str) -> str:
     """What the observation of a table says about an argument of this name."""
     text = getattr(_DOCUMENTED.get(model.__name__), "__doc__", None) or ""
-    found = re.search(rf"^ +{key}: (.*?)(?=\n +\w+: |\n\n|\Z)", text, flags=re.MULTILINE | re.DOTALL)
-    return " ".join(found[1].split()) if found else ""
+    match = re.search(rf"^ +{key}: (.*?)(?=\n +\w+: |\n\n|\Z)", text, flags=re.MULTILINE | re.DOTALL)
+    return " ".join(match[1].split()) if match else ""
 
 
 def description(model: type[BaseModel], key: str, field_name: str) -> str:
@@ -97,17 +97,17 @@ def description(model: type[BaseModel], key: str, field_name: str) -> str:
 
 def tables(model: type[BaseModel]) -> dict[str, tuple[type[BaseModel], bool]]:
     """Every table of a file by its name: its model, and whether there may be several."""
-    found: dict[str, tuple[type[BaseModel], bool]] = {"": (model, False)}
+    by_path: dict[str, tuple[type[BaseModel], bool]] = {"": (model, False)}
     waiting = [("", model)]
     while waiting:
         prefix, current = waiting.pop(0)
         for name, field in current.model_fields.items():
             for inner in _models(field.annotation):
                 path = f"{prefix}.{field.alias or name}".lstrip(".")
-                if path not in found:
-                    found[path] = (inner, "list[" in str(field.annotation))
+                if path not in by_path:
+                    by_path[path] = (inner, "list[" in str(field.annotation))
                     waiting.append((path, inner))
-    return found
+    return by_path
 
 
 def _table_of_keys(model: type[BaseModel]) -> list[str]:
@@ -138,15 +138,15 @@ def page(title: str, purpose: str, model: type[BaseModel]) -> str:
 def _written_files(folder: Path) -> dict[str, Path]:
     """A file of each kind, made of what the examples of the reference use."""
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "reference" / "index.md").read_text("utf-8"), flags=re.DOTALL)
-    found: dict[str, typing.Any] = {}
+    namespace: dict[str, typing.Any] = {}
     with contextlib.chdir(folder):
         for block in blocks:
-            exec(compile(block, "docs/reference/index.md", "exec"), found)
+            exec(compile(block, "docs/reference/index.md", "exec"), namespace)
     paths = {name: folder / f"{name}.h5" for name in ("capture", "calibration", "evaluation", "study")}
-    aj.files.save_capture(paths["capture"], found["recording"])
-    aj.files.save_calibration(paths["calibration"], found["record"])
-    recording = aj.Recording(found["two_bars"], found["nominal"])
-    aj.files.save_evaluation(paths["evaluation"], aj.evaluate_capture(found["record"], recording))
+    aj.files.save_capture(paths["capture"], namespace["recording"])
+    aj.files.save_calibration(paths["calibration"], namespace["record"])
+    recording = aj.Recording(namespace["two_bars"], namespace["nominal"])
+    aj.files.save_evaluation(paths["evaluation"], aj.evaluate_capture(namespace["record"], recording))
     return paths
 
 

@@ -8,10 +8,10 @@ from sphinx.util.docutils import SphinxTranslator
 
 def _converted(node, display: str) -> str:
     """The MathML of a formula; a command that the converter does not know, which it leaves as it is, is warned of."""
-    found = convert(node.astext(), display=display)
-    if "\\" in found:
+    formula = convert(node.astext(), display=display)
+    if "\\" in formula:
         logging.getLogger(__name__).warning("a formula has a command that cannot be shown: %s", node.astext())
-    return found
+    return formula
 
 
 def _inline(translator: SphinxTranslator, node) -> None:

@@ -74,7 +74,7 @@ def _sources(namespace: str) -> dict[str, Path]:
 def public_names() -> list[PublicName]:
     """Functions, classes and values that a namespace exports, namespaces themselves left out."""
     names: dict[object, list[str]] = {}
-    found: dict[object, tuple[object, Path]] = {}
+    defined: dict[object, tuple[object, Path]] = {}
     for namespace in namespaces():
         module, sources = importlib.import_module(namespace), _sources(namespace)
         for name in module.__all__:
@@ -85,5 +85,5 @@ def public_names() -> list[PublicName]:
             names.setdefault(key, []).append(f"{namespace}.{name}")
             path = inspect.getsourcefile(inspect.unwrap(value)) if callable(value) else sources[name]
             assert path is not None
-            found.setdefault(key, (value, Path(path)))
-    return [PublicName(full[0], found[key][0], tuple(full[1:]), found[key][1]) for key, full in names.items()]
+            defined.setdefault(key, (value, Path(path)))
+    return [PublicName(full[0], defined[key][0], tuple(full[1:]), defined[key][1]) for key, full in names.items()]

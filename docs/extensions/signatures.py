@@ -37,8 +37,9 @@ def _constructor(cls: type) -> str:
                 return _arguments(node)
     annotations, parameters = fields(cls), inspect.signature(cls).parameters.values()
     parts = [
-        f"{one.name}: {annotations.get(one.name, ('Any', ''))[0]}" + ("" if one.default is one.empty else " = ...")
-        for one in parameters
+        f"{parameter.name}: {annotations.get(parameter.name, ('Any', ''))[0]}"
+        + ("" if parameter.default is parameter.empty else " = ...")
+        for parameter in parameters
     ]
     return f"({', '.join(parts)})"
 
