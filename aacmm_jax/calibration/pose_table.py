@@ -2,22 +2,23 @@
 
 With rows in standard deviations of the noise, A their derivatives by the parameters less what the geometry follows of
 them, G those by the geometry, C the covariance of the parameters and F that of the geometry for given parameters, the
-rows of a pose have the covariance I + A C A^T + G F G^T where neither arm nor geometry knows the pose, and
-I - A C A^T - G F G^T where both were fitted to it.
+rows of a pose have the covariance I + A C A^T + G F G^T where neither the arm nor the geometry was fitted to it. Where
+both were, it is I - A S A^T - G F G^T, with the part S of C that follows from the scatter of single poses; functions of
+the readings that the model lacks add what the parameters do not follow of them.
 """
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..core.arrays import Numbers
-from ..core.numpy_or_jax import to_numpy
+from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..data.capture import Capture
 from ..data.noise import Noise
-from ..data.observations.observation import OTHER_UNITS, AbstractObservation
+from ..data.observations.observation import OTHER_UNITS
 from ..model.elimination import followed
 from ..model.layout import unknowns_of
 from ..model.observed import Observed
@@ -38,7 +39,7 @@ class PoseResiduals(NamedTuple):
     Example:
         >>> rows = aj.residuals_of(record)
         >>> print(rows.observation[0], rows.pose[0], rows.use[0], f"{rows.distance[0]:.3f} mm")
-        A 1 used 0.012 mm
+        A 1 used 0.013 mm
     """
 
     observation: tuple[str, ...]  # socket or other observation of each pose
@@ -53,10 +54,9 @@ class PoseResiduals(NamedTuple):
     def select(self, rows: Numbers) -> "PoseResiduals":
         """Some of the poses, by index or mask."""
         chosen = np.arange(len(self.pose))[np.asarray(rows)]
-        return PoseResiduals(
-            *(np.asarray(column)[chosen] if isinstance(column, np.ndarray) else tuple(column[i] for i in chosen)
-              for column in self)
-        )  # fmt: skip
+        return PoseResiduals._make(
+            column[chosen] if isinstance(column, np.ndarray) else tuple(column[i] for i in chosen) for column in self
+        )
 
     def used_as(self, use: str) -> "PoseResiduals":
         """The poses that were used, or those that were held out."""
@@ -94,14 +94,25 @@ def residuals_by_pose(
     weights = [np.concatenate([fitted[observed.slices[number]] for number in group.members]).astype(float)
                for group in observed.layout.groups]  # fmt: skip
     linear = linear._replace(weights=[*weights, *linear.weights[len(weights) :]])
+    of_used = _scatter_of(uncertainty, model)
     rows = []
     for part, by_parameters, by_geometry in zip(linear.parts(), *_derivatives(linear), strict=True):
         masks = used[part.poses], fitted[part.poses]
-        # Functions that the model lacks, the last parameters of the complete uncertainty, move held-out poses; in poses
-        # that were used, they are what the parameters did not follow.
-        by_parameters[model:, :, masks[0]] = 0.0
-        rows.append(_of_part(uncertainty, part, masks, by_parameters, by_geometry))
-    return _joined(rows)
+        rows.append(_of_part((uncertainty, of_used), part, masks, by_parameters, by_geometry))
+    return _concatenated(rows)
+
+
+def _scatter_of(uncertainty: Uncertainty, model: int) -> Float[np.ndarray, "p p"]:
+    """What is added to the covariance of used poses: less the part of the covariance of the parameters that follows
+    from their scatter; and that of the functions that the model lacks, the last parameters of the complete uncertainty,
+    with what the parameters follow of them."""
+    covariance, components = np.asarray(uncertainty.covariance), uncertainty.components
+    others = 0.0 if components is None else np.sum(np.asarray(components.matrices), axis=0)
+    scatter = np.zeros_like(covariance)
+    scatter[:model, :model] = (covariance - others)[:model, :model]
+    moments = covariance[model:, model:]
+    follow = np.concatenate([covariance[:model, model:] @ np.linalg.pinv(moments), np.eye(len(moments))])
+    return follow @ moments @ follow.T - scatter
 
 
 def noise_of_poses(uncertainty: Uncertainty) -> Noise:
@@ -112,7 +123,7 @@ def noise_of_poses(uncertainty: Uncertainty) -> Noise:
     return eqx.tree_at(lambda n: n.seating, noise, np.hypot(noise.seating, shared.sd_of(VISITS, SUCCESSIVE)))
 
 
-def _derivatives(linear: Linearisation) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _derivatives(linear: Linearisation) -> tuple[list[AnyArray], list[AnyArray]]:
     """Of the whitened rows of each observation, with the poses last: A, by mm and rad of the parameters; and G times a
     root of F."""
     influence, observed, p = linear.influence(), linear.observed, len(linear.space.names)
@@ -137,27 +148,33 @@ def _derivatives(linear: Linearisation) -> tuple[list[np.ndarray], list[np.ndarr
 
 
 def _of_part(
-    uncertainty: Uncertainty,
+    covariances: tuple[Uncertainty, Float[np.ndarray, "p p"]],
     part: ObservationRows,
     masks: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]],
     by_parameters: Float[np.ndarray, "p r m"],
     by_geometry: Float[np.ndarray, "g r m"],
 ) -> PoseResiduals:
-    """The poses of one observation; masks: those that the arm, and those that the geometry was fitted to."""
+    """The poses of one observation. ``covariances`` are those of the parameters for held-out and for used poses,
+    ``masks`` the poses that the arm, and those that the geometry was fitted to."""
     observation, by_tip, (used, fitted) = part.observation, np.asarray(part.by_tip), masks
     values, m = np.asarray(part.values), len(used)
     position, moved = (np.asarray(observation.in_mm(rows, by_tip)) for rows in (values, by_tip))
     to_mm = np.moveaxis(np.linalg.inv(np.asarray(part.root)), 0, -1)
     to_mm = np.moveaxis(np.asarray(observation.in_mm(to_mm, by_tip)), -1, 0)
     a, g = np.moveaxis(by_parameters, -1, 0).swapaxes(1, 2), np.moveaxis(by_geometry, -1, 0).swapaxes(1, 2)
-    of_arm = uncertainty.covariance_of_functions(to_mm @ a)
-    of_geometry = np.einsum("mcg,mdg->mcd", to_mm @ g, to_mm @ g)
-    signs = np.where(used, -1.0, 1.0)[:, None, None], np.where(fitted, -1.0, 1.0)[:, None, None]
-    with np.errstate(invalid="ignore"):
-        variances = to_mm @ to_mm.swapaxes(1, 2) + signs[0] * of_arm + signs[1] * of_geometry
-        u = np.sqrt(np.maximum(np.einsum("mcc->m", variances), 0.0))
-    others = [np.linalg.norm(values[observation.lengths :], axis=0) if observation.other_unit == unit
-              else np.full(m, np.nan) for unit in OTHER_UNITS]  # fmt: skip
+    by_arm, by_place = to_mm @ a, to_mm @ g
+    of_arm = np.where(
+        used[:, None, None],
+        by_arm @ covariances[1] @ by_arm.swapaxes(1, 2),
+        covariances[0].covariance_of_functions(by_arm),
+    )
+    of_place = np.where(fitted, -1.0, 1.0)[:, None, None] * (by_place @ by_place.swapaxes(1, 2))
+    variances = to_mm @ to_mm.swapaxes(1, 2) + of_arm + of_place
+    u = np.sqrt(np.maximum(np.einsum("mcc->m", variances), 0.0))
+    angle, pixels = (
+        np.linalg.norm(values[observation.lengths :], axis=0) if observation.other_unit == unit else np.full(m, np.nan)
+        for unit in OTHER_UNITS
+    )
     alone = observation.kind == "socket" and m == 1 and bool(fitted.all())
     distance = np.full(m, np.nan) if alone else np.linalg.norm(position, axis=0)
     return PoseResiduals(
@@ -166,13 +183,26 @@ def _of_part(
         tuple(USED if of_pose else HELD_OUT for of_pose in used),
         np.einsum("cxm,cm->mx", moved, position),
         distance,
-        *others,
+        angle,
+        pixels,
         np.full(m, np.nan) if alone else u,
     )
 
 
-def _joined(parts: list[PoseResiduals]) -> PoseResiduals:
-    columns = zip(*parts, strict=True)
-    return PoseResiduals(
-        *(np.concatenate(column) if isinstance(column[0], np.ndarray) else sum(column, ()) for column in columns)
+def _concatenated(parts: Sequence[PoseResiduals]) -> PoseResiduals:
+    columns: Any = zip(*parts, strict=True)
+    return PoseResiduals._make(
+        np.concatenate(column) if isinstance(column[0], np.ndarray) else sum(column, ()) for column in columns
     )
+
+
+def joined_rows(used: PoseResiduals, held_out: PoseResiduals) -> PoseResiduals:
+    """Both in one table, observation by observation; the used poses have the numbers that the held-out ones leave."""
+    names, numbers = np.array(used.observation, dtype=object), used.pose.copy()
+    for name in dict.fromkeys(held_out.observation):
+        taken = held_out.pose[np.array(held_out.observation, dtype=object) == name]
+        free = np.setdiff1d(np.arange(1, int(np.sum(names == name)) + len(taken) + 1), taken)
+        numbers[names == name] = free
+    rows = _concatenated([used._replace(pose=numbers), held_out])
+    order = {name: i for i, name in enumerate(dict.fromkeys(rows.observation))}
+    return rows.select(np.lexsort((rows.pose, np.array([order[name] for name in rows.observation]))))
