@@ -98,7 +98,8 @@ def residuals_by_pose(
     rows = []
     for part, by_parameters, by_geometry in zip(linear.parts(), *_derivatives(linear), strict=True):
         masks = used[part.poses], fitted[part.poses]
-        rows.append(_of_part((uncertainty, of_used), part, masks, by_parameters, by_geometry))
+        derivatives = np.asarray(by_parameters), np.asarray(by_geometry)
+        rows.append(_of_part((uncertainty, of_used), part, masks, *derivatives))
     return _concatenated(rows)
 
 
