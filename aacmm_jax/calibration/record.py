@@ -21,8 +21,8 @@ from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.degrees_of_freedom import Components
+from .agreement import CrossValidation
 from .evaluation import Evaluation, evaluate
-from .prediction import CrossValidation
 from .results import (
     Calibration,
     Identification,

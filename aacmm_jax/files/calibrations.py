@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.agreement import CrossValidation, LeftOut
 from ..calibration.evaluation import Evaluation
-from ..calibration.prediction import CrossValidation, LeftOut
 from ..calibration.record import CalibrationRecord, OtherPoses, Removed
 from ..calibration.results import NoisyEncoder, ObservedMetrics, PriorMetrics
 from ..data.capture import Capture

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..calibration.prediction import CrossValidation, LeftOut, unseen_errors
+from ..calibration.agreement import CrossValidation, LeftOut
+from ..calibration.prediction import unseen_errors
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.scale_anchor import fixes_scale
 from ..core.arguments import checked_arguments, items_of, with_options

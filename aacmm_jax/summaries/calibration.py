@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.agreement import Agreement, CrossValidation
 from ..calibration.evaluation import Evaluation
-from ..calibration.prediction import Agreement, CrossValidation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics
 from ..core.text import csv_text, pluralise

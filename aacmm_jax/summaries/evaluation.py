@@ -7,8 +7,9 @@ import numpy as np
 from ..acceptance.judgement import RULES
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
+from ..calibration.agreement import NOTHING, Agreement
 from ..calibration.evaluation import Evaluation, evaluate
-from ..calibration.prediction import NOTHING, Agreement, unseen_errors
+from ..calibration.prediction import unseen_errors
 from ..core.errors import InputError
 from ..core.text import common_labels
 from ..data.capture import Capture, names_in, part_of

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..calibration.prediction import SIGNIFICANCE
+from ..calibration.agreement import SIGNIFICANCE
 from ..core.text import shorten
 from ..diagnostics.findings import Finding
 from ..uncertainty.coverage import U_AT_LEVEL
@@ -130,4 +130,7 @@ def _as_predicted(predicted: Mapping[str, Any]) -> Verdict:
         return Verdict("unsure", f"Errors on held-out data exceed the prediction (p = {chance:.1g}): {rms}.")
     if max(measured / expected if expected else 0.0, ratio or 0.0) > _LARGER:
         return Verdict("unsure", f"Errors on held-out data are larger than predicted, but this may be chance: {rms}.")
-    return Verdict("neutral", f"Errors on held-out data are about as predicted, or smaller: {rms}. No limit was given.")
+    return Verdict(
+        "neutral",
+        f"Errors on held-out data are about as predicted, or smaller: {rms}. No largest permitted error was given.",
+    )

@@ -300,7 +300,7 @@ def test_a_report_says_what_was_left_out(observed_record):
 
 
 def test_groups_held_out_are_listed_one_by_one_the_worst_first(written):
-    from aacmm_jax.calibration.prediction import CrossValidation, LeftOut
+    from aacmm_jax.calibration.agreement import CrossValidation, LeftOut
     from aacmm_jax.report.calibration import calibration_report
 
     def left_out(name, rms, predicted):
