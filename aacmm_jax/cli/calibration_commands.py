@@ -47,8 +47,8 @@ def calibrate(
     ),
     model: str | None = option(
         "Model these non-geometric errors of the joints, for example dh,gravity,harmonics=1+2,gear,coupled=2-3; dh "
-        "alone includes none of them. Default: the model of the arm file; if it has none, the model that predicts "
-        "held-out regions best.",
+        "alone includes none of them; gravity=masses takes the masses of the URDF as known. Default: the model of the "
+        "arm file; if it has none, the model that predicts held-out regions best.",
         "KINDS",
     ),
     prior: str | None = option(
