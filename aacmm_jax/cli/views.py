@@ -221,11 +221,14 @@ def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:
 def _uncertainty(summary: dict[str, Any]) -> View:
     """The expanded uncertainty over the volume, the noise that it follows from, and what the data determine."""
     part = summary["uncertainty"]
-    factors = ", ".join(filter(None, (LEVEL_IN_PERCENT, words.factor_words(part["volume"]))))
-    yield tables.volume_table(f"Expanded uncertainty U over the working volume ({factors}) [mm]", part["volume"])
+    regions = {"where poses were taken": part["where_poses_were_taken"], "over all joint limits": part["volume"]}
+    for region, volume in regions.items():
+        if volume is not None:
+            factors = ", ".join(filter(None, (LEVEL_IN_PERCENT, words.factor_words(volume))))
+            yield tables.volume_table(f"Expanded uncertainty U {region} ({factors}) [mm]", volume)
     yield (
-        "U is propagated from the uncertainties of the parameters to the tip positions of 400 random poses within the "
-        "joint limits."
+        "U is propagated from the uncertainties of the parameters to tip positions: those of poses of the calibration, "
+        "and those of 400 random poses within the joint limits."
     )
     if part.get("tried"):
         yield words.tried_sentence(part["tried"])

@@ -25,23 +25,20 @@ class Verdict(NamedTuple):
 
 
 def calibration_verdict(
-    findings: Sequence[Finding], volume: Mapping[str, Any], held_out: Mapping[str, Any] | None, simulated: bool
+    findings: Sequence[Finding], uncertainty: Mapping[str, Any], held_out: Mapping[str, Any] | None, simulated: bool
 ) -> Verdict:
-    """Of a calibration: by its findings, the most serious first, and by the uncertainty over the working volume and the
-    cross-validation of its summary."""
+    """Of a calibration: by its findings, the most serious first, and by the uncertainty and the cross-validation of its
+    summary."""
     unusable = [finding for finding in findings if finding.severity == "unusable"]
     if unusable:
         says = unusable[0].doubt
         return Verdict("bad", f"Not usable: {says}." if says else f"Not usable. {unusable[0].says}")
     doubts = list(dict.fromkeys(finding.doubt or _LACKING for finding in findings if finding.severity == "doubt"))
-    median, largest = (volume[f"expanded_length_reading_{which}_mm"] for which in ("median", "largest"))
-    if median is None or largest is None:
+    values, length = length_uncertainty(uncertainty), uncertainty["volume"]["length_mm"]
+    stated = f"{U_AT_LEVEL} of a measured length of {length:g} mm is {values}"
+    if values is None:
         doubts = ["the data do not determine lengths everywhere in the working volume", *doubts]
         return Verdict("unsure", f"To be used with care: {'; '.join(doubts)}.")
-    stated = (
-        f"{U_AT_LEVEL} of a measured length of {volume['length_mm']:g} mm is {two_digits(median)} mm (at worst "
-        f"{two_digits(largest)} mm)"
-    )
     if doubts:
         says = f"To be used with care: {'; '.join(doubts)}, so errors may exceed the stated uncertainty. {stated}."
         return Verdict("unsure", says)
@@ -49,6 +46,22 @@ def calibration_verdict(
     checked = "held-out data agree with this U" if agrees else "no held-out data confirm this U"
     prefix = "Calibrated, in simulation" if simulated else "Calibrated"
     return Verdict("good" if agrees else "neutral", f"{prefix}: {stated}; {checked}.")
+
+
+def length_uncertainty(uncertainty: Mapping[str, Any]) -> str | None:
+    """U of a measured length, where poses were taken and over all joint limits, of the summary of an uncertainty: its
+    median and, over all limits, its largest value; None where the data do not determine lengths."""
+    volume, near = uncertainty["volume"], uncertainty.get("where_poses_were_taken")
+
+    def of(region: Mapping[str, Any] | None, which: str) -> str | None:
+        value = None if region is None else region[f"expanded_length_reading_{which}_mm"]
+        return None if value is None else f"{two_digits(value)} mm"
+
+    median, largest, taken = of(volume, "median"), of(volume, "largest"), of(near, "median")
+    if median is None or largest is None:
+        return None
+    everywhere = f"{median} over all joint limits (at worst {largest})"
+    return everywhere if taken is None else f"{taken} where poses were taken, {everywhere}"
 
 
 def checked_lengths(

@@ -11,6 +11,8 @@ from aacmm_jax.summaries.verdicts import (
 )
 
 VOLUME = {"length_mm": 300.0, "expanded_length_reading_median_mm": 0.02, "expanded_length_reading_largest_mm": 0.1}
+NEAR = VOLUME | {"expanded_length_reading_median_mm": 0.011, "expanded_length_reading_largest_mm": 0.03}
+U = {"volume": VOLUME, "where_poses_were_taken": NEAR}
 HELD_OUT_RMS = {"rms_mm": 0.1}
 
 
@@ -25,8 +27,8 @@ def finding(severity, doubt="", says="Something was found."):
             [],
             HELD_OUT_RMS,
             "good",
-            "Calibrated: U (95 %) of a measured length of 300 mm is 0.020 mm (at worst 0.10 mm); held-out data agree "
-            "with this U.",
+            "Calibrated: U (95 %) of a measured length of 300 mm is 0.011 mm where poses were taken, 0.020 mm over all "
+            "joint limits (at worst 0.10 mm); held-out data agree with this U.",
         ),
         ([], None, "neutral", "no held-out data confirm this U"),
         ([finding("note")], HELD_OUT_RMS, "good", "Calibrated: U (95 %)"),
@@ -52,14 +54,16 @@ def finding(severity, doubt="", says="Something was found."):
     ],
 )
 def test_of_a_calibration(findings, held_out, mark, says):
-    verdict = calibration_verdict(findings, VOLUME, held_out, simulated=False)
+    verdict = calibration_verdict(findings, U, held_out, simulated=False)
     assert verdict.mark == mark
     assert says in verdict.says
 
 
 def test_of_a_simulation_and_of_what_is_not_determined():
-    assert calibration_verdict([], VOLUME, None, simulated=True).says.startswith("Calibrated, in simulation: U (95 %)")
-    unknown = VOLUME | {"expanded_length_reading_largest_mm": None}
+    assert calibration_verdict([], U, None, simulated=True).says.startswith("Calibrated, in simulation: U (95 %)")
+    nowhere_near = calibration_verdict([], U | {"where_poses_were_taken": None}, None, simulated=False)
+    assert "of 300 mm is 0.020 mm over all joint limits (at worst 0.10 mm)" in nowhere_near.says
+    unknown = U | {"volume": VOLUME | {"expanded_length_reading_largest_mm": None}}
     verdict = calibration_verdict([], unknown, HELD_OUT_RMS, simulated=False)
     assert verdict == (
         "unsure",
