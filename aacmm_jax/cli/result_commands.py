@@ -116,7 +116,7 @@ def evaluate(
             files.save_evaluation(output, record, summary)
             summary["written"] = str(output)
     show_summary(summary, as_json, views.points if capture is None else views.evaluation)
-    if summary["failed"] or any(test["decision"] in ("fails", "undecided") for test in summary["acceptance"]):
+    if not summary["verdict"]["achieved"]:
         raise typer.Exit(1)
 
 
