@@ -182,8 +182,8 @@ def _observations(summary: dict[str, Any]) -> View:
         hidden = len(summary["geometry"]) - len(parts)
         if hidden:
             yield (
-                f"{pluralise(hidden, 'more part')} of the geometry, including the positions of the sockets, with "
-                "--json."
+                f"--json also shows {pluralise(hidden, 'more part')} of the geometry, including the positions of the "
+                "sockets."
             )
     if summary.get("base"):
         yield base(summary["base"], factor)

@@ -198,8 +198,10 @@ PRIOR: Fields = {
     "units": text("unit of the standard deviation", "prior_group"),
     "parameters": count("number of free parameters in the group", "prior_group"),
     "sd": number("standard deviation, given or learned", "mm or rad, see unit", "prior_group"),
-    "effective": number("effective number of parameters of the group that the data determine", "1", "prior_group"),
-    "supported": truth("whether the data support a deviation of the group from its mean", "prior_group"),
+    "effective": number("how many parameters of the group the data determine (effective number)", "1", "prior_group"),
+    "supported": truth(
+        "whether the data show that parameters of the group differ from the means of their prior", "prior_group"
+    ),
     "names": text("free parameter", "prior_parameter", name="prior_parameter"),
     "mean": number("mean", _EITHER, "prior_parameter"),
     "weight": number("reciprocal of the standard deviation; 0 without a prior", "1/mm or 1/rad", "prior_parameter"),

@@ -38,7 +38,7 @@ _WORTH = 10.0  # log evidence that a richer model must add for a still richer on
 
 
 def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
-    """The calibration with wider bounds where parameters ended on one that nobody stated, and the residuals are smaller
+    """The calibration with wider bounds where parameters ended on one not stated, and the residuals are smaller
     by more than chance explains; else as it is."""
     first, nominal = on_bounds(record), record.recording.nominal
     if not first or "bounds" in nominal.stated:

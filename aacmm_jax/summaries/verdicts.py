@@ -155,4 +155,7 @@ def _as_predicted(held_out: Mapping[str, Any]) -> Verdict:
         return Verdict("unsure", f"Not confirmed: {says}.", False)
     if larger > _LARGER:
         return Verdict("unsure", f"Errors on held-out data are larger than predicted, but this may be chance: {rms}.")
-    return Verdict("neutral", f"Errors on held-out data are about as predicted, or smaller: {rms}. No limit was given.")
+    return Verdict(
+        "neutral",
+        f"Errors on held-out data are about as predicted, or smaller: {rms}. No largest permitted error was given.",
+    )
