@@ -21,6 +21,7 @@ from .options import argument, flag, names_option, option, output, seed
 
 
 @command(
+    "aacmm calibrate capture.toml",
     "aacmm calibrate capture.h5 -o calibration.h5",
     "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
     "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
@@ -28,9 +29,13 @@ from .options import argument, flag, names_option, option, output, seed
 )
 def calibrate(
     capture: list[Path] = argument(
-        "One capture, or several captures of the same arm (one per session).", "CAPTURE.h5 ..."
+        "Capture or manifest; or several of one arm, each of one session.", "CAPTURE.h5|MANIFEST.toml ..."
     ),
-    output: Path = output("Calibration to write (HDF5).", "FILE.h5"),
+    output: Path | None = output(
+        "Calibration to write (HDF5). Default: the name of the first capture, ending in -calibration.h5.",
+        "FILE.h5",
+        None,
+    ),
     method: Literal["two-stage", "joint"] | None = option(
         "two-stage: identify the parameters from the repeatability in each socket, then set the scale with the "
         "reference lengths; joint: one least-squares fit of all data. Default: joint if there are observations other "
@@ -42,8 +47,8 @@ def calibrate(
     ),
     model: str | None = option(
         "Model these non-geometric errors of the joints, for example dh,gravity,harmonics=1+2,gear,coupled=2-3; dh "
-        "alone includes none of them. Default: the model of the arm file; if it has none, the model that predicts "
-        "held-out regions best.",
+        "alone includes none of them; gravity=masses takes the masses of the URDF as known. Default: the model of the "
+        "arm file; if it has none, the model that predicts held-out regions best.",
         "KINDS",
     ),
     prior: str | None = option(
@@ -148,6 +153,7 @@ def calibrate(
         leave_out=tuple(leave_out or ()),
         stage=with_spinner,
     )
+    output = Path(f"{capture[0].stem}-calibration.h5") if output is None else output
     with together(output, figure):
         for file in capture:
             reading(file)
@@ -175,13 +181,17 @@ def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
         raise InputError("--same-probe applies to several captures only; name all captures, or leave out --same-probe.")
     sessions = {}
     for path in paths:
-        recording = files.load_capture(read := InputFile(path))
+        if path.suffix == ".toml":
+            recording = files.read_manifest(path)
+        else:
+            recording = files.load_capture(read := InputFile(path))
+            recording = recording._replace(sources=(fingerprint(read), *recording.sources))
         if path.stem in sessions:
             raise InputError(
                 f"two captures have the file name '{path.stem}', which becomes the name of the session; rename "
                 "one of the files."
             )
-        sessions[path.stem] = recording._replace(sources=(fingerprint(read), *recording.sources))
+        sessions[path.stem] = recording
     return pipeline.join_recordings(sessions, same_probe=same_probe)
 
 
@@ -232,7 +242,9 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
     name="compare-models",
 )
 def compare_models(
-    capture: Path = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5"),
+    capture: Path = argument(
+        "Capture, written by aacmm import or aacmm simulate; or the manifest of one.", "CAPTURE.h5|MANIFEST.toml"
+    ),
     models: str | None = option(
         "Models to compare, from the simplest to the most complex, separated by semicolons; each is written as for "
         "calibrate --model. Default: dh; gravity; harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); "
@@ -268,7 +280,7 @@ def compare_models(
 
     with together(output):
         reading(capture)
-        recording = files.load_capture(read := InputFile(capture))
+        recording = _recording([capture], same_probe=False)
     chosen = None if models is None else tuple(model.strip() for model in models.split(";"))
     if chosen is not None and not all(chosen):
         raise InputError(
@@ -286,7 +298,7 @@ def compare_models(
     summary = summaries.compared_models.compared_models_summary(compared, nominal.name)
     summary["poses"] = len(part.readings)
     if output is not None:
-        files.save_compared_models(output, summary, [fingerprint(read)], None if only_poses is None else seed)
+        files.save_compared_models(output, summary, recording.sources[:1], None if only_poses is None else seed)
         summary["written"] = str(output)
     show_summary(summary, as_json, summaries.compared_models.compared_models)
     if not compared.recommended.result.converged:

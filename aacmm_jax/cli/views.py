@@ -117,6 +117,8 @@ def calibration(summary: dict[str, Any]) -> View:
     if summary.get("lengths_tested"):
         yield words.lengths_sentence(summary["lengths_tested"])
     yield from (f"Decided by default: {decision}" for decision in summary["decisions"])
+    if summary["masses"]:
+        yield summary["masses"]
     anchor = f"scale anchor {summary['hold']}" if summary["hold"] else "no scale anchor"
     if summary["scale_k"] is not None:
         u = summary["scale_u"] or 0.0

@@ -12,13 +12,14 @@ from ..core.errors import InputError
 from ..core.text import shorten
 from ..data.capture import draw_poses
 from ..kinematics.parameters import Parameters
+from .capture_check import check_capture
 from .contradictions import session_metrics
 from .equations import EXACT
 from .findings import Case, Finding, findings_of
 from .missing_terms import missing
 from .noisy_encoders import noisiest_joint
 from .pose_residuals import distances_of
-from .reading_check import check_capture, explanation_words
+from .reading_check import coupling_words, explanation_words
 from .recorded import likely_cause
 from .residual_tests import LEVEL
 
@@ -91,6 +92,8 @@ def mistake_in_data(case: Case) -> str:
         check = check_capture(arm, capture)
     except InputError:  # neither two poses in a socket nor measured points
         return ""
+    if check.couplings:
+        return f"Likely cause: {coupling_words(check.couplings)}. {_TRY_ALL}"
     given, best = check.given.rms_fitted, check.best.rms_fitted
     if not check.explained or check.best == check.given or best * _BETTER > given:
         return ""

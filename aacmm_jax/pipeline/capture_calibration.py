@@ -20,7 +20,7 @@ from ..diagnostics.findings import case_of
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
-from .automatic import with_best_model, with_wider_bounds, without_contradicting
+from .automatic import with_best_model, with_full_couplings, with_wider_bounds, without_contradicting
 from .cross_validation import can_cross_validate, cross_validate
 from .single import CalibrationOptions, calibrate, identify
 
@@ -86,9 +86,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         monte_carlo: check the uncertainties by Monte Carlo.
         strict: raise `InputError` where such data could not determine free parameters even without noise.
         remove_contradicting: leave out groups that contradict all others.
-        automatic: widen default bounds that the fit reaches, leave out what contradicts the rest, and compare models of
-            the joints unless a model, a prior, a method or a robust loss is stated. ``decisions`` of the record says
-            what was done and why.
+        automatic: find joints that move with others, widen default bounds that the fit reaches, leave out what
+            contradicts the rest, and compare models of the joints unless a model, a prior, a method or a robust loss is
+            stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -134,6 +134,8 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         solved = partial(_solved, chosen)
         record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
         if automatic:
+            further = chosen.model is None and nominal.arm.corrections is None
+            record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
         if automatic or chosen.remove_contradicting:
             record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))

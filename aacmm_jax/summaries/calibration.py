@@ -22,7 +22,8 @@ from ..diagnostics.model_errors import model_tests, rows_of_tests
 from ..diagnostics.pose_residuals import rms
 from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.usability import on_bounds
-from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
+from ..kinematics.arm import Arm, by_joint, correction_names, parameter_unit, value_of
+from ..kinematics.corrected_arm import loads_of
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -104,6 +105,18 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
     }
 
 
+def masses_sentence(arm: Arm) -> str | None:
+    """Which masses the bending of an arm's joints was computed with; None where masses are not taken as known."""
+    loads = None if arm.corrections is None else loads_of(arm)
+    if loads is None:
+        return None
+    links = ", ".join(f"{mass:.3g}" for mass in loads.mass)
+    return (
+        f"Masses taken as known (gravity=masses): {links} kg by link, {sum(loads.mass):.3g} kg in all. A tool or "
+        "payload counts only if it is part of these; --model gravity needs no masses."
+    )
+
+
 def reference_length_rows(lengths: Sequence[ReferenceLength], **columns: Any) -> list[dict[str, Any]]:
     """Reference lengths with their calibrated value and other columns, mm."""
     ends = {"from": [length.start for length in lengths], "to": [length.end for length in lengths]}
@@ -166,6 +179,7 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
         "sockets_used": list(recording.capture.names),
         "scale_expanded": uncertainty.expanded_k() if math.isfinite(record.u_k) else None,
         "decisions": list(record.decisions),
+        "masses": masses_sentence(record.calibrated.arm),
         "active_stage1": on_bounds(record),
         "active": on_bounds(record, final=True),
         **{stage: metrics(evaluation) for stage, evaluation in evaluations.items()},

@@ -16,7 +16,7 @@ import aacmm_jax as aj
 from aacmm_jax.data.recording import Recording
 from aacmm_jax.files.hdf5_content import seal
 
-from ..conftest import command_line
+from ..conftest import EXAMPLES, command_line
 
 COMMANDS = (
     *("arm", "demo", "simulate", "import", "calibrate", "evaluate", "export", "correct", "show", "plan", "compare"),
@@ -387,3 +387,15 @@ def test_data_of_another_arm_are_no_calibration(aacmm, tmp_path, noisy_capture, 
     aacmm("export", "k.h5", "-o", "nominal.toml", "--arm", "nominal")
     assert "not usable" in aacmm("export", "k.h5", "-o", "arm.toml", "--force").stderr
     assert (tmp_path / "arm.toml").exists()
+
+
+@pytest.mark.slow
+def test_a_manifest_is_calibrated_as_its_capture_is(aacmm, tmp_path):
+    manifest, plain = EXAMPLES / "simulated_robot" / "plate.toml", ("--no-automatic", "--no-cross-validate", "--json")
+    aacmm("import", manifest, "-o", "plate.h5")
+    of_capture, of_manifest = (
+        json.loads(aacmm("calibrate", source, *plain).stdout) for source in ("plate.h5", manifest)
+    )
+    assert (of_capture.pop("written"), of_manifest.pop("written")) == ("plate-calibration.h5", "plate-calibration.h5")
+    assert of_capture == of_manifest
+    assert aj.files.load_calibration(tmp_path / "plate-calibration.h5").recording.sources

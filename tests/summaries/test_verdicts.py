@@ -162,7 +162,7 @@ def test_situations(summary, mark, begins, code):
             evaluated(held_out=held_out(0.5, 0.19)),
             0,
             "neutral",
-            "and length errors are 0.7 times as large as predicted. No limit",
+            "and length errors are 0.7 times as large as predicted. No largest",
         ),
         (evaluated(held_out=held_out(0.5, None)), 0, "neutral", "Measured on held-out data"),
     ],
