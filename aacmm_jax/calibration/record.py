@@ -11,7 +11,6 @@ from jaxtyping import Float
 from ..core._compat import member_numbers
 from ..core.arguments import checked_arguments
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture, names_in
 from ..data.noise import Noise
 from ..data.observations.observation import stated_u
 from ..data.recording import Recording
@@ -25,6 +24,7 @@ from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.degrees_of_freedom import Components
 from .agreement import CrossValidation
 from .evaluation import Evaluation, evaluate
+from .pose_table import PoseResiduals
 from .results import (
     Calibration,
     Identification,
@@ -44,23 +44,6 @@ _POINTS = 400  # of a joint's corrections as a function of its reading
 _BEYOND = 0.15  # of a joint's travel, on either side of it, where its corrections are given
 _CORRELATED = 0.1  # smallest eigenvalue of correlations, below which parameters slide along each other
 _MOST_NAMED, _LEAST_SHARE = 4, 0.3  # of the parameters that do, and of the largest share
-
-
-class OtherPoses(NamedTuple):
-    """How the calibrated arm agrees with poses that it was not calibrated with; the geometry found is kept."""
-
-    names: tuple[str, ...]  # sockets and other observations
-    poses: np.ndarray
-    rms: np.ndarray  # mm
-    rms_angle: np.ndarray  # of residuals in rad; NaN where there are none
-    rms_px: np.ndarray | None = None  # in px; None where no observation has any
-
-    @property
-    def rms_of_all(self) -> float:
-        """Over all of these poses, mm."""
-        measured = np.isfinite(self.rms)
-        total = np.sum(self.poses[measured] * self.rms[measured] ** 2)
-        return float(np.sqrt(total / max(self.poses[measured].sum(), 1)))
 
 
 class Removed(NamedTuple):
@@ -121,7 +104,7 @@ class CalibrationRecord(NamedTuple):
     sampled: Mapping[str, np.ndarray] | None = None
     sampled_says: str | None = None
     robust: str | None = None  # the robust loss
-    others: OtherPoses | None = None
+    held_out: PoseResiduals | None = None  # residuals of poses that it was not calibrated with
     removed: tuple[Removed, ...] = ()
     prior: PriorMetrics | None = None  # with arrays of NumPy
     noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected
@@ -221,7 +204,6 @@ def record_of(
     recording: Recording,
     *,
     robust: str | None = None,
-    others: Capture | None = None,
 ) -> CalibrationRecord:
     """The record of a calibration.
 
@@ -229,7 +211,6 @@ def record_of(
         calibration: what `calibrate` returned, or `identify`: the scale is then that of the nominal arm.
         recording: the capture that it was identified from, and the nominal arm.
         robust: the robust loss of the calibration.
-        others: poses that it was not identified from, on which it is tested.
 
     Returns:
         What a calibration file holds, as NumPy arrays.
@@ -244,17 +225,6 @@ def record_of(
     # What files hold is NumPy's.
     kept = (calibration.parameter_covariance, calibration.observed, calibration.prior)
     covariance, observed, prior, shared = jax.tree.map(np.asarray, (*kept, None if single else calibration.shared))
-    tested = None
-    if others is not None:
-        # What another observation alone determined is fitted; the rest of the geometry is as it was found.
-        geometry = calibration.observed.geometry if others.observations else None
-        evaluation = evaluate(calibration.arm, others, geometry=geometry)
-        poses = np.array([*others.sizes, *(observation.q.shape[0] for observation in others.observations)])
-        rms, rms_angle, rms_px = evaluation.repeatability.socket_rms, np.full(len(poses), np.nan), None
-        if evaluation.observed is not None:
-            rms, rms_angle, rms_px = (getattr(evaluation.observed, name) for name in ("rms", "rms_angle", "rms_px"))
-            rms_px = None if np.all(np.isnan(rms_px)) else np.asarray(rms_px)
-        tested = OtherPoses(tuple(names_in(others)), poses, np.asarray(rms), np.asarray(rms_angle), rms_px)
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -289,7 +259,6 @@ def record_of(
         shared=shared,
         components=covariance.components,
         surplus_k=0.0 if scale is None else float(scale.surplus),
-        others=tested,
     )
 
 

@@ -26,6 +26,7 @@ from .options import argument, flag, names_option, option, output, seed
     "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
     "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
     "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
+    "aacmm calibrate capture.h5 -o calibration.h5 --hold-out 0.3 --residuals residuals.csv",
 )
 def calibrate(
     capture: list[Path] = argument(
@@ -66,10 +67,15 @@ def calibrate(
     same_probe: bool = flag(
         "--same-probe", "Use one probe position for all sessions, because the probe was not remounted."
     ),
+    hold_out: str | None = option(
+        "Do not calibrate with these poses, and test the result on them: a share of the poses of each observation, "
+        "drawn at random ('0.3'), or a group by its name or shell pattern (a socket, a placement, a session).",
+        "SHARE|GROUP",
+    ),
     only_poses: int | None = option(
         "Calibrate with N poses drawn at random, and test the result on the remaining poses.", "N", min=1
     ),
-    seed: int = seed("--only-poses"),
+    seed: int = seed("--hold-out and --only-poses"),
     hold: str = option(
         "Length parameter that stage 1 holds constant (scale anchor): its name, 'longest', or 'none' as in Cheng et "
         "al. 2018.",
@@ -126,6 +132,7 @@ def calibrate(
         "of the joints that predicts held-out regions best. What is stated by options or the arm file stays as stated.",
         default=True,
     ),
+    residuals: Path | None = options.RESIDUALS,
     figure: Path | None = option("Plot the residual of every pose to this file (.png, .svg or .pdf).", "FILE"),
     max_steps: int = option(
         "Maximum number of solver steps in each least-squares fit.", "N", default=300, min=1, max=1_000_000
@@ -151,10 +158,11 @@ def calibrate(
         noise=_known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
         replace_noise=not keep_noise,
         leave_out=tuple(leave_out or ()),
+        hold_out=options.share_or_name(hold_out),
         stage=with_spinner,
     )
     output = Path(f"{capture[0].stem}-calibration.h5") if output is None else output
-    with together(output, figure):
+    with together(output, figure, residuals):
         for file in capture:
             reading(file)
         options.check_figure(figure)
@@ -170,6 +178,8 @@ def calibrate(
         files.save_calibration(output, record, summary)
         if figure is not None:
             plot.save_calibration_figure(record, figure)
+        if residuals is not None:
+            options.write_residuals(residuals, record)
     show_summary(summary | {"written": str(output)}, as_json, views.calibration)
     if any(row["severity"] == "unusable" for row in summary["findings"]) or does_not_fit(record):
         raise typer.Exit(1)
@@ -288,7 +298,7 @@ def compare_models(
         )
     part, nominal = recording.capture.select(only or None, without or ()), recording.nominal
     if only_poses is not None:
-        part = draw_poses(part, only_poses, seed)[0]
+        part = draw_poses(part, only_poses, seed)
     noise = _known_noise(encoder_arcsec, seating_mm, linear_encoder_mm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)

@@ -200,8 +200,8 @@ def _observations(summary: dict[str, Any]) -> View:
         )
         if rows:
             yield tables.weights_table(summary, _MOST_PARTS)
-    if "other_poses" in summary:
-        yield tables.other_poses_table(summary["other_poses"])
+    if "held_out_poses" in summary:
+        yield from tables.held_out_tables(summary["held_out_poses"])
 
 
 def base(frames: Sequence[dict[str, Any]], factor: float) -> Table:

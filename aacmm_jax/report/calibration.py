@@ -87,8 +87,12 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
         facts.append(("Held-out groups, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
     for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():
         facts.append((f"{name}, nominal → calibrated", changed(nominal[key], calibrated[key])))
-    if "other_poses" in summary:
-        facts.append(("Other poses, RMS distance", f"{format_number(summary['other_poses']['rms_mm'])}\u00a0mm"))
+    if "held_out_poses" in summary:
+        row = summary["held_out_poses"]["held_out"]
+        numbers = " / ".join(format_number(row[key]) for key in ("rms_mm", "mean_mm", "largest_mm"))
+        facts.append(
+            (f"{pluralise(row['poses'], 'held-out pose')}, distance: RMS / mean / largest", f"{numbers}\u00a0mm")
+        )
     for row in summary["kinds"][:_MOST_KINDS]:
         title = f"RMS residual, {row['kind']}, nominal → calibrated"
         facts.append((title, changed(row["rms_before_mm"], row["rms_after_mm"])))
@@ -168,6 +172,8 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
     blocks: list[Block] = [introduction]
     if summary["cross_validation"] is not None:
         blocks += result_tables.validation_tables(summary["cross_validation"])
+    if "held_out_poses" in summary:
+        blocks += result_tables.held_out_tables(summary["held_out_poses"])
     capture = record.recording.capture
     if summary.get("prior"):
         blocks.append(result_tables.prior_table(summary["prior"]))
@@ -175,7 +181,6 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
         blocks.append(shared_sentence(summary["shared_errors"]))
     if not record.sockets_alone:
         blocks += result_tables.agreement_tables(summary)
-        blocks += [result_tables.other_poses_table(summary["other_poses"])] if "other_poses" in summary else []
     if summary["nominal"]:
         caption = "Metrics by arm [mm]"
         if capture.observations:

@@ -127,6 +127,8 @@ def metrics(evaluation: Evaluation) -> dict[str, Any]:
     """Repeatability over all sockets, and the errors of the lengths; mm."""
     repeatability, error = evaluation.repeatability, np.asarray(evaluation.error)
     values = {"de_mm": repeatability.de, "deltam_mm": repeatability.deltam, "rms_mm": repeatability.rms}
+    if np.isfinite(repeatability.rms):
+        values["distance_largest_mm"] = np.asarray(evaluation.distances).max()
     # With one pose in every socket none of them is finite: there is no scatter.
     return {key: float(value) for key, value in values.items() if np.isfinite(value)} | length_metrics(error)
 

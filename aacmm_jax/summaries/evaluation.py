@@ -92,7 +92,13 @@ def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> 
         pairs = zip(part.observed.kinds, part.observed.distances, strict=True)
         # The only pose of a socket shows no scatter.
         scattered = [np.asarray(distances) for kind, distances in pairs if kind != "socket" or len(distances) > 1]
-        row["observed_rms_mm"] = rms(np.concatenate([np.zeros(0), *scattered]))
+        whole_distances = np.concatenate([np.zeros(0), *scattered])
+        row["observed_rms_mm"] = rms(whole_distances)
+        if len(whole_distances):
+            row |= {
+                "observed_mean_mm": float(whole_distances.mean()),
+                "observed_largest_mm": float(whole_distances.max()),
+            }
     return row | length_metrics(np.asarray(whole.error)[lengths])
 
 
