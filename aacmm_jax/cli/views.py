@@ -160,8 +160,10 @@ def calibration(summary: dict[str, Any]) -> View:
 
 
 def solve(summary: dict[str, Any]) -> Line:
-    """How the solve ended; a residual that no arm has is not called converged, whatever the solver says."""
+    """How the solve ended; a residual or a scale that no arm has is not called converged, whatever the solver says."""
     ended = Styled("converged", "green") if summary["converged"] else Styled("did not converge", "red")
+    if not summary["scale_plausible"]:
+        ended = Styled("ended with a scale that is not plausible", "red")
     if summary["converged"] and not summary["residual_plausible"]:
         ended = Styled("ended with residuals that are too large for this arm,", "red")
     rows = summary["observations"]  # with observations of other kinds, or a probe for each session: sockets too
