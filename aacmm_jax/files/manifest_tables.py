@@ -191,7 +191,7 @@ class SocketTable(_Named):
     @model_validator(mode="after")
     def _has_name(self) -> "SocketTable":
         if self.files is not None and self.name is None and self.group is None:
-            raise ValueError("a socket with several files needs a name; add the key name.")
+            raise ValueError("a socket with several files needs a name; add the key 'name'.")
         if self.visits is not None and self.target:
             raise ValueError(
                 "visits apply only to sockets measured with the arm's own probe, but this socket has a target; remove "

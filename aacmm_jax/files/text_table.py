@@ -199,8 +199,8 @@ class TextTable:
         hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip(' \t"').startswith("#")), None)
         if hashed is not None and not self._hashes:
             raise InputError(
-                f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; remove "
-                "the line if it is a comment, otherwise remove the # from its first cell."
+                f"{self.path} line {self._lines[hashed]} begins with #, but has the same number of columns as the rows "
+                "of numbers; remove the line if it is a comment, otherwise remove the # from its first cell."
             )
         # A file without a last line's end may be cut: then its last number has fewer decimals than the others.
         decimals = [len(row[-1].partition(self._decimal)[2]) for row in self._rows]
