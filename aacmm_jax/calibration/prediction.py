@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -26,9 +25,10 @@ from ..uncertainty.coverage import LEVEL
 from ..uncertainty.degrees_of_freedom import Law, coverage_factor, degrees_of_freedom
 from ..uncertainty.linear_propagation import Influence
 from ..uncertainty.linearisation import Linearisation, ObservationRows
-from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
+from ..uncertainty.shared_kinds import PLACES
 from .agreement import NOTHING, Agreement
 from .evaluation import fit_geometry
+from .pose_table import noise_of_poses
 from .redrawn import variances_in_places
 from .task import without_lengths
 
@@ -160,10 +160,7 @@ class _Unseen(NamedTuple):
     @classmethod
     def of(cls, uncertainty: Uncertainty, capture: Capture) -> "_Unseen":
         """Reference lengths take no part: they are to be measured."""
-        noise, shared = uncertainty.noise, uncertainty.shared
-        if shared is not None:
-            seating = np.hypot(noise.seating, shared.sd_of(VISITS, SUCCESSIVE))
-            noise = eqx.tree_at(lambda n: n.seating, noise, seating)
+        noise = noise_of_poses(uncertainty)
         observed = to_numpy(Observed.of(without_lengths(capture), uncertainty.arm))
         fitted = fit_geometry(uncertainty.arm, observed, {}, noise)
         space, p = uncertainty.space, len(uncertainty.space.names)

@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import Calibration, Identification, NoisyEncoder
+from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.noise import Noise, one_arcsec
@@ -308,7 +309,10 @@ def amend(result: Result, case: Case, again: Callable[[Noise], Result]) -> Resul
     noise, encoders = replaced
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the first calibration has said it
-        weighted = again(noise)
+        try:
+            weighted = again(noise)
+        except InputError:  # more noise than any arm has: the data do not match the arm, and that is what is wrong
+            return result
     changes = {"noisy_encoders": encoders}
     if result.given_noise is None:  # it is still one that was estimated
         first = result if isinstance(result, Identification) else result.stage1
