@@ -471,6 +471,8 @@ def _of_parameters(case: Case) -> list[_Cause]:
     """Parameters that are no unknowns: those that are fixed, and the scale anchor."""
     free = [name for name in case.record.names if name != case.equations.anchor]
     joints, poses = case.record.calibrated.arm.joints, len(np.asarray(case.record.recording.capture.readings))
+    if len(case.record.scale_set_by) == 1:  # without it the arm could shrink
+        free += case.record.scale_set_by
     terms = fixed_parameters(case.equations.extra, free, joints, poses)
     return [_Cause("fixed", "fixed", term.concerns, term) for term in terms]
 
