@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.text import shorten
@@ -41,8 +41,11 @@ _SECOND_ORDER = 3e-3
 # Mean square of a pose that is off, over that of the others. Errors that the model lacks reach 49 among the 1,443 poses
 # of `examples/mukca`.
 _FAR = 60.0
+_MOSTLY = 0.5  # part of a column that certified values and lengths see
 _ONE_JOINT = 0.9  # part of the excess of a pose that a single reading must explain to be named
 _NOTHING = 0.02  # part of all excess, below which a cause is not named
+# Of the gain of the best cause: what a step can lose where its pose is only near that of the change.
+_NEARLY, _MOST_REFINED = 0.5, 4
 _FACTORS = np.geomspace(0.1, 1e4, 32)  # of variances, in units of what they add to the mean square
 _FEWEST = 6  # poses of a socket or observation whose scatter is compared with that of the others
 _MOST_GROUPS = 60
@@ -171,10 +174,14 @@ class _Search:
         residuals."""
         if not self.anchor:
             return self.fixed
-        whole = self.fixed.projected
-        anchor = whole[:, -1:]
-        others = whole - anchor @ (anchor.T @ whole) / max(float(np.sum(anchor**2)), 1e-300)
+        whole, anchor = self.fixed.projected, self.fixed.projected[:, -1:]
+        others = whole - anchor @ (anchor.T @ whole) / self._of_anchor()
         return self.fixed._replace(parts=self.fixed.parts[:-1], projected=others)
+
+    def _of_anchor(self) -> float:
+        """Squared length of what the model leaves of the scale anchor; infinite where that is nothing."""
+        square = float(np.sum(self.fixed.projected[:, -1] ** 2))
+        return square if square > _PRESENT else np.inf
 
     def _of_pose(self, number: int) -> Float[np.ndarray, "R r"]:
         """Columns with which a pose agrees whatever its residuals are."""
@@ -197,10 +204,9 @@ class _Search:
             results = self._results()
             if not results:
                 break
-            best, *others = sorted(results, key=lambda result: -result.criterion)
+            best, *others = self._at_their_poses(sorted(results, key=lambda result: -result.criterion))
             if best.cause.kind != "pose" and sum(r.cause.kind != "pose" for r, _ in self.chosen) >= MOST_CAUSES:
                 break
-            best = self._at_its_pose(best)
             alike = [other for other in others if other.criterion > best.criterion - _AS_WELL]
             self.chosen.append((best, alike))
             added = 1 if best.test is None else best.test.degrees_of_freedom[0]
@@ -254,8 +260,7 @@ class _Search:
             return lambda: self._columns(cause)
         number, lengths = self.parameters.index(cause), self.fixed.lengths
         of_cause, of_anchor = self.fixed.projected[:, number], self.fixed.projected[:, -1]
-        part = float(of_cause @ of_anchor) / max(float(of_anchor @ of_anchor), 1e-300)
-        part *= lengths[number] / lengths[-1]
+        part = float(of_cause @ of_anchor) / self._of_anchor() * lengths[number] / lengths[-1]
         return lambda: self._columns(cause) - part * self._columns(self.anchor[0])
 
     def _results(self) -> list[_Result]:
@@ -269,7 +274,10 @@ class _Search:
         for cause, test in zip(causes, tests, strict=True):
             number[cause.family] += test.degrees_of_freedom[0] > 0
         results = []
-        for cause, test in zip(causes, tests, strict=True):
+        of_relations = self._in_relations()
+        for number_of_cause, (cause, test) in enumerate(zip(causes, tests, strict=True)):
+            if number_of_cause < len(of_relations) and of_relations[number_of_cause]:
+                continue
             probability = test.probability * number[cause.family]
             if test.degrees_of_freedom[0] and probability < (LEVEL if cause.family == "function" else _LEVEL):
                 results.append(self._of_columns(cause, test, number[cause.family]))
@@ -279,19 +287,30 @@ class _Search:
         ]
         return [*results, *self._bad_poses(poses), *self._noisy(poses)]
 
+    def _at_their_poses(self, results: Sequence[_Result]) -> list[_Result]:
+        """Causes, the best first, with steps that are nearly as good at the poses where they explain most."""
+        refined: dict[tuple[str, str], _Result] = {}
+        near = results[0].criterion - max(_NEARLY * results[0].share * self.left.degrees_of_freedom, _AS_WELL)
+        for result in results:
+            term = result.cause.term
+            if term is not None and term.first >= 0 and result.criterion > near:
+                refined.setdefault((term.kind, term.concerns), result)
+        steps_there = [self._at_its_pose(result) for result in list(refined.values())[:_MOST_REFINED]]
+        return sorted([*results, *steps_there], key=lambda result: -result.criterion)
+
     def _at_its_pose(self, best: _Result) -> _Result:
         """A step at the pose of all near it where it explains most."""
         term, case = best.cause.term, self.case
-        if term is None or term.first < 0:
-            return best
+        assert term is not None
         arm, capture = case.record.calibrated.arm, case.record.recording.capture
         if best.cause.family == "seat":
             terms = shifted_seats(capture, term)
         else:
             gravity = [t for t in missing_terms(arm, np.asarray(capture.readings)) if t.kind == "gravity"]
             terms = steps(arm, capture, gravity, term)
-        causes = [best.cause._replace(term=near) for near in terms]
-        tests = Candidates.of(self.left, [self._columns(cause) for cause in causes]).tests(self.left, self.least)
+        causes = [best.cause._replace(term=shifted) for shifted in terms]
+        near = Candidates.of(self.left, [self._columns(cause) for cause in causes])
+        tests = near.tests(self.left, self.least)
         cause, test = max(zip(causes, tests, strict=True), key=lambda pair: pair[1].gain)
         return self._of_columns(cause, test, self.sizes[cause.family])
 
@@ -300,6 +319,17 @@ class _Search:
         gain = -freedom * float(np.log(max(1 - share, 1e-12)))
         penalty = test.degrees_of_freedom[0] * np.log(freedom) + 2 * np.log(number)
         return _Result(cause, gain - float(penalty), min(test.probability * number, 1.0), share, test)
+
+    def _in_relations(self) -> Bool[np.ndarray, " c"]:
+        """Which functions only certified values and lengths see, as a step between two sockets: that these values are
+        wrong is then as good an explanation, and a simpler one."""
+        count = sum(len(block.residual) for block in self.relations)
+        projected, parts = self.candidates.projected, self.candidates.parts
+        rows = len(projected) - count
+        squares = np.array([np.sum(projected[:, part] ** 2) for part in parts])
+        below = np.array([np.sum(projected[rows:, part] ** 2) for part in parts])
+        of_values = np.array([cause.kind == "certified" for cause in self.causes])
+        return (below > _MOSTLY * squares) & ~of_values
 
     def _bad_poses(self, poses: Sequence[_Studentised]) -> list[_Result]:
         """The pose that is farthest from what all others say of it."""

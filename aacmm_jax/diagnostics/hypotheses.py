@@ -21,6 +21,7 @@ _STEPS = 24  # poses at which something may change, evenly chosen: between two o
 _STEPS_OF_GROUP = 6
 _FEWEST = 6  # poses on each side of a step
 _FEWEST_OF_GROUP = 3
+_BASE, _PROBE = "a base, artefact or instrument that was moved", "a probe or target that was displaced"
 _MOST_GROUPS = 40  # sockets and holes of artefacts, beyond which no steps within single ones are looked for
 
 
@@ -56,8 +57,8 @@ def steps(
             term = MissingTerm("slipped zero", joint, later, follows=follows, concerns=concerns, first=first)
             terms.append(term._replace(cause="a zero offset that slips"))
         for kind, columns, follows, cause in (
-            ("moved base", np.eye(3)[None], "a step of the tip", "a base, artefact or instrument that was moved"),
-            ("moved probe", turned, "a step of the probe in the last frame", "a probe or target that was displaced"),
+            ("moved base", np.eye(3)[None], "a step of the tip, as if base, artefact or instrument had moved,", _BASE),
+            ("moved probe", turned, "a step of the probe in the last frame, as if it had moved,", _PROBE),
         ):
             columns = later[:, :, None] * columns
             terms.append(MissingTerm(kind, None, columns, follows=f"{follows} {after}", cause=cause, first=first))
@@ -86,7 +87,7 @@ def shifted_seats(capture: Capture, near: MissingTerm | None = None) -> list[Mis
             continue
         for first in np.unique(np.linspace(_FEWEST_OF_GROUP, last, number).astype(int)):
             later = np.isin(np.arange(len(labels)), poses[first:]).astype(float)
-            follows = f"a step of {place} from {names[poses[first]]} on, as if it had moved"
+            follows = f"a step of {place}, as if it had moved, from {names[poses[first]]} on"
             term = MissingTerm("shifted seat", None, later[:, None, None] * np.eye(3), follows=follows)
             term = term._replace(first=int(poses[first]))
             cause = "a seat or artefact that shifts"

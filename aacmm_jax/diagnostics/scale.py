@@ -196,6 +196,9 @@ def lengths_of(case: Case) -> Lengths | None:
     plain = _tested(record, related, covariance, freedom, names)
     if plain is None or plain.odd or record.shared is None or not capture.lengths:
         return plain
+    # Errors of places that so few lengths have taught only say again that these disagree.
+    if plain.number <= _FEW and set(record.shared.kinds) == {PLACES} and not culprits_of(case):
+        return plain
     by_shared = covariance_of_lengths(record.shared, to_numpy(record.calibrated.arm), record.names, capture)
     number = len(by_shared)  # they come before certified values
     by_shared = by_shared / (related.units[:number, None] * related.units[:number])
