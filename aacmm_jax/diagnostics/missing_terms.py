@@ -14,15 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.numpy_or_jax import to_numpy
-from ..core.text import shorten
-from ..core.units import ARCSEC
 from ..kinematics.arm import DOWN, Arm
 from ..kinematics.chain import forward_pass, joint_motion
 from ..kinematics.corrected_arm import function_values
 from ..kinematics.corrections import KINDS, Term, all_sought, model_of, model_with, terms_of
-from ..uncertainty.shared_kinds import PLACES, SUCCESSIVE, VISITS
 from .equations import Rows
-from .findings import Case, Finding, chance_text, rounded
 from .residual_tests import ScoreTest
 
 # Terms that no kind of joint correction has: what residuals follow, of joint {i}, and what causes that.
@@ -69,38 +65,6 @@ class FoundTerm(NamedTuple):
     def alternatives(self) -> tuple[tuple[str, int | None], ...]:
         """What explains as much, by kind and joint."""
         return tuple((term.kind, term.joint) for term in self.others)
-
-
-def terms_finding(case: Case, terms: Sequence[FoundTerm], explains: float) -> Finding:
-    """Terms that the model lacks, in one finding: each explains what those before it leave."""
-    texts = []
-    for term in terms:
-        if term.term.relative and term.kind != "zero":
-            amplitude = f"{rounded(100 * term.amplitude)} %"
-        else:
-            unit, size = ("mm", 1.0) if term.joint is None else ("arcsec", ARCSEC)
-            amplitude = f"{rounded(term.amplitude / size)} {unit}"
-        texts.append(f"{term.term.follows} ({amplitude})")
-    named = {term.term.follows for term in terms}
-    likely = [text for text in dict.fromkeys(other.follows for term in terms for other in term.others)]
-    likely = [text for text in likely if text not in named]
-    model = wider_model(terms, case.record.calibrated.arm)
-    causes = dict.fromkeys(term.term.cause for term in terms)
-    probability = max(term.probability for term in terms)
-    shared = set() if case.record.shared is None else set(case.record.shared.kinds)
-    return Finding(
-        "missing-terms",
-        f"Residuals follow {shorten(texts, 3)} ({chance_text(probability)}), which the model does not describe. "
-        f"Possible causes: {', '.join(causes)}{f'; try --model {model}' if model else ''}."
-        + (f" Equally likely: {shorten(likely, 3)}." if likely else ""),
-        "The stated uncertainties include these errors as estimated from the residuals."
-        if shared - {PLACES, VISITS, SUCCESSIVE}
-        else "Every stated uncertainty is too small.",
-        severity="doubt",
-        probability=probability,
-        concerns=tuple(dict.fromkeys(term.term.concerns for term in terms)),
-        explains=explains,
-    )
 
 
 def wider_model(terms: Sequence[FoundTerm], arm: Arm | None) -> str:

@@ -65,8 +65,8 @@ def from_pose(first, last=80):
         (load, "missing-terms", "joint 2", "load on joint 2 from"),
         (moved(from_pose(30, 40), at_base), "missing-terms", "B", "a step of B, as if it had moved, from B pose 11 on"),
         # C and D, which were recorded afterwards, have places of their own, so that this is the same.
-        (moved(from_pose(33), at_base), "missing-terms", "B", "Equally likely: a step of the tip, as if base, artefact"),
-        (moved(from_pose(33), of_flange), "missing-terms", "tip", "a step of the probe in the last frame, as if it had"),
+        (moved(from_pose(33), at_base), "missing-terms", "B", "Equally likely: a step of the tip, as if base"),
+        (moved(from_pose(33), of_flange), "missing-terms", "tip", "a step of the probe in the last frame, as if"),
     ],
 )
 def test_the_cause_stands_first(paper_arm, capture, errors, code, concerns, words):

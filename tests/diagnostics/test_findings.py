@@ -162,8 +162,8 @@ def test_uncertainties_in_another_unit_are_named(paper_arm, u, said):
 def test_every_diagnostic_says_where_it_stands(noisy_capture, paper_arm):
     """A module with a ``test`` is found by itself; its findings have all that a reader needs."""
     modules = diagnostics()
-    assert {"culprits", "scale", "likely_cause"} & {m.__name__.rpartition(".")[2] for m in modules} == {
-        "culprits",
+    assert {"causes", "scale", "likely_cause"} & {m.__name__.rpartition(".")[2] for m in modules} == {
+        "causes",
         "scale",
     }
     assert len({module.ORDER for module in modules}) == len(modules)
