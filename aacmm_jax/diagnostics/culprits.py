@@ -22,11 +22,11 @@ from jaxtyping import Bool, Float
 
 from ..core.distributions import chi_square_tail, f_tail
 from ..core.units import ARCSEC, DEG
-from ..model.observed import Observed
-from .equations import PRIOR, Block, Rows, lengths_in_solve, wider
+from .equations import Block, Rows, wider
 from .findings import Case, by_equations, rounded
-from .hypotheses import couplings, fixed_parameters, fixed_text, pose_names, shifted_seats, steps
-from .missing_terms import FoundTerm, MissingTerm, columns_of, missing_terms
+from .hypotheses import fixed_text, pose_names, shifted_seats, steps
+from .missing_terms import FoundTerm, columns_of, missing_terms
+from .possible_causes import Cause, of_certified, of_functions, of_variances, of_parameters
 from .residual_tests import LEVEL, Candidates, Residuals, ScoreTest
 
 MOST_CAUSES = 6  # that are looked for one after the other
@@ -45,8 +45,6 @@ _NOTHING = 0.02  # part of all excess, below which a cause is not named
 # Of the gain of the best cause: what a step can lose where its pose is only near that of the change.
 _NEARLY, _MOST_REFINED = 0.5, 4
 _FACTORS = np.geomspace(0.1, 1e4, 32)  # of variances, in units of what they add to the mean square
-_FEWEST = 6  # poses of a socket or observation whose scatter is compared with that of the others
-_MOST_GROUPS = 60
 _PRESENT = 1e-6  # part of a direction of a pose that the model leaves, below which nothing is left
 
 
@@ -73,19 +71,10 @@ class Selection(NamedTuple):
     remaining: float  # part of the sum of squares that no named cause explains
 
 
-class _Cause(NamedTuple):
-    kind: str
-    family: str
-    name: str
-    term: MissingTerm | None = None
-    row: int = -1  # of the relations
-    of_noise: Callable[[Rows], np.ndarray] | None = None  # (m, r, c): errors that scatter along these
-
-
 class _Result(NamedTuple):
     """A cause against the present model."""
 
-    cause: _Cause
+    cause: Cause
     criterion: float  # twice the gain of the log likelihood, less the penalties
     probability: float  # of all causes of its family
     share: float  # of the sum of squares
@@ -134,10 +123,10 @@ class _Search:
     def __init__(self, case: Case):
         self.case, (self.rows, self.relations) = case, case.chunks
         self.names = pose_names(case.record.recording.capture)[0]
-        self.causes, parameters = [*_of_functions(case), *_of_certified(case)], _of_parameters(case)
+        self.causes, parameters = [*of_functions(case), *of_certified(case)], of_parameters(case)
         self.anchor = [cause for cause in parameters if cause.name == case.equations.anchor]
         self.parameters = [cause for cause in parameters if cause not in self.anchor] + self.anchor
-        self.noises = _of_noise(case, self.rows)
+        self.noises = of_variances(case, self.rows)
         self.added: list[Callable[[], Float[np.ndarray, "R c"]]] = []  # columns of the causes that were chosen
         self.chosen: list[tuple[_Result, list[_Result]]] = []
         self.sizes: dict[str, int] = {}  # causes of each family
@@ -158,7 +147,7 @@ class _Search:
         self.candidates = self.candidates.less(self.left.basis[:, before:])
         self.fixed = self.fixed.less(self.left.basis[:, before:])
 
-    def _columns(self, cause: _Cause) -> Float[np.ndarray, "R _"]:
+    def _columns(self, cause: Cause) -> Float[np.ndarray, "R _"]:
         of_relations = sum(len(block.residual) for block in self.relations)
         if cause.term is not None:
             (columns,) = columns_of([cause.term], self.rows)
@@ -250,7 +239,7 @@ class _Search:
         self.rows = whitened
         self._begin()
 
-    def _adding(self, cause: _Cause) -> Callable[[], Float[np.ndarray, "R c"]]:
+    def _adding(self, cause: Cause) -> Callable[[], Float[np.ndarray, "R c"]]:
         """The columns that a cause adds to the model, also where rows are weighted anew."""
         if cause.kind == "pose":
             return lambda: self._of_pose(cause.row)
@@ -312,7 +301,7 @@ class _Search:
         cause, test = max(zip(causes, tests, strict=True), key=lambda pair: pair[1].gain)
         return self._of_columns(cause, test, self.sizes[cause.family])
 
-    def _of_columns(self, cause: _Cause, test: ScoreTest, number: int) -> _Result:
+    def _of_columns(self, cause: Cause, test: ScoreTest, number: int) -> _Result:
         share, freedom = test.gain / self.left.cost, self.left.degrees_of_freedom
         gain = -freedom * float(np.log(max(1 - share, 1e-12)))
         penalty = test.degrees_of_freedom[0] * np.log(freedom) + 2 * np.log(number)
@@ -349,7 +338,7 @@ class _Search:
         if probability * len(self.names) >= _LEVEL:
             return []
         test = ScoreTest(gain, ratio, (added, freedom - added), probability, np.zeros(added))
-        cause = _Cause("pose", "pose", self.names[number], row=number)
+        cause = Cause("pose", "pose", self.names[number], row=number)
         return [self._of_columns(cause, test, len(self.names))]
 
     def _noisy(self, poses: Sequence[_Studentised]) -> list[_Result]:
@@ -479,69 +468,3 @@ def studentised(part: Rows, left: Residuals, rows: slice, private: Float[np.ndar
     along = np.where(present, along / np.where(present, roots, 1.0), 0.0)
     root = (vectors * roots[:, None, :]) @ vectors.swapaxes(1, 2)
     return _Studentised(np.einsum("mab,mb->ma", vectors, along), root, present.sum(axis=1))
-
-
-def _of_functions(case: Case) -> list[_Cause]:
-    """Causes that are functions of the readings, and of the order of the poses."""
-    arm, capture = case.record.calibrated.arm, case.record.recording.capture
-    q = np.asarray(capture.readings)
-    functions = missing_terms(arm, q)
-    gravity = [term for term in functions if term.kind == "gravity"]
-    families = {
-        "function": functions,
-        "step": steps(arm, capture, gravity),
-        "seat": shifted_seats(capture),
-        "coupling": couplings(arm, q),
-    }
-    return [_Cause("term", family, term.concerns, term) for family, terms in families.items() for term in terms]
-
-
-def _of_parameters(case: Case) -> list[_Cause]:
-    """Parameters that are no unknowns: those that are fixed, and the scale anchor."""
-    free = [name for name in case.record.names if name != case.equations.anchor]
-    joints, poses = case.record.calibrated.arm.joints, len(np.asarray(case.record.recording.capture.readings))
-    if len(case.record.scale_set_by) == 1:  # without it the arm could shrink
-        free += case.record.scale_set_by
-    terms = fixed_parameters(case.equations.extra, free, joints, poses)
-    return [_Cause("fixed", "fixed", term.concerns, term) for term in terms]
-
-
-def _of_certified(case: Case) -> list[_Cause]:
-    """Certified values, and lengths that took part in the least squares."""
-    capture = case.record.recording.capture
-    lengths = capture.lengths if lengths_in_solve(case.record) else ()
-    names = [f"{length.start} - {length.end}" for length in lengths]
-    points = {f"coordinates of {getattr(o, 'artefact', '')}": getattr(o, "names", ()) for o in capture.observations}
-    for part, (value, _) in Observed.of(capture, None).certified().items():
-        labels, size = points.get(part, ()), np.asarray(value).size
-        whole = [part.partition(" of ")[2] or part] * size
-        names += [label for label in labels for _ in range(3)] if 3 * len(labels) == size else whole
-    total = sum(len(block.residual) for block in case.chunks[1] if block.fixture != PRIOR)
-    if len(names) != total:
-        return []
-    return [_Cause("certified", "certified", name, row=row) for row, name in enumerate(names)]
-
-
-def _of_noise(case: Case, rows: Sequence[Rows]) -> list[_Cause]:
-    """One encoder, or one socket or observation, that is noisier; and the seat, beside the encoders."""
-
-    def of_joint(joint: int) -> Callable[[Rows], np.ndarray]:
-        return lambda part: part.extra[..., [joint]]
-
-    def of_group(name: str) -> Callable[[Rows], np.ndarray]:
-        return lambda part: np.broadcast_to(
-            np.eye(part.residual.shape[1]) * (part.name == name), (*part.residual.shape, part.residual.shape[1])
-        )
-
-    if not case.shows_noise:
-        return []
-    joints = case.record.calibrated.arm.joints
-    causes = [_Cause("noisy joint", "noise", f"joint {j + 1}", of_noise=of_joint(j)) for j in range(joints)]
-    causes.append(_Cause("tip", "noise", "tip", of_noise=lambda part: part.by_tip))
-    poses: dict[str, int] = {}
-    for part in rows:
-        poses[part.name] = poses.get(part.name, 0) + len(part.poses)
-    groups = [name for name, count in poses.items() if count >= _FEWEST]
-    if 1 < len(groups) <= _MOST_GROUPS:
-        causes += [_Cause("scatter", "noise", name, of_noise=of_group(name)) for name in groups]
-    return causes

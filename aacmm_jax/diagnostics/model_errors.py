@@ -129,12 +129,13 @@ def unexplained_misfit(case: Case) -> Misfit | None:
 
 def _usual_with_noisy(case: Case, usual: Noise) -> Noise:
     """The noise of a class, with that of the encoders whose noise was replaced."""
-    encoder = np.broadcast_to(np.asarray(usual.encoder_arcsec, dtype=float), (case.record.calibrated.arm.joints,))
-    noisy = {part.joint - 1: part.found / ARCSEC for part in case.record.noisy_encoders}
-    slides = case.record.calibrated.arm.prismatic
-    arcsec = [noisy.get(i, value) if i + 1 not in slides else value for i, value in enumerate(encoder)]
+    encoder, slides = np.zeros(case.record.calibrated.arm.joints), case.record.calibrated.arm.prismatic
+    for noisy in case.record.noisy_encoders:
+        if noisy.joint not in slides:
+            encoder[noisy.joint - 1] = noisy.found / ARCSEC
+    arcsec = np.maximum(encoder, np.asarray(usual.encoder_arcsec))
     linear = usual.linear_encoder
-    return Noise(encoder_arcsec=np.maximum(encoder, arcsec), seating=usual.seating, linear_encoder=linear)
+    return Noise(encoder_arcsec=arcsec, seating=usual.seating, linear_encoder=linear)
 
 
 def misfit_of(case: Case, remaining: float | None = None) -> Misfit | None:
