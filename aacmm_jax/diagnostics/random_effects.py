@@ -93,14 +93,18 @@ class OneVariance(NamedTuple):
     log_likelihood: float  # its maximum over that without the effect
 
 
-def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: float) -> OneVariance:
+def one_variance(
+    effects: Effects, columns: Float[np.ndarray, "R c"], usual: float, probability: float = 1.0
+) -> OneVariance:
     """The variance of one more effect, with its posterior distribution.
 
-    Beforehand the standard deviation has a half-Cauchy distribution: as probable anywhere below what is ``usual``, and
-    less and less above, which few data would not exclude (Gelman 2006, Bayesian Analysis 1, 515-534, section 7, for
-    just such effects of a few groups). What residuals show is the sum of the effect and of the independent errors in
-    its place; stated is the geometric mean of that sum, less the errors. Intervals do not follow from it alone, but
-    from the whole distribution (`degrees_of_freedom`).
+    Beforehand there is such an effect with a ``probability``, and its standard deviation then has a half-Cauchy
+    distribution: as probable anywhere below what is ``usual``, and less and less above, which few data would not
+    exclude (Gelman 2006, Bayesian Analysis 1, 515-534, section 7, for just such effects of a few groups; with a
+    probability of one half, Jeffreys' prior of a test for an effect: 1961, Theory of Probability, section 5.2). What
+    residuals show is the sum of the effect and of the independent errors in its place; stated is the geometric mean of
+    that sum, less the errors. Intervals do not follow from it alone, but from the whole distribution
+    (`degrees_of_freedom`).
 
     ``columns`` are those of the effect, as far as the model does not explain them; ``usual`` is in mm.
     """
@@ -115,9 +119,13 @@ def one_variance(effects: Effects, columns: Float[np.ndarray, "R c"], usual: flo
     of_errors = variance / ratio / np.mean(values)
     of_cost = cost - total if effects.given else freedom * np.log(cost / total)
     likelihood = -0.5 * (of_cost + log_sum)
-    weight = likelihood + 0.5 * np.log(variance) - np.log1p(variance / usual**2)
-    weight = np.exp(weight - weight.max())
+    weight = likelihood + 0.5 * np.log(variance / usual**2) - np.log1p(variance / usual**2)
+    highest = max(float(weight.max()), 0.0)  # without the effect, the logarithm of the likelihood is 0
+    # Half-Cauchy by the logarithm of the standard deviation; the last is that there is no effect.
+    share = probability * 2 / np.pi * np.log(_RANGE[1] / _RANGE[0]) / (_GRID - 1)
+    weight = np.append(share * np.exp(weight - highest), (1 - probability) * np.exp(-highest))
     weight = weight / weight.sum()
+    variance, of_errors = np.append(variance, 0.0), np.append(of_errors, effects.variance / np.mean(values))
     stated = float(np.exp(weight @ np.log(variance + of_errors)) - weight @ of_errors)
     stated = max(stated, float(variance[0]))
     return OneVariance(stated, variance / stated, weight, float(np.max(likelihood)))
