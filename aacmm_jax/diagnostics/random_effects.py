@@ -242,7 +242,7 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
 
     Fixed lengths or a prior may contradict the scale of all lengths, which errors of single places do not explain.
     """
-    record, lengths, whitening = problem.record, problem.record.recording.capture.lengths, None
+    record, lengths, whitening, related = problem.record, problem.record.recording.capture.lengths, None, None
     blocks = [*(part.block("") for part in problem.rows), *relations]
     first = sum(part.residual.size for part in problem.rows)
     by_scale = np.array([float(length.value) / max(float(length.u), LEAST_U) for length in lengths])
@@ -265,8 +265,11 @@ def with_lengths(problem: SharedProblem, relations: list[Block]) -> SharedProble
             pairs = zip(blocks, parts, strict=True)
             blocks = [block._replace(shared=np.column_stack([block.shared, part])) for block, part in pairs]
     left = Residuals.of(blocks)
-    column = np.zeros((len(left.values), 1))
-    column[first : first + len(by_scale), 0] = by_scale
-    if np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column):
-        left = left.extended(column)
+    if related is None or related.scale is None:
+        # Beside a scale anchor, the scale of the lengths is no further unknown: what the anchor leaves of it is along
+        # the residuals of the lengths, which it would take away.
+        column = np.zeros((len(left.values), 1))
+        column[first : first + len(by_scale), 0] = by_scale
+        if np.linalg.norm(left.unexplained(column)) > _EXPLAINED * np.linalg.norm(column):
+            left = left.extended(column)
     return problem._replace(left=left, lengths=whitening)

@@ -60,7 +60,7 @@ _USUAL = 1.25
 # Probability beforehand that places err at all: even odds where several differences between lengths show them. A single
 # difference (two lengths) may as well be that of one wrong length, and says so little that with even odds U would be
 # several times too large in one sound capture of ten (`benchmarks/NOTES.md`).
-_SEVERAL, _ONE_DIFFERENCE = 0.5, 0.2
+_SEVERAL, _ONE_DIFFERENCE = 0.8, 0.2
 
 
 def amend(result: Calibration, case: Case, sensitivities: Callable[[], Sensitivities]) -> Calibration:
