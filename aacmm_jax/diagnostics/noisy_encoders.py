@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from ..calibration.record import CalibrationRecord
 from ..calibration.results import Calibration, Identification, NoisyEncoder
+from ..core.errors import InputError
 from ..core.numpy_or_jax import to_numpy
 from ..core.text import shorten
 from ..data.noise import Noise, one_arcsec
@@ -290,6 +291,10 @@ def noise_by_joint(case: Case) -> tuple[Noise, tuple[NoisyEncoder, ...]] | None:
         seating=float(record.noise.seating) if given else np.sqrt(now.variances[-1]),
         linear_encoder=None if kinds is None else np.where(kinds.mask(), sd, 0.0),
     )
+    try:
+        noise.check(joints)
+    except InputError:  # more than any encoder has: poses that hardly see the joint do not determine its noise
+        return None
     encoders = []
     for test, i, u_log in zip(noisy, index, u, strict=False):
         # u of a standard deviation is half of it times u of its log variance.
