@@ -46,6 +46,7 @@ from .pipeline.capture_evaluation import evaluate_capture as evaluate_capture
 from .pipeline.capture_evaluation import evaluate_points as evaluate_points
 from .pipeline.capture_simulation import simulate_capture as simulate_capture
 from .pipeline.cross_validation import cross_validate as cross_validate
+from .pipeline.hold_out import residuals_of as residuals_of
 from .pipeline.model_ladder import compare_models as compare_models
 from .pipeline.single import calibrate as calibrate
 from .pipeline.single import identify as identify

@@ -160,7 +160,7 @@ def ur10() -> dict[str, Any]:
     for model in ("dh", "gravity,functions"):
         for seed in range(3):
             begun = time.process_time()
-            part, _ = draw_poses(series[0].capture, 500, seed)
+            part = draw_poses(series[0].capture, 500, seed)
             arm, bounds = with_model(series[0].nominal, model)
             for shared in (True, False):
                 result = aj.calibrate(

@@ -12,7 +12,7 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 from mistakes.cases import CASES  # noqa: E402
-from mistakes.judge import applies, detection_limit, made, rank_of, shown  # noqa: E402
+from mistakes.judge import applies, detection_limit, made, rank_of, run, shown  # noqa: E402
 from mistakes.kinds import KINDS  # noqa: E402
 
 
@@ -51,6 +51,14 @@ def test_only_the_mistake_is_in_the_residuals_of_an_exact_capture():
     # A chi-square test at 1 % needs about this non-centrality (normal approximation) to reject half of the time.
     assert squares == pytest.approx(2.33 * np.sqrt(2 * degrees_of_freedom), rel=0.1)
     assert np.isnan(detection_limit("wrong sign", "arm6-sockets"))
+
+
+def test_poses_are_named_as_findings_name_them():
+    row = run("reading mistyped", "arm6-sockets", 2e-3)
+    assert row["culprit"]["pose"] == "B pose 5"
+    (finding,) = (text for text in row["findings"] if text.startswith("outlying-poses"))
+    assert finding.endswith("[B pose 5]")
+    assert rank_of(row | {"kind": "reading mistyped"}) is not None
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
+from .agreement import CrossValidation as CrossValidation
 from .evaluation import Evaluation as Evaluation
-from .prediction import CrossValidation as CrossValidation
+from .pose_table import PoseResiduals as PoseResiduals
 from .prediction import unseen_errors as unseen_errors
 from .record import CalibrationRecord as CalibrationRecord
 from .record import record_of as record_of

@@ -227,7 +227,7 @@ def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task
         whitening, sigma = whitening_at(task, state, of_prior and of_prior.rows), 1.0
         pairs = zip(whitening.roots, state.point.rows, strict=True)
         white = [jnp.einsum("mab,bm->am", root, rows.values) for root, rows in pairs if root is not None]
-    spare = jnp.maximum(task.observed.equations - (z.shape[0] if of_prior is None else of_prior.effective), 1.0)
+    redundancy = jnp.maximum(task.observed.equations - (z.shape[0] if of_prior is None else of_prior.effective), 1.0)
     k = None
     if problem.capture.lengths and not form.with_lengths:
         covariances = [sigma**2 * matrices for matrices in own_covariances(task.observed, state.point, whitening)]
@@ -243,7 +243,7 @@ def _fields(form: Form, losses: list[Loss | None], problem: Problems, task: Task
         "reason": numbers_of(last.result),
         "active": set_at(jnp.zeros(task.start.shape, dtype=side.dtype), free, side),
         "prior": of_prior and of_prior.metrics,
-        "reduced_chi": jnp.sqrt(sum(jnp.sum(rows**2) for rows in white) / spare),
+        "reduced_chi": jnp.sqrt(sum(jnp.sum(rows**2) for rows in white) / redundancy),
         "k": k,
     }
     if form.covariance:

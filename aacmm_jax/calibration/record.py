@@ -1,5 +1,6 @@
 """The record of a calibration: everything that a file keeps of it, in plain arrays; and its uncertainty."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -10,8 +11,8 @@ from jaxtyping import Float
 from ..core._compat import member_numbers
 from ..core.arguments import checked_arguments
 from ..core.numpy_or_jax import to_numpy
-from ..data.capture import Capture, names_in
 from ..data.noise import Noise
+from ..data.observations.observation import stated_u
 from ..data.recording import Recording
 from ..kinematics.arm import Arm, joint_limits, parameter_names, value_of
 from ..kinematics.corrected_arm import function_values
@@ -21,41 +22,28 @@ from ..solver.reason import MAX_STEPS, STALLED, Reason
 from ..uncertainty.arm_uncertainty import Uncertainty
 from ..uncertainty.covariance import SharedErrors
 from ..uncertainty.degrees_of_freedom import Components
+from .agreement import CrossValidation
 from .evaluation import Evaluation, evaluate
-from .prediction import CrossValidation
+from .pose_table import PoseResiduals
 from .results import (
     Calibration,
     Identification,
     NoisyEncoder,
     ObservedMetrics,
     PriorMetrics,
+    converged,
     largest_plausible_residual,
     plausible,
 )
 from .stages import against_division
 
 REPEATABILITY = "repeatability"  # method of stage 1 alone
+# First words of the reason where the solve ended, but with a k that is not plausible.
+SCALE_REFUSED = "Not usable: the scale factor k"
 _POINTS = 400  # of a joint's corrections as a function of its reading
 _BEYOND = 0.15  # of a joint's travel, on either side of it, where its corrections are given
 _CORRELATED = 0.1  # smallest eigenvalue of correlations, below which parameters slide along each other
 _MOST_NAMED, _LEAST_SHARE = 4, 0.3  # of the parameters that do, and of the largest share
-
-
-class OtherPoses(NamedTuple):
-    """How the calibrated arm agrees with poses that it was not calibrated with; the geometry found is kept."""
-
-    names: tuple[str, ...]  # sockets and other observations
-    poses: np.ndarray
-    rms: np.ndarray  # mm
-    rms_angle: np.ndarray  # of residuals in rad; NaN where there are none
-    rms_px: np.ndarray | None = None  # in px; None where no observation has any
-
-    @property
-    def rms_of_all(self) -> float:
-        """Over all of these poses, mm."""
-        measured = np.isfinite(self.rms)
-        total = np.sum(self.poses[measured] * self.rms[measured] ** 2)
-        return float(np.sqrt(total / max(self.poses[measured].sum(), 1)))
 
 
 class Removed(NamedTuple):
@@ -116,7 +104,7 @@ class CalibrationRecord(NamedTuple):
     sampled: Mapping[str, np.ndarray] | None = None
     sampled_says: str | None = None
     robust: str | None = None  # the robust loss
-    others: OtherPoses | None = None
+    held_out: PoseResiduals | None = None  # residuals of poses that it was not calibrated with
     removed: tuple[Removed, ...] = ()
     prior: PriorMetrics | None = None  # with arrays of NumPy
     noisy_encoders: tuple[NoisyEncoder, ...] = ()  # whose noise was estimated, because it is larger than expected
@@ -159,17 +147,33 @@ class CalibrationRecord(NamedTuple):
         return self.divided and len(self.recording.capture.lengths) == 1
 
     @property
+    def residual(self) -> float:
+        """RMS distance of the poses from their geometry, mm; without those that a robust loss took weight from."""
+        return self.observed.rms if self.robust is None else float(np.sqrt(3) * self.observed.sigma)
+
+    @property
     def largest_plausible_residual(self) -> float:
         """RMS distance from the geometry, mm, that no arm of this size and class exceeds with its own data."""
-        usual = self.recording.usual
-        return largest_plausible_residual(self.calibrated.arm, self.given_noise, None if usual is None else usual.noise)
+        return self._largest_residual(only_usual=False)
+
+    @property
+    def largest_usual_residual(self) -> float:
+        """RMS distance from the geometry, mm, above which a mistake in the data is looked for."""
+        return self._largest_residual(only_usual=True)
 
     @property
     def implausible_residual(self) -> bool:
         """Whether the residual is larger than that of any such arm, so that data and arm do not belong together."""
-        # Bad poses do not count where a robust loss took their weight.
-        rms = self.observed.rms if self.robust is None else float(np.sqrt(3) * self.observed.sigma)
-        return rms > self.largest_plausible_residual
+        return self.residual > self.largest_plausible_residual
+
+    def _largest_residual(self, only_usual: bool) -> float:
+        noises = self.given_noise, None if self.recording.usual is None else self.recording.usual.noise
+        # Of each observation at most three coordinates; a socket has no measured point.
+        capture = self.recording.capture
+        stated_of = [(len(part.q), stated_u(part)) for part in capture.observations]
+        squares = sum(poses * 3 * float(np.mean(u**2)) for poses, u in stated_of if len(u))
+        stated = math.sqrt(squares / len(capture.readings))
+        return largest_plausible_residual(self.calibrated.arm, *noises, stated_rms=stated, only_usual=only_usual)
 
     def vectors(self) -> dict[str, np.ndarray]:
         """Free parameters of the nominal arm, after stage 1, and calibrated; and of the true arm of a simulation."""
@@ -200,7 +204,6 @@ def record_of(
     recording: Recording,
     *,
     robust: str | None = None,
-    others: Capture | None = None,
 ) -> CalibrationRecord:
     """The record of a calibration.
 
@@ -208,7 +211,6 @@ def record_of(
         calibration: what `calibrate` returned, or `identify`: the scale is then that of the nominal arm.
         recording: the capture that it was identified from, and the nominal arm.
         robust: the robust loss of the calibration.
-        others: poses that it was not identified from, on which it is tested.
 
     Returns:
         What a calibration file holds, as NumPy arrays.
@@ -223,17 +225,6 @@ def record_of(
     # What files hold is NumPy's.
     kept = (calibration.parameter_covariance, calibration.observed, calibration.prior)
     covariance, observed, prior, shared = jax.tree.map(np.asarray, (*kept, None if single else calibration.shared))
-    tested = None
-    if others is not None:
-        # What another observation alone determined is fitted; the rest of the geometry is as it was found.
-        geometry = calibration.observed.geometry if others.observations else None
-        evaluation = evaluate(calibration.arm, others, geometry=geometry)
-        poses = np.array([*others.sizes, *(observation.q.shape[0] for observation in others.observations)])
-        rms, rms_angle, rms_px = evaluation.repeatability.socket_rms, np.full(len(poses), np.nan), None
-        if evaluation.observed is not None:
-            rms, rms_angle, rms_px = (getattr(evaluation.observed, name) for name in ("rms", "rms_angle", "rms_px"))
-            rms_px = None if np.all(np.isnan(rms_px)) else np.asarray(rms_px)
-        tested = OtherPoses(tuple(names_in(others)), poses, np.asarray(rms), np.asarray(rms_angle), rms_px)
     return CalibrationRecord(
         recording=recording,
         stage1=nominal._replace(arm=stage1.arm, name=f"{nominal.name}, after stage 1"),
@@ -268,7 +259,6 @@ def record_of(
         shared=shared,
         components=covariance.components,
         surplus_k=0.0 if scale is None else float(scale.surplus),
-        others=tested,
     )
 
 
@@ -278,6 +268,12 @@ def _reason(calibration: Calibration | Identification) -> str:
     result = calibration.result if bool(stage1.converged) else stage1.result
     sentence, number = Reason[result], int(member_numbers(result))
     covariance = np.asarray(calibration.covariance)
+    if not bool(calibration.converged) and bool(converged(result)):
+        # What the solve says of itself would contradict that.
+        k = calibration.stage1.k
+        if k is not None and not bool(plausible(k)):
+            return f"{SCALE_REFUSED} = {float(k):.6g} is not plausible."
+        return "Not converged: a parameter is not finite; check the data and the start."
     sd = np.sqrt(np.diag(covariance))
     moving = np.flatnonzero(sd > 0)
     if number not in (MAX_STEPS, STALLED) or not len(moving) or not np.all(np.isfinite(covariance)):

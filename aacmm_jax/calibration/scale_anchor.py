@@ -142,8 +142,8 @@ def _checked_hold(hold: object, space: Parameters, lengths: list[str], concrete:
         raise InputError(f"hold is {shown(hold)}; give the name of a length, 'longest' or None.")
     if hold not in (None, "longest", *lengths):
         space.index(hold)
-        example = f", for example '{lengths[0]}'" if lengths else ", or omit hold, since no length is free"
-        raise InputError(f"hold is '{hold}', which is an angle; hold a length{example}.")
+        advice = f"; hold a length, for example '{lengths[0]}'" if lengths else ", and no length is free; omit hold"
+        raise InputError(f"hold is '{hold}', which is an angle{advice}.")
     if hold == "longest" and (not lengths or len(space.names) == 1):
         return None
     if hold == "longest" and not concrete:

@@ -118,9 +118,9 @@ def concluded(
     metrics = _metrics(task, begun.before, linear, state.sigma, _of_geometry(linear, influence, unknowns), spent)
     parameters, after = set_at(task.start, free, z[:p]), repeatability_of(state, observed, state.sigma)
     # Of all equations, or of poses where each has a variance of its own.
-    spare = float(observed.equations - p - count)
+    redundancy = float(observed.equations - p - count)
     if task.noise_model == "robust":
-        spare *= observed.q.shape[0] / observed.equations
+        redundancy *= observed.q.shape[0] / observed.equations
     identification = Identification(  # pyright: ignore[reportCallIssue] - `stage1` is itself
         arm=task.bounds.space.arm(parameters),
         parameters=parameters,
@@ -138,7 +138,7 @@ def concluded(
         bounds=task.bounds,
         anchor=task.anchor,
         noise_model=task.noise_model,
-        fitted_degrees_of_freedom=math.inf if task.noise_model == "given" else max(spare, 1.0),
+        fitted_degrees_of_freedom=math.inf if task.noise_model == "given" else max(redundancy, 1.0),
         observed=metrics,
         prior_metrics=of_prior and of_prior.metrics,
     )
@@ -179,7 +179,7 @@ def _of_parameters(
     return ParameterCovariance(
         set_at(xp.zeros((size, size)), grid, unknowns.head[:p, :p] * scale),
         set_at(xp.ones(size, dtype=bool), free, influence.determined[:p]),
-        set_at(xp.zeros((size, size)), grid, influence.lost[:p, :p]),
+        set_at(xp.zeros((size, size)), grid, influence.null_projector[:p, :p]),
         noise,
         parts and parts.wider(free, size),
     )
@@ -191,7 +191,9 @@ def _of_geometry(
     """Of each part, mm and rad; NaN for what the data leave open, such as the turn of a ball bar about itself."""
     xp, observed, p = namespace(linear.z), linear.observed, len(linear.space.names)
     by_class = [(covariance.head[None, p:, p:], influence.determined[None, p:])]
-    by_class += [(matrix, ~is_open) for matrix, is_open in zip(covariance.components, influence.open, strict=True)]
+    by_class += [
+        (matrix, ~is_open) for matrix, is_open in zip(covariance.components, influence.undetermined, strict=True)
+    ]
     scaled = [xp.where(seen[:, :, None] & seen[:, None, :], matrix, np.nan) for matrix, seen in by_class]
     matrices = {}
     for name, rows in observed.positions.items():

@@ -170,7 +170,7 @@ def _checked_table(specification: Any, path: Path, unit: str | None) -> dict[str
 
 def checked_recording(specification: Any, recording: Any, manifest: Path | None) -> dict[str, Any]:
     """What a check of a recording finds, with the lines of its manifest that correct it, where it has one."""
-    from ..diagnostics.reading_check import check_capture
+    from ..diagnostics.capture_check import check_capture
     from ..files.reading_checks import compare_reading_sets, positions_unit, reading_sets_sentence
 
     check = with_spinner("Comparing", lambda: check_capture(specification.arm, recording.capture))

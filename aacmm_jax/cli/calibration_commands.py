@@ -21,16 +21,22 @@ from .options import argument, flag, names_option, option, output, seed
 
 
 @command(
+    "aacmm calibrate capture.toml",
     "aacmm calibrate capture.h5 -o calibration.h5",
     "aacmm calibrate capture.h5 -o calibration.h5 --without 'test*' --method joint",
     "aacmm calibrate monday.h5 tuesday.h5 -o calibration.h5 --robust tukey",
     "aacmm calibrate capture.h5 -o calibration.h5 --prior length=0.5mm,angle=0.05deg",
+    "aacmm calibrate capture.h5 -o calibration.h5 --hold-out 0.3 --residuals residuals.csv",
 )
 def calibrate(
     capture: list[Path] = argument(
-        "One capture, or several captures of the same arm (one per session).", "CAPTURE.h5 ..."
+        "Capture or manifest; or several of one arm, each of one session.", "CAPTURE.h5|MANIFEST.toml ..."
     ),
-    output: Path = output("Calibration to write (HDF5).", "FILE.h5"),
+    output: Path | None = output(
+        "Calibration to write (HDF5). Default: the name of the first capture, ending in -calibration.h5.",
+        "FILE.h5",
+        None,
+    ),
     method: Literal["two-stage", "joint"] | None = option(
         "two-stage: identify the parameters from the repeatability in each socket, then set the scale with the "
         "reference lengths; joint: one least-squares fit of all data. Default: joint if there are observations other "
@@ -42,8 +48,8 @@ def calibrate(
     ),
     model: str | None = option(
         "Model these non-geometric errors of the joints, for example dh,gravity,harmonics=1+2,gear,coupled=2-3; dh "
-        "alone includes none of them. Default: the model of the arm file; if it has none, the model that predicts "
-        "held-out regions best.",
+        "alone includes none of them; gravity=masses takes the masses of the URDF as known. Default: the model of the "
+        "arm file; if it has none, the model that predicts held-out regions best.",
         "KINDS",
     ),
     prior: str | None = option(
@@ -61,10 +67,15 @@ def calibrate(
     same_probe: bool = flag(
         "--same-probe", "Use one probe position for all sessions, because the probe was not remounted."
     ),
+    hold_out: str | None = option(
+        "Do not calibrate with these poses, and test the result on them: a share of the poses of each observation, "
+        "drawn at random ('0.3'), or a group by its name or shell pattern (a socket, a placement, a session).",
+        "SHARE|GROUP",
+    ),
     only_poses: int | None = option(
         "Calibrate with N poses drawn at random, and test the result on the remaining poses.", "N", min=1
     ),
-    seed: int = seed("--only-poses"),
+    seed: int = seed("--hold-out and --only-poses"),
     hold: str = option(
         "Length parameter that stage 1 holds constant (scale anchor): its name, 'longest', or 'none' as in Cheng et "
         "al. 2018.",
@@ -121,6 +132,7 @@ def calibrate(
         "of the joints that predicts held-out regions best. What is stated by options or the arm file stays as stated.",
         default=True,
     ),
+    residuals: Path | None = options.RESIDUALS,
     figure: Path | None = option("Plot the residual of every pose to this file (.png, .svg or .pdf).", "FILE"),
     max_steps: int = option(
         "Maximum number of solver steps in each least-squares fit.", "N", default=300, min=1, max=1_000_000
@@ -146,9 +158,11 @@ def calibrate(
         noise=_known_noise(encoder_arcsec, seating_mm, linear_encoder_mm),
         replace_noise=not keep_noise,
         leave_out=tuple(leave_out or ()),
+        hold_out=options.share_or_name(hold_out),
         stage=with_spinner,
     )
-    with together(output, figure):
+    output = Path(f"{capture[0].stem}-calibration.h5") if output is None else output
+    with together(output, figure, residuals):
         for file in capture:
             reading(file)
         options.check_figure(figure)
@@ -164,8 +178,10 @@ def calibrate(
         files.save_calibration(output, record, summary)
         if figure is not None:
             plot.save_calibration_figure(record, figure)
+        if residuals is not None:
+            options.write_residuals(residuals, record)
     show_summary(summary | {"written": str(output)}, as_json, views.calibration)
-    if not record.converged or not record.plausible_scale or record.implausible_residual or does_not_fit(record):
+    if any(row["severity"] == "unusable" for row in summary["findings"]) or does_not_fit(record):
         raise typer.Exit(1)
 
 
@@ -175,13 +191,17 @@ def _recording(paths: Sequence[Path], same_probe: bool) -> Any:
         raise InputError("--same-probe applies to several captures only; name all captures, or leave out --same-probe.")
     sessions = {}
     for path in paths:
-        recording = files.load_capture(read := InputFile(path))
+        if path.suffix == ".toml":
+            recording = files.read_manifest(path)
+        else:
+            recording = files.load_capture(read := InputFile(path))
+            recording = recording._replace(sources=(fingerprint(read), *recording.sources))
         if path.stem in sessions:
             raise InputError(
                 f"two captures have the file name '{path.stem}', which becomes the name of the session; rename "
                 "one of the files."
             )
-        sessions[path.stem] = recording._replace(sources=(fingerprint(read), *recording.sources))
+        sessions[path.stem] = recording
     return pipeline.join_recordings(sessions, same_probe=same_probe)
 
 
@@ -232,7 +252,9 @@ def _known_noise(encoder_arcsec: float | None, seating_mm: float | None, linear_
     name="compare-models",
 )
 def compare_models(
-    capture: Path = argument("Capture, written by aacmm import or aacmm simulate.", "CAPTURE.h5"),
+    capture: Path = argument(
+        "Capture, written by aacmm import or aacmm simulate; or the manifest of one.", "CAPTURE.h5|MANIFEST.toml"
+    ),
     models: str | None = option(
         "Models to compare, from the simplest to the most complex, separated by semicolons; each is written as for "
         "calibrate --model. Default: dh; gravity; harmonics=1; gravity,harmonics=1; functions (harmonics=1-31); "
@@ -268,7 +290,7 @@ def compare_models(
 
     with together(output):
         reading(capture)
-        recording = files.load_capture(read := InputFile(capture))
+        recording = _recording([capture], same_probe=False)
     chosen = None if models is None else tuple(model.strip() for model in models.split(";"))
     if chosen is not None and not all(chosen):
         raise InputError(
@@ -276,7 +298,7 @@ def compare_models(
         )
     part, nominal = recording.capture.select(only or None, without or ()), recording.nominal
     if only_poses is not None:
-        part = draw_poses(part, only_poses, seed)[0]
+        part = draw_poses(part, only_poses, seed)
     noise = _known_noise(encoder_arcsec, seating_mm, linear_encoder_mm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IdentifiabilityWarning)
@@ -286,7 +308,7 @@ def compare_models(
     summary = summaries.compared_models.compared_models_summary(compared, nominal.name)
     summary["poses"] = len(part.readings)
     if output is not None:
-        files.save_compared_models(output, summary, [fingerprint(read)], None if only_poses is None else seed)
+        files.save_compared_models(output, summary, recording.sources[:1], None if only_poses is None else seed)
         summary["written"] = str(output)
     show_summary(summary, as_json, summaries.compared_models.compared_models)
     if not compared.recommended.result.converged:

@@ -11,7 +11,8 @@ import typer
 from .. import data, files
 from ..core.errors import InputError
 from ..core.jax_setup import LARGEST_INTEGER
-from ..core.text import is_control, number, quoted
+from ..core.text import is_control, is_number, number, quoted
+from ..files.outputs import write_text
 
 
 def argument(help: str, metavar: str, default: Any = ...) -> Any:
@@ -76,6 +77,26 @@ REFERENCE_LENGTHS = option(
     "A,B[,U]",
     "--length",
 )
+
+
+RESIDUALS = option(
+    "Write the residual of every pose to this file (CSV): observation, pose, used or held out, residual x, y, z in the "
+    "base frame, distance and its predicted standard uncertainty.",
+    "FILE.csv",
+)
+
+
+def share_or_name(text: str | None) -> float | str | None:
+    """A share where the text is a number, otherwise a name."""
+    return number(text) if text is not None and is_number(text) else text
+
+
+def write_residuals(path: Path, record: Any) -> None:
+    """Write the residual of every pose of a calibration or an evaluation."""
+    from ..pipeline.hold_out import residuals_of
+    from ..summaries.observations import residuals_csv
+
+    write_text(path, residuals_csv(residuals_of(record)))
 
 
 def bad_option(option: str, text: str, form: str) -> NoReturn:

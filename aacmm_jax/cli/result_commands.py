@@ -81,6 +81,7 @@ def evaluate(
     max_length_error_mm: float | None = option(
         "Exit with code 1 if the error of any length is larger than this.", min=0
     ),
+    residuals: Path | None = options.RESIDUALS,
     as_json: bool = options.JSON,
 ) -> None:
     """Test a calibration on a capture that was not used for it.
@@ -104,7 +105,9 @@ def evaluate(
         measuring_range=range_mm,
         maxima={name: value for name, value in maxima.items() if value is not None},
     )
-    with together(output):
+    if residuals is not None and capture is None:
+        raise InputError("--residuals is of the poses of a capture, but only points are given; leave it out.")
+    with together(output, residuals):
         if capture is None:
             record = evaluate_points(_points(calibration), **chosen._asdict())
             summarise = summaries.evaluation.points_summary
@@ -115,8 +118,10 @@ def evaluate(
         if output is not None:
             files.save_evaluation(output, record, summary)
             summary["written"] = str(output)
+        if residuals is not None:
+            options.write_residuals(residuals, record)
     show_summary(summary, as_json, views.points if capture is None else views.evaluation)
-    if summary["failed"] or any(test["decision"] in ("fails", "undecided") for test in summary["acceptance"]):
+    if not summary["verdict"]["achieved"]:
         raise typer.Exit(1)
 
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..core.arguments import checked_arguments, items_of, shown
 from ..core.arrays import Numbers, is_concrete, joined
@@ -218,20 +218,9 @@ def part_of(
     return Capture(sockets, lengths, others, repeated, capture.sessions, visits)
 
 
-def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Capture]:
-    """Divide the poses of a capture at random: some to calibrate with, the others to test the result on.
-
-    Args:
-        capture: The capture.
-        count: How many poses to draw, of sockets and other observations alike.
-        seed: Of the random numbers.
-
-    Returns:
-        A capture of the drawn poses, and one of the others; each with the reference lengths whose two sockets it has.
-
-    Raises:
-        InputError: The capture is a batch, or has not more poses than ``count``.
-    """
+def drawn_poses(capture: Capture, count: int, seed: int = 0) -> dict[str, Bool[np.ndarray, " m"]]:
+    """Draw so many poses of a capture at random, of sockets and other observations alike: which of the poses of each
+    were drawn. Raises `InputError` where the capture is a batch, or has not more poses than ``count``."""
     check_one_capture(capture)
     sizes = {part.name: part.q.shape[0] for part in capture.parts}
     total = sum(sizes.values())
@@ -239,10 +228,13 @@ def draw_poses(capture: Capture, count: int, seed: int = 0) -> tuple[Capture, Ca
         raise InputError(f"{count} of {total} poses cannot be selected at random; give a number from 1 to {total - 1}.")
     drawn = np.zeros(total, dtype=bool)
     drawn[random_generator(seed).choice(total, count, replace=False)] = True
-    of_parts = dict(zip(sizes, np.split(drawn, np.cumsum(list(sizes.values()))[:-1]), strict=True))
-    rows = [{name: np.flatnonzero(part == wanted) for name, part in of_parts.items()} for wanted in (True, False)]
-    first, second = (part_of(capture, [name for name in chosen if len(chosen[name])], chosen) for chosen in rows)
-    return first, second
+    return dict(zip(sizes, np.split(drawn, np.cumsum(list(sizes.values()))[:-1]), strict=True))
+
+
+def draw_poses(capture: Capture, count: int, seed: int = 0) -> Capture:
+    """The capture of `drawn_poses`, with the reference lengths whose two sockets it has."""
+    rows = {name: np.flatnonzero(drawn) for name, drawn in drawn_poses(capture, count, seed).items()}
+    return part_of(capture, [name for name in rows if len(rows[name])], rows)
 
 
 @checked_arguments

@@ -320,5 +320,5 @@ def remove_contradicting(
             changed_most=again.names[worst],
             change=float(changes[worst]),
         )
-        record = again._replace(others=again.others or record.others, removed=(*record.removed, removed))
+        record = again._replace(removed=(*record.removed, removed))
     return record

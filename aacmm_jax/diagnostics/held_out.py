@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..calibration.prediction import SIGNIFICANCE, Agreement, CrossValidation
+from ..calibration.agreement import SIGNIFICANCE, Agreement, CrossValidation
 from ..core.text import shorten
 from .findings import Case, Finding
 

@@ -313,7 +313,10 @@ def amend(result: Result, case: Case, again: Callable[[Noise], Result]) -> Resul
     noise, encoders = replaced
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the first calibration has said it
-        weighted = again(noise)
+        try:
+            weighted = again(noise)
+        except InputError:  # more noise than any arm has: the data do not match the arm, and that is what is wrong
+            return result
     changes = {"noisy_encoders": encoders}
     if result.given_noise is None:  # it is still one that was estimated
         first = result if isinstance(result, Identification) else result.stage1

@@ -8,7 +8,8 @@ the result in words and numbers.
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,16 +21,15 @@ from ..core.errors import InputError
 from ..core.numpy_or_jax import AnyArray, to_numpy
 from ..core.text import listed
 from ..core.units import DEG, INCH, LENGTH_UNITS, M, length_unit
-from ..data.capture import Capture
-from ..data.observations.measured import MeasuredPoints
 from ..kinematics.arm import Arm, is_single, joint_limits
+from ..kinematics.corrections import coefficient_of
 from ..kinematics.jacobian import tip_position
 from ..kinematics.workspace import total_link_length
 from .joint_travel import standing_joints
 from .reading_fit import Explanation, ReadingFit
 from .reading_search import Evidence, Hypothesis, search
 
-_EXPLAINED = 0.003  # of the arm's size: a smaller residual is left by a nominal arm, once its parameters are adjusted
+EXPLAINED = 0.003  # of the arm's size: a smaller residual is left by a nominal arm, once its parameters are adjusted
 _REFITTED = 24  # hypotheses
 _EQUAL = 1e-6, 2e-4  # of a residual, and mm: the same cost but for rounding
 _LISTED = 200  # hypotheses of equal cost that are looked at
@@ -63,6 +63,9 @@ class ReadingCheck(NamedTuple):
     # Of the nominal arm as the best has it, with the tip where it fits in the last frame, mm; None: it is not free.
     rms_with_tip: float | None = None
     free_tip: bool = False  # whether the place of the tip was said to be unknown
+    # Of joints that move with others, 1 or -1 by the name of the coefficient: what explains the readings of a capture
+    # where nothing else does.
+    couplings: Mapping[str, float] = MappingProxyType({})
 
     @property
     def fits(self) -> bool:
@@ -108,6 +111,19 @@ def check_readings(
         >>> print(check.fits, check.best.order)
         False (1, 0, 2, 3, 4, 5)
     """
+    return checked_fit(reading_fit(arm, q, sockets, positions, rotations, own_frame, free_tip))
+
+
+def reading_fit(
+    arm: Arm,
+    q: Float[AnyArray, "poses joints"],
+    sockets: Numbers | None = None,
+    positions: Float[AnyArray, "poses 3"] | None = None,
+    rotations: Float[AnyArray, "poses 3 3"] | None = None,
+    own_frame: bool = False,
+    free_tip: bool = False,
+) -> ReadingFit:
+    """What hypotheses are compared by; the arguments are those of `check_readings`."""
     arm = to_numpy(arm)
     if not is_single(arm):
         raise InputError("check_readings takes one arm, not a batch; give one arm of the batch.")
@@ -129,10 +145,10 @@ def check_readings(
             raise InputError("no socket has two poses, so nothing can be compared; record more poses in a socket.")
         order = np.argsort(owner, kind="stable")
         evidence = Evidence(q[order], owner[order])
-    return _checked(ReadingFit(arm, evidence, max(total_link_length(arm), 1e-9), free_tip), free_tip)
+    return ReadingFit(arm, evidence, max(total_link_length(arm), 1e-9), free_tip)
 
 
-def _checked(fit: ReadingFit, free_tip: bool) -> ReadingCheck:
+def checked_fit(fit: ReadingFit) -> ReadingCheck:
     """The hypotheses that the search finds, refitted and compared."""
     arm, evidence, n = fit.arm, fit.evidence, fit.arm.joints
     given = fit.explanation(Hypothesis(tuple(range(n)), (1,) * n, (0.0,) * n))
@@ -157,35 +173,14 @@ def _checked(fit: ReadingFit, free_tip: bool) -> ReadingCheck:
     good = [(members, fit.needed_zeros(members[0], zeros, rms)) for members, zeros, rms in candidates if rms <= bound]
     explanations = [explanation for _, explanation in good] + [given] * (possible and given.rms_fitted <= bound)
     closest = min(explanations, key=lambda explanation: explanation.rms_fitted)
-    explained, best, others, equal = closest.rms_fitted <= _EXPLAINED * fit.size, closest, (), 0
+    explained, best, others, equal = closest.rms_fitted <= EXPLAINED * fit.size, closest, (), 0
     if explained:
         best = min(explanations, key=lambda x: (x.outside > 0, x.changes, x.rms_fitted))
         others, equal = _others(fit, best, good)
     best = best if best == given else fit.within_limits(best)
     with_tip = fit.with_tip_found(best) if evidence.own_frame else None
     return ReadingCheck(
-        given, best, others, equal, explained, len(evidence.q), evidence.in_base, tried, with_tip, free_tip
-    )
-
-
-def check_capture(arm: Arm, capture: Capture) -> ReadingCheck:
-    """`check_readings` of what was recorded in sockets, or as one station of an instrument saw it."""
-    if any(size > 1 for size in capture.sizes):
-        return check_readings(arm, np.asarray(capture.q)[:, : arm.joints], sockets=capture.owner)
-    measured = [observation for observation in capture.observations if isinstance(observation, MeasuredPoints)]
-    if not measured:
-        raise InputError(
-            "readings are checked against at least two poses in one socket, or against measured points; the "
-            "capture has neither."
-        )
-    station, target = measured[0].station, measured[0].target
-    seen = [part for part in measured if (part.station, part.target) == (station, target)]
-    return check_readings(
-        arm,
-        np.concatenate([np.asarray(part.q)[:, : arm.joints] for part in seen]),
-        positions=np.concatenate([np.asarray(part.points) for part in seen]),
-        own_frame=True,
-        free_tip=bool(target),
+        given, best, others, equal, explained, len(evidence.q), evidence.in_base, tried, with_tip, fit.free_tip
     )
 
 
@@ -274,7 +269,12 @@ def reading_check_summary(
     given, best, tip = check.given, check.best, ""
     improved = f"from {given.rms:.3g} to {best.rms:.3g} mm RMS ({best.rms_fitted:.3g} mm"
     words = explanation_words(best, positions)
-    if not check.explained:
+    if check.couplings:
+        sentence = (
+            f"The readings fit an arm with coupled joints: {coupling_words(check.couplings)}. 'aacmm calibrate' finds "
+            "these couplings, unless a model is stated."
+        )
+    elif not check.explained:
         sentence = (
             f"No permutation, sign or zero offset of the columns explains these readings: {given.rms:.3g} mm RMS as "
             f"they are, {best.rms:.3g} mm at best. Is this the right arm, do the rows belong to these sockets or "
@@ -322,6 +322,19 @@ def reading_check_summary(
         "rms_with_tip_mm": check.rms_with_tip,
         "hypotheses": check.tried,
     }
+
+
+def coupling_words(couplings: Mapping[str, float]) -> str:
+    """What full couplings do, in words."""
+    texts = []
+    for name, factor in couplings.items():
+        term = coefficient_of(name)
+        assert term is not None
+        texts.append(
+            f"joint {term.joint} moves by its reading {'plus' if factor > 0 else 'minus'} that of joint {term.number} "
+            f"({name} = {factor:g})"
+        )
+    return listed(texts)
 
 
 def _row(explanation: Explanation, positions: str) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class ReadingFit:
     """Residuals of hypotheses, with nominal and with adjusted parameters."""
 
     def __init__(self, arm: Arm, evidence: Evidence, size: float, free_tip: bool):
-        self.arm, self.evidence, self.size, self.lever = arm, evidence, size, size / 4
+        self.arm, self.evidence, self.size, self.lever, self.free_tip = arm, evidence, size, size / 4, free_tip
         self._few = evidence.thinned(*_FITTED)
         names = parameter_names(arm)
         self._nominal = np.array([value_of(arm, name) for name in names], dtype=float)

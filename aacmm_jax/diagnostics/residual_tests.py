@@ -185,14 +185,14 @@ def form_test(left: Residuals, kernels: Kernels, relative: bool) -> FormTest:
     all (``alike``). Parts without any, and those that follow, have no part in it. Where it is ``relative``, the form
     is compared with the variance of all residuals instead of 1.
     """
-    spare, (value, traces) = left.degrees_of_freedom, _value_and_traces(left, kernels)
+    freedom, (value, traces) = left.degrees_of_freedom, _value_and_traces(left, kernels)
     t1, t2, t3 = traces
     if relative:
         # r'A r > x r'r, which is r'(A - x I) r > 0.
         x = value / max(left.cost, 1e-300)
-        shifted = (t1 - x * spare, t2 - 2 * x * t1 + x**2 * spare)
-        shifted = (*shifted, t3 - 3 * x * t2 + 3 * x**2 * t1 - x**3 * spare)
-        probability, expected = _tail(0.0, shifted), t1 * left.cost / max(spare, 1)
+        shifted = (t1 - x * freedom, t2 - 2 * x * t1 + x**2 * freedom)
+        shifted = (*shifted, t3 - 3 * x * t2 + 3 * x**2 * t1 - x**3 * freedom)
+        probability, expected = _tail(0.0, shifted), t1 * left.cost / max(freedom, 1)
     else:
         probability, expected = _tail(value, traces), t1
     ratio = value / expected if expected > 0 else float("nan")

@@ -105,6 +105,10 @@ class CorrectionsTable(Strict):
                 "exactly one of model and coefficients is needed; give model = 'gravity,harmonics=1', for example, or "
                 "the coefficients by name."
             )
+        if self.mass is not None and self.model is not None and "gravity=masses" not in self.model:
+            raise ValueError(
+                "the keys mass and centre apply only to model = 'gravity=masses'; write this model, or remove the keys."
+            )
         if self.nominal and not self.coefficients:
             raise ValueError("the key nominal applies only to coefficients, but a model is given; remove nominal.")
         unknown = set(self.nominal) - {*GEOMETRY}
@@ -271,8 +275,8 @@ _VALUE = re.compile(r"(?:(?P<mean>[^\s]+?)\s*\+-\s*)?(?P<sd>[^\s]+?)\s*(?P<unit>
 
 
 def with_model(specification: ArmSpecification, model: str) -> ArmSpecification:
-    """The specification with another model of its joints; masses are those of its URDF, where it has one. Raises
-    `InputError` where the model names an unknown kind."""
+    """The specification with another model of its joints; the masses of ``gravity=masses`` are those of its URDF.
+    Raises `InputError` where the model names an unknown kind, or needs masses and there are none."""
     if not model.strip():
         raise InputError("the model is empty; give the model dh for an arm without joint corrections.")
     arm = with_corrections(specification.arm, model, **masses_of(specification))

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.agreement import CrossValidation, LeftOut
 from ..calibration.evaluation import Evaluation
-from ..calibration.prediction import CrossValidation, LeftOut
-from ..calibration.record import CalibrationRecord, OtherPoses, Removed
+from ..calibration.pose_table import PoseResiduals
+from ..calibration.record import CalibrationRecord, Removed
 from ..calibration.results import NoisyEncoder, ObservedMetrics, PriorMetrics
 from ..data.capture import Capture
 from ..kinematics.arm import parameter_unit
@@ -24,7 +25,7 @@ from .stored_checks import read_checked
 # Records within the record that are a table each.
 _RECORDS = {
     "sampled": Within("monte_carlo", dict, schema.SAMPLED),
-    "others": Within("other_poses", OtherPoses, schema.OTHER_POSES),
+    "held_out": Within("held_out_poses", PoseResiduals, schema.HELD_OUT),
     "prior": Within("prior", PriorMetrics, schema.PRIOR),
     "shared": Within("shared_errors", SharedErrors, schema.SHARED_ERRORS),
     "components": Within("components", Components, schema.COMPONENTS),

@@ -184,12 +184,15 @@ GEOMETRY: Fields = {
     "covariance": number("row of the covariance matrix of all values of the part", "products of units", "entry"),
 }
 
-OTHER_POSES: Fields = {
-    "names": text("observation", "observation", name="observation"),
-    "poses": count("number of poses that were not used in the calibration", "observation"),
-    "rms": number("RMS distance of the unused poses from the estimated geometry", "mm", "observation"),
-    "rms_angle": number("RMS of the residuals of the unused poses in rad, such as orientations", "rad", "observation"),
-    "rms_px": number("RMS of the residuals of the unused poses in px", "px", "observation"),
+HELD_OUT: Fields = {
+    "observation": text("socket or other observation of the held-out pose", "held_out_pose"),
+    "pose": count("number of the pose in its observation, from 1", "held_out_pose", least=1),
+    "use": text("what the pose was used for", "held_out_pose", among=("used", "held out")),
+    "residual": number("residual in the base frame", "mm", "held_out_pose", "axis"),
+    "distance": number("distance of the tip from the estimated geometry", "mm", "held_out_pose"),
+    "angle": number("size of the residuals that are measured in rad", "rad", "held_out_pose"),
+    "pixels": number("size of the residuals that are measured in px", "px", "held_out_pose"),
+    "u": number("predicted standard uncertainty of the distance", "mm", "held_out_pose"),
 }
 
 PRIOR: Fields = {
@@ -198,8 +201,10 @@ PRIOR: Fields = {
     "units": text("unit of the standard deviation", "prior_group"),
     "parameters": count("number of free parameters in the group", "prior_group"),
     "sd": number("standard deviation, given or learned", "mm or rad, see unit", "prior_group"),
-    "effective": number("effective number of parameters of the group that the data determine", "1", "prior_group"),
-    "supported": truth("whether the data support a deviation of the group from its mean", "prior_group"),
+    "effective": number("how many parameters of the group the data determine (effective number)", "1", "prior_group"),
+    "supported": truth(
+        "whether the data show that parameters of the group differ from the means of their prior", "prior_group"
+    ),
     "names": text("free parameter", "prior_parameter", name="prior_parameter"),
     "mean": number("mean", _EITHER, "prior_parameter"),
     "weight": number("reciprocal of the standard deviation; 0 without a prior", "1/mm or 1/rad", "prior_parameter"),
@@ -268,6 +273,7 @@ EVALUATION: Fields = {
     "used": text("sockets whose poses were used in the calibration"),
     "warnings": text("warnings about the results"),
     "calibration_warnings": text("warnings about the calibration"),
+    "calibration_unusable": text("why the calibration is not to be used, if it is not"),
     "maxima": mapping("largest permitted value of each metric, mm"),
     **JUDGED,
 }
@@ -290,7 +296,7 @@ TABLES: dict[str, Fields] = {
     "removed": REMOVED,
     "observed": OBSERVED,
     "geometry": GEOMETRY,
-    "other_poses": OTHER_POSES,
+    "held_out_poses": HELD_OUT,
     "prior": PRIOR,
     "shared_errors": SHARED_ERRORS,
     "components": COMPONENTS,

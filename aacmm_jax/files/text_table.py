@@ -16,6 +16,7 @@ from .text_lines import (
     Line,
     along_axes,
     cells_of,
+    decimal_of,
     delimiter_of,
     has_number,
     is_row,
@@ -40,9 +41,9 @@ class TextTable:
     A name that the header does not have exactly is compared without regard to case, blanks and a unit in brackets.
     A header is a line of words before the first row: none of them begins like a number.
 
-    ``delimiter`` is found where it is None; ``skip`` lines before the header are left out; of several lines of words,
-    the header is the one that has the columns that are ``wanted``. Raises `InputError` where the file is no text, its
-    rows differ in their number of columns, or several lines may be its header.
+    ``delimiter`` and ``decimal`` are found where they are None; ``skip`` lines before the header are left out; of
+    several lines of words, the header is the one that has the columns that are ``wanted``. Raises `InputError` where
+    the file is no text, its rows differ in their number of columns, or several lines may be its header.
     """
 
     def __init__(
@@ -50,15 +51,16 @@ class TextTable:
         path: str | os.PathLike,
         *,
         delimiter: str | None = None,
-        decimal: str = ".",
+        decimal: str | None = ".",
         skip: int = 0,
         wanted: Sequence[Column] = (),
     ):
-        self.path, self._decimal, self._hashes = path, decimal, False
+        self.path, self._hashes = path, False
         lines, self._ended = table_lines(path)
         if lines[skip : skip + 1] and (stated := re.fullmatch('"?sep=(.)"?', lines[skip])):  # of spreadsheets
             delimiter, skip = delimiter or stated[1], skip + 1
         delimiter = delimiter or delimiter_of(lines[skip:], decimal)
+        self._decimal = decimal or decimal_of(lines[skip:], delimiter)
         words: list[Line] = []
         comments: list[Line] = []
         rows: list[Line] = []
@@ -197,8 +199,8 @@ class TextTable:
         hashed = next((i for i, row in enumerate(self._rows) if row[0].lstrip(' \t"').startswith("#")), None)
         if hashed is not None and not self._hashes:
             raise InputError(
-                f"{self.path} line {self._lines[hashed]} begins with #, but has as many columns as the rows; remove "
-                "the line if it is a comment, otherwise remove the # from its first cell."
+                f"{self.path} line {self._lines[hashed]} begins with #, but has the same number of columns as the rows "
+                "of numbers; remove the line if it is a comment, otherwise remove the # from its first cell."
             )
         # A file without a last line's end may be cut: then its last number has fewer decimals than the others.
         decimals = [len(row[-1].partition(self._decimal)[2]) for row in self._rows]

@@ -103,6 +103,12 @@ class KnownFunctions:
         sizes = np.where(self.by_gravity, 3, 1)
         return np.cumsum(sizes) - sizes
 
+    @cached_property
+    def couplings(self) -> tuple[tuple[int, int, int], ...]:
+        """Of each function that is another joint's reading: its number, that joint, and the one it moves, from 0."""
+        terms = enumerate(self.terms)
+        return tuple((b, term.number - 1, term.joint - 1) for b, term in terms if term.kind.of_other_reading)
+
     @property
     def expands(self) -> bool:
         """Whether some function scales all lengths."""
@@ -117,6 +123,7 @@ class JointErrors(NamedTuple):
     by_gravity: Float[AnyArray, "n 3 ... 1 N"]
     functions: KnownFunctions
     scale: Float[AnyArray, "... 1 N"] | None  # of all lengths; None without thermal expansion
+    couplings: Float[AnyArray, "c ... 1 N"] | None  # `full_couplings`
 
 
 class Corrections(NamedTuple):
@@ -214,8 +221,29 @@ def joint_motion_of_rows(geometry: Geometry, rows: Float[AnyArray, "n ... 1 N"])
         motion = JointMotion(xp.cos(angle), xp.sin(angle), xp.where(prismatic, readings, 0.0))
     if corrections is None:
         return motion
-    forward = forward_pass(corrections.nominal, motion)
-    return motion._replace(functions=corrections.functions.values(rows, forward))
+    functions, moved = corrections.functions, motion
+    if functions.couplings and np.any(functions.by_gravity):
+        # Where a reading moves another joint by as much as its own, the frames at the readings alone are far off.
+        whole = full_couplings(functions, joints_first(geometry.coefficients, rows.ndim - 2))
+        nominal = geometry._replace(coefficients=None, gravity=None, corrections=None)
+        moved = joint_motion_of_rows(nominal, coupled_joints(functions, whole, readings))
+    return motion._replace(functions=functions.values(rows, forward_pass(corrections.nominal, moved)))
+
+
+def full_couplings(functions: KnownFunctions, coefficients: Float[AnyArray, "k ..."]) -> Float[AnyArray, "c ..."]:
+    """The whole part of each coupling's coefficient: 1 or -1 of a joint that keeps its direction when another one
+    moves, as with parallel links; 0 of couplings that are errors."""
+    return namespace(coefficients).round(coefficients[np.array([number for number, _, _ in functions.couplings])])
+
+
+def coupled_joints(
+    functions: KnownFunctions, whole: Float[AnyArray, "c ..."], readings: Float[AnyArray, "n ..."]
+) -> Float[AnyArray, "n ..."]:
+    """The angles of joints that move with others, from their readings."""
+    joints = [readings[joint] for joint in range(readings.shape[0])]
+    for factor, (_, source, moved) in zip(whole, functions.couplings, strict=True):
+        joints[moved] = joints[moved] + factor * readings[source]
+    return namespace(readings, whole).stack(joints)
 
 
 @compiled
@@ -328,9 +356,10 @@ def _errors_of(parameters: Geometry, motion: JointMotion) -> JointErrors:
         by_gravity = xp.tensordot(of_joints[:, heavy], weighted, axes=1)
     products = coefficients * by_coefficient
     added, scale = xp.tensordot(of_joints, products, axes=1), None
+    couplings = full_couplings(functions, coefficients) if functions.couplings else None
     if functions.expands:
         scale = 1.0 + xp.tensordot((functions.moved < 0).astype(float), products, axes=1)
-    return JointErrors(added, by_coefficient, by_gravity, functions, scale)
+    return JointErrors(added, by_coefficient, by_gravity, functions, scale, couplings)
 
 
 def joint_errors(

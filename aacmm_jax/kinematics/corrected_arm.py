@@ -10,7 +10,7 @@ from ..core.arrays import Numbers
 from ..core.errors import InputError
 from ..core.linear_algebra import independent_columns
 from ..core.numpy_or_jax import namespace, to_numpy
-from .arm import DOWN, Arm, is_single, joint_limits, without_corrections
+from .arm import DOWN, Arm, correction_names, is_single, joint_limits, without_corrections
 from .chain import Corrections, Geometry, KnownFunctions, forward_pass, joint_motion, joints_first
 from .corrections import Loads, Term, term_of, terms_of
 
@@ -38,7 +38,7 @@ def with_corrections(
         arm: The nominal arm; corrections that it has are replaced.
         model: What the joints do: "gravity,harmonics=1" (kinds of corrections, see `kinematics.corrections`), or names
             of coefficients, such as ``["cos1_2", "sin1_2", "compliance3_2"]``, all of which are taken.
-        mass: Mass of each link ``(n,)``, kg, for compliances alone; by default unknown.
+        mass: Mass of each link ``(n,)``, kg, for ``gravity=masses`` and ``compliance_2`` alone; by default unknown.
         centre: Centre of mass of each link in its D-H frame ``(n, 3)``, mm.
         gravity: Direction of gravity in the base frame ``(3,)``.
 
@@ -67,6 +67,10 @@ def with_corrections(
         for name, term in by_name.items():
             if term is None:
                 raise InputError(f"'{name}' is not the name of a coefficient; give a name such as cos1_2, or a model.")
+            if term.kind.rows == 3 and not term.number and loads is None:
+                raise InputError(
+                    f"'{name}' needs the masses of the links; give mass and centre, or name one of a link."
+                )
         terms = tuple(dict.fromkeys(term for term in by_name.values() if term is not None))
     if not terms:
         return plain
@@ -106,12 +110,26 @@ def corrected_like(corrected: Arm, arm: Arm) -> Arm:
 def with_further_corrections(arm: Arm, names: Sequence[str]) -> Arm:
     """The same arm with more corrections than it has, by the names of their coefficients, which are 0."""
     added = tuple(term for term in (term_of(name, arm.joints) for name in names) if term is not None)
+    if not added:
+        return arm
     if arm.corrections is None:
         return arm.replace(corrections=Corrections(KnownFunctions(added), arm.geometry), gravity=np.array(DOWN))
     assert arm.coefficients is not None
     functions = KnownFunctions((*arm.corrections.functions.terms, *added))
     coefficients = namespace(arm.coefficients).concatenate([arm.coefficients, np.zeros(len(added))])
     return arm.replace(corrections=arm.corrections._replace(functions=functions), coefficients=coefficients)
+
+
+def with_couplings_of(coupled: Arm, arm: Arm) -> Arm:
+    """An arm with the full couplings of another one of its joints (`chain.full_couplings`), with their coefficients."""
+    if coupled.corrections is None:
+        return arm
+    assert coupled.coefficients is not None
+    functions = coupled.corrections.functions
+    numbers = [number for number, _, _ in functions.couplings]
+    values = {functions.names[i]: coupled.coefficients[i] for i in numbers if np.round(coupled.coefficients[i])}
+    missing = [name for name in values if name not in correction_names(arm)]
+    return with_further_corrections(arm, missing).replace(**values) if values else arm
 
 
 def loads_of(arm: Arm) -> Loads | None:

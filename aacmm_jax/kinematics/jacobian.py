@@ -64,19 +64,19 @@ def _column(forward: ForwardPass, kind: str, at: int | slice) -> Vectors:
 def _columns(forward: ForwardPass, kind: str) -> Float[AnyArray, "k ... 3 N"]:
     """Derivative of the tip by all parameters of a kind."""
     if kind in ("coefficients", "gravity"):
-        return _by_errors(forward, kind, reading_columns(forward), _tip_by_scale(forward))
+        return _by_errors(forward, kind, joint_columns(forward), _tip_by_scale(forward))
     return _column(forward, kind, _ALL)
 
 
-def _by_errors(forward: ForwardPass, kind: str, by_reading: ByJoint, by_scale: Vectors) -> Float[AnyArray, "k ... 3 N"]:
-    """Columns of coefficients or of gravity, from those of the joints' readings and of the scale of all lengths."""
+def _by_errors(forward: ForwardPass, kind: str, by_joint: ByJoint, by_scale: Vectors) -> Float[AnyArray, "k ... 3 N"]:
+    """Columns of coefficients or of gravity, from those of the joints and of the scale of all lengths."""
     assert forward.errors is not None
     if kind == "gravity":
-        return namespace(by_reading).sum(forward.errors.by_gravity * by_reading[:, None], axis=0)
+        return namespace(by_joint).sum(forward.errors.by_gravity * by_joint[:, None], axis=0)
     functions = forward.errors.functions
     if functions.expands:  # the last, -1, is that of the scale
-        by_reading = namespace(by_reading).concatenate([by_reading, by_scale[None]])
-    return forward.errors.by_coefficient * by_reading[functions.moved]
+        by_joint = namespace(by_joint).concatenate([by_joint, by_scale[None]])
+    return forward.errors.by_coefficient * by_joint[functions.moved]
 
 
 def _tip_by_scale(forward: ForwardPass) -> Vectors:
@@ -84,12 +84,8 @@ def _tip_by_scale(forward: ForwardPass) -> Vectors:
     return forward.tip if forward.errors is None or forward.errors.scale is None else forward.tip / forward.errors.scale
 
 
-def reading_columns(forward: ForwardPass) -> ByJoint:
-    """Derivative of the tip by every joint reading, mm per rad, or mm per mm of a prismatic joint.
-
-    A reading enters only in its sum with ``theta``, or with ``d`` of a prismatic joint. That corrections change with
-    the readings, by as little as a gear ratio errs, is left out here; `tip_jacobian` has it.
-    """
+def joint_columns(forward: ForwardPass) -> ByJoint:
+    """Derivative of the tip by every joint, mm per rad, or mm per mm of a prismatic joint."""
     rotations = _column(forward, "theta", _ALL)
     if forward.kinds is None:
         return rotations
@@ -97,11 +93,36 @@ def reading_columns(forward: ForwardPass) -> ByJoint:
     return namespace(forward).where(forward.kinds.mask(rotations.ndim), slides, rotations)
 
 
-def reading_rotations(forward: ForwardPass) -> ByJoint:
-    """Derivative of the last frame's orientation, as a rotation vector, by every joint reading."""
+def joint_rotations(forward: ForwardPass) -> ByJoint:
+    """Derivative of the last frame's orientation, as a rotation vector, by every joint."""
     if forward.kinds is None:
         return forward.z_before
     return namespace(forward).where(forward.kinds.mask(forward.z_before.ndim), 0.0, forward.z_before)
+
+
+def reading_columns(forward: ForwardPass) -> ByJoint:
+    """Derivative of the tip by every joint reading, mm per rad, or mm per mm of a prismatic joint.
+
+    A reading enters only in its sum with ``theta``, or with ``d`` of a prismatic joint, of its joint and of those that
+    move with it (`chain.full_couplings`). That corrections change with the readings, by as little as a gear ratio errs,
+    is left out here; `tip_jacobian` has it.
+    """
+    return _by_readings(forward, joint_columns(forward))
+
+
+def reading_rotations(forward: ForwardPass) -> ByJoint:
+    """Derivative of the last frame's orientation, as a rotation vector, by every joint reading."""
+    return _by_readings(forward, joint_rotations(forward))
+
+
+def _by_readings(forward: ForwardPass, by_joint: ByJoint) -> ByJoint:
+    """Derivatives by readings, from those by joints."""
+    if forward.errors is None or forward.errors.couplings is None:
+        return by_joint
+    columns = [by_joint[joint] for joint in range(by_joint.shape[0])]
+    for factor, (_, source, moved) in zip(forward.errors.couplings, forward.errors.functions.couplings, strict=True):
+        columns[source] = columns[source] + factor * by_joint[moved]
+    return namespace(by_joint).stack(columns)
 
 
 def _parameters(kinds: JointKinds | None, indices: Indices) -> Indices:
@@ -125,7 +146,7 @@ def rotation_columns(forward: ForwardPass, indices: Indices) -> Columns:
     still, wanted = namespace(forward).zeros_like(forward.tip), _parameters(forward.kinds, indices)
     axes: dict[str, Any] = {kind: getattr(forward, axis) for kind, (axis, _) in _ROTATIONS.items()}
     for kind in {kind for kind, _ in wanted} & {"coefficients", "gravity"}:
-        axes[kind] = _by_errors(forward, kind, reading_rotations(forward), still)
+        axes[kind] = _by_errors(forward, kind, joint_rotations(forward), still)
     return _stacked([still if axes.get(kind) is None else axes[kind][i] for kind, i in wanted], forward)
 
 
@@ -233,11 +254,11 @@ def _tip_position_jvp(primals, tangents):
         if not isinstance(tangent, SymbolicZero):
             moved = moved + jnp.sum(_columns(forward, kind) * joints_first(tangent, rank), axis=0)
     if not isinstance(q_dot, SymbolicZero):
-        moved = moved + jnp.sum(reading_columns(forward) * of_joints(geometry, joints_first(q_dot, rank)), axis=0)
+        moved = moved + jnp.sum(joint_columns(forward) * of_joints(geometry, joints_first(q_dot, rank)), axis=0)
         if geometry.corrections is not None:  # which change with the readings, and so does the scale of all lengths
             errors = lambda q: joint_errors(geometry, joint_motion(geometry, q))  # noqa: E731
             _, (by_joints, by_scale) = jax.jvp(errors, (q,), (q_dot,))
-            moved = moved + jnp.sum(reading_columns(forward) * by_joints, axis=0) + by_scale * _tip_by_scale(forward)
+            moved = moved + jnp.sum(joint_columns(forward) * by_joints, axis=0) + by_scale * _tip_by_scale(forward)
     return components_last(forward.tip, geometry, q), components_last(moved, geometry, q)
 
 

@@ -1,4 +1,4 @@
-"""What `calibrate_capture` decides where nothing is said: bounds, groups left out, the model of joints.
+"""What `calibrate_capture` decides where nothing is said: couplings, bounds, groups left out, the model of joints.
 
 Each remedy is tried only where the calibration shows that it is needed, is kept only where it helps, and says in one
 sentence what was done and why. What somebody stated is never overruled: stated bounds stay, and with a stated model,
@@ -18,10 +18,13 @@ from ..core.text import shorten
 from ..core.units import DEG
 from ..data.capture import Capture
 from ..data.recording import Recording
+from ..diagnostics.capture_check import search_couplings
 from ..diagnostics.contradictions import remove_contradicting
 from ..diagnostics.equations import EXACT
+from ..diagnostics.reading_check import coupling_words
 from ..diagnostics.usability import on_bounds
-from ..kinematics.arm import is_length
+from ..kinematics.arm import correction_names, is_length, without_corrections
+from ..kinematics.corrected_arm import with_further_corrections
 from ..kinematics.parameters import ArmSpecification
 from ..kinematics.priors import default_prior
 from .model_ladder import ComparedModels, compare_models, default_models
@@ -37,8 +40,35 @@ _SOME, _FUNCTIONS = "harmonics=1-6", "functions"
 _WORTH = 10.0  # log evidence that a richer model must add for a still richer one to be tried
 
 
+def with_full_couplings(record: CalibrationRecord, solve: Solve, recorded: Record, further: bool) -> CalibrationRecord:
+    """The calibration with joints that move by the readings of others as well, where the readings do not fit the arm
+    without (`search_couplings`); else as it is.
+
+    Where a model is stated (not ``further``), only its own couplings are set. A coupling is a coefficient like any
+    other, but its nominal value, which is the mean of its prior, is 1 or -1 instead of 0.
+    """
+    nominal, capture = record.recording.nominal, record.recording.capture
+    try:
+        couplings = search_couplings(without_corrections(nominal.arm), capture)
+    except InputError:  # neither sockets nor points
+        return record
+    missing = [name for name in couplings if name not in correction_names(nominal.arm)]
+    if not couplings or (missing and not further):
+        return record
+    arm = with_further_corrections(nominal.arm, missing).replace(**couplings)
+    recording = record.recording._replace(nominal=nominal._replace(arm=arm))
+    again = recorded(solve(recording), recording)
+    if not again.observed.rms < record.observed.rms:
+        return record
+    says = (
+        f"The readings fit an arm with coupled joints: {coupling_words(couplings)}. The residuals fell from "
+        f"{record.observed.rms:.3g} to {again.observed.rms:.3g} mm RMS."
+    )
+    return again._replace(decisions=(*record.decisions, says))
+
+
 def with_wider_bounds(record: CalibrationRecord, solve: Solve, recorded: Record) -> CalibrationRecord:
-    """The calibration with wider bounds where parameters ended on one that nobody stated, and the residuals are smaller
+    """The calibration with wider bounds where parameters ended on one not stated, and the residuals are smaller
     by more than chance explains; else as it is."""
     first, nominal = on_bounds(record), record.recording.nominal
     if not first or "bounds" in nominal.stated:

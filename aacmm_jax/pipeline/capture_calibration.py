@@ -13,15 +13,16 @@ from ..calibration.results import Calibration, Identification
 from ..calibration.sampling import monte_carlo
 from ..core.arguments import checked_arguments, with_options
 from ..core.errors import IdentifiabilityWarning, InputError
-from ..data.capture import draw_poses, join_sessions
+from ..data.capture import join_sessions
 from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.findings import case_of
 from ..kinematics.corrected_arm import with_corrections
 from ..kinematics.priors import Prior, default_prior
 from ..model.loss_names import LossName
-from .automatic import with_best_model, with_wider_bounds, without_contradicting
+from .automatic import with_best_model, with_full_couplings, with_wider_bounds, without_contradicting
 from .cross_validation import can_cross_validate, cross_validate
+from .hold_out import held_out_poses, tested, without_held_out
 from .single import CalibrationOptions, calibrate, identify
 
 _SOLVE = CalibrationOptions()
@@ -41,6 +42,7 @@ class CaptureOptions(NamedTuple):
     robust: LossName | None = _SOLVE.robust
     prior: Prior | Literal["stated"] | None = "stated"
     scale: Literal["measured", "nominal"] = "measured"
+    hold_out: float | str | None = None
     only_poses: int | None = None
     seed: int = 0
     hold: str | None = _SOLVE.hold
@@ -74,7 +76,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         robust: a robust loss, as for `identify`.
         prior: what is known of the parameters; "stated", that of the nominal arm; None, nothing.
         scale: "nominal" for stage 1 alone, with the scale of the nominal arm, where nothing observed fixes it.
-        only_poses: calibrate with so many poses drawn at random, and evaluate the result on the others.
+        hold_out: test the result on poses that it was not calibrated with: a share of the poses of each observation,
+            drawn at random (0.3), or the group of such a name or shell pattern (a socket, a placement, a session).
+        only_poses: calibrate with so many poses drawn at random, and test the result on the others.
         seed: of these random numbers.
         hold: the scale anchor of stage 1, as for `identify`.
         noise: standard deviations of readings and seat, as for `identify`.
@@ -86,9 +90,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         monte_carlo: check the uncertainties by Monte Carlo.
         strict: raise `InputError` where such data could not determine free parameters even without noise.
         remove_contradicting: leave out groups that contradict all others.
-        automatic: widen default bounds that the fit reaches, leave out what contradicts the rest, and compare models of
-            the joints unless a model, a prior, a method or a robust loss is stated. ``decisions`` of the record says
-            what was done and why.
+        automatic: find joints that move with others, widen default bounds that the fit reaches, leave out what
+            contradicts the rest, and compare models of the joints unless a model, a prior, a method or a robust loss is
+            stated. ``decisions`` of the record says what was done and why.
         max_steps: most evaluations of each solve.
         stage: called with what is done next, in words, and a function that does it, such as to show progress.
 
@@ -109,10 +113,9 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
             "--leave-out (leave_out) names the groups that --cross-validate (cross_validate) leaves out; give both "
             "options."
         )
-    others = None
-    if chosen.only_poses is not None:
-        part, others = draw_poses(recording.capture, chosen.only_poses, chosen.seed)
-        recording = recording._replace(capture=part)
+    capture = recording.capture
+    masks = held_out_poses(capture, chosen.hold_out, chosen.only_poses, chosen.seed)
+    recording = recording._replace(capture=without_held_out(capture, masks))
     nominal = recording.nominal
     if chosen.model is not None and nominal.arm.corrections is None:
         nominal = nominal._replace(arm=with_corrections(nominal.arm, chosen.model))
@@ -125,7 +128,7 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
     stated = (chosen.model, chosen.robust, chosen.method, nominal.prior, nominal.arm.corrections)
 
     def recorded(result: Calibration | Identification, part: Recording) -> CalibrationRecord:
-        record = record_of(result, part, robust=chosen.robust, others=others)
+        record = record_of(result, part, robust=chosen.robust)
         case_of(record)  # takes over what the calibration has computed to test its noise, before others are tested
         return record
 
@@ -134,11 +137,15 @@ def calibrate_capture(recording: Recording, **options: Any) -> CalibrationRecord
         solved = partial(_solved, chosen)
         record = chosen.stage("Calibrating", lambda: recorded(solved(recording), recording))
         if automatic:
+            further = chosen.model is None and nominal.arm.corrections is None
+            record = chosen.stage("Checking couplings", lambda: with_full_couplings(record, solved, recorded, further))
             record = chosen.stage("Checking bounds", lambda: with_wider_bounds(record, solved, recorded))
         if automatic or chosen.remove_contradicting:
             record = chosen.stage("Comparing groups", lambda: without_contradicting(record, solved, recorded))
         if automatic and all(value is None for value in stated):
             record = with_best_model(record, recorded, chosen)
+        if masks:
+            record = chosen.stage("Testing held-out poses", lambda: tested(record, capture, masks))
         if _to_cross_validate(record, chosen):
             record = chosen.stage("Cross-validating", lambda: _cross_validated(record, chosen))
         if chosen.monte_carlo:
@@ -194,6 +201,8 @@ def _to_cross_validate(record: CalibrationRecord, chosen: CaptureOptions) -> boo
     capture, nominal = record.recording.capture, record.recording.nominal
     if chosen.cross_validate is not None:
         return chosen.cross_validate
+    if record.validation is not None:  # by the group that was held out
+        return False
     plain = chosen.scale == "measured" and chosen.robust is None and (nominal.prior is None or record.decisions)
     if not plain or capture.observations or record.recording.true is not None or len(capture.lengths) < 2:
         return False

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..calibration.prediction import CrossValidation, LeftOut, unseen_errors
+from ..calibration.agreement import CrossValidation, LeftOut
+from ..calibration.prediction import unseen_errors
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.scale_anchor import fixes_scale
 from ..core.arguments import checked_arguments, items_of, with_options
@@ -25,6 +26,7 @@ from ..diagnostics.equations import Equations, equations_of
 from ..kinematics.arm import Arm
 from ..kinematics.parameters import Bounds
 from ..model.observed import Observed
+from ..uncertainty.arm_uncertainty import Uncertainty
 from .single import CalibrationOptions, calibrate, with_joint_model
 
 _HALVINGS = 2  # of joint space into regions
@@ -172,12 +174,19 @@ def cross_validate(
     left_out = []
     for rest, left, names in parts:
         result = calibrate(arm, rest, bounds, **given._asdict())
-        errors = unseen_errors(uncertainty_of(to_numpy(result)), left)
-        poses, lengths = errors.of(errors.parts), errors.of_lengths()
-        of_lengths, of_noise = lengths.degrees_of_freedom, errors.noise_degrees_of_freedom
-        columns = poses.count, poses.rms, poses.predicted, errors.length_error, errors.length_u, bool(result.converged)
-        left_out.append(LeftOut(names, *columns, poses.degrees_of_freedom, of_lengths, of_noise))
+        left_out.append(left_out_group(uncertainty_of(to_numpy(result)), left, bool(result.converged), names))
     return CrossValidation(tuple(left_out))
+
+
+def left_out_group(
+    uncertainty: Uncertainty, left: Capture, converged: bool, names: tuple[str, ...] | None = None
+) -> LeftOut:
+    """How a calibrated arm agrees with a capture that it was not identified from, under its names or others."""
+    errors = unseen_errors(uncertainty, left)
+    poses, lengths = errors.of(errors.parts), errors.of_lengths()
+    of_lengths, of_noise = lengths.degrees_of_freedom, errors.noise_degrees_of_freedom
+    columns = poses.count, poses.rms, poses.predicted, errors.length_error, errors.length_u, converged
+    return LeftOut(names or names_in(left), *columns, poses.degrees_of_freedom, of_lengths, of_noise)
 
 
 def _check_some_left(pattern: str, some: bool) -> None:

@@ -32,7 +32,7 @@ from ..data.noise import Noise
 from ..data.recording import Recording
 from ..diagnostics.equations import PRIOR, Equations, equations_of
 from ..kinematics.arm import DOWN, Arm, without_corrections
-from ..kinematics.corrected_arm import with_corrections
+from ..kinematics.corrected_arm import with_corrections, with_couplings_of
 from ..kinematics.parameters import ArmSpecification, Bounds
 from ..kinematics.priors import default_prior
 from .cross_validation import UnseenRegion, regions_of, unseen_regions
@@ -154,7 +154,7 @@ def compare_models(
     geometry; reference lengths take part in the fits only.
 
     Args:
-        arm: The nominal arm; corrections that it has are replaced by those of each model.
+        arm: The nominal arm; corrections that it has are replaced by those of each model, except full couplings.
         capture: Sockets, reference lengths and other observations.
         bounds: Box of the free Denavit-Hartenberg parameters, mm and rad; by default around those
             that such data determine. Coefficients of corrections are free in each model that has them.
@@ -196,7 +196,8 @@ def compare_models(
 
     def compared(model: str) -> ComparedModel:
         begun = time.process_time()
-        widened = with_coefficients(bounds, with_corrections(plain, model, **loads))
+        modelled = with_couplings_of(arm, with_corrections(plain, model, **loads))
+        widened = with_coefficients(bounds, modelled)
         corrected, prior = widened.space.base, default_prior(widened.space.base)
         result = calibrate(
             *(corrected, capture, widened),

@@ -25,6 +25,7 @@ from ..summaries.tables import (
     shared_sentence,
     two_digits,
 )
+from ..summaries.verdicts import length_uncertainty
 from ..uncertainty.coverage import LEVEL_IN_PERCENT
 from ..uncertainty.volume import volumetric_uncertainty
 from . import calibration_sections as sections
@@ -87,19 +88,18 @@ def _facts(summary: dict[str, Any]) -> list[tuple[str, str]]:
         facts.append(("Held-out groups, RMS distance", f"{rms}\u00a0mm (predicted {predicted})"))
     for key, name in (("de_mm", "DE"), ("deltam_mm", "Deltam")) if "de_mm" in calibrated else ():
         facts.append((f"{name}, nominal → calibrated", changed(nominal[key], calibrated[key])))
-    if "other_poses" in summary:
-        facts.append(("Other poses, RMS distance", f"{format_number(summary['other_poses']['rms_mm'])}\u00a0mm"))
+    if "held_out_poses" in summary:
+        row = summary["held_out_poses"]["held_out"]
+        numbers = " / ".join(format_number(row[key]) for key in ("rms_mm", "mean_mm", "largest_mm"))
+        facts.append(
+            (f"{pluralise(row['poses'], 'held-out pose')}, distance: RMS / mean / largest", f"{numbers}\u00a0mm")
+        )
     for row in summary["kinds"][:_MOST_KINDS]:
         title = f"RMS residual, {row['kind']}, nominal → calibrated"
         facts.append((title, changed(row["rms_before_mm"], row["rms_after_mm"])))
-    volume = summary["uncertainty"]["volume"]
-    length = f"U of a {volume['length_mm']:g} mm length with the noise of its readings"
-    largest, median = (volume[f"expanded_length_reading_{which}_mm"] for which in ("largest", "median"))
-    if median is not None and largest is not None:
-        typical, worst = (f"{two_digits(u)}\u00a0mm" for u in (median, largest))
-        facts.append((f"{length} ({LEVEL_IN_PERCENT})", f"median {typical}, largest {worst}"))
-    else:
-        facts.append((length, "not determined everywhere"))
+    stated = length_uncertainty(summary["uncertainty"])
+    length = f"{summary['uncertainty']['volume']['length_mm']:g} mm length with the noise of its readings"
+    facts.append((f"U of a {length} ({LEVEL_IN_PERCENT})", stated or "not determined everywhere"))
     if summary.get("lengths_tested"):
         facts.append(("Lengths tested", lengths_sentence(summary["lengths_tested"]).partition(": ")[2]))
     if summary["scale_k"] is not None:
@@ -168,6 +168,8 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
     blocks: list[Block] = [introduction]
     if summary["cross_validation"] is not None:
         blocks += result_tables.validation_tables(summary["cross_validation"])
+    if "held_out_poses" in summary:
+        blocks += result_tables.held_out_tables(summary["held_out_poses"])
     capture = record.recording.capture
     if summary.get("prior"):
         blocks.append(result_tables.prior_table(summary["prior"]))
@@ -175,7 +177,6 @@ def _nominal_and_calibrated(record: CalibrationRecord, summary: dict[str, Any]) 
         blocks.append(shared_sentence(summary["shared_errors"]))
     if not record.sockets_alone:
         blocks += result_tables.agreement_tables(summary)
-        blocks += [result_tables.other_poses_table(summary["other_poses"])] if "other_poses" in summary else []
     if summary["nominal"]:
         caption = "Metrics by arm [mm]"
         if capture.observations:

@@ -110,8 +110,8 @@ def blocks_of(study: Study, chunk: int) -> list[Block]:
     cells, trials = len(study.cells), study.trials
     if cells * -(-trials // chunk) > MOST_BLOCKS:
         raise InputError(
-            f"chunks of {chunk} trials divide {cells} cells of {trials:,} trials into more than {MOST_BLOCKS:,} "
-            "blocks; give a larger chunk."
+            f"the study has {cells} cells of {trials:,} trials each, which makes more than {MOST_BLOCKS:,} blocks in "
+            f"chunks of {chunk} trials; give a larger chunk."
         )
 
     def of_one_setting(count: int) -> bool:

@@ -1,15 +1,17 @@
 """Arms, captures and calibrations as plain dictionaries with the unit in every key; ``--json`` prints them."""
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from ..calibration.agreement import Agreement, CrossValidation
 from ..calibration.evaluation import Evaluation
-from ..calibration.prediction import Agreement, CrossValidation
 from ..calibration.record import CalibrationRecord, uncertainty_of
 from ..calibration.results import PriorMetrics
+from ..core.errors import InputError
 from ..core.text import csv_text, pluralise
 from ..core.units import ARCSEC, people_read
 from ..data.capture import Capture, ReferenceLength
@@ -22,7 +24,8 @@ from ..diagnostics.model_errors import model_tests, rows_of_tests
 from ..diagnostics.pose_residuals import rms
 from ..diagnostics.recorded import findings_of_capture
 from ..diagnostics.usability import on_bounds
-from ..kinematics.arm import by_joint, correction_names, parameter_unit, value_of
+from ..kinematics.arm import Arm, by_joint, correction_names, parameter_unit, value_of
+from ..kinematics.corrected_arm import loads_of
 from ..kinematics.corrections import coefficient_of
 from ..kinematics.parameters import ArmSpecification
 from ..uncertainty.arm_uncertainty import Uncertainty
@@ -104,6 +107,18 @@ def capture_summary(recording: Recording) -> dict[str, Any]:
     }
 
 
+def masses_sentence(arm: Arm) -> str | None:
+    """Which masses the bending of an arm's joints was computed with; None where masses are not taken as known."""
+    loads = None if arm.corrections is None else loads_of(arm)
+    if loads is None:
+        return None
+    links = ", ".join(f"{mass:.3g}" for mass in loads.mass)
+    return (
+        f"Masses taken as known (gravity=masses): {links} kg by link, {sum(loads.mass):.3g} kg in all. A tool or "
+        "payload counts only if it is part of these; --model gravity needs no masses."
+    )
+
+
 def reference_length_rows(lengths: Sequence[ReferenceLength], **columns: Any) -> list[dict[str, Any]]:
     """Reference lengths with their calibrated value and other columns, mm."""
     ends = {"from": [length.start for length in lengths], "to": [length.end for length in lengths]}
@@ -114,6 +129,8 @@ def metrics(evaluation: Evaluation) -> dict[str, Any]:
     """Repeatability over all sockets, and the errors of the lengths; mm."""
     repeatability, error = evaluation.repeatability, np.asarray(evaluation.error)
     values = {"de_mm": repeatability.de, "deltam_mm": repeatability.deltam, "rms_mm": repeatability.rms}
+    if np.isfinite(repeatability.rms):
+        values["distance_largest_mm"] = np.asarray(evaluation.distances).max()
     # With one pose in every socket none of them is finite: there is no scatter.
     return {key: float(value) for key, value in values.items() if np.isfinite(value)} | length_metrics(error)
 
@@ -166,6 +183,7 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
         "sockets_used": list(recording.capture.names),
         "scale_expanded": uncertainty.expanded_k() if math.isfinite(record.u_k) else None,
         "decisions": list(record.decisions),
+        "masses": masses_sentence(record.calibrated.arm),
         "active_stage1": on_bounds(record),
         "active": on_bounds(record, final=True),
         **{stage: metrics(evaluation) for stage, evaluation in evaluations.items()},
@@ -197,7 +215,7 @@ def calibration_summary(record: CalibrationRecord, volume: VolumetricUncertainty
             summary["truth"][stage] = truth
     held_out = summary["cross_validation"]
     summary["lengths_tested"] = checked_lengths(summary["lengths"], held_out, record.fixed_by_one_length)
-    verdict = calibration_verdict(findings, summary["uncertainty"]["volume"], held_out, "truth" in summary)
+    verdict = calibration_verdict(findings, summary["uncertainty"], held_out, "truth" in summary)
     return summary | {"verdict": verdict._asdict()}
 
 
@@ -209,7 +227,9 @@ def _uncertainty_summary(record: CalibrationRecord, volume: VolumetricUncertaint
     if len(readings) > 1:  # a single pose has no distance from another
         poses = tried_poses(record.calibrated.arm, readings, volume.q)
         nearby = {"poses": len(poses.distance), "tried": int(poses.tried.sum()), "spacing_rad": poses.spacing}
-    pairs = uncertainty.correlated(_CORRELATED)
+    pairs, near = uncertainty.correlated(_CORRELATED), None
+    with contextlib.suppress(InputError):  # where no two poses are as far apart as the length
+        near = volumetric_uncertainty(uncertainty, length=volume.length, near=readings).summary
     for encoder in record.noisy_encoders:
         unit, size = ("mm", 1.0) if encoder.joint in record.calibrated.arm.prismatic else ("arcsec", ARCSEC)
         values = {name: getattr(encoder, name) / size for name in ("expected", "found", "u")}
@@ -223,6 +243,7 @@ def _uncertainty_summary(record: CalibrationRecord, volume: VolumetricUncertaint
         # Of the unknown geometry, whose uncertainty follows from the scatter of single poses.
         "coverage_factor_geometry_95": float(uncertainty.expanded_by_scatter(np.ones(1), np.zeros(1))[0]),
         "volume": plain(volume.summary),
+        "where_poses_were_taken": plain(near),
         "correlated": [{"one": first, "other": second, "r": r} for first, second, r in pairs],
         **attributes(observability, "rank", "condition", "indices"),
         "parameters": len(observability.names),

@@ -7,8 +7,9 @@ import numpy as np
 from ..acceptance.judgement import RULES
 from ..acceptance.record import EvaluationRecord, PointsRecord, check_geometry, unstated_uncertainty_warning
 from ..acceptance.results import METRICS, AcceptanceTest, Metric, MetricValue
+from ..calibration.agreement import NOTHING, Agreement
 from ..calibration.evaluation import Evaluation, evaluate
-from ..calibration.prediction import NOTHING, Agreement, unseen_errors
+from ..calibration.prediction import unseen_errors
 from ..core.errors import InputError
 from ..core.text import common_labels
 from ..data.capture import Capture, names_in, part_of
@@ -46,6 +47,7 @@ def evaluation_summary(
         "kind": "evaluation",
         "arm": record.recording.nominal.name,
         "warnings": list(record.warnings),
+        "calibration_unusable": record.calibration_unusable,
     }
     whole = _evaluated(record, capture)
     rows = metrics_by_socket_and_length(capture, whole["calibrated"])
@@ -90,7 +92,13 @@ def _grouped(part: Evaluation | None, whole: Evaluation, lengths: list[int]) -> 
         pairs = zip(part.observed.kinds, part.observed.distances, strict=True)
         # The only pose of a socket shows no scatter.
         scattered = [np.asarray(distances) for kind, distances in pairs if kind != "socket" or len(distances) > 1]
-        row["observed_rms_mm"] = rms(np.concatenate([np.zeros(0), *scattered]))
+        whole_distances = np.concatenate([np.zeros(0), *scattered])
+        row["observed_rms_mm"] = rms(whole_distances)
+        if len(whole_distances):
+            row |= {
+                "observed_mean_mm": float(whole_distances.mean()),
+                "observed_largest_mm": float(whole_distances.max()),
+            }
     return row | length_metrics(np.asarray(whole.error)[lengths])
 
 
@@ -141,12 +149,15 @@ def _add_prediction(
             {"group": label, "members": list(names)} | agreement_row(compared.of(names))
             for label, names in zip(common_labels(groups_of(part)), groups_of(part), strict=True)
         ]
+    unexpected = NOTHING  # lengths that are all within their U are as expected, however they lie within it
     if lengths:
         errors = compared if compared is not None and part is capture else unseen_errors(record.uncertainty, capture)
         of_lengths, expanded = errors.of_lengths(lengths), plain(errors.expanded())
         for row, i in zip(group["lengths"], lengths, strict=True):
             row["expanded_mm"] = expanded[i]
             row["error_over_expanded"] = plain(row["error_mm"] / expanded[i]) if expanded[i] else None
+        if any(abs(row["error_over_expanded"] or 0.0) > 1 for row in group["lengths"]):
+            unexpected = of_lengths
     group["predicted"] = {
         "poses": agreement_row(poses),
         "lengths": {
@@ -156,7 +167,7 @@ def _add_prediction(
         },
     }
     before, after = (group[stage].get("observed_rms_mm", group[stage].get("rms_mm")) for stage in record.arms())
-    unseen = surprise(poses, of_lengths, by_name, lambda: _with_probe_fitted(record.uncertainty, part))
+    unseen = surprise(poses, unexpected, by_name, lambda: _with_probe_fitted(record.uncertainty, part))
     return sentences(unseen + no_better(before, after))
 
 

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Evaluation
+from ..calibration.pose_table import HELD_OUT, USED, PoseResiduals
 from ..calibration.record import REPEATABILITY, CalibrationRecord
 from ..calibration.results import ObservedMetrics
 from ..core.rotations import inverse_frame
+from ..core.text import csv_text
 from ..data.capture import Capture
 from ..data.observations.observation import (
     POINT,
@@ -23,6 +25,7 @@ from ..data.observations.observation import (
 from ..diagnostics.contradictions import session_metrics
 from ..diagnostics.pose_residuals import ObservationResiduals, distances_of, observation_residuals, rms
 from ..model.observed import Observed
+from ..pipeline.hold_out import residuals_of
 from .tables import OTHER_RMS, attributes, observed_words, plain, rows_of
 
 _LITTLE_WEIGHT = 0.5
@@ -105,14 +108,50 @@ def observed_summary(record: CalibrationRecord, nominal: Evaluation) -> dict[str
         summary["geometry"] = _geometry(record.recording.capture, record.observed)
         summary["base"] = _base_rows(record)
         summary["less_weight"] = less_weight(residuals)
-    others = record.others
-    if others is not None:
-        columns = {"poses": others.poses, "rms_mm": others.rms, "rms_angle_rad": others.rms_angle}
-        columns |= {} if others.rms_px is None else {"rms_px": others.rms_px}
-        rows = rows_of(observation=others.names, **columns)
-        poses = int(others.poses.sum())
-        summary["other_poses"] = {"poses": poses, "rms_mm": others.rms_of_all, "observations": rows}
+    if record.held_out is not None:
+        summary["held_out_poses"] = _held_out_summary(record)
     return summary
+
+
+def _held_out_summary(record: CalibrationRecord) -> dict[str, Any]:
+    """Distances of held-out poses from their geometry, all together and by observation, and those of the used poses."""
+    rows = residuals_of(record)
+    held_out, names = rows.used_as(HELD_OUT), np.array(rows.observation, dtype=object)
+    return {
+        "held_out": distances_row(held_out),
+        "used": distances_row(rows.used_as(USED)),
+        "observations": [
+            {"observation": name} | distances_row(rows.select(names == name).used_as(HELD_OUT))
+            for name in dict.fromkeys(held_out.observation)
+        ],
+    }
+
+
+def distances_row(rows: PoseResiduals) -> dict[str, Any]:
+    """RMS, mean and largest distance of poses from their geometry, and the RMS that is predicted, mm; and the RMS of
+    residuals that are no lengths."""
+    known = np.isfinite(rows.distance)  # not of the only pose of a socket
+    distance = rows.distance[known]
+    row = {
+        "poses": len(distance),
+        "rms_mm": rms(distance),
+        "mean_mm": float(distance.mean()) if len(distance) else None,
+        "largest_mm": float(distance.max()) if len(distance) else None,
+        "rms_predicted_mm": rms(rows.u[known]),
+    }
+    others = {"rad": rows.angle, "px": rows.pixels}
+    measured = {key: others[unit][np.isfinite(others[unit])] for unit, key in OTHER_RMS.items()}
+    return plain(row | {key: rms(values) for key, values in measured.items()})
+
+
+def residuals_csv(rows: PoseResiduals) -> str:
+    """The residual of every pose as CSV: in the base frame, mm, with its distance and the u that is predicted for it;
+    empty where there is none."""
+    headings = ("observation", "pose", "use", *(f"residual_{axis}_mm" for axis in "xyz"), "distance_mm", "u_mm")
+    columns = (*rows.residual.T, rows.distance, rows.u, rows.angle, rows.pixels)
+    numbers = [["" if value is None else value for value in plain(column)] for column in columns]
+    cells = zip(rows.observation, rows.pose.tolist(), rows.use, *numbers, strict=True)
+    return csv_text([(*headings, "residual_rad", "residual_px"), *cells])
 
 
 def _agreement(pairs: Sequence[tuple[ObservationResiduals, np.ndarray]]) -> dict[str, Any]:

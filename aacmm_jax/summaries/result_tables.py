@@ -215,12 +215,22 @@ def agreement_tables(summary: Row) -> list[Table]:
     return [by_observation] if len(by_kind.rows) == len(by_observation.rows) else [by_kind, by_observation]
 
 
-def other_poses_table(others: Row) -> Table:
-    """How the calibrated arm agrees with poses that it was not calibrated with."""
-    caption = f"Held-out poses, drawn at random: {others['poses']}; RMS distance {others['rms_mm']:.4f} mm"
-    rows = others["observations"]
-    columns: Columns = {"observation": "observation", "poses": "poses", "RMS [mm]": "rms_mm"}
-    return listed(caption, rows, columns | tables.other_rms_columns(rows, "RMS"))
+def held_out_tables(summary: Row) -> list[Table]:
+    """How the calibrated arm agrees with poses that it was not calibrated with, beside those that it was."""
+    uses = [{"": name.replace("_", "-")} | summary[name] for name in ("held_out", "used")]
+    rows, columns = summary["observations"], {
+        "poses": "poses",
+        "RMS": "rms_mm",
+        "mean": "mean_mm",
+        "largest": "largest_mm",
+        "RMS predicted": "rms_predicted_mm",
+    }  # fmt: skip
+    title = "Distances of poses from their geometry [mm]"
+    shown = [listed(title, uses, {"": ""} | columns | tables.other_rms_columns(uses, "RMS"))]
+    if len(rows) > 1:
+        by_observation = {"observation": "observation"} | columns | tables.other_rms_columns(rows, "RMS")
+        shown.append(listed("Held-out poses by observation [mm]", rows, by_observation))
+    return shown
 
 
 def weights_table(summary: Row, most: int | None = None) -> Table:

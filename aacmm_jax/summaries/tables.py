@@ -28,7 +28,10 @@ METRICS = (
     ("de_mm", "DE, mean distance of poses from their socket's centroid"),
     ("deltam_mm", "Deltam, largest half range of a coordinate in a socket"),
     ("rms_mm", "RMS distance of poses from their socket's centroid"),
+    ("distance_largest_mm", "largest distance of a pose from its socket's centroid"),
     ("observed_rms_mm", "RMS distance of poses from their geometry, all kinds"),
+    ("observed_mean_mm", "mean distance of poses from their geometry, all kinds"),
+    ("observed_largest_mm", "largest distance of a pose from its geometry, all kinds"),
     ("length_error_mean_absolute_mm", "length error, mean absolute"),
     ("length_error_largest_mm", "length error, largest"),
 )

@@ -56,12 +56,12 @@ def inverse_information(
     # Only masks and a basis come from the eigenvectors: their derivative is infinite where eigenvalues repeat.
     values, vectors = semidefinite_eigen(information)
     informed = values > _NULL * values[0]
-    seen, lost = xp.where(informed[None, :], vectors, 0.0), xp.where(informed[None, :], 0.0, vectors)
+    seen, null = xp.where(informed[None, :], vectors, 0.0), xp.where(informed[None, :], 0.0, vectors)
     inner = seen.T @ information @ seen + xp.diag(xp.where(informed, 0.0, 1.0))
     inverse = seen @ inverse_positive_definite(inner) @ seen.T
     undetermined = xp.where((values > _LEAST_INFORMATION)[None, :] & informed[None, :], 0.0, vectors)
     determined = fixed | (xp.sum(undetermined**2, axis=1) < 1e-6)
-    return xp.where(free[:, None] & free[None, :], inverse, 0.0), lost @ lost.T, determined
+    return xp.where(free[:, None] & free[None, :], inverse, 0.0), null @ null.T, determined
 
 
 class SharedErrors(eqx.Module):

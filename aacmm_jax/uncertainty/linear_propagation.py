@@ -91,11 +91,11 @@ class Influence(NamedTuple):
     prior: Float[AnyArray, "h h"]  # information of the prior
     information: Float[AnyArray, "h h"]  # 1/G, with that of the prior
     inverse: Float[AnyArray, "h h"]  # G
-    lost: Float[AnyArray, "h h"]  # projector onto what the data leave open
+    null_projector: Float[AnyArray, "h h"]  # projector onto what the data leave open
     determined: Bool[AnyArray, " h"]  # numbers of the head that are determined one by one
     d_inverses: list[Float[AnyArray, "_ _ _"]]  # D^-1, class by class
     follow: list[Float[AnyArray, "_ _ h"]]  # D^-1 C
-    open: list[Bool[AnyArray, "_ _"]]  # numbers of components that their rows leave open
+    undetermined: list[Bool[AnyArray, "_ _"]]  # numbers of components that their rows leave open
 
     @classmethod
     def of(
@@ -131,13 +131,13 @@ class Influence(NamedTuple):
         for eliminated, weight in zip(rows, weights, strict=True):
             flat = _flat(eliminated if weight is None else eliminated * xp.sqrt(weight)[None, None])
             information = information + flat @ flat.T
-        inverse, lost, determined = inverse_information(information, fixed)
+        inverse, null_projector, determined = inverse_information(information, fixed)
         # D D^-1 has ones on the diagonal where a number is determined.
         seen = [
             xp.diagonal(matrix @ inverted, axis1=-2, axis2=-1)
             for matrix, inverted in zip(arrow.private, d_inverses, strict=True)
         ]
-        left = [values < 1 - 1e-6 for values in seen]
+        undetermined = [values < 1 - 1e-6 for values in seen]
         return cls(
             blocks,
             weights,
@@ -147,11 +147,11 @@ class Influence(NamedTuple):
             of_prior,
             information,
             inverse,
-            lost,
+            null_projector,
             determined,
             d_inverses,
             follow,
-            left,
+            undetermined,
         )
 
     def weighted(self, number: int, rows: Float[AnyArray, "k r m"]) -> Float[AnyArray, "k r m"]:

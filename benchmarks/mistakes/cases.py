@@ -1,6 +1,6 @@
 """Arms and kinds of data: eight captures that are sound, as they would be recorded with care.
 
-A case says which arm holds or shows what, and how well; `Case.layout` says where the tip is in every pose. Its noise is
+A case says which arm holds or shows what, and how well; `layout` says where the tip is in every pose. Its noise is
 what such encoders, seats and instruments have, and every u that its manifest states is right.
 """
 

@@ -5,7 +5,7 @@ import pytest
 
 import aacmm_jax as aj
 from aacmm_jax.calibration import sampling
-from aacmm_jax.calibration.prediction import CrossValidation, LeftOut
+from aacmm_jax.calibration.agreement import CrossValidation, LeftOut
 from aacmm_jax.calibration.sampling import numerical_tolerance
 from aacmm_jax.diagnostics.findings import findings_of, sentences
 from aacmm_jax.pipeline.cross_validation import groups_of
@@ -185,7 +185,9 @@ def test_one_placement_cannot_be_cross_validated(arm, bounds, capture):
 
 
 @pytest.mark.filterwarnings("ignore:.* the scale, so the reference lengths have no effect")
-@pytest.mark.parametrize(("options", "text"), [({"digits": 3}, "digits is 3; known"), ({"level": 95}, "level is 95")])
+@pytest.mark.parametrize(
+    ("options", "text"), [({"digits": 3}, "digits is 3; choose one of 1, 2"), ({"level": 95}, "level is 95")]
+)
 def test_refused(arm, bounds, capture, options, text):
     with pytest.raises(aj.InputError, match=text):
         aj.monte_carlo(aj.calibrate(arm, capture, bounds), capture, **options)

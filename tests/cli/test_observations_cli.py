@@ -1,6 +1,7 @@
 """The command line with observations: import, calibrate, robust losses, sessions, random parts, and refusals."""
 
 import contextlib
+import csv
 import io
 import json
 import re
@@ -72,7 +73,7 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
         "points",
         "sphere",
         "frame of tracker",
-        "Held-out poses, drawn",
+        "Held-out poses by observation",
     ):
         assert part in shown
     assert aacmm("show", "c.h5").stdout in shown
@@ -80,8 +81,9 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
     assert found["scale_k"] is None
     assert [row["kind"] for row in found["observations"]] == ["points", "sphere"]
     assert all(row["rms_after_mm"] < 0.1 < row["rms_before_mm"] for row in found["observations"])
-    assert (found["poses"], found["other_poses"]["poses"]) == (60, 25)
-    assert found["other_poses"]["rms_mm"] < 0.1
+    held_out = found["held_out_poses"]
+    assert (found["poses"], held_out["used"]["poses"], held_out["held_out"]["poses"]) == (60, 60, 25)
+    assert held_out["held_out"]["rms_mm"] < 0.1
     record = aj.files.load_calibration(tmp_path / "c.h5")
     aj.files.save_calibration(tmp_path / "again.h5", record)
     again = aj.files.load_calibration(tmp_path / "again.h5")
@@ -90,9 +92,9 @@ def test_a_tracker_and_a_sphere(aacmm, folder, tmp_path):
     assert np.array_equal(record.observed.rms_after, again.observed.rms_after)
     for part, values in record.observed.geometry.items():
         assert np.array_equal(values, again.observed.geometry[part])
-    assert record.others is not None
-    assert again.others is not None
-    assert np.array_equal(record.others.rms, again.others.rms)
+    assert record.held_out is not None
+    assert again.held_out is not None
+    assert np.array_equal(record.held_out.distance, again.held_out.distance)
     assert np.all(np.isfinite(aj.uncertainty_of(record).u))
     # Without the summary that the command stored, the same is computed.
     assert json.loads(aacmm("show", "again.h5", "--json").stdout) == found
@@ -270,6 +272,9 @@ def test_the_scale_of_the_nominal_arm(aacmm, folder):
         ("calibrate monday.h5 -o x.h5 --same-probe", ["--same-probe applies to several captures"]),
         ("calibrate monday.h5 monday.h5 -o x.h5", ["two captures have the file name 'monday'"]),
         ("calibrate monday.h5 -o x.h5 --only-poses 80", ["80 of 80 poses cannot be selected", "1 to 79"]),
+        ("calibrate monday.h5 -o x.h5 --hold-out 2", ["--hold-out 2", "between 0 and 1"]),
+        ("calibrate monday.h5 -o x.h5 --hold-out F", ["no socket or observation matches --hold-out 'F'"]),
+        ("calibrate monday.h5 -o x.h5 --hold-out 0.2 --only-poses 9", ["give one of them"]),
         ("calibrate tracker.h5 -o x.h5 --without 'no*'", ["no socket matches"]),
         ("evaluate c.h5 few.h5", ["sphere 'ball' has 2 touches"]),
         ("evaluate c.h5 monday.h5 --acceptance din", ["'din'", "jjf, asme, iso"]),
@@ -338,6 +343,26 @@ def test_poses_that_a_calibration_did_not_use_are_held_out(aacmm, folder):
     assert found["warnings"] == []
 
 
+def test_residuals_are_written_pose_by_pose(aacmm, folder, tmp_path):
+    """By `calibrate` and by `evaluate`: the same distances of the poses that were used, whose geometry is the same."""
+    command = ("calibrate", folder / "tracker.h5", "-o", "c.h5", "--hold-out", "ball", "--residuals", "c.csv")
+    found = json.loads(aacmm(*command, "--json").stdout)
+    aacmm("evaluate", "c.h5", folder / "tracker.h5", "--residuals", "e.csv")
+    tables = [list(csv.DictReader((tmp_path / name).read_text().splitlines())) for name in ("c.csv", "e.csv")]
+    uses = [[(row["observation"], row["pose"], row["use"]) for row in rows] for rows in tables]
+    assert uses[0] == uses[1]
+    assert [use for *_, use in uses[0]] == ["used"] * 60 + ["held out"] * 25
+    for row, again in zip(*tables, strict=True):
+        vector = [float(row[f"residual_{axis}_mm"]) for axis in "xyz"]
+        assert float(row["distance_mm"]) == pytest.approx(np.linalg.norm(vector), rel=1e-6)
+        assert float(row["distance_mm"]) == pytest.approx(float(again["distance_mm"]), abs=2e-3)
+    held_out = np.array([float(row["distance_mm"]) for row in tables[0][60:]])
+    summary = found["held_out_poses"]["held_out"]
+    assert summary["mean_mm"] == pytest.approx(held_out.mean())
+    assert summary["largest_mm"] == pytest.approx(held_out.max())
+    assert "--residuals" in aacmm("evaluate", "points.toml", "--residuals", "p.csv", expect=2).stderr
+
+
 @pytest.mark.slow
 def test_a_robust_cross_validation_names_the_group(aacmm, folder):
     """The group with a bad pose comes first, with a robust loss too."""
@@ -372,8 +397,9 @@ def test_the_robot_of_the_examples(aacmm, mukca):
     aacmm("import", mukca.parent / "ipa_ur10" / "positions.toml", "-o", "ur10.h5")
     aacmm("calibrate", "ur10.h5", "-o", "c.h5", "--only-poses", 500, "--seed", 0)
     found = json.loads(aacmm("show", "c.h5", "--json").stdout)
-    assert (found["poses"], found["other_poses"]["poses"]) == (500, 2272)
-    assert found["other_poses"]["rms_mm"] == pytest.approx(0.487, abs=0.001)
+    held_out = found["held_out_poses"]["held_out"]
+    assert (found["poses"], held_out["poses"]) == (500, 2272)
+    assert held_out["rms_mm"] == pytest.approx(0.487, abs=0.001)
     assert "beta_2" in [row["parameter"] for row in found["parameters"]]
     judged = json.loads(aacmm("evaluate", "c.h5", "ur10.h5", "--json").stdout)["identified_from"]["observations"][0]
     # The nominal arm is as far from its points in both: 1.15 mm where its errors count as noise of the readings.

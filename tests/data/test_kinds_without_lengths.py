@@ -242,8 +242,8 @@ def test_calibrate_prints_each_kind_in_its_unit(files, kind):
         assert row["rms_after_mm"] < 0.05 < row["rms_before_mm"]
         assert row["reduced_chi"] == pytest.approx(1.0, abs=0.3)
     assert rows["A"][key] is None
-    assert summary["other_poses"]["rms_mm"] < 0.05
-    others = {row["observation"]: row for row in summary["other_poses"]["observations"]}
+    assert summary["held_out_poses"]["held_out"]["rms_mm"] < 0.05
+    others = {row["observation"]: row for row in summary["held_out_poses"]["observations"]}
     assert others["left"][key] is not None
     assert others["A"].get(key) is None
     largest = summary["truth"]["calibrated"]["length_error_largest_mm"]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from aacmm_jax.calibration.prediction import NOTHING, Agreement, CrossValidation, LeftOut
+from aacmm_jax.calibration.agreement import NOTHING, Agreement, CrossValidation, LeftOut
 from aacmm_jax.diagnostics.findings import sentences
 from aacmm_jax.diagnostics.held_out import contradicted_prediction, no_better, surprise
 from aacmm_jax.summaries.calibration import cross_validation_summary

@@ -8,7 +8,8 @@ import pytest
 import aacmm_jax as aj
 from aacmm_jax.data import observations as kinds
 from aacmm_jax.diagnostics import reading_check, reading_search
-from aacmm_jax.diagnostics.reading_check import check_capture, explanation_words, reading_check_summary
+from aacmm_jax.diagnostics.capture_check import check_capture
+from aacmm_jax.diagnostics.reading_check import explanation_words, reading_check_summary
 from aacmm_jax.diagnostics.reading_fit import Explanation
 from aacmm_jax.files.reading_checks import units_toml
 

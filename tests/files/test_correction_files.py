@@ -19,7 +19,9 @@ MASSES = {"mass": [1.0, 2.0, 0.5], "centre": np.arange(9.0).reshape(3, 3)}
 def corrected(**masses) -> aj.Arm:
     """An arm whose parameters have changed since its corrections were chosen."""
     arm = aj.Arm(alpha=[1.5, 0.1, 0.4], a=[50.0, 300.0, 40.0], d=[20.0, 0.0, 250.0], beta=[0, 0.1, 0])
-    arm = with_corrections(arm.replace(limits=[(-2, 2)] * 3), "gravity,harmonics=1,gear", **masses)
+    arm = with_corrections(
+        arm.replace(limits=[(-2, 2)] * 3), f"gravity{'=masses' * bool(masses)},harmonics=1,gear", **masses
+    )
     return arm.replace(coefficients=1e-3 * np.arange(len(arm.coefficients)), d_3=251.0, gravity=(0, 0.1, -1))
 
 
@@ -75,7 +77,8 @@ def test_a_model_in_an_arm_file(tmp_path):
         'model = "gear"\ncoefficients = {gear_1 = 1e-3}': "exactly one of model and coefficients",
         'model = "gears"': "unknown model 'gears'; did you mean 'gear'",
         "coefficients = {gear_4 = 1e-3}": "'gear_4' must name a joint from 1 to 3",
-        'model = "gravity"\nmass = [1, 2, 3]': "give both or neither",
+        'model = "gravity=masses"\nmass = [1, 2, 3]': "give both or neither",
+        'model = "gravity"\nmass = [1, 2, 3]': "apply only to model = 'gravity=masses'",
         "coefficients = {gear_1 = 1e-3}\nnominal = {alfa = [1, 2, 3]}": "nominal has the unknown key 'alfa'",
     }.items():
         file.write_text(f"{plain}\n[corrections]\n{text}\n")

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 import aacmm_jax as aj
-from aacmm_jax.calibration.prediction import CrossValidation, LeftOut
+from aacmm_jax.calibration.agreement import CrossValidation, LeftOut
 from aacmm_jax.core.text import printable
 from aacmm_jax.files.arms import specification_toml
 from aacmm_jax.files.hdf5 import write_tables

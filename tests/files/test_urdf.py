@@ -8,8 +8,10 @@ import pytest
 import yourdfpy
 
 import aacmm_jax as aj
+from aacmm_jax.files.arm_tables import with_model
 from aacmm_jax.files.urdf import urdf_chain, urdf_of
 from aacmm_jax.kinematics.axes_to_dh import dh_frames, geometry_of
+from aacmm_jax.summaries.calibration import masses_sentence
 
 from ..refusals import assert_refused
 
@@ -145,6 +147,18 @@ def test_masses_of_what_each_joint_carries(nominal):
     np.testing.assert_allclose(first, [0, 0, 400], atol=1e-9)
     along = 50 * np.array([np.cos(0.2), np.sin(0.2)])
     np.testing.assert_allclose(second, [*along, 400 + (3 * 200 + 400) / 4], atol=1e-9)
+
+
+def test_gravity_is_one_model_with_or_without_masses(nominal):
+    """Those of a URDF, which seldom has all, count only where the model says so, which a result then states."""
+    general = with_model(nominal, "gravity").arm
+    assert all(term.number and term.loads is None for term in general.corrections.functions.terms)
+    assert masses_sentence(general) is None
+    loaded = with_model(nominal, "gravity=masses").arm
+    assert set(loaded.corrections.functions.names) == {"compliance_2"}  # the masses end there, and axis 1 is vertical
+    assert masses_sentence(loaded).startswith(
+        "Masses taken as known (gravity=masses): 4, 4, 0, 0, 0, 0 kg by link, 8 kg in all."
+    )
 
 
 def test_files_keep_the_urdf(tmp_path, nominal):

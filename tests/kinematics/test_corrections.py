@@ -13,7 +13,7 @@ from aacmm_jax.kinematics.arm import correction_names
 from aacmm_jax.kinematics.chain import KnownFunctions, forward_pass, joint_motion, joints_first
 from aacmm_jax.kinematics.corrected_arm import function_values
 from aacmm_jax.kinematics.corrections import terms_of
-from aacmm_jax.kinematics.jacobian import rotation_columns
+from aacmm_jax.kinematics.jacobian import reading_columns, rotation_columns
 
 MODEL = "gravity,harmonics,gear,coupled"
 
@@ -120,13 +120,18 @@ def test_moment_of_gravity():
     q = np.array([[0.7, np.radians(30)]])
     moment = -2e-3 * 9.80665 * 0.3 * np.cos(np.radians(30))
     for gravity, expected in (((0, 0, -1), moment), ((0, 0, -3), moment)):
-        loaded = with_corrections(arm, "gravity", mass=[0, 2], centre=[(0, 0, 0), (-100, 0, 0)], gravity=gravity)
+        loaded = with_corrections(arm, "gravity=masses", mass=[0, 2], centre=[(0, 0, 0), (-100, 0, 0)], gravity=gravity)
         assert correction_names(loaded)[:-3] == ("compliance_2",)  # the first axis is vertical
         (found,) = function_values(arm.geometry, loaded.corrections.functions.terms, q, np.asarray(loaded.gravity))
         np.testing.assert_allclose(found, [expected], rtol=1e-12)
         yielded = loaded.replace(compliance_2=0.1)
         np.testing.assert_allclose(yielded.position(q), arm.position(q + np.array([0, 0.1 * expected])), rtol=1e-12)
-    unknown = with_corrections(arm, "gravity")
+    # Without this option masses count for nothing, and with it they are needed.
+    unknown = with_corrections(arm, "gravity", mass=[0, 2], centre=[(0, 0, 0), (-100, 0, 0)])
+    assert parameter_names(unknown) == parameter_names(with_corrections(arm, "gravity"))
+    for model in ("gravity=masses", ["compliance_2"]):
+        with pytest.raises(aj.InputError, match="needs the masses of the links"):
+            with_corrections(arm, model)
     (found,) = function_values(arm.geometry, unknown.corrections.functions.terms, q, np.asarray(unknown.gravity))
     np.testing.assert_allclose(found, -0.4 * np.cos(np.radians(30)), rtol=1e-12)
 
@@ -149,6 +154,26 @@ def test_functions_of_the_readings():
         corrected = with_corrections(arm, [name]).replace(**{name: 1e-3})
         moved = q + 1e-3 * function[:, None] * (np.arange(1, 4) == int(name[-1]))
         np.testing.assert_allclose(corrected.position(q), arm.position(moved), atol=1e-10)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 1.0])
+def test_a_full_coupling_moves_the_frames_of_gravity_and_the_reading(elbow, factor):
+    """Joint 3 of parallel links: its moments are those at the angle that it has, and moving joint 2 moves both."""
+    plain = elbow.replace(corrections=None, coefficients=None, gravity=None)
+    names = ["coupled2_3", "compliance3_2", "compliance3_3"]
+    coupled = with_corrections(plain, names).replace(coupled2_3=factor + 1e-3)
+    q = readings(plain)
+    angles = q + factor * q[:, 1:2] * (np.arange(3) == 2)
+    rows = joint_motion(coupled.geometry, q).functions[1:]  # the first is the reading itself
+    uncoupled = coupled.replace(coupled2_3=0.0)
+    np.testing.assert_allclose(rows, joint_motion(uncoupled.geometry, angles).functions[1:], atol=1e-12)
+    forward = forward_pass(coupled.geometry, joint_motion(coupled.geometry, q))
+    columns = np.moveaxis(np.asarray(reading_columns(forward)), -1, 0)
+    exact = np.swapaxes(coupled.jacobian(q, ["q_1", "q_2", "q_3"]), 1, 2)
+    np.testing.assert_allclose(columns, exact, atol=1e-3 * 600)  # but for the small part
+    np.testing.assert_allclose(
+        np.asarray(forward.tip).T, plain.position(angles + 1e-3 * q[:, 1:2] * (np.arange(3) == 2)), atol=1e-9
+    )
 
 
 def test_ranges_of_orders():
@@ -177,6 +202,7 @@ def test_the_nominal_arm_decides_the_functions(elbow):
         ("expansion=2", "expansion takes no option"),
         (["expansion_1"], "applies to the whole arm, so its name must have no number"),
         (["cos1"], "must name a joint from 1 to 7"),
+        ("gravity=mass", "gravity=mass is unknown; write gravity, or gravity=masses"),
         ("coupled=2", "does not name pairs of joints"),
         ("coupled=2-9", "must name a joint from 1 to 7"),
         (["cos1_9"], "must name a joint from 1 to 7"),
