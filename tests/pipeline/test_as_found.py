@@ -8,9 +8,8 @@ from aacmm_jax.files.arms import specification_toml
 from aacmm_jax.report import write_report
 from tests.refusals import assert_refused
 
-MANIFEST = (
-    'arm = "cheng2018-simulation"\n{}socket = [{{ name = "A", file = "A.csv" }}, {{ name = "B", file = "B.csv" }}]\n'
-)
+ARM = 'arm = "cheng2018-simulation"\n'
+SOCKETS = 'socket = [{ name = "A", file = "A.csv" }, { name = "B", file = "B.csv" }]\n'
 LENGTH = 'length = [{ from = "A", to = "B", value = 200.0, u = 0.001 }]\n'
 
 
