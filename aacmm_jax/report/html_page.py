@@ -18,7 +18,7 @@ from ..plot.svg import drawn, key, points
 from ..summaries.tables import Cell, Table
 from .elements import ArmView, Report
 
-KINDS = ("calibration", "evaluation", "study", "model comparison")
+KINDS = ("calibration", "evaluation", "study", "model comparison", "comparison")
 _FOLDER = Path(__file__).parent
 _MOST_STACKED = 30  # cells: more would be a list without end
 _NARROW, _CHARACTER, _GAP = 370.0, 7.6, 8.0  # pixels: a telephone's page, a character, between columns
@@ -51,13 +51,13 @@ _ADDRESS = ("street", "postal_code", "city", "country", "email", "phone")
 def write_report(
     source: str | os.PathLike, target: str | os.PathLike, administrative_data: AdministrativeData | None = None
 ) -> dict[str, Any]:
-    """Write the report of a calibration, an evaluation, a study or compared models as one HTML file.
+    """Write the report of a calibration, an evaluation, a study, or compared models or calibrations as one HTML file.
 
     Returns title, verdict, warnings and size of the report. `InputError` if the source cannot be read or the target not
     written, the administrative data state a conformity that the source contradicts, or Jinja is not installed.
 
     Args:
-        source: The HDF5 file of the calibration, the evaluation, the study or the compared models.
+        source: The HDF5 file of the calibration, the evaluation, the study, or the compared models or calibrations.
         target: The HTML file to write, whole or not at all.
         administrative_data: Laboratory, customer, item, persons, dates and artefacts, shown in a section of their own.
 
@@ -112,6 +112,11 @@ def _report_of(kind: str, source: str | os.PathLike, attributes: dict[str, Any])
         from .studies import study_report
 
         return study_report(Results.of(source))
+    if kind == "comparison":
+        from ..files.comparisons import load_comparison
+        from .drift import comparison_report
+
+        return comparison_report(load_comparison(source))
     from ..files.evaluations import load_compared_models
     from .studies import models_report
 
