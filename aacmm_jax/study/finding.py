@@ -77,7 +77,10 @@ def _in_words(effect: _Effect, what: str) -> str:
     ratio, levels, unit = effect.ratios[worst], effect.levels, factor_title(effect.name).partition(" [")[2][:-1]
     times = f"{ratio:.2g}" if ratio < 10 else f"{ratio:.0f}"
     says = f"{level_title(effect.name, levels[worst])} makes {what} {times} times as large"
-    from_there, up_to_there = alike[::-1].argmin(), alike.argmin()  # how many levels at either end make no difference
+    from_there, up_to_there = (
+        int(alike[::-1].argmin()),
+        int(alike.argmin()),
+    )  # how many levels at either end make no difference
     if worst == 0 and from_there > 1 and not isinstance(levels[0], str):
         return f"{says}; from {level_text(levels[len(levels) - from_there])} {unit} on, it makes no difference"
     if worst == len(levels) - 1 and up_to_there > 1 and not isinstance(levels[0], str):
