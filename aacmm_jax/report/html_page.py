@@ -79,9 +79,9 @@ def write_report(
             mark = "unsure" if report.decision == "conforms" else report.verdict_mark  # no real arm conforms
             report = report._replace(warnings=warnings, verdict_mark=mark)
         if administrative_data is not None:
-            tested = kind == "evaluation"
-            check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, tested=tested)
-            report = report._replace(administrative=_administrative(administrative_data, tested))
+            needed = "" if kind == "evaluation" else "write the report of an evaluation with limits"
+            check_conformity(administrative_data, simulated=report.simulated, decision=report.decision, needed=needed)
+            report = report._replace(administrative=_administrative(administrative_data))
         page = _render(report, _origin(read, attributes))
         write_text(target, page)
     return {
@@ -181,8 +181,8 @@ def _stacked(table: Table, cells: list[list[Cell]]) -> bool:
     return characters * _CHARACTER + _GAP * len(texts) > _NARROW
 
 
-def _administrative(given: AdministrativeData, tested: bool) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Groups of titles and values of the administrative data; ``tested``: whether the report has acceptance tests."""
+def _administrative(given: AdministrativeData) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Groups of titles and values of the administrative data."""
 
     def stated(part: str, key: str) -> str:
         value = getattr(getattr(given, part), key)
@@ -211,9 +211,8 @@ def _administrative(given: AdministrativeData, tested: bool) -> list[tuple[str, 
     for title, lines in (("Reference artefacts", artefacts), ("Responsible", persons)):
         groups.append((title, [("", line) for line in lines or [NOT_STATED]]))
     if given.conformity is not None:
-        source = "" if tested else " (stated by the laboratory; this file contains no acceptance test)"
         conformity = given.conformity
-        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}{source}"
+        words = f"{conformity.verdict}: {conformity.specification}; {conformity.decision_rule}"
         groups.append(("Statement of conformity", [("", words)]))
     return groups
 
