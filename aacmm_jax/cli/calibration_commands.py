@@ -128,8 +128,9 @@ def calibrate(
         "Leave out a socket, placement or station that contradicts all others, even with --no-automatic.",
     ),
     automatic: bool = option(
-        "Widen default bounds that the fit reaches, leave out groups that contradict all others, and choose the model "
-        "of the joints that predicts held-out regions best. What is stated by options or the arm file stays as stated.",
+        "Use a prior if there are too few data, correct readings whose order, signs, zeros or units are wrong, widen "
+        "default bounds that the fit reaches, leave out groups that contradict all others, and choose the model of the "
+        "joints that predicts held-out regions best. What is stated by options or the arm file stays as stated.",
         default=True,
     ),
     residuals: Path | None = options.RESIDUALS,
