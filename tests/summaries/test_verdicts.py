@@ -104,8 +104,8 @@ _EXPECTED = "Errors on held-out data are about as predicted, or smaller"
         (
             evaluated("undecided", deciding_mm=0.0123, expanded_mm=0.03, where="bar 1"),
             "unsure",
-            "Undecided: the measurement is too uncertain for a decision on E_0: its U at bar 1 would have to be at most "
-            "0.012 mm instead of 0.030 mm",
+            "Undecided: the measurement is too uncertain for a decision on E_0: its U at bar 1 would have to be at "
+            "most 0.012 mm instead of 0.030 mm",
             1,
         ),
         (evaluated("fails", undecided=["About 9 poses."]), "bad", "Fails", 1),
