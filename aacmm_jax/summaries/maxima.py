@@ -1,7 +1,8 @@
 """Decisions on the limits of ``aacmm evaluate --max-...``: passed, failed or undecided, and what would decide.
 
 By JCGM 106:2012, a value passes where the probability that the quantity is over its limit, the specific risk of a false
-acceptance, is at most 5 %; and fails where the probability that it is within is at most that. The quantity has no prior.
+acceptance, is at most 5 %, and fails where the probability that it is within is at most that. The quantity has no
+prior.
 
 An RMS distance v of f degrees of freedom says of the arm's own RMS s that f v^2 / s^2 is chi-square distributed; the
 error of a length is Student's t distributed about the value found, with its u. Deltam is a largest value of the very
