@@ -16,6 +16,7 @@ from ..core.text import shorten
 from ..data.capture import Capture, ReferenceLength, check_readings, join_sessions
 from ..data.observations.held import Socket
 from ..data.recording import ProbedSphere, Recording, checked_sphere
+from ..kinematics.chain import beside_joints
 from ..kinematics.workspace import Reach
 from .arms import arm_beside, read_arm, usual_noise, with_parameters
 from .inputs import InputFile
@@ -90,8 +91,9 @@ def _read(path: str | os.PathLike) -> tuple[Recording, Readings]:
                 "[sessions] applies only to tables with a session, but no table has a session; remove [sessions]."
             )
         capture = _capture(lengths, observed, probe == "remounted")
-        if capture.columns == nominal.arm.joints + 1:
-            nominal = nominal._replace(arm=nominal.arm.replace(thermometer=True))
+        torques, temperature = beside_joints(nominal.arm.joints, capture.columns)
+        beside = {"torques": torques.stop > torques.start, "thermometer": temperature.start < capture.columns}
+        nominal = nominal._replace(arm=nominal.arm.replace(**{key: True for key, given in beside.items() if given}))
         check_readings(capture, nominal.arm)
         recording = Recording(
             capture,
